@@ -1,0 +1,119 @@
+"""JSON cards: what made an artifact, written whole or not at all, and checked before use."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import psutil
+import torch
+
+from crptpro.errors import CRPTproError, DiskSpaceError
+
+PACKAGES = (
+    "crptpro", "torch", "torchrl", "tensordict", "dm-control", "mujoco", "gymnasium", "numpy", "wandb",
+)  # fmt: skip
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Return the installed version of every package that can change a number, and Python's."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+@cache
+def hardware() -> dict[str, Any]:
+    """Return CPU model and core count, RAM in bytes, and the GPU names torch sees."""
+    cpu = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
+        cpu = names[0].split(":", 1)[1].strip() if names else cpu
+    return {
+        "cpu": cpu,
+        "cpu_cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "ram_bytes": psutil.virtual_memory().total,
+        "gpus": [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())],
+    }
+
+
+@cache
+def git_revision() -> str:
+    """Return the revision of the source checkout, ``+dirty`` if modified, or ``"unknown"``."""
+    here = Path(__file__).resolve().parent
+    try:
+        run = ["git", "-C", str(here), "describe", "--always", "--dirty=+dirty", "--abbrev=12"]
+        return subprocess.run(run, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+
+
+def provenance() -> dict[str, Any]:
+    """Return the part of a card that every artifact shares: versions, hardware, git revision."""
+    return {"versions": versions(), "hardware": hardware(), "git_revision": git_revision()}
+
+
+def write_json(path: str | Path, content: dict[str, Any]) -> None:
+    """Write JSON beside ``path`` and rename it into place, so that a reader never sees half a card."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "w") as file:
+            json.dump(content, file, indent=2, sort_keys=True, default=str)
+            file.write("\n")
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def read_json(path: str | Path, *, error: type[CRPTproError] = CRPTproError) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        CRPTproError: (or ``error``) if the file is missing, not JSON, or not an object.
+    """
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise error(f"{path} does not exist.") from None
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as reason:
+        raise error(f"{path} cannot be read as JSON ({reason}); it is damaged or foreign.") from None
+    if not isinstance(content, dict):
+        raise error(f"{path} holds a {type(content).__name__}, expected a JSON object.")
+    return content
+
+
+def require_disk(path: str | Path, needed_bytes: int, what: str) -> None:
+    """Refuse, before anything is written, what the disk under ``path`` cannot hold with 5 % to spare.
+
+    Raises:
+        DiskSpaceError: naming what is needed, what is free, and where.
+    """
+    probe = Path(path).absolute()
+    while not probe.exists():
+        probe = probe.parent
+    free = shutil.disk_usage(probe).free
+    if needed_bytes * 1.05 > free:
+        raise DiskSpaceError(
+            f"{what} needs {needed_bytes / 1e9:.2f} GB, but {probe} has {free / 1e9:.2f} GB free. "
+            "Free space, choose another directory, or ask for fewer transitions."
+        )

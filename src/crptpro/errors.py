@@ -1,0 +1,35 @@
+"""Errors that a user can act on: each message names the offending value and the remedy."""
+
+from __future__ import annotations
+
+
+class CRPTproError(RuntimeError):
+    """Base of every error this library raises on purpose; the command line prints only its message."""
+
+
+class UnknownNameError(CRPTproError):
+    """A domain, task, group or method that is not registered; the message lists the nearest names."""
+
+
+class RenderingError(CRPTproError):
+    """No GL backend renders a live frame, or the first frame did not arrive in time."""
+
+
+class DatasetError(CRPTproError):
+    """A dataset is missing, truncated, foreign or does not fit its use."""
+
+
+class DiskSpaceError(CRPTproError):
+    """A write was announced that the disk cannot hold."""
+
+
+class CheckpointError(CRPTproError):
+    """A checkpoint is unreadable or belongs to another configuration."""
+
+
+class PretrainedError(CRPTproError):
+    """A pretrained artifact is missing, damaged or does not fit its use."""
+
+
+class NonFiniteError(CRPTproError):
+    """A loss or a gradient became NaN or infinite."""
