@@ -1,0 +1,17 @@
+"""Networks: the pixel encoder, its pre-training heads, and the downstream actor and critic."""
+
+from crptpro.modules.actor_critic import SquashedGaussianActor, TwinCritic
+from crptpro.modules.encoder import PixelEncoder
+from crptpro.modules.heads import Predictor, Projector, Prototypes
+from crptpro.modules.precision import resolve_precision, set_compute_dtype
+
+__all__ = [
+    "PixelEncoder",
+    "Predictor",
+    "Projector",
+    "Prototypes",
+    "SquashedGaussianActor",
+    "TwinCritic",
+    "resolve_precision",
+    "set_compute_dtype",
+]

@@ -1,0 +1,22 @@
+"""TorchRL transforms: augmentation, frozen features, and the exploration bonus."""
+
+from crptpro.transforms.dense_features import DenseShiftFeatures
+from crptpro.transforms.dense_shift import crop_features, dense_shift_geometry, dense_shift_maps
+from crptpro.transforms.frozen_encoder import FrozenEncoder
+from crptpro.transforms.prototype_reward import PrototypeReward
+from crptpro.transforms.random_shift import RandomShift, draw_offsets, random_shift
+from crptpro.transforms.shift_cache import DenseShiftCache, choose_feature_mode
+
+__all__ = [
+    "DenseShiftCache",
+    "DenseShiftFeatures",
+    "FrozenEncoder",
+    "PrototypeReward",
+    "RandomShift",
+    "choose_feature_mode",
+    "crop_features",
+    "dense_shift_geometry",
+    "dense_shift_maps",
+    "draw_offsets",
+    "random_shift",
+]

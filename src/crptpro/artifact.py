@@ -1,0 +1,130 @@
+"""A directory of weights and a card, written whole or not at all and checked before use."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor, nn
+
+from crptpro.cards import read_json, write_json
+from crptpro.errors import CRPTproError
+
+WEIGHTS_FILE = "weights.safetensors"
+CARD_FILE = "card.json"
+
+
+def write_artifact(
+    path: str | Path,
+    modules: Mapping[str, nn.Module | Mapping[str, Tensor]],
+    *,
+    card: Mapping[str, Any],
+    format_name: str,
+    version: int,
+) -> Path:
+    """Write ``weights.safetensors`` and ``card.json`` beside ``path`` and rename the directory into place.
+
+    A reader sees the old artifact or the new one, never a mixture; a write that fails (a full disk, a kill)
+    leaves the old one.
+
+    Args:
+        path: directory to write or replace.
+        modules: name to network or to its state dict; tensors are stored as ``name.key``.
+        card: JSON-able facts; ``format``, ``version`` and ``weights_sha256`` are added.
+        format_name: what kind of artifact this is.
+        version: of the format.
+
+    Returns:
+        ``path``.
+    """
+    from safetensors.torch import save_file
+
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tensors = {}
+    for name, module in modules.items():
+        state = module.state_dict() if isinstance(module, nn.Module) else module
+        # A clone: safetensors refuses tensors that share storage, as slices of one buffer do.
+        tensors.update({f"{name}.{key}": value.detach().cpu().contiguous().clone() for key, value in state.items()})
+    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    try:
+        weights = temporary / WEIGHTS_FILE
+        save_file(tensors, weights)
+        with open(weights, "rb") as file:
+            os.fsync(file.fileno())
+        digest = _sha256(weights)
+        facts = {"format": format_name, "version": version, "weights_sha256": digest}
+        write_json(temporary / CARD_FILE, {**card, **facts})
+        temporary.chmod(0o755)
+        _replace_directory(temporary, path)
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+    return path
+
+
+def read_artifact(
+    path: str | Path, *, format_name: str, version: int, error: type[CRPTproError] = CRPTproError
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Read and verify an artifact.
+
+    Returns:
+        The card, and the tensors by ``name.key`` on the CPU.
+
+    Raises:
+        CRPTproError: (or ``error``) naming what is missing, damaged, of another kind or too new.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    path = Path(path)
+    _recover(path)
+    if not path.is_dir():
+        raise error(f"{path} does not exist or is not a directory; expected one with {WEIGHTS_FILE} and {CARD_FILE}.")
+    card = read_json(path / CARD_FILE, error=error)
+    if card.get("format") != format_name:
+        raise error(f"{path} is a {card.get('format', 'directory of unknown format')!r}, expected {format_name!r}.")
+    if card.get("version", 0) > version:
+        raise error(f"{path} has format version {card['version']}; this crptpro reads up to {version}. Upgrade crptpro.")
+    weights = path / WEIGHTS_FILE
+    if not weights.exists():
+        raise error(f"{weights} is missing; the artifact is incomplete. Copy the whole directory.")
+    if _sha256(weights) != card.get("weights_sha256"):
+        raise error(f"{weights} is not the file its card was written for: truncated, damaged or replaced.")
+    try:
+        return card, load_file(weights)
+    except (SafetensorError, OSError) as reason:
+        raise error(f"{weights} cannot be read ({reason}).") from None
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        for block in iter(lambda: file.read(1 << 20), b""):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _previous(path: Path) -> Path:
+    return path.with_name(f".{path.name}.previous")
+
+
+def _replace_directory(new: Path, path: Path) -> None:
+    """Swap directories; a kill between the two renames is repaired by :func:`_recover`."""
+    previous = _previous(path)
+    if path.exists():
+        shutil.rmtree(previous, ignore_errors=True)
+        os.rename(path, previous)
+    os.rename(new, path)
+    shutil.rmtree(previous, ignore_errors=True)
+
+
+def _recover(path: Path) -> None:
+    previous = _previous(path)
+    if previous.is_dir() and not path.exists():
+        os.rename(previous, path)

@@ -1,0 +1,283 @@
+"""The ``crptpro`` command: a thin, typed shell over the library's functions."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from crptpro.console import run_main
+from crptpro.domains import GROUPS
+from crptpro.errors import CRPTproError, UnknownNameError
+from crptpro.training.downstream_config import DownstreamConfig
+
+logger = logging.getLogger(__name__)
+
+Quality = Literal["exact", "fast"]
+Precision = Literal["auto", "fp32", "bf16"]
+RANDOM_ENCODER = "random-encoder"
+
+
+@dataclass(frozen=True)
+class Logging:
+    """Where metrics go besides the local CSV and JSONL records, which are always written."""
+
+    wandb: Literal["off", "auto", "offline", "online"] = "off"
+    """mirror to Weights & Biases; auto is online when logged in, else offline"""
+    wandb_project: str = "crptpro"
+    """W&B project"""
+    wandb_group: str | None = None
+    """W&B group"""
+    wandb_tags: tuple[str, ...] = ()
+    """W&B tags"""
+    tensorboard: bool = False
+    """also write TensorBoard event files"""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Check that this machine can run crptpro: render every domain, print versions, say what to fix."""
+
+    domains: tuple[str, ...] = ()
+    """only these domains (default: the paper's eight)"""
+
+    def run(self) -> None:
+        """Print the report; exit status 1 unless a run would work."""
+        from crptpro.doctor import run_doctor
+
+        report = run_doctor(domains=self.domains or None)
+        print(report.text())
+        if not report.ok:
+            raise SystemExit(1)
+
+
+@dataclass(frozen=True)
+class Collect:
+    """Let a uniform random policy fill one dataset per domain."""
+
+    domains: Positional[tuple[str, ...]]
+    """domains, tasks, or group letters, e.g. `walker cartpole`, `A`, `gymnasium:HalfCheetah-v5`"""
+    out: Path = Path("data")
+    """one directory per domain is made below this one"""
+    transitions: int = 100_000
+    """transitions per domain (21 KB each)"""
+    seed: int = 0
+    """the same seed gives the same data whatever the number of workers"""
+    workers: int = field(default_factory=lambda: len(os.sched_getaffinity(0)))
+    """collecting processes, shared by all domains (default: one per core)"""
+    quality: Quality = "exact"
+    """render quality; fast uses smaller shadow maps on software GL"""
+
+    def run(self) -> None:
+        """Collect, or continue collecting."""
+        from crptpro.data import collect_group
+
+        paths = collect_group(
+            expand_groups(self.domains),
+            self.out,
+            transitions=self.transitions,
+            seed=self.seed,
+            workers=self.workers,
+            quality=self.quality,
+        )
+        for name, path in paths.items():
+            logger.info("%s: %s", name, path)
+
+
+@dataclass(frozen=True)
+class Pretrain:
+    """Pre-train one encoder on the datasets of several domains, one update per domain in turn."""
+
+    datasets: Positional[tuple[Path, ...]]
+    """dataset directories, e.g. data/walker data/cartpole"""
+    out: Annotated[Path, arg(name="out")]
+    """run directory: records and checkpoints, and the pretrained encoder in OUT/encoder"""
+    method: str = "crptpro"
+    """a registered method, e.g. crptpro or released-code"""
+    updates: int | None = None
+    """encoder updates over all domains (default: the method's, 50,000)"""
+    batch_size: int | None = None
+    """transitions per update (default: the method's, 512)"""
+    learning_rate: float | None = None
+    """of Adam (default: the method's, 1e-4)"""
+    assignment_temperature: float | None = None
+    """temperature of the Sinkhorn-Knopp targets (default: the student's, 0.1)"""
+    intr_loss_coef: float | None = None
+    """weight of the prototype dispersion loss (default: the method's, 5e-3)"""
+    seed: int = 0
+    """seeds initialisation, sampling and shifts"""
+    precision: Precision = "auto"
+    """arithmetic of the convolutions and big matrix products"""
+    device: str = "cpu"
+    """where to train"""
+    checkpoint_interval: int = 500
+    """updates between two checkpoints"""
+    log_interval: int = 50
+    """updates between two rows of the record"""
+    logging: Logging = Logging()
+    """mirrors"""
+
+    def run(self) -> None:
+        """Pre-train, or continue, and write the artifact."""
+        from crptpro.objectives import build_loss
+        from crptpro.pretrained import save_pretrained
+        from crptpro.training import pretrain
+
+        options = {
+            name: value
+            for name in ("assignment_temperature", "intr_loss_coef")
+            if (value := getattr(self, name)) is not None
+        }
+        loss = build_loss(self.method, seed=self.seed, **options)
+        with run_logger(self.out, self.logging, self) as records:
+            pretrain(
+                loss,
+                list(self.datasets),
+                updates=self.updates,
+                batch_size=self.batch_size,
+                learning_rate=self.learning_rate,
+                seed=self.seed,
+                precision=self.precision,
+                device=self.device,
+                run_dir=self.out,
+                logger=records,
+                checkpoint_interval=self.checkpoint_interval,
+                log_interval=self.log_interval,
+            )
+            logger.info("pretrained encoder: %s", save_pretrained(loss, self.out / "encoder"))
+
+
+@dataclass(frozen=True)
+class Finetune:
+    """Continue pre-training on one domain from a pretrained encoder."""
+
+    pretrained: Positional[Path]
+    """directory of the pretrained encoder"""
+    dataset: Positional[Path]
+    """dataset directory of the one domain"""
+    out: Path
+    """run directory; the new encoder goes to OUT/encoder"""
+    updates: int = 2_000
+    """encoder updates (the paper: pendulum 2,000, manipulation 2,000, cartpole 3,000, cheetah 1,000, walker 500)"""
+    batch_size: int | None = None
+    """transitions per update (default: the method's)"""
+    learning_rate: float | None = None
+    """of Adam (default: the method's)"""
+    seed: int = 0
+    """seeds sampling and shifts"""
+    precision: Precision = "auto"
+    """arithmetic of the convolutions and big matrix products"""
+    device: str = "cpu"
+    """where to train"""
+
+    def run(self) -> None:
+        """Fine-tune, or continue, and write the artifact."""
+        from crptpro.pretrained import finetune, save_pretrained
+
+        loss, _ = finetune(
+            self.pretrained,
+            self.dataset,
+            updates=self.updates,
+            batch_size=self.batch_size,
+            learning_rate=self.learning_rate,
+            seed=self.seed,
+            precision=self.precision,
+            device=self.device,
+            run_dir=self.out,
+        )
+        logger.info("fine-tuned encoder: %s", save_pretrained(loss, self.out / "encoder"))
+
+
+@dataclass(frozen=True)
+class Downstream:
+    """Train SAC on a frozen encoder with the prototype-kNN exploration bonus."""
+
+    task: Positional[str]
+    """task to learn, e.g. walker_run, reach_duplo, gymnasium:HalfCheetah-v5"""
+    pretrained: str
+    """directory of the pretrained encoder, or `random-encoder` for the untrained control"""
+    out: Path
+    """run directory: eval.csv, train.csv, checkpoints, and the agent in OUT/agent"""
+    config: Annotated[DownstreamConfig, arg(name="")] = DownstreamConfig()
+    """every number of the stage"""
+    logging: Logging = Logging()
+    """mirrors"""
+
+    def run(self) -> None:
+        """Train, or continue."""
+        from crptpro.pretrained import random_pretrained
+        from crptpro.training import train_downstream
+
+        is_random = self.pretrained == RANDOM_ENCODER
+        artifact = random_pretrained(seed=self.config.seed) if is_random else self.pretrained
+        with run_logger(self.out, self.logging, self) as records:
+            result = train_downstream(self.task, artifact, run_dir=self.out, config=self.config, logger=records)
+        logger.info("agent: %s", result.agent_path)
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Evaluate a trained agent, or the uniform random policy, for whole episodes."""
+
+    agent: Positional[str]
+    """directory of an agent (OUT/agent of a downstream run), or `random-policy`"""
+    task: str | None = None
+    """task to act in (default: the agent's own)"""
+    episodes: int = 10
+    """whole episodes"""
+    seed: int = 0
+    """seeds the episodes"""
+    quality: Quality = "exact"
+    """render quality"""
+    csv: Path | None = None
+    """write one row per episode here"""
+    video: Path | None = None
+    """write the first episode as MP4 here (needs the `video` extra)"""
+
+    def run(self) -> None:
+        """Print mean and deviation, and write what was asked for."""
+        from crptpro.envs import make_env
+        from crptpro.training import evaluate, load_agent, summarize, uniform_policy
+        from crptpro.training.video import write_video
+
+        is_random = self.agent == "random-policy"
+        if is_random and self.task is None:
+            raise CRPTproError("The random policy has no task of its own; name one with --task, e.g. --task walker_run.")
+        agent, card = (None, {}) if is_random else load_agent(self.agent)
+        task = self.task or card["task"]
+        env = make_env(task, seed=self.seed, quality=self.quality)
+        policy = agent if agent is not None else uniform_policy(env, seed=self.seed)
+        episodes, videos = evaluate(
+            policy, env, episodes=self.episodes, seed=self.seed, record_episodes=int(self.video is not None)
+        )
+        env.close()
+        scores = summarize(episodes)
+        print(
+            f"{task}: {scores['mean']:.1f} ± {scores['std']:.1f} "
+            f"({scores['min']:.1f} to {scores['max']:.1f}) over {len(episodes)} episodes"
+        )
+        if self.csv is not None:
+            self.csv.parent.mkdir(parents=True, exist_ok=True)
+            with open(self.csv, "w", newline="") as file:
+                writer = csv.writer(file)
+                writer.writerow(["task", "agent", "episode", "episode_return", "agent_steps", "seed"])
+                writer.writerows(
+                    [task, self.agent, e.episode, e.episode_return, e.agent_steps, e.seed] for e in episodes
+                )
+        if self.video is not None:
+            write_video(videos[0], self.video)
+
+
+def expand_groups(names: Sequence[str]) -> list[str]:
+    """Replace group letters by their domains, keeping order and dropping repeats."""
+    expanded = [domain for name in names for domain in GROUPS.get(name, (name,))]
+    if not expanded:
+        raise UnknownNameError(f"Name at least one domain, task or group ({', '.join(GROUPS)}).")
+    return list(dict.fromkeys(expanded))

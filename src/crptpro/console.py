@@ -1,0 +1,43 @@
+"""What the command line and the recipes share: readable log lines, and one clear line per error."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable
+
+from tqdm import tqdm
+
+from crptpro.errors import CRPTproError
+
+
+class _BarFriendlyHandler(logging.Handler):
+    """Writes above a progress bar instead of through it."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        prefix = "" if record.levelno <= logging.INFO else f"{record.levelname.lower()}: "
+        tqdm.write(prefix + self.format(record), file=sys.stderr)
+
+
+def configure_logging(level: int = logging.INFO) -> None:
+    """Show the library's log lines on standard error; other packages' from warnings upwards."""
+    handler = _BarFriendlyHandler()
+    root = logging.getLogger("crptpro")
+    root.handlers[:] = [handler]
+    root.setLevel(level)
+    root.propagate = False
+    # absl and TorchRL announce things no user can act on at INFO.
+    logging.getLogger("absl").setLevel(logging.ERROR)
+
+
+def run_main(main: Callable[[], object]) -> None:
+    """Run a program: expected errors become one line and exit status 1, Ctrl-C exits with 130."""
+    configure_logging()
+    try:
+        main()
+    except CRPTproError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+    except KeyboardInterrupt:
+        print("interrupted; the same command continues from the last checkpoint.", file=sys.stderr)
+        raise SystemExit(130) from None

@@ -1,0 +1,326 @@
+"""The state of one dataset while it is being collected: what is durable, what is running, what comes next."""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import re
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from crptpro.cards import provenance, read_json, versions, write_json
+from crptpro.data.card import read_card
+from crptpro.data.collect_worker import EpisodeJob
+from crptpro.data.episode import Episode
+from crptpro.data.episode_writer import EpisodeWriter
+from crptpro.data.layout import (
+    CARD_FILE, COLLECTION_FILE, FORMAT, VERSION, Layout, estimate_bytes, write_tensordict_metadata,
+)  # fmt: skip
+from crptpro.errors import DatasetError
+from crptpro.seeding import derive_seed
+
+logger = logging.getLogger(__name__)
+
+INCOMING = ".incoming"
+
+
+class DomainCollection:
+    """Collects the episodes 0, 1, 2, ... of one domain until they hold the transitions asked for.
+
+    Episodes may arrive in any order and are appended in order; one that is early waits on disk. Thus the dataset
+    depends on ``request`` alone, and a kill costs only the episodes that were running.
+
+    Args:
+        path: The dataset's directory.
+        request: What is asked for: domain, task, seed, transitions, image_size, action_repeat, camera, quality.
+        episode_agent_steps: Usual length of an episode, ``None`` if unknown. It only saves work.
+
+    Raises:
+        DatasetError: if the directory holds something else, or another process is collecting there.
+    """
+
+    def __init__(self, path: Path, request: dict[str, Any], episode_agent_steps: int | None = None):
+        self.path, self.request = path, request
+        self.name: str = request["domain"]
+        self.target: int = request["transitions"]
+        self.render: dict[str, Any] = {}
+        self._usual_length = episode_agent_steps
+        self._seen_lengths: set[int] = set()
+        self._running: dict[int, int] = {}
+        self._waiting: dict[int, Episode] = {}
+        self._writer: EpisodeWriter | None = None
+        self._lock: int | None = None
+        self._sessions: list[dict[str, Any]] = []
+        self.is_complete = False
+        if (path / CARD_FILE).exists():
+            self._check_request(read_card(path).get("request", {}), "holds a dataset")
+            self.is_complete = True
+            return
+        if path.exists() and any(path.iterdir()) and not (path / COLLECTION_FILE).exists():
+            raise DatasetError(
+                f"{path} is not empty and not a collection. Choose another directory or empty it."
+            )
+        path.mkdir(parents=True, exist_ok=True)
+        self._lock = _lock(path)
+        try:
+            self._resume()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def transitions(self) -> int:
+        """Durable transitions."""
+        return self.target if self.is_complete else self._writer.transitions if self._writer else 0
+
+    @property
+    def transitions_seen(self) -> int:
+        """Transitions made so far, those of waiting and running episodes included."""
+        early = sum(map(len, self._waiting.values())) + sum(self._running.values())
+        return min(self.target, self.transitions + early)
+
+    def missing_bytes(self) -> int:
+        """Estimate what is still to be written."""
+        if self.is_complete:
+            return 0
+        missing = self.target - self.transitions
+        return estimate_bytes(missing, self.request["image_size"], self._usual_length)
+
+    def next_job(self) -> EpisodeJob | None:
+        """Return the next episode worth starting, ``None`` while those under way are expected to suffice."""
+        if self.is_complete:
+            return None
+        episode = self._writer.episodes if self._writer else 0
+        needed = self.target - self.transitions  # for certain, if the usual length is right
+        expected = needed
+        while episode in self._waiting or episode in self._running:
+            if episode in self._waiting:
+                needed -= len(self._waiting[episode])
+                expected -= len(self._waiting[episode])
+            else:
+                needed -= self._usual_length or max(1, self._running[episode])
+                expected -= self._expected_length(episode)
+            episode += 1
+        if needed <= 0 or expected <= 0:
+            return None
+        self._running[episode] = 0
+        seed = self.request["seed"]
+        return EpisodeJob(
+            domain=self.name,
+            episode=episode,
+            env_seed=derive_seed(seed, "collect", self.name, episode),
+            action_seed=derive_seed(seed, "collect-actions", self.name, episode),
+            limit=needed,
+        )
+
+    def note_progress(self, episode: int, transitions: int) -> None:
+        """Note how far a running episode is."""
+        if episode in self._running:
+            self._running[episode] = transitions
+
+    def note_environment(self, card: dict[str, Any]) -> None:
+        """Note what renders the frames.
+
+        Raises:
+            DatasetError: if earlier episodes were rendered by another backend.
+        """
+        for session in self._sessions:
+            before = session["render"].get("backend")
+            if before is not None and card.get("backend", before) != before:
+                raise DatasetError(
+                    f"{self.path} was begun with the render backend {before!r}, now it is {card['backend']!r}: their "
+                    f"pixels differ. Continue with MUJOCO_GL={before}, or remove the directory to begin anew."
+                )
+        if self.render:
+            return
+        self.render = card
+        if self._sessions and self._sessions[-1]["versions"] != versions():
+            logger.warning("%s is continued with other package versions; its card lists both.", self.path)
+        self._sessions.append({"versions": versions(), "render": card})
+        self._write_state()
+
+    def accept(self, index: int, episode: Episode) -> None:
+        """Take a collected episode; it and those that waited for it are durable when this returns.
+
+        Raises:
+            DiskSpaceError: if the disk is full; everything appended before is kept.
+        """
+        self._running.pop(index, None)
+        if self.is_complete:
+            return
+        if not episode.is_cut:
+            self._seen_lengths.add(len(episode))
+        if self._writer is None:
+            self._open_writer(episode.layout)
+        assert self._writer is not None
+        self._waiting[index] = episode
+        if index != self._writer.episodes:
+            _write_incoming(self.path / INCOMING / f"{index:06d}.npz", episode)
+        self._append_ready()
+
+    def close(self) -> None:
+        """Release files and lock; the collection can be continued later."""
+        if self._writer is not None:
+            self._writer.close()
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def _append_ready(self) -> None:
+        writer = self._writer
+        assert writer is not None
+        while (
+            writer.transitions < self.target
+            and (episode := self._waiting.pop(writer.episodes, None)) is not None
+        ):
+            index = writer.episodes
+            needed = self.target - writer.transitions
+            if episode.is_cut and len(episode) < needed:
+                # It was stopped in the belief that earlier episodes would be longer: it is collected again.
+                self._usual_length = None
+            else:
+                now = time.monotonic()
+                writer.append(episode.cut(needed), wall_s=now - self._last_append_s)
+                self._last_append_s = now
+            (self.path / INCOMING / f"{index:06d}.npz").unlink(missing_ok=True)
+            if index == writer.episodes:
+                return
+        if writer.transitions >= self.target:
+            self._finish()
+
+    def _finish(self) -> None:
+        writer = self._writer
+        assert writer is not None
+        transitions, frames = writer.transitions, writer.frames
+        write_tensordict_metadata(self.path, writer.layout, transitions, frames)
+        shutil.rmtree(self.path / INCOMING, ignore_errors=True)
+        card = {
+            "format": FORMAT,
+            "version": VERSION,
+            **self.request,
+            "request": self.request,
+            "frame_stack": 3,
+            "episodes": writer.episodes,
+            "frames": frames,
+            "layout": writer.layout.to_dict(),
+            "bytes": writer.layout.bytes(transitions, frames),
+            "last_episode_cut": writer.entries[-1].is_cut,
+            "crc32": [entry.crc32 for entry in writer.entries],
+            "wall_time_s": round(sum(entry.wall_s for entry in writer.entries), 1),
+            "policy": "uniform random in [-1, 1]",
+            "render": self._sessions[-1]["render"] if self._sessions else {},
+            "sessions": self._sessions,
+            **provenance(),
+        }
+        # The card is the mark of a complete dataset, so it is written last.
+        write_json(self.path / CARD_FILE, card)
+        self.is_complete = True
+        self.close()
+
+    def _resume(self) -> None:
+        state_path = self.path / COLLECTION_FILE
+        self._last_append_s = time.monotonic()
+        if not state_path.exists():
+            self._write_state()
+            return
+        state = read_json(state_path, error=DatasetError)
+        if (state.get("format"), state.get("version")) != (FORMAT, VERSION):
+            raise DatasetError(
+                f"{state_path} belongs to another release or program. Choose another directory."
+            )
+        self._check_request(state.get("request", {}), "was begun")
+        self._sessions = state.get("sessions", [])
+        if state.get("layout") is None:
+            return
+        self._open_writer(Layout.from_dict(state["layout"]))
+        assert self._writer is not None
+        for file in sorted((self.path / INCOMING).glob("*.npz")):
+            index = int(file.stem)
+            episode = _read_incoming(file)
+            if episode is None or episode.layout != self._writer.layout or index < self._writer.episodes:
+                file.unlink()
+            else:
+                self._waiting[index] = episode
+        logger.info("%s: continuing after %d of %d transitions", self.name, self.transitions, self.target)
+        self._append_ready()
+
+    def _open_writer(self, layout: Layout) -> None:
+        self._writer = EpisodeWriter(self.path, layout)
+        self._write_state()
+
+    def _write_state(self) -> None:
+        layout = self._writer.layout.to_dict() if self._writer else None
+        write_json(
+            self.path / COLLECTION_FILE,
+            {
+                "format": FORMAT,
+                "version": VERSION,
+                "request": self.request,
+                "layout": layout,
+                "sessions": self._sessions,
+            },
+        )
+
+    def _check_request(self, found: dict[str, Any], what: str) -> None:
+        differing = [
+            f"{name} {found.get(name)!r} there, {value!r} asked for"
+            for name, value in self.request.items()
+            if found.get(name) != value
+        ]
+        if differing:
+            raise DatasetError(
+                f"{self.path} {what} with other settings: {'; '.join(differing)}. "
+                "Ask for the same, choose another directory, or remove this one to collect anew."
+            )
+
+    def _expected_length(self, episode: int) -> int:
+        if self._usual_length is not None:
+            return self._usual_length
+        usual = next(iter(self._seen_lengths)) if len(self._seen_lengths) == 1 else 1
+        return max(usual, self._running[episode])
+
+
+def dataset_path(root: str | Path, domain_name: str) -> Path:
+    """Return the directory of a domain's dataset: its name, with what a file system may refuse replaced by ``-``."""
+    return Path(root) / re.sub(r"[^\w.+-]+", "-", domain_name)
+
+
+def _lock(path: Path) -> int:
+    handle = os.open(path / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(handle)
+        raise DatasetError(f"Another process is collecting into {path}. Wait for it, or end it.") from None
+    return handle
+
+
+def _write_incoming(path: Path, episode: Episode) -> None:
+    path.parent.mkdir(exist_ok=True)
+    arrays = {
+        name: getattr(episode, name) for name in ("pixels", "action", "reward", "terminated", "truncated")
+    }
+    arrays |= {f"state_{name}": values for name, values in episode.state.items()}
+    temporary = path.with_suffix(".new")
+    with open(temporary, "wb") as file:
+        np.savez(file, is_cut=episode.is_cut, **arrays)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)
+
+
+def _read_incoming(path: Path) -> Episode | None:
+    try:
+        with np.load(path) as arrays:  # checks the archive's checksums
+            content = dict(arrays)
+    except Exception:
+        return None
+    state = {
+        name.removeprefix("state_"): content.pop(name) for name in list(content) if name.startswith("state_")
+    }
+    return Episode(is_cut=bool(content.pop("is_cut")), state=state, **content)

@@ -1,0 +1,244 @@
+"""What a domain and a task are: the paper's eight domains and groups A-D, every other suite task, and your own."""
+
+from __future__ import annotations
+
+import difflib
+import logging
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+from crptpro.errors import CRPTproError, UnknownNameError
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+logger = logging.getLogger(__name__)
+
+GYMNASIUM_PREFIX = "gymnasium:"
+
+
+@dataclass(frozen=True)
+class Domain:
+    """A world that looks and moves in one way, and the task from which its frames are collected.
+
+    The paper pre-trains on domains and evaluates on tasks; tasks of one domain share their pixels.
+
+    Args:
+        name: Name of the domain, and of its dataset directory.
+        task: Task used for collection, a name that :func:`crptpro.envs.make_env` understands.
+        action_repeat: Default number of env steps per agent step.
+        camera: Camera index or name that is rendered by default.
+        make: For a world of your own: a callable that is given, by keyword, those of ``seed`` (int),
+            ``image_size`` (int, pixels), ``action_repeat`` (int), ``camera``, ``quality`` and
+            ``physics_state`` (bool) that its signature names, and returns an unbatched TorchRL
+            environment on CPU whose ``pixels`` are one uint8 RGB image ``[H, W, 3]`` or ``[3, H, W]`` with
+            ``H = W = image_size``, whose ``action`` is continuous in [-1, 1], and whose reward has shape
+            ``[1]``. It repeats the action itself if it names ``action_repeat``. Frame stacking and the
+            choice of dtypes are done by ``make_env``. With ``physics_state`` it may also emit ``qpos`` and
+            ``qvel``. Its ``set_seed`` must make the next ``reset`` reproducible.
+            It must be a module-level function (or ``functools.partial`` of one): worker processes receive the
+            ``Domain`` by pickling and import ``make`` by its module's name.
+        episode_env_steps: Env steps of a full episode, ``None`` if unknown or unlimited.
+        source: What ``task`` is loaded with; ``"own"`` goes with ``make``.
+    """
+
+    name: str
+    task: str
+    action_repeat: int = 2
+    camera: int | str = 0
+    make: Callable[..., EnvBase] | None = None
+    episode_env_steps: int | None = None
+    source: Literal["suite", "manipulation", "gymnasium", "own"] = "own"
+
+
+def _suite(name: str, task: str, camera: int = 0) -> Domain:
+    return Domain(name, task, camera=camera, episode_env_steps=1000, source="suite")
+
+
+PAPER_DOMAINS: dict[str, Domain] = {
+    domain.name: domain
+    for domain in (
+        _suite("cheetah", "cheetah_run"),
+        _suite("walker", "walker_run"),
+        # Camera 2 follows the torso from the side, as in the released code. The floor's size depends on the
+        # task (run 100 m, walk 10 m), so the domain is collected from the task that is evaluated.
+        _suite("quadruped", "quadruped_run", camera=2),
+        _suite("cartpole", "cartpole_swingup_sparse"),
+        _suite("pendulum", "pendulum_swingup"),
+        Domain("manipulation", "reach_duplo", camera="front_close", episode_env_steps=250,
+               source="manipulation"),
+        _suite("hopper", "hopper_hop"),
+        _suite("finger", "finger_spin"),
+    )
+}  # fmt: skip
+
+#: The paper's pre-training groups, by domain name.
+GROUPS: dict[str, tuple[str, ...]] = {
+    "A": ("cheetah", "walker", "quadruped"),
+    "B": ("cartpole", "pendulum", "manipulation"),
+    "C": ("manipulation", "hopper", "finger"),
+    "D": ("walker", "pendulum", "hopper"),
+}
+
+#: The paper's eight tasks, each with its domain.
+TASKS: dict[str, str] = {domain.task: domain.name for domain in PAPER_DOMAINS.values()}
+
+#: Every task of dm_control's suite as ``domain_task``, by domain. Written out so that a name can be looked up
+#: without importing dm_control, which would fix the render backend.
+SUITE_TASKS: dict[str, tuple[str, ...]] = {
+    domain: tuple(f"{domain}_{task}" for task in tasks.split())
+    for domain, tasks in {
+        "acrobot": "swingup swingup_sparse",
+        "ball_in_cup": "catch",
+        "cartpole": "balance balance_sparse swingup swingup_sparse two_poles three_poles",
+        "cheetah": "run",
+        "dog": "stand walk trot run fetch",
+        "finger": "spin turn_easy turn_hard",
+        "fish": "upright swim",
+        "hopper": "stand hop",
+        "humanoid": "stand walk run run_pure_state",
+        "humanoid_CMU": "stand walk run",
+        "lqr": "2_1 6_2",
+        "manipulator": "bring_ball bring_peg insert_ball insert_peg",
+        "pendulum": "swingup",
+        "point_mass": "easy hard",
+        "quadruped": "walk run escape fetch",
+        "reacher": "easy hard",
+        "stacker": "stack_2 stack_4",
+        "swimmer": "swimmer6 swimmer15",
+        "walker": "stand walk run",
+    }.items()
+}
+
+#: Manipulation tasks that have a camera observation.
+MANIPULATION_TASKS = (
+    "stack_2_bricks",
+    "stack_2_bricks_moveable_base",
+    "stack_3_bricks",
+    "stack_2_of_3_bricks_random_order",
+    "reassemble_3_bricks_fixed_order",
+    "reassemble_5_bricks_random_order",
+    "lift_brick",
+    "lift_large_box",
+    "place_brick",
+    "place_cradle",
+    "reach_duplo",
+    "reach_site",
+)
+
+_MANIPULATION_PREFIXES = ("manipulation_", "manip_")
+_registered: dict[str, Domain] = {}
+
+
+def register_domain(domain: Domain) -> Domain:
+    """Make a domain known by its name and by its task's name, in this process; returns it.
+
+    A spawned worker process starts with an empty registry. Either pass the ``Domain`` itself where a name is
+    accepted (it is pickled with the job), or call ``register_domain`` at the top level of the module that
+    defines ``make``: unpickling ``make`` imports that module, which registers the domain again.
+
+    Raises:
+        CRPTproError: if the domain has no ``make``, or its name belongs to the paper's domains or tasks.
+    """
+    if domain.make is None and domain.source == "own":
+        raise CRPTproError(f"Domain {domain.name!r} has no make; pass make=<function that builds the environment>.")
+    for name in (domain.name, domain.task):
+        if name in PAPER_DOMAINS or name in TASKS or name.startswith(GYMNASIUM_PREFIX):
+            raise CRPTproError(f"{name!r} is one of the built-in names; register the domain under another one.")
+    try:
+        pickle.dumps(domain)
+    except Exception as reason:
+        logger.warning(
+            "Domain %r cannot be sent to worker processes (%s); define its make at the top level of a module.",
+            domain.name, reason,
+        )  # fmt: skip
+    _registered[domain.name] = domain
+    return domain
+
+
+def get_domain(name: str | Domain) -> Domain:
+    """Return the domain behind a domain name, a task name, ``gymnasium:<id>`` or a registered name.
+
+    A task's name gives its domain with that task in ``Domain.task``; a ``Domain`` is returned as it is.
+    dm_control is not imported, so that the render backend can still be chosen afterwards.
+
+    Raises:
+        UnknownNameError: with the nearest known names.
+
+    Examples:
+        >>> get_domain("cheetah").task
+        'cheetah_run'
+        >>> get_domain("quadruped_walk").camera
+        2
+        >>> get_domain("manip_reach_duplo").name
+        'manipulation'
+    """
+    if isinstance(name, Domain):
+        return name
+    if name in _registered:
+        return _registered[name]
+    for domain in _registered.values():
+        if name == domain.task:
+            return domain
+    if name in PAPER_DOMAINS:
+        return PAPER_DOMAINS[name]
+    if name in TASKS:
+        return PAPER_DOMAINS[TASKS[name]]
+    if name.startswith(GYMNASIUM_PREFIX):
+        return _gymnasium_domain(name)
+    bare = _without_manipulation_prefix(name)
+    if bare in TASKS:
+        return PAPER_DOMAINS[TASKS[bare]]
+    if bare in MANIPULATION_TASKS:
+        return replace(PAPER_DOMAINS["manipulation"], task=bare)
+    for domain_name, tasks in SUITE_TASKS.items():
+        if name == domain_name:
+            return _suite_domain(domain_name, tasks[0])
+        if name in tasks:
+            return _suite_domain(domain_name, name)
+    raise UnknownNameError(_unknown(name))
+
+
+def known_names() -> list[str]:
+    """Return every name :func:`get_domain` accepts, ``gymnasium:<id>`` and prefixed aliases excepted."""
+    suite = {task for tasks in SUITE_TASKS.values() for task in tasks}
+    own = {name for domain in _registered.values() for name in (domain.name, domain.task)}
+    return sorted({*PAPER_DOMAINS, *SUITE_TASKS, *suite, *MANIPULATION_TASKS, *own})
+
+
+def _suite_domain(domain_name: str, task: str) -> Domain:
+    if domain_name in PAPER_DOMAINS:
+        return replace(PAPER_DOMAINS[domain_name], task=task)
+    # Every task of the suite is limited to 1000 control steps, except LQR's, which have no time limit.
+    return Domain(domain_name, task, episode_env_steps=None if domain_name == "lqr" else 1000, source="suite")
+
+
+def _gymnasium_domain(name: str) -> Domain:
+    import gymnasium
+
+    env_id = name[len(GYMNASIUM_PREFIX) :]
+    try:
+        spec = gymnasium.spec(env_id)
+    except gymnasium.error.Error:
+        near = difflib.get_close_matches(env_id, gymnasium.registry, n=5, cutoff=0.5)
+        hint = f" Nearest: {', '.join(GYMNASIUM_PREFIX + n for n in near)}." if near else ""
+        raise UnknownNameError(f"Gymnasium has no environment {env_id!r}.{hint}") from None
+    return Domain(name, name, episode_env_steps=spec.max_episode_steps, source="gymnasium")
+
+
+def _without_manipulation_prefix(name: str) -> str:
+    for prefix in _MANIPULATION_PREFIXES:
+        if name.startswith(prefix):
+            name = name[len(prefix) :]
+    return name.removesuffix("_vision")
+
+
+def _unknown(name: str) -> str:
+    near = difflib.get_close_matches(name.lower().replace("-", "_"), known_names(), n=5, cutoff=0.5)
+    hint = f" Nearest: {', '.join(near)}." if near else f" Domains: {', '.join(PAPER_DOMAINS)}."
+    return (
+        f"There is no domain or task {name!r}.{hint} Gymnasium environments are written gymnasium:<id>; "
+        "your own are made known with register_domain."
+    )

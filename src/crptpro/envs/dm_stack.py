@@ -1,0 +1,177 @@
+"""dm_control worlds: action scaling, action repeat below the camera, one persistent camera, time limits told apart."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from crptpro.domains import Domain
+from crptpro.envs.rendering import first_frame_watchdog
+from crptpro.envs.simulator import Outcome
+from crptpro.errors import CRPTproError
+
+if TYPE_CHECKING:
+    import dm_env
+
+Quality = Literal["exact", "fast"]
+
+#: Side of the shadow map, texels, that ``quality="fast"`` uses instead of the model's own 2048 (suite) or 4096
+#: (manipulation). On software GL the shadow map is half the cost of a frame; fewer than 1 % of pixels change.
+FAST_SHADOW_SIZE = {"suite": 512, "manipulation": 1024}
+
+
+def load_dm_env(domain: Domain) -> dm_env.Environment:
+    """Load ``domain.task`` from dm_control, with all camera observations of composer tasks switched off.
+
+    The model does not depend on any seed (LQR draws its own from a fixed one), so that an episode depends on
+    nothing but the seed given before its reset.
+    """
+    if domain.source == "manipulation":
+        from dm_control import manipulation
+
+        env = manipulation.load(f"{domain.task}_vision", seed=0)
+        # The built-in camera renders at every env step, twice per agent step; SceneCamera replaces it. The
+        # switch takes effect at the first reset, which compiles the model anew.
+        for observable in env.task.observables.values():
+            observable.enabled = False
+        return env
+    from dm_control import suite
+
+    name = domain.task.removeprefix(f"{domain.name}_")
+    if name not in {task for _, task in suite.ALL_TASKS if _ == domain.name}:
+        name = domain.task  # lqr_2_1 is a task of the domain lqr under its full name
+    return suite.load(domain.name, name, task_kwargs={"random": 0})
+
+
+class SceneCamera:
+    """One dm_control ``Camera`` kept alive over steps and resets.
+
+    ``physics.render`` builds and frees a camera and its scene for every image; this one is rebuilt only when the
+    model changes, as composer environments do at every reset. The pixels are identical.
+
+    Args:
+        image_size: H = W, pixels.
+        camera: Index or name of a camera of the model, -1 for the free camera.
+        shadow_size: Side of the shadow map, texels; ``None`` keeps the model's.
+    """
+
+    def __init__(self, image_size: int, camera: int | str, shadow_size: int | None = None):
+        self._image_size = image_size
+        self._camera_id = camera
+        self._shadow_size = shadow_size
+        self._model: Any = None
+        self._camera: Any = None
+
+    def render(self, physics: Any) -> np.ndarray:
+        """Return the image, uint8 ``[H, W, 3]``, in a buffer that the next call overwrites."""
+        model = physics.model
+        if model is not self._model:
+            self._build(physics, model)
+        return self._camera.render()
+
+    def release(self) -> None:
+        """Drop the scene; the render context belongs to the physics."""
+        self._camera = self._model = None
+
+    def _build(self, physics: Any, model: Any) -> None:
+        from dm_control.mujoco.engine import Camera
+
+        # All of these are read once, when the context is made, which the Camera does.
+        if self._shadow_size is not None:
+            model.vis.quality.shadowsize = min(self._shadow_size, model.vis.quality.shadowsize)
+        model.vis.global_.offwidth = max(self._image_size, model.vis.global_.offwidth)
+        model.vis.global_.offheight = max(self._image_size, model.vis.global_.offheight)
+        try:
+            self._camera = Camera(physics, self._image_size, self._image_size, camera_id=self._camera_id)
+        except ValueError as reason:
+            names = [model.id2name(index, "camera") or str(index) for index in range(model.ncam)]
+            raise CRPTproError(
+                f"This model has no camera {self._camera_id!r} ({reason}). It has: {', '.join(names)}; "
+                "-1 is the free camera."
+            ) from None
+        self._model = model
+
+
+class DmControlSimulator:
+    """A dm_control environment as a :class:`~crptpro.envs.simulator.Simulator`.
+
+    Actions are mapped affinely from [-1, 1] to the actuators' ranges (they differ for quadruped and manipulation).
+    Rewards of the repeated env steps are summed without discount. A time limit (dm_env: last step with discount 1)
+    is a truncation, anything else that ends an episode a termination.
+
+    Args:
+        env: ``dm_env.Environment`` with ``physics`` and either ``task.random`` (suite) or ``random_state``
+            (composer).
+        camera: Draws the images.
+        action_repeat: Env steps per agent step, at least 1.
+        description: Goes into the card as it is.
+    """
+
+    def __init__(
+        self,
+        env: dm_env.Environment,
+        camera: SceneCamera,
+        *,
+        action_repeat: int = 2,
+        description: dict[str, Any] | None = None,
+    ):
+        from dm_control.suite.wrappers import action_scale
+
+        self._env = env
+        self._scaled = action_scale.Wrapper(env, -1.0, 1.0)
+        self._camera = camera
+        self._action_repeat = action_repeat
+        self._description = description or {}
+        self._first_frame = True
+        self._closed = False
+        self.action_size = int(np.prod(env.action_spec().shape))
+        self.state_size = (env.physics.model.nq, env.physics.model.nv)
+
+    def seed(self, seed: int) -> None:
+        """Re-seed the generator that the task draws from, without resetting."""
+        generator = getattr(self._env, "random_state", None)
+        generator = self._env.task.random if generator is None else generator
+        generator.seed(seed)
+
+    def reset(self) -> None:
+        """Start an episode."""
+        self._env.reset()
+
+    def step(self, action: np.ndarray) -> Outcome:
+        """Repeat the action, summing rewards, up to the end of the episode."""
+        reward = 0.0
+        for _ in range(self._action_repeat):
+            time_step = self._scaled.step(action)
+            reward += time_step.reward or 0.0
+            if time_step.last():
+                is_time_limit = time_step.discount == 1.0
+                return Outcome(reward, not is_time_limit, is_time_limit)
+        return Outcome(reward, False, False)
+
+    def render(self) -> np.ndarray:
+        """Return the current image, uint8 ``[H, W, 3]``."""
+        if self._first_frame:
+            with first_frame_watchdog():
+                image = self._camera.render(self._env.physics)
+            self._first_frame = False
+            return image
+        return self._camera.render(self._env.physics)
+
+    def state(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return ``qpos`` and ``qvel``, float64."""
+        data = self._env.physics.data
+        return data.qpos, data.qvel
+
+    def card(self) -> dict[str, Any]:
+        """Return the description given at construction and the action repeat."""
+        return {**self._description, "action_repeat": self._action_repeat}
+
+    def close(self) -> None:
+        """Free the physics and its render context."""
+        if self._closed:
+            return
+        self._closed = True
+        self._camera.release()
+        self._env.physics.free()
+        self._env.close()

@@ -1,0 +1,145 @@
+"""From a task's name to a TorchRL environment that emits stacks of uint8 frames."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from torchrl.envs import CatFrames, EnvBase, TransformedEnv
+
+from crptpro.domains import GYMNASIUM_PREFIX, Domain, get_domain
+from crptpro.envs.dm_stack import FAST_SHADOW_SIZE, DmControlSimulator, Quality, SceneCamera, load_dm_env
+from crptpro.envs.gymnasium_env import GymnasiumSimulator
+from crptpro.envs.own_env import make_own_env
+from crptpro.envs.pixel_env import PixelEnv
+from crptpro.envs.rendering import backend_card, first_frame_watchdog, select_backend
+from crptpro.errors import CRPTproError, RenderingError
+
+logger = logging.getLogger(__name__)
+
+
+def make_env(
+    task: str | Domain,
+    *,
+    seed: int,
+    image_size: int = 84,
+    action_repeat: int | None = None,
+    frame_stack: int = 3,
+    camera: int | str | None = None,
+    quality: Quality = "exact",
+    physics_state: bool = False,
+) -> EnvBase:
+    """Build an unbatched CPU environment that renders once per agent step.
+
+    Output keys: ``pixels`` uint8 ``[3 * frame_stack, H, W]``, oldest to newest (a reset repeats its first frame);
+    ``action`` float32 ``[A]`` in [-1, 1]; ``("next", "reward")`` float32 ``[1]``, summed over the repeated env steps;
+    ``done``, ``terminated``, ``truncated`` (time limits truncate). Consecutive frames are ``action_repeat`` env steps
+    apart. ``env.set_seed(s)`` re-seeds the simulator without resetting, and the next ``reset`` starts the episode
+    that belongs to ``s``. ``env.card()`` says what shaped the pixels. ``env.close()`` frees the render context.
+
+    Args:
+        task: Any name that :func:`crptpro.domains.get_domain` knows, or a :class:`~crptpro.domains.Domain`.
+        seed: Seed of the simulator's first episode.
+        image_size: H = W, pixels.
+        action_repeat: Env steps per agent step; ``None`` takes the domain's (2).
+        frame_stack: Frames per observation; 1 gives the single frame ``[3, H, W]``.
+        camera: Camera index or name; ``None`` takes the domain's.
+        quality: ``"exact"`` renders the model as it is; ``"fast"`` uses smaller shadow maps, up to twice as fast on
+            software GL, with fewer than 1 % of the pixels changed.
+        physics_state: Also emit ``qpos`` and ``qvel``, float64, where the world has a MuJoCo state.
+
+    Raises:
+        UnknownNameError: for a task nobody knows.
+        RenderingError: if no GL backend renders.
+        CRPTproError: for options or an own environment that cannot be used.
+    """
+    domain = get_domain(task)
+    action_repeat = domain.action_repeat if action_repeat is None else action_repeat
+    _check_options(image_size=image_size, action_repeat=action_repeat, frame_stack=frame_stack, quality=quality)
+    settings: dict[str, Any] = {
+        "image_size": image_size, "action_repeat": action_repeat, "quality": quality, "physics_state": physics_state,
+    }  # fmt: skip
+    env: EnvBase
+    if domain.source == "own":
+        env = make_own_env(domain, seed=seed, camera=domain.camera if camera is None else camera, **settings)
+    elif domain.source == "gymnasium":
+        env = _make_gymnasium_env(domain, camera=camera, **settings)
+    else:
+        env = _make_dm_env(domain, camera=domain.camera if camera is None else camera, **settings)
+    env.set_seed(seed)
+    if frame_stack == 1:
+        return env
+    return TransformedEnv(env, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
+
+
+def episode_length(task: str | Domain, *, action_repeat: int | None = None) -> int | None:
+    """Return the agent steps of a full episode (500; manipulation 125), ``None`` if unknown or unlimited."""
+    domain = get_domain(task)
+    repeat = domain.action_repeat if action_repeat is None else action_repeat
+    return None if domain.episode_env_steps is None else -(-domain.episode_env_steps // repeat)
+
+
+def _check_options(*, image_size: int, action_repeat: int, frame_stack: int, quality: str) -> None:
+    for name, value in (("image_size", image_size), ("action_repeat", action_repeat), ("frame_stack", frame_stack)):
+        if value < 1:
+            raise CRPTproError(f"{name} must be at least 1, got {value}.")
+    if quality not in ("exact", "fast"):
+        raise CRPTproError(f"quality must be 'exact' or 'fast', got {quality!r}.")
+
+
+def _make_dm_env(
+    domain: Domain,
+    *,
+    image_size: int,
+    action_repeat: int,
+    camera: int | str,
+    quality: Quality,
+    physics_state: bool,
+) -> PixelEnv:
+    select_backend()
+    shadow_size = FAST_SHADOW_SIZE[domain.source] if quality == "fast" else None
+    with first_frame_watchdog():  # composer renders once when it is built
+        env = load_dm_env(domain)
+    description = {
+        "task": domain.task, "image_size": image_size, "camera": camera, **backend_card(), "quality": quality,
+    }  # fmt: skip
+    scene_camera = SceneCamera(image_size, camera, shadow_size)
+    simulator = DmControlSimulator(env, scene_camera, action_repeat=action_repeat, description=description)
+    return PixelEnv(simulator, image_size=image_size, physics_state=physics_state)
+
+
+def _make_gymnasium_env(
+    domain: Domain,
+    *,
+    image_size: int,
+    action_repeat: int,
+    camera: int | str | None,
+    quality: Quality,
+    physics_state: bool,
+) -> PixelEnv:
+    gl_card = _gymnasium_gl_card(domain.task)
+    simulator = GymnasiumSimulator(
+        domain.task[len(GYMNASIUM_PREFIX) :],
+        image_size=image_size,
+        action_repeat=action_repeat,
+        camera=camera,
+        shadow_size=FAST_SHADOW_SIZE["suite"] if quality == "fast" else None,
+        description={
+            "task": domain.task, "image_size": image_size, "camera": camera, **gl_card, "quality": quality,
+        },
+    )  # fmt: skip
+    return PixelEnv(simulator, image_size=image_size, physics_state=physics_state)
+
+
+def _gymnasium_gl_card(task: str) -> dict[str, Any]:
+    """Prove a GL backend for MuJoCo environments; for others, which may draw without GL, only try to."""
+    import gymnasium
+
+    try:
+        select_backend()
+        return backend_card()
+    except RenderingError:
+        if "mujoco" in str(gymnasium.spec(task[len(GYMNASIUM_PREFIX) :]).entry_point):
+            raise
+        logger.info("%s is made without a GL backend; it must draw by itself.", task)
+        return {"backend": "none"}

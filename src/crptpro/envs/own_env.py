@@ -1,0 +1,79 @@
+"""A user's own TorchRL environment, checked and brought to the form that every other environment here has."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import torch
+from torchrl.envs import Compose, DoubleToFloat, EnvBase, PermuteTransform, TransformedEnv
+from torchrl.envs.transforms import SelectTransform
+
+from crptpro.domains import Domain
+from crptpro.errors import CRPTproError
+
+_OFFERED = ("seed", "image_size", "action_repeat", "camera", "quality", "physics_state")
+
+
+def make_own_env(domain: Domain, **settings: Any) -> EnvBase:
+    """Call ``domain.make`` with those of the settings that it names, check what it returns, and make pixels CHW.
+
+    Keys other than ``pixels`` (and ``qpos``, ``qvel`` if asked for) are dropped.
+
+    Raises:
+        CRPTproError: naming the part of the contract (see :class:`~crptpro.domains.Domain`) that is not kept.
+    """
+    make = domain.make
+    if make is None:
+        raise CRPTproError(f"Domain {domain.name!r} has no make, the function that builds its environment.")
+    env = make(**_accepted(make, settings))
+    layout = _check(domain, env, image_size=settings["image_size"])
+    state = ("qpos", "qvel") if settings["physics_state"] else ()
+    kept = [key for key in ("pixels", *state) if key in env.observation_spec.keys(True, True)]
+    transforms: list[Any] = []
+    if set(kept) != set(env.observation_spec.keys(True, True)):
+        transforms.append(SelectTransform(*kept))
+    if layout == "HWC":
+        transforms.append(PermuteTransform((-1, -3, -2), in_keys=["pixels"]))
+    if torch.float64 in (env.reward_spec.dtype, env.action_spec.dtype):
+        is_double = env.action_spec.dtype == torch.float64
+        actions = {"in_keys_inv": ["action"]} if is_double else {"in_keys_inv": []}
+        rewards = ["reward"] if env.reward_spec.dtype == torch.float64 else []
+        transforms.append(DoubleToFloat(in_keys=rewards, **actions))
+    return TransformedEnv(env, Compose(*transforms)) if transforms else env
+
+
+def _accepted(make: Any, settings: dict[str, Any]) -> dict[str, Any]:
+    parameters = inspect.signature(make).parameters
+    takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+    return {name: settings[name] for name in _OFFERED if takes_all or name in parameters}
+
+
+def _check(domain: Domain, env: Any, *, image_size: int) -> str:
+    """Return ``"CHW"`` or ``"HWC"``; raise for what the rest of the library cannot use."""
+
+    def refuse(what: str) -> CRPTproError:
+        return CRPTproError(f"The environment of domain {domain.name!r} {what} (see crptpro.domains.Domain).")
+
+    if not isinstance(env, EnvBase):
+        raise refuse(f"is a {type(env).__name__}; make must return a TorchRL EnvBase")
+    if env.batch_size != torch.Size([]):
+        raise refuse(f"has batch size {tuple(env.batch_size)}; it must be unbatched")
+    if "pixels" not in env.observation_spec.keys():
+        raise refuse(f"emits {sorted(map(str, env.observation_spec.keys()))}, but no 'pixels'")
+    spec = env.observation_spec["pixels"]
+    if spec.dtype != torch.uint8:
+        raise refuse(f"emits pixels of {spec.dtype}; they must be torch.uint8")
+    layouts = {(3, image_size, image_size): "CHW", (image_size, image_size, 3): "HWC"}
+    layout = layouts.get(tuple(spec.shape))
+    if layout is None:
+        raise refuse(f"emits pixels of shape {tuple(spec.shape)}; expected one RGB image, {' or '.join(map(str, layouts))}")
+    action = env.action_spec
+    low, high = getattr(action.space, "low", None), getattr(action.space, "high", None)
+    if not action.dtype.is_floating_point or low is None or len(action.shape) != 1:
+        raise refuse(f"has the action {action}; it must be a bounded float vector")
+    if not ((low == -1).all() and (high == 1).all()):
+        raise refuse("has action bounds other than [-1, 1]; add torchrl.envs.ActionScaling or scale the actions in make")
+    if tuple(env.reward_spec.shape) != (1,):
+        raise refuse(f"has rewards of shape {tuple(env.reward_spec.shape)}; expected (1,)")
+    return layout

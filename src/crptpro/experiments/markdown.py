@@ -1,0 +1,61 @@
+"""A short report of one run as Markdown: what was run, what came out, what it does not show."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from crptpro.cards import git_revision, hardware, versions
+
+
+def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a Markdown table; columns are the keys of the first row, in order."""
+    columns = list(rows[0])
+    lines = ["| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
+    lines += ["| " + " | ".join(str(row.get(column, "")) for column in columns) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def write_report(
+    path: str | Path,
+    *,
+    title: str,
+    command: str,
+    summary: str,
+    tables: Mapping[str, Sequence[Mapping[str, Any]]],
+    figures: Mapping[str, str | Path],
+    caveats: Sequence[str] = (),
+) -> Path:
+    """Write a Markdown report beside its figures, whole or not at all.
+
+    Args:
+        path: the ``.md`` file; figures are linked relative to it.
+        title: heading.
+        command: what reproduces the run.
+        summary: the result in a sentence or two.
+        tables: heading to rows.
+        figures: caption to picture.
+        caveats: what the result does not show.
+    """
+    path = Path(path)
+    machine = hardware()
+    gpus = ", ".join(machine["gpus"]) or "no GPU"
+    parts = [f"# {title}", summary, f"Made by `{command}`."]
+    for heading, rows in tables.items():
+        parts += [f"## {heading}", markdown_table(rows)]
+    for caption, figure in figures.items():
+        parts += [f"## {caption}", f"![{caption}]({os.path.relpath(figure, path.parent)})"]
+    if caveats:
+        parts += ["## What this does not show", "\n".join(f"- {caveat}" for caveat in caveats)]
+    installed = ", ".join(f"{name} {version}" for name, version in versions().items())
+    parts += [
+        "## Made with",
+        f"{machine['cpu']}, {machine['cpu_cores']} cores, {machine['ram_bytes'] / 2**30:.0f} GiB RAM, {gpus}.\n\n"
+        f"{installed}; source revision {git_revision()}.",
+    ]
+    temporary = path.with_suffix(".tmp")
+    temporary.write_text("\n\n".join(parts) + "\n")
+    temporary.replace(path)
+    return path

@@ -1,0 +1,119 @@
+"""What sits on the encoder during pre-training: projector, predictor and prototypes (CRPTpro, Sec. III)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from crptpro.modules.precision import linear_in
+
+NORM_EPS = 1e-12
+
+
+class Projector(nn.Module):
+    r"""One linear layer from features to the latent space: :math:`g_\theta`.
+
+    Orthogonal weights (gain 1), zero bias. The product runs in ``compute_dtype``; the result has the
+    parameters' dtype, so normalisation, softmax and Sinkhorn stay float32.
+
+    Args:
+        feature_dim: input length (39,200 for the default encoder).
+        latent_dim: output length D.
+    """
+
+    def __init__(self, feature_dim: int = 39_200, latent_dim: int = 128) -> None:
+        super().__init__()
+        self.linear = nn.Linear(feature_dim, latent_dim)
+        self.config: dict[str, Any] = {"feature_dim": feature_dim, "latent_dim": latent_dim}
+        self.compute_dtype: torch.dtype = torch.float32
+        self.reset_parameters()
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        """Draw orthogonal weights and zero the bias."""
+        orthogonal_linear_(self.linear)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Project ``[*, feature_dim]`` (any floating dtype) to ``[*, latent_dim]``, not normalised."""
+        return linear_in(features, self.linear.weight, self.linear.bias, self.compute_dtype)
+
+
+class Predictor(nn.Module):
+    r"""Two-layer perceptron in the latent space, online branch only: :math:`v_\psi`.
+
+    Args:
+        latent_dim: input and output length D.
+        hidden_dim: hidden width. 1024 as in the paper's table; the released code has 512.
+    """
+
+    def __init__(self, latent_dim: int = 128, hidden_dim: int = 1024) -> None:
+        super().__init__()
+        self.hidden = nn.Linear(latent_dim, hidden_dim)
+        self.output = nn.Linear(hidden_dim, latent_dim)
+        self.config: dict[str, Any] = {"latent_dim": latent_dim, "hidden_dim": hidden_dim}
+        self.reset_parameters()
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        """Draw orthogonal weights and zero the biases."""
+        orthogonal_linear_(self.hidden)
+        orthogonal_linear_(self.output)
+
+    def forward(self, latents: Tensor) -> Tensor:
+        """Map ``[*, D]`` to ``[*, D]``."""
+        return self.output(F.relu(self.hidden(latents)))
+
+
+class Prototypes(nn.Module):
+    """M trainable vectors; what matters of each is its direction.
+
+    Orthogonal initialisation (a tight frame when M > D). Training keeps the rows at unit length by calling
+    :meth:`normalize_` before every update, as the released code does; every read goes through
+    :meth:`unit_weight`, so rows of any length give the same scores.
+
+    Args:
+        num_prototypes: M.
+        latent_dim: D.
+    """
+
+    def __init__(self, num_prototypes: int = 512, latent_dim: int = 128) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(num_prototypes, latent_dim))
+        self.config: dict[str, Any] = {"num_prototypes": num_prototypes, "latent_dim": latent_dim}
+        self.reset_parameters()
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        """Draw an orthogonal matrix and scale its rows to unit length."""
+        nn.init.orthogonal_(self.weight)
+        self.normalize_()
+
+    @torch.no_grad()
+    def normalize_(self) -> Prototypes:
+        """Scale every row to unit length in place, outside autograd. Returns self."""
+        self.weight.div_(self.weight.norm(dim=-1, keepdim=True).clamp_min(NORM_EPS))
+        return self
+
+    def unit_weight(self, *, through_norm: bool = False) -> Tensor:
+        """Return the rows at unit length ``[M, D]``.
+
+        Args:
+            through_norm: differentiate the normalisation. By default the length is a constant, so the
+                gradient reaches the raw weight as it does in the released code, radial part included.
+        """
+        norm = self.weight.norm(dim=-1, keepdim=True).clamp_min(NORM_EPS)
+        return self.weight / (norm if through_norm else norm.detach())
+
+    def forward(self, latents: Tensor) -> Tensor:
+        """Cosine scores ``[*, M]`` in [-1, 1] of l2-normalised latents ``[*, D]``."""
+        return F.linear(latents, self.unit_weight())
+
+
+def orthogonal_linear_(linear: nn.Linear, gain: float = 1.0) -> None:
+    """Initialise a linear layer in place: orthogonal weight, zero bias."""
+    nn.init.orthogonal_(linear.weight, gain=gain)
+    if linear.bias is not None:
+        nn.init.zeros_(linear.bias)

@@ -1,0 +1,115 @@
+"""Which number format the big convolutions and matrix products run in, and the switch that sets it everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal, TypeVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+Precision = Literal["auto", "fp32", "bf16"]
+
+COMPUTE_DTYPES: tuple[torch.dtype, ...] = (torch.float32, torch.bfloat16)
+
+_Module = TypeVar("_Module", bound=nn.Module)
+
+
+def resolve_precision(precision: Precision, device: torch.device | str) -> torch.dtype:
+    """Turn a precision name into the compute dtype for a device.
+
+    Args:
+        precision: ``"fp32"`` (the reference), ``"bf16"``, or ``"auto"``: bf16 where the hardware multiplies
+            bf16 natively (CUDA compute capability 8 or newer; a CPU with AVX512-BF16 or AMX), otherwise fp32.
+        device: the device that will compute.
+
+    Returns:
+        ``torch.float32`` or ``torch.bfloat16``.
+
+    Raises:
+        ValueError: unknown precision name.
+
+    Examples:
+        >>> resolve_precision("fp32", "cpu")
+        torch.float32
+    """
+    if precision == "fp32":
+        return torch.float32
+    if precision == "bf16":
+        return torch.bfloat16
+    if precision != "auto":
+        raise ValueError(f"precision must be 'auto', 'fp32' or 'bf16', got {precision!r}.")
+    device = torch.device(device)
+    if device.type == "cuda":
+        native = torch.cuda.get_device_capability(device)[0] >= 8
+    else:
+        native = device.type == "cpu" and _cpu_multiplies_bf16()
+    return torch.bfloat16 if native else torch.float32
+
+
+def set_compute_dtype(module: _Module, dtype: torch.dtype) -> _Module:
+    """Set ``compute_dtype`` on every network inside ``module`` that has one.
+
+    Parameters keep their dtype (fp32 master weights); only the convolutions and the large matrix products
+    change. Networks that a TorchRL ``LossModule`` keeps outside its registered children are reached too.
+
+    Args:
+        module: a network, or a loss that owns networks.
+        dtype: ``torch.float32`` or ``torch.bfloat16``. Float32 means "the dtype of the parameters".
+
+    Returns:
+        ``module``.
+
+    Raises:
+        ValueError: any other dtype.
+    """
+    if dtype not in COMPUTE_DTYPES:
+        raise ValueError(f"compute dtype must be torch.float32 or torch.bfloat16, got {dtype}.")
+    for network in _all_modules(module, set()):
+        if hasattr(network, "compute_dtype"):
+            network.compute_dtype = dtype
+    return module
+
+
+def linear_in(inputs: Tensor, weight: Tensor, bias: Tensor | None, compute_dtype: torch.dtype) -> Tensor:
+    """Linear layer whose product runs in ``compute_dtype`` and whose result has the weight's dtype.
+
+    In bf16 the factors are rounded, the sums are kept in fp32 by the kernel, the product is rounded once, and
+    the bias is added in the weight's dtype.
+
+    Args:
+        inputs: ``[*, D_in]``, any floating dtype.
+        weight: ``[D_out, D_in]``.
+        bias: ``[D_out]`` or None.
+        compute_dtype: ``torch.bfloat16``, or ``torch.float32`` for "the weight's dtype".
+
+    Returns:
+        ``[*, D_out]`` in the weight's dtype.
+    """
+    if compute_dtype == torch.float32:
+        return F.linear(inputs.to(weight.dtype), weight, bias)
+    product = F.linear(inputs.to(compute_dtype), weight.to(compute_dtype)).to(weight.dtype)
+    return product if bias is None else product + bias
+
+
+def _all_modules(module: nn.Module, seen: set[int]) -> Iterator[nn.Module]:
+    for child in module.modules():
+        if id(child) in seen:
+            continue
+        seen.add(id(child))
+        yield child
+        # LossModule.convert_to_functional hides networks in the instance dictionary.
+        for value in list(vars(child).values()):
+            if isinstance(value, nn.Module):
+                yield from _all_modules(value, seen)
+
+
+def _cpu_multiplies_bf16() -> bool:
+    probes = ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
+    if all(hasattr(torch.cpu, probe) for probe in probes):
+        return any(getattr(torch.cpu, probe)() for probe in probes)
+    cpuinfo = Path("/proc/cpuinfo")
+    flags = cpuinfo.read_text(errors="replace") if cpuinfo.exists() else ""
+    return "avx512_bf16" in flags or "amx_bf16" in flags

@@ -1,0 +1,160 @@
+"""The wiring that every pre-training loss shares: keys, masks, target networks, re-initialisation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor, nn
+from torchrl.objectives import LossModule
+from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
+
+
+class PretrainingLoss(LossModule):
+    """A self-supervised loss on pairs of consecutive observations.
+
+    A subclass converts its networks with ``convert_to_functional``, lists their names in ``network_names``,
+    its outputs in ``default_out_keys``, and writes ``forward``. Targets, where it has any, follow by
+    ``SoftUpdate``.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can change.
+
+        Attributes:
+            observation: images at time t.
+            next_observation: images at time t + 1.
+        """
+
+        observation: NestedKey = "pixels"
+        next_observation: NestedKey = ("next", "pixels")
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+
+    network_names: ClassVar[tuple[str, ...]] = ()
+    """Names given to ``convert_to_functional``, in the order of re-initialisation."""
+
+    default_out_keys: ClassVar[tuple[str, ...]] = ()
+    """Entries that ``forward`` returns."""
+
+    method_name: str | None = None
+    """Registered method or preset that built this loss, if it was built by name."""
+
+    def __init__(self, *, reduction: str | None = None) -> None:
+        self._in_keys: list[NestedKey] | None = None
+        self._out_keys: list[NestedKey] | None = None
+        super().__init__()
+        reduction = "mean" if reduction is None else reduction
+        if reduction not in ("none", "mean", "sum"):
+            raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}.")
+        self.reduction = reduction
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries that ``forward`` reads."""
+        if self._in_keys is None:
+            self._in_keys = [self.tensor_keys.observation, self.tensor_keys.next_observation]
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Entries that ``forward`` returns."""
+        if self._out_keys is None:
+            self._out_keys = list(self.default_out_keys)
+        return self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, values: list[NestedKey]) -> None:
+        self._out_keys = values
+
+    def target_state(self) -> dict[str, dict[str, Tensor]]:
+        """State dictionary of every target network, by network name (``{"encoder": {"convs.0.weight": ...}}``).
+
+        The tensors are the live ones, not copies. Empty for a loss without targets.
+        """
+        state = {}
+        for name in self.network_names:
+            target = self._modules.get(f"target_{name}_params")
+            if target is not None:
+                leaves = target.items(True, True)
+                state[name] = {
+                    ".".join(key) if isinstance(key, tuple) else key: value.data for key, value in leaves
+                }
+        return state
+
+    @torch.no_grad()
+    def reset_parameters_recursive(self) -> None:
+        """Re-initialise every network, prototypes included, and copy the new parameters into the targets.
+
+        TorchRL's version re-draws the targets independently and cannot reach plain modules; the method starts
+        from targets that equal their sources.
+        """
+        for name in self.network_names:
+            network, params = getattr(self, name), getattr(self, f"{name}_params")
+            with params.to_module(network, preserve_module_state=False):
+                _reset(network)
+            target = self._modules.get(f"target_{name}_params")
+            if target is not None:
+                target.data.update_(params.data)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore from a pickle or a deep copy, tying the networks to the copied parameters again."""
+        super().__setstate__(state)
+        for name in self.network_names:
+            getattr(self, f"{name}_params").to_module(getattr(self, name), preserve_module_state=False)
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        # No value estimator here; changed keys only have to show in in_keys.
+        self._in_keys = None
+
+    def _read_pair(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None, torch.Size]:
+        """Images flattened to one batch dimension without masked rows, the mask, and the original batch shape."""
+        observation = tensordict.get(self.tensor_keys.observation)
+        next_observation = tensordict.get(self.tensor_keys.next_observation)
+        for key, value in zip(self.in_keys, (observation, next_observation)):
+            if value is None:
+                raise KeyError(f"{type(self).__name__} needs the entry {key!r}; set_keys() names another one.")
+        lead = observation.shape[:-3]
+        observation = observation.reshape(-1, *observation.shape[-3:])
+        next_observation = next_observation.reshape(-1, *next_observation.shape[-3:])
+        valid = self._valid_rows(tensordict)
+        if valid is not None:
+            # Dropped, not multiplied by zero: batch-wise normalisations couple all rows.
+            observation, next_observation = observation[valid], next_observation[valid]
+        return observation, next_observation, valid, lead
+
+    def _valid_rows(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Validity of each row ``[B]`` from the mask entries of ``loss_mask_key``, None if there is none."""
+        names = self.loss_mask_key
+        valid = None
+        for key in AUTO_LOSS_MASK_KEYS if names == "auto" else [] if names is None else [names]:
+            mask = tensordict.get(key, None)
+            if mask is not None:
+                valid = mask.reshape(-1) if valid is None else valid & mask.reshape(-1)
+        return valid
+
+    def _reduce_rows(self, rows: Tensor, valid: Tensor | None, lead: torch.Size) -> Tensor:
+        """Reduce per-row values of :meth:`_read_pair`'s rows; ``"none"`` restores the batch shape, 0 where masked."""
+        if self.reduction == "none":
+            if valid is not None:
+                rows = rows.new_zeros(valid.shape).masked_scatter(valid, rows)
+            return rows.reshape(lead)
+        return rows.sum() if self.reduction == "sum" else rows.sum() / max(rows.numel(), 1)
+
+
+def _reset(network: nn.Module) -> None:
+    """Call the outermost ``reset_parameters`` of each branch."""
+    reset = getattr(network, "reset_parameters", None)
+    if callable(reset):
+        reset()
+        return
+    for child in network.children():
+        _reset(child)

@@ -1,0 +1,297 @@
+"""The mathematics of every objective as free functions on plain tensors.
+
+``scores`` are cosine similarities before division by a temperature. Nothing here holds state, mutates its input,
+synchronises with the host, or repairs bad numbers: non-finite input gives non-finite output, and the training loops
+check finiteness.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+Reduction = Literal["none", "mean", "sum"]
+DispersionReduction = Literal["mean_all", "sum", "mean_offdiag"]
+
+
+@torch.no_grad()
+def sinkhorn_knopp(scores: Tensor, *, temperature: float | Tensor = 0.1, iterations: int = 3) -> Tensor:
+    r"""Soft assignments whose mass is spread evenly over the prototypes (CRPTpro Eq. 4-6; SwaV, arXiv 2006.09882).
+
+    Starts from :math:`\exp(s/\tau)`, alternately scales the prototype marginal to 1/M and the sample marginal to 1/B,
+    and ends with each sample's assignments summing to 1. No gradient.
+
+    Computed in the log domain, in float32 or wider. That equals the exponentiated form of the released code wherever
+    that one is finite, and needs none of its guards: a sample whose scores all underflow keeps its assignments.
+
+    Deviation: the paper's Eq. 4 prints the scores without the exponential, which would divide by sums near zero.
+
+    Args:
+        scores: ``[B, M]`` cosine similarities.
+        temperature: positive; smaller is sharper.
+        iterations: number of prototype/sample scalings; 0 leaves a softmax.
+
+    Returns:
+        ``[B, M]``, rows sum to 1. One sample gives (for ``iterations >= 1``) the uniform row.
+    """
+    log_q = _at_least_float32(scores) / temperature
+    for _ in range(iterations):
+        # The constants 1/M and 1/B of the marginals cancel in the final normalisation.
+        log_q = log_q - log_q.logsumexp(dim=0, keepdim=True)
+        log_q = log_q - log_q.logsumexp(dim=1, keepdim=True)
+    return log_q.softmax(dim=1)
+
+
+def comparative_loss(
+    student_scores: Tensor,
+    assignments: Tensor,
+    *,
+    temperature: float | Tensor = 0.1,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    r"""Cross-entropy between target assignments and predicted ones (CRPTpro Eq. 7-8).
+
+    :math:`L_{comp} = -\frac1B\sum_i\sum_j q_{ij}\log\mathrm{softmax}_j(s_{ij}/\tau)`. At uniform prediction it equals
+    ln M (6.238 for 512); a run that stays there has learned nothing.
+
+    Args:
+        student_scores: ``[B, M]`` cosine similarities, with gradient.
+        assignments: ``[B, M]``, rows sum to 1.
+        temperature: positive.
+        reduction: over the batch.
+
+    Returns:
+        Scalar, or ``[B]`` for ``"none"``; non-negative, nats.
+    """
+    log_p = F.log_softmax(_at_least_float32(student_scores) / temperature, dim=-1)
+    return reduce_batch(-(assignments * log_p).sum(dim=-1), reduction)
+
+
+def prototype_dispersion(
+    prototypes: Tensor, *, offset: float | Tensor = 1.5, reduction: DispersionReduction = "mean_all"
+) -> Tensor:
+    r"""Intrinsic loss that pushes prototypes apart (CRPTpro Eq. 9).
+
+    :math:`L_{intr} = \frac1{M^2}\sum_{j\ne k}\frac{\mathrm{sg}(c_j)\cdot c_k}{\mathrm{sg}(c_j\cdot c_k) + w}`. The left
+    factor and the denominator carry no gradient, so row k receives
+    :math:`\frac1{M^2}\sum_{j\ne k}\mathrm{sg}(c_j)/(s_{jk}+w)`.
+
+    Deviation: the paper prints a sum; its own table only fits the mean over all M x M entries, which is the default
+    (the sum equals it times M^2).
+
+    Args:
+        prototypes: ``[M, D]`` unit rows. Whether the gradient passes through their normalisation is the caller's
+            choice (:meth:`crptpro.modules.Prototypes.unit_weight`).
+        offset: w, larger than 1 so that the denominator stays positive.
+        reduction: ``"mean_all"`` divides by M^2 (the zeroed diagonal counts), ``"mean_offdiag"`` by M(M-1),
+            ``"sum"`` by nothing.
+
+    Returns:
+        Scalar; about -0.0023 to -0.0028 at orthogonal initialisation of 512 x 128.
+
+    Raises:
+        ValueError: unknown reduction.
+    """
+    count = prototypes.shape[0]
+    divisors = {"mean_all": count * count, "mean_offdiag": max(count * (count - 1), 1), "sum": 1}
+    if reduction not in divisors:
+        raise ValueError(f"reduction must be one of {', '.join(divisors)}, got {reduction!r}.")
+    cosines = prototypes.detach() @ prototypes.T  # (M, D) x (D, M) -> (M, M)
+    ratio = cosines / (cosines.detach() + offset)
+    diagonal = torch.eye(count, dtype=torch.bool, device=prototypes.device)
+    return ratio.masked_fill(diagonal, 0.0).sum() / divisors[reduction]
+
+
+def knn_distances(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
+    """Euclidean distances to the k nearest keys, ascending.
+
+    The neighbours are found with a matrix product, which cannot resolve distances near zero; the k distances are then
+    taken again from the differences, so that a key equal to the query is at exactly 0.
+
+    Args:
+        queries: ``[N, D]``.
+        keys: ``[K, D]``. A query that is itself among the keys is its own nearest neighbour.
+        k: number of neighbours.
+
+    Returns:
+        ``[N, k]``.
+
+    Raises:
+        ValueError: fewer keys than ``k``.
+
+    Examples:
+        >>> z = torch.tensor([[1.0, 0.0]])
+        >>> keys = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+        >>> knn_distances(z, keys, k=3)
+        tensor([[0.0000, 1.4142, 2.0000]])
+    """
+    if not 1 <= k <= keys.shape[0]:
+        raise ValueError(f"k must be between 1 and the number of keys {keys.shape[0]}, got {k}.")
+    nearest = torch.cdist(queries, keys).topk(k, dim=-1, largest=False).indices  # (N, k)
+    exact = (queries.unsqueeze(1) - keys[nearest]).norm(dim=-1)  # (N, 1, D) - (N, k, D) -> (N, k)
+    return exact.sort(dim=-1).values
+
+
+def knn_distance(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
+    """Euclidean distance to the k-th nearest key: the exploration reward of CRPTpro (Eq. 11).
+
+    Args:
+        queries: ``[N, D]`` (l2-normalised for the prototype reward, which then lies in [0, 2]).
+        keys: ``[K, D]``.
+        k: which neighbour, counting a copy of the query itself.
+
+    Returns:
+        ``[N]``.
+
+    Raises:
+        ValueError: fewer keys than ``k``.
+    """
+    return knn_distances(queries, keys, k=k)[:, -1]
+
+
+def particle_reward(
+    features: Tensor,
+    *,
+    k: int = 12,
+    keys: Tensor | None = None,
+    average: bool = True,
+    scale: float | Tensor = 1.0,
+    clip: float = 0.0,
+) -> Tensor:
+    r"""Particle entropy estimate :math:`\log(1 + \overline{\mathrm{relu}(d/scale - clip)})` (APT, arXiv 2103.04551).
+
+    Form of rll-research/url_benchmark ``utils.py``: division and clipping act on each distance, the average over the
+    k neighbours comes after, the logarithm last.
+
+    Args:
+        features: ``[N, D]``.
+        k: neighbours, self included when ``keys`` is None.
+        keys: ``[K, D]``; the features themselves if None.
+        average: mean over the k neighbours, otherwise the k-th alone.
+        scale: running mean of the distances, kept by the caller.
+        clip: subtracted before the relu.
+
+    Returns:
+        ``[N]``, non-negative.
+
+    Raises:
+        ValueError: fewer keys than ``k``.
+    """
+    distances = knn_distances(features, features if keys is None else keys, k=k)
+    if not average:
+        distances = distances[:, -1:]
+    return torch.log1p(F.relu(distances / scale - clip).mean(dim=-1))
+
+
+def info_nce(
+    anchors: Tensor,
+    positives: Tensor,
+    *,
+    temperature: float | Tensor = 1.0,
+    negatives: Literal["positives", "both"] = "positives",
+    valid: Tensor | None = None,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    """Contrastive cross-entropy in which row i's positive is row i of the other side.
+
+    Args:
+        anchors: ``[B, D]``.
+        positives: ``[B, D]``. Normalise both beforehand where the method asks for cosines (SimCLR yes, ATC no).
+        temperature: divides the inner products.
+        negatives: ``"positives"`` compares each anchor with all B positives (ATC); ``"both"`` compares each of the 2B
+            views with the other 2B - 1 (SimCLR).
+        valid: ``[B]`` bool; rows that are False do not count, but their positives stay as negatives. Rows of both
+            views for ``"both"``.
+        reduction: over the rows; the mean is over valid rows, 0 if there is none.
+
+    Returns:
+        Scalar; for ``"none"`` ``[B]``, or ``[2B]`` for ``negatives="both"``, zero where invalid. Non-negative, nats.
+
+    Raises:
+        ValueError: unknown ``negatives``.
+    """
+    count = anchors.shape[0]
+    labels = torch.arange(count, device=anchors.device)
+    if negatives == "positives":
+        logits = anchors @ positives.T / temperature  # (B, D) x (D, B) -> (B, B)
+    elif negatives == "both":
+        views = torch.cat([anchors, positives])
+        itself = torch.eye(2 * count, dtype=torch.bool, device=anchors.device)
+        logits = (views @ views.T / temperature).masked_fill(itself, float("-inf"))
+        labels = torch.cat([labels + count, labels])
+        valid = None if valid is None else torch.cat([valid, valid])
+    else:
+        raise ValueError(f"negatives must be 'positives' or 'both', got {negatives!r}.")
+    rows = F.cross_entropy(_at_least_float32(logits), labels, reduction="none")
+    return reduce_batch(rows, reduction, valid)
+
+
+def becl_loss(
+    features: Tensor,
+    skills: Tensor,
+    *,
+    temperature: float | Tensor = 0.5,
+    eps: float = 1e-6,
+    reduction: Reduction = "mean",
+) -> Tensor:
+    r"""Behaviour contrastive loss (BeCL, Rooshy-yang/BeCL ``agent/becl.py``); its reward is ``exp(-loss)`` per row.
+
+    Features are l2-normalised. Row i has one positive: the first other row with the same skill, or, where no other
+    row has it, the first other row, as in the released code.
+    :math:`\ell_i = -\log(pos_i / (\sum_{j\ne i} e^{s_{ij}} + \epsilon) + \epsilon)`, similarities over the temperature
+    with the row's maximum subtracted.
+
+    Args:
+        features: ``[B, D]``, B at least 2.
+        skills: ``[B]`` integer skill indices.
+        temperature: divides the cosines.
+        eps: guard in the quotient and in the logarithm.
+        reduction: over the rows.
+
+    Returns:
+        Scalar, or ``[B]`` for ``"none"``.
+
+    Raises:
+        ValueError: fewer than two rows.
+    """
+    count = features.shape[0]
+    if count < 2:
+        raise ValueError(f"becl_loss needs at least two rows, got {count}.")
+    unit = F.normalize(_at_least_float32(features), dim=-1)
+    itself = torch.eye(count, dtype=torch.bool, device=features.device)
+    similarity = (unit @ unit.T / temperature).masked_fill(itself, float("-inf"))
+    weights = (similarity - similarity.amax(dim=1, keepdim=True).detach()).exp()  # diagonal: exactly 0
+    same_skill = (skills.unsqueeze(0) == skills.unsqueeze(1)) & ~itself
+    # argmax of 0/1 (2 for a match) picks the first match, else the first off-diagonal row.
+    positive = (same_skill.int() * 2 + (~itself).int()).argmax(dim=1, keepdim=True)
+    quotient = weights.gather(1, positive).squeeze(1) / (weights.sum(dim=1) + eps)
+    return reduce_batch(-(quotient + eps).log(), reduction)
+
+
+def reduce_batch(rows: Tensor, reduction: Reduction, valid: Tensor | None = None) -> Tensor:
+    """Reduce per-row values; the mean is over valid rows, and 0 when there is none.
+
+    Args:
+        rows: ``[B]``.
+        reduction: ``"none"``, ``"mean"`` or ``"sum"``.
+        valid: ``[B]`` bool or None for all; invalid rows become 0 and pass no gradient, whatever they hold.
+
+    Raises:
+        ValueError: unknown reduction.
+    """
+    if reduction not in ("none", "mean", "sum"):
+        raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}.")
+    if valid is not None:
+        rows = torch.where(valid, rows, torch.zeros_like(rows))
+    if reduction == "none":
+        return rows
+    if reduction == "sum":
+        return rows.sum()
+    return rows.sum() / (max(rows.numel(), 1) if valid is None else valid.sum().clamp_min(1))
+
+
+def _at_least_float32(values: Tensor) -> Tensor:
+    return values if values.dtype == torch.float64 else values.float()

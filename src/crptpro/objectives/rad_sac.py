@@ -1,0 +1,251 @@
+"""Soft actor-critic on frozen features, with the arithmetic of CRPTpro's and Proto-RL's released agents."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, dispatch
+from tensordict.utils import unravel_key
+from torch import Tensor
+from torchrl.modules import ProbabilisticActor
+from torchrl.objectives import SACLoss, ValueEstimators
+
+from crptpro.modules import SquashedGaussianActor, TwinCritic
+from crptpro.modules.distributions import SquashedGaussian
+
+
+class RADSACLoss(SACLoss):
+    r"""RAD-SAC of CRPTpro (liuxin0824/CRPTpro and denisyarats/proto, ``proto.py``) on TorchRL's ``SACLoss``.
+
+    With :math:`h, h'` the features of an observation and the next, :math:`a' \sim \pi(h')`:
+
+    * :math:`y = r + \gamma (1-\mathrm{terminated}) (\min(Q_1', Q_2')(h', a') - \alpha \log\pi(a'|h'))`
+    * ``loss_qvalue`` = MSE(Q1, y) + MSE(Q2, y), gradient to the critic only;
+    * ``loss_actor`` = mean(alpha log pi(a|h) - min(Q1, Q2)(h, a)), gradient to the actor only;
+    * ``loss_alpha`` = mean(exp(log_alpha) * sg(-log pi - target_entropy)), gradient to ``log_alpha`` only.
+
+    Features never receive a gradient. What differs from ``SACLoss``: squared error; the temperature loss of the
+    released code (not its logarithm); the log-std squash and pre-tanh log-probability of
+    :class:`~crptpro.modules.SquashedGaussianActor`; one trunk under both Q heads, so the critic is one network with two
+    outputs instead of a stack of two; and the separate steps :meth:`critic_loss` and :meth:`actor_and_temperature_loss`,
+    because the actor, the temperature and the target are updated every second time, against the critic just stepped::
+
+        loss.critic_loss(td)["loss_qvalue"].backward(); critic_optimizer.step()
+        if update % 2 == 0:
+            out = loss.actor_and_temperature_loss(td)   # backward each, step both
+            target_updater.step()                       # SoftUpdate(loss, tau=0.01)
+
+    Deviation: the released code bootstraps with 0.99 always. Here ``terminated`` cuts the bootstrap and ``truncated``
+    does not, which is the same for every DeepMind Control task.
+
+    Args:
+        actor: on features.
+        critic: on features and actions; the target is a copy of all of it.
+        gamma: discount per agent step.
+        alpha_init: initial temperature.
+        target_entropy: in nats; None for minus the action dimension.
+        observation: key of the features; also read under ``"next"``. Change it, and the keys of action, reward,
+            done and terminated, with ``set_keys``.
+        generator: source of all action noise; torch's global generator if None. Not part of the state dictionary.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (per-row losses).
+
+    Returns (``forward``):
+        ``loss_actor``, ``loss_qvalue``, ``loss_alpha`` and, detached scalars, ``alpha``, ``entropy`` (-log pi, nats),
+        ``q_mean``, ``target_q_mean``, ``td_error`` (mean absolute). Non-finite input propagates; the training loop
+        checks. Batches of any shape, one row included.
+
+    Examples:
+        >>> actor = SquashedGaussianActor(6, 2, hidden_dim=8)
+        >>> loss = RADSACLoss(actor, TwinCritic(6, 2, hidden_dim=8))
+        >>> from torchrl.objectives import SoftUpdate
+        >>> updater = SoftUpdate(loss, tau=0.01)
+        >>> def step():
+        ...     done = torch.zeros(4, 1, dtype=torch.bool)
+        ...     return {"features": torch.randn(4, 6), "reward": torch.ones(4, 1), "done": done, "terminated": done}
+        >>> td = TensorDict({"features": torch.randn(4, 6), "action": torch.zeros(4, 2), "next": step()}, [4])
+        >>> loss(td)["loss_qvalue"].shape
+        torch.Size([])
+    """
+
+    @dataclass
+    class _AcceptedKeys(SACLoss._AcceptedKeys):
+        """``SACLoss``'s keys and one more.
+
+        Attributes:
+            observation: the features, at the root and under ``"next"``.
+        """
+
+        observation: NestedKey = "features"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+
+    default_out_keys = (
+        "loss_actor",
+        "loss_qvalue",
+        "loss_alpha",
+        "alpha",
+        "entropy",
+        "q_mean",
+        "target_q_mean",
+        "td_error",
+    )
+
+    def __init__(
+        self,
+        actor: SquashedGaussianActor,
+        critic: TwinCritic,
+        *,
+        gamma: float = 0.99,
+        alpha_init: float = 0.1,
+        target_entropy: float | None = None,
+        observation: NestedKey = "features",
+        generator: torch.Generator | None = None,
+        reduction: str | None = None,
+    ) -> None:
+        policy = ProbabilisticActor(
+            TensorDictModule(actor, in_keys=[observation], out_keys=["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            out_keys=["action"],
+            distribution_class=SquashedGaussian,
+            return_log_prob=True,
+        )
+        super().__init__(
+            policy,
+            TensorDictModule(critic, in_keys=[observation, "action"], out_keys=["state_action_value"]),
+            # Not 1 or 2: any count makes SACLoss stack the parameters into new ones, and for a single module draw them
+            # anew, losing the orthogonal initialisation and the identity with ``critic``.
+            num_qvalue_nets=0,
+            loss_function="l2",
+            alpha_init=alpha_init,
+            target_entropy=-float(actor.action_dim) if target_entropy is None else float(target_entropy),
+            reduction=reduction,
+            scalar_output_mode="exclude",
+        )
+        self.num_qvalue_nets = 2
+        # Hidden from nn.Module, as LossModule hides its networks: the parameters are registered once.
+        self.__dict__["actor"] = actor
+        self.__dict__["critic"] = critic
+        self.generator = generator
+        self.set_keys(observation=observation)
+        self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Entries that ``forward`` returns."""
+        if self._out_keys is None:
+            self._out_keys = list(self.default_out_keys)
+        return self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, values: list[NestedKey]) -> None:
+        self._out_keys = values
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute all three losses against the same critic; see the class."""
+        critic = self.critic_loss(tensordict)
+        return critic.update(self.actor_and_temperature_loss(tensordict)).select(*self.default_out_keys)
+
+    def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not written to."""
+        loss, metadata = self.qvalue_v2_loss(tensordict)
+        out = {
+            "loss_qvalue": loss,
+            "q_mean": metadata["q"].mean(),
+            "target_q_mean": metadata["target_q"].mean(),
+            "td_error": metadata["td_error"].mean(),
+        }
+        return TensorDict(out, batch_size=[])
+
+    def actor_and_temperature_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """``loss_actor`` and ``loss_alpha`` of one action draw, with ``alpha`` and ``entropy``."""
+        loss_actor, metadata = self.actor_loss(tensordict)
+        log_prob = metadata["log_prob"]
+        weights = self._maybe_get_priority_weight(tensordict)
+        loss_alpha = self._reduce_loss(self._alpha_loss(log_prob), tensordict=tensordict, weights=weights)
+        out = {
+            "loss_actor": loss_actor,
+            "loss_alpha": loss_alpha,
+            "alpha": self._alpha,
+            "entropy": -log_prob.mean(),
+        }
+        return TensorDict(out, batch_size=[])
+
+    def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Critic loss and detached per-row metadata (``td_error``, ``q``, ``target_q``)."""
+        target = self._compute_target_v2(tensordict)  # (B,)
+        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
+            values = self.critic(self._features(tensordict), tensordict.get(self.tensor_keys.action))  # (B, 2)
+        errors = values - target.unsqueeze(-1)
+        # Sum over the two heads of the mean over the batch.
+        loss = self._reduce_loss(
+            errors.square().sum(-1),
+            tensordict=tensordict,
+            weights=self._maybe_get_priority_weight(tensordict),
+        )
+        metadata = {"td_error": errors.detach().abs().amax(-1), "q": values.detach(), "target_q": target}
+        return loss, metadata
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Actor loss and the detached log-probability of its actions."""
+        features = self._features(tensordict)
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            action, log_prob = self.actor.sample(features, generator=self.generator)
+        # Detached weights: the gradient passes through Q to the action and to nothing else.
+        with self._cached_detached_qvalue_params.to_module(self.qvalue_network, preserve_module_state=False):
+            value = self.critic(features, action).amin(-1)
+        loss = self._reduce_loss(
+            self._alpha * log_prob - value,
+            tensordict=tensordict,
+            weights=self._maybe_get_priority_weight(tensordict),
+        )
+        return loss, {"log_prob": log_prob.detach()}
+
+    def _alpha_loss(self, log_prob: Tensor) -> Tensor:
+        # SACLoss uses log_alpha in place of alpha.
+        return self.log_alpha.exp() * (-log_prob - self.target_entropy).detach()
+
+    @torch.no_grad()
+    def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
+        next_features = self._features(tensordict.get("next"))
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            action, log_prob = self.actor.sample(next_features, generator=self.generator)
+        with self.target_qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
+            value = self.critic(next_features, action).amin(-1)
+        soft_value = (value - self._alpha * log_prob).unsqueeze(-1)
+        names = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
+        estimate = tensordict.select(*[unravel_key(("next", name)) for name in names], strict=False)
+        estimate.set(("next", self.value_estimator.tensor_keys.value), soft_value)
+        return self.value_estimator.value_estimate(estimate).squeeze(-1)
+
+    def _features(self, tensordict: TensorDictBase) -> Tensor:
+        return tensordict.get(self.tensor_keys.observation).detach()
+
+    def _set_in_keys(self) -> None:
+        keys = self.tensor_keys
+        following = (keys.observation, keys.reward, keys.done, keys.terminated)
+        self._in_keys = [keys.observation, keys.action, *(unravel_key(("next", key)) for key in following)]
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        super()._forward_value_estimator_keys(**kwargs)
+        self._set_in_keys()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore from a pickle or a deep copy, tying the networks to the copied parameters again."""
+        super().__setstate__(state)
+        self.actor_network_params.to_module(self.actor_network, preserve_module_state=False)
+        self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False)
+
+    @torch.no_grad()
+    def reset_parameters_recursive(self) -> None:
+        """Re-initialise actor and critic, copy the critic into its target, and restore the initial temperature."""
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            self.actor.reset_parameters()
+        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
+            self.critic.reset_parameters()
+        self.target_qvalue_network_params.data.update_(self.qvalue_network_params.data)
+        self.log_alpha.copy_(self.alpha_init.log())

@@ -1,0 +1,152 @@
+"""Methods by name: which loss, with which options, trained by which defaults."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from torch import nn
+from torchrl.objectives import LossModule
+
+from crptpro.errors import UnknownNameError
+
+
+@dataclass(frozen=True)
+class MethodDefaults:
+    """How a method is trained unless the caller says otherwise; the values here are CRPTpro's."""
+
+    updates: int = 50_000
+    """Encoder updates in total, over all domains."""
+
+    batch_size: int = 512
+    """Transitions per update."""
+
+    lr: float = 1e-4
+    """Adam learning rate (peak, if scheduled)."""
+
+    betas: tuple[float, float] = (0.9, 0.999)
+    """Adam moments."""
+
+    eps: float = 1e-8
+    """Adam epsilon."""
+
+    weight_decay: float = 0.0
+    """Adam weight decay."""
+
+    encoder_tau: float | None = 0.05
+    """EMA rate of the target networks, every update; None for a method without targets."""
+
+    schedule: Literal["constant", "warmup_cosine"] = "constant"
+    """Learning rate over the updates."""
+
+    warmup_updates: int = 0
+    """Linear warm-up from 0, for ``warmup_cosine``."""
+
+    grad_clip: float | None = None
+    """Largest gradient norm; None for no clipping."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A registered method or preset."""
+
+    name: str
+    """Registered name."""
+
+    loss_class: type[LossModule]
+    """The loss it trains."""
+
+    defaults: MethodDefaults = MethodDefaults()
+    """How it is trained."""
+
+    loss_options: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of ``loss_class`` that make up the preset."""
+
+    is_preset: bool = False
+    """A variant of another method: not listed among the methods, not the default of its class."""
+
+    def build(self, encoder: nn.Module, **options: Any) -> LossModule:
+        """Build the loss on ``encoder``; ``options`` override the preset's own.
+
+        The result remembers this method's name, so that :func:`method_defaults` returns this method's defaults.
+        """
+        loss = self.loss_class(encoder, **{**self.loss_options, **options})
+        loss.method_name = self.name
+        return loss
+
+
+_METHODS: dict[str, Method] = {}
+
+
+def register_method(
+    name: str,
+    loss_class: type[LossModule],
+    defaults: MethodDefaults | None = None,
+    *,
+    loss_options: dict[str, Any] | None = None,
+    is_preset: bool = False,
+) -> Method:
+    """Make a method available by name, on the command line too.
+
+    Args:
+        name: unique name; registering a name again with another class is refused.
+        loss_class: built as ``loss_class(encoder, **loss_options)``.
+        defaults: None for the generic defaults.
+        loss_options: keyword arguments of the loss.
+        is_preset: a variant of an already registered method.
+
+    Returns:
+        The registered method.
+
+    Raises:
+        ValueError: the name is taken by another class.
+    """
+    taken = _METHODS.get(name)
+    if taken is not None and taken.loss_class is not loss_class:
+        raise ValueError(f"The method {name!r} is already registered for {taken.loss_class.__name__}; choose another.")
+    method = Method(name, loss_class, defaults or MethodDefaults(), dict(loss_options or {}), is_preset)
+    _METHODS[name] = method
+    return method
+
+
+def get_method(name: str) -> Method:
+    """Look a method or preset up by name.
+
+    Raises:
+        UnknownNameError: with the nearest known names.
+
+    Examples:
+        >>> get_method("crptpro").defaults.updates
+        50000
+    """
+    if name not in _METHODS:
+        known = sorted(_METHODS)
+        nearest = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+        raise UnknownNameError(f"There is no method {name!r}. Did you mean {', '.join(nearest or known)}?")
+    return _METHODS[name]
+
+
+def methods(*, presets: bool = False) -> list[str]:
+    """Names of the registered methods, sorted; with ``presets``, of their variants too."""
+    return sorted(name for name, method in _METHODS.items() if presets or not method.is_preset)
+
+
+def method_defaults(loss: LossModule | type[LossModule]) -> MethodDefaults:
+    """Training defaults of a loss, its class, or the nearest registered base class.
+
+    A loss built by name has that method's defaults. A user's own, unregistered loss gets the generic ones, with
+    ``encoder_tau`` None if it has no target networks.
+    """
+    named = _METHODS.get(getattr(loss, "method_name", None) or "")
+    loss_class = loss if isinstance(loss, type) else type(loss)
+    if named is not None and issubclass(loss_class, named.loss_class):
+        return named.defaults
+    for base in loss_class.__mro__:
+        for method in _METHODS.values():
+            if method.loss_class is base and not method.is_preset:
+                return method.defaults
+    if isinstance(loss, type):
+        return MethodDefaults()
+    has_targets = any(name.startswith("target_") for name, _ in loss.named_children())
+    return MethodDefaults() if has_targets else MethodDefaults(encoder_tau=None)

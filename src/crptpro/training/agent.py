@@ -1,0 +1,76 @@
+"""The downstream agent: a frozen encoder and the actor on it, acting on pixels and kept as an artifact."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from crptpro.artifact import read_artifact, write_artifact
+from crptpro.cards import provenance
+from crptpro.errors import CheckpointError
+from crptpro.modules import PixelEncoder, SquashedGaussianActor
+
+AGENT_FORMAT = "crptpro-agent"
+AGENT_VERSION = 1
+
+
+class PixelAgent:
+    """Acts on one observation at a time; callable as a deterministic evaluation policy.
+
+    Args:
+        encoder: frozen; maps pixels to features.
+        actor: maps features to a squashed Gaussian over actions.
+    """
+
+    def __init__(self, encoder: PixelEncoder, actor: SquashedGaussianActor) -> None:
+        self.encoder = encoder
+        self.actor = actor
+
+    @torch.no_grad()
+    def __call__(self, pixels: Tensor) -> Tensor:
+        """Return ``tanh`` of the mean, float32 ``[A]``, for uint8 ``[C, H, W]`` (no shift, no noise)."""
+        features = self.encoder(pixels.unsqueeze(0).to(_device_of(self.actor)))
+        return self.actor.mode(features).squeeze(0).float().cpu()
+
+
+def save_agent(path: str | Path, agent: PixelAgent, *, card: dict[str, Any]) -> Path:
+    """Write encoder and actor with a card; whole or not at all.
+
+    Args:
+        path: directory to write or replace.
+        agent: what to keep.
+        card: what else the reader should know: task, seed, env steps, where the encoder came from.
+    """
+    modules: dict[str, nn.Module] = {"encoder": agent.encoder, "actor": agent.actor}
+    content = {
+        "modules": {name: module.config for name, module in modules.items()},
+        **card,
+        **provenance(),
+    }
+    return write_artifact(path, modules, card=content, format_name=AGENT_FORMAT, version=AGENT_VERSION)
+
+
+def load_agent(path: str | Path) -> tuple[PixelAgent, dict[str, Any]]:
+    """Rebuild an agent from its artifact alone.
+
+    Returns:
+        The agent, ready to act, and its card.
+
+    Raises:
+        CheckpointError: if the directory is missing, damaged, or not an agent.
+    """
+    card, tensors = read_artifact(path, format_name=AGENT_FORMAT, version=AGENT_VERSION, error=CheckpointError)
+    encoder = PixelEncoder(**card["modules"]["encoder"])
+    actor = SquashedGaussianActor(**card["modules"]["actor"])
+    for name, module in (("encoder", encoder), ("actor", actor)):
+        prefix = f"{name}."
+        module.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
+        module.requires_grad_(False).eval()
+    return PixelAgent(encoder, actor), card
+
+
+def _device_of(module: nn.Module) -> torch.device:
+    return next(module.parameters()).device

@@ -1,0 +1,174 @@
+"""Telling a plateau from a dead run: the prototype loss at ln(M), or embeddings that all point one way."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from typing import Any, Literal
+
+_LOG = logging.getLogger(__name__)
+
+State = Literal["learning", "plateau", "dead"]
+
+
+class CollapseMonitor:
+    """Watch a pre-training run for collapse and announce what it sees.
+
+    A comparative loss of ln(M) (6.238 for 512 prototypes) means that predictions or assignments are uniform;
+    a mean pairwise cosine near 1 means that every observation has the same embedding. Small trials of the
+    paper's loss stay there for about 1,200 updates and then leave, so being there is a ``plateau`` at first
+    (announced once, as expected to pass) and ``dead`` only when it lasts longer than ``patience_updates`` or
+    to the end of training.
+
+    Args:
+        num_prototypes: M; ``None`` for a loss without prototypes, which is watched by cosine only.
+        patience_updates: length of a plateau, in updates, beyond which the run is called dead.
+        loss_margin: how near to ln(M) counts, as a fraction of ln(M).
+        cosine_threshold: mean pairwise cosine above which embeddings count as collapsed.
+        exit_observations: consecutive observations outside that end a plateau, so that noise does not.
+
+    Examples:
+        >>> monitor = CollapseMonitor(512, patience_updates=1_000)
+        >>> [monitor.observe(u, comp=c, cosine=0.5) for u, c in [(100, 6.63), (200, 6.24), (1300, 6.24)]]
+        ['learning', 'plateau', 'dead']
+        >>> monitor.verdict(1300)["plateau_updates"]
+        1100
+    """
+
+    def __init__(
+        self,
+        num_prototypes: int | None = None,
+        *,
+        patience_updates: int = 5_000,
+        loss_margin: float = 0.005,
+        cosine_threshold: float = 0.99,
+        exit_observations: int = 2,
+    ) -> None:
+        self.floor = math.log(num_prototypes) if num_prototypes and num_prototypes > 1 else None
+        self.patience_updates = patience_updates
+        self.loss_margin = loss_margin
+        self.cosine_threshold = cosine_threshold
+        self.exit_observations = exit_observations
+        self.state: State = "learning"
+        self.plateaus: list[list[int | None]] = []  # [entry update, exit update or None]
+        self._outside_since: int | None = None
+        self._outside_count = 0
+        self._comp: float | None = None
+        self._cosines: dict[str, float] = {}
+
+    def observe(
+        self, updates: int, *, comp: float | None = None, cosine: float | Mapping[str, float] | None = None
+    ) -> State:
+        """Take one measurement and return the state after it.
+
+        Args:
+            updates: updates done so far.
+            comp: comparative loss in nats, mean since the last observation; ``None`` if the loss has none.
+            cosine: mean pairwise cosine of embeddings in [-1, 1]: one number, or one per domain (their mean
+                decides).
+        """
+        self._comp = comp
+        if cosine is not None:
+            self._cosines = dict(cosine) if isinstance(cosine, Mapping) else {"all": float(cosine)}
+        reasons = self._reasons()
+        if reasons:
+            self._outside_since, self._outside_count = None, 0
+            if self.state == "learning":
+                self.state = "plateau"
+                self.plateaus.append([updates, None])
+                _LOG.info(
+                    "Update %d: plateau (%s). Expected to pass; called dead after %d updates of it.",
+                    updates, reasons, self.patience_updates,
+                )  # fmt: skip
+        elif self.state != "learning":
+            if self._outside_since is None:
+                self._outside_since = updates
+            self._outside_count += 1
+            if self._outside_count >= self.exit_observations:
+                self._leave()
+        entered = self.plateaus[-1][0] if self.state == "plateau" else None
+        if entered is not None and reasons and updates - entered > self.patience_updates:
+            self.state = "dead"
+            _LOG.error(
+                "Update %d: DEAD RUN: %s since update %d, longer than %d updates. "
+                "The encoder is not learning; check the data and the temperatures.",
+                updates, reasons, entered, self.patience_updates,
+            )  # fmt: skip
+        return self.state
+
+    def verdict(self, updates: int) -> dict[str, Any]:
+        """Return the judgement after ``updates`` updates as JSON-able values; changes nothing.
+
+        Returns:
+            ``verdict`` (``"learning"``, or ``"dead"`` if training ends on a plateau), ``plateaus`` (entry and
+            exit updates), ``plateau_updates`` (their total length), ``ln_num_prototypes``, the last ``comp``
+            and ``cosine`` per domain, and ``collapsed_domains`` (those above the threshold).
+        """
+        length = sum((updates if leave is None else leave) - (enter or 0) for enter, leave in self.plateaus)
+        return {
+            "verdict": "learning" if self.state == "learning" else "dead",
+            "plateaus": [{"entered": enter, "left": leave} for enter, leave in self.plateaus],
+            "plateau_updates": length,
+            "ln_num_prototypes": self.floor,
+            "comp": self._comp,
+            "cosine": dict(self._cosines),
+            "collapsed_domains": sorted(k for k, v in self._cosines.items() if v > self.cosine_threshold),
+        }
+
+    def finish(self, updates: int) -> dict[str, Any]:
+        """Announce how training ended and return :meth:`verdict`."""
+        verdict = self.verdict(updates)
+        if verdict["verdict"] == "dead":
+            entered = self.plateaus[-1][0]
+            _LOG.error(
+                "DEAD RUN: training ended at update %d on a plateau entered at update %s (%s). Small trials "
+                "of the paper's loss needed about 1,200 updates to leave it; train longer or check the data.",
+                updates, entered, self._reasons() or "not left yet",
+            )  # fmt: skip
+        elif verdict["collapsed_domains"]:
+            _LOG.warning(
+                "Embeddings of %s have collapsed (pairwise cosine above %g), not those of every domain.",
+                ", ".join(verdict["collapsed_domains"]), self.cosine_threshold,
+            )  # fmt: skip
+        return verdict
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what a resumed run needs to judge as if never interrupted."""
+        return {
+            "state": self.state,
+            "plateaus": [list(plateau) for plateau in self.plateaus],
+            "outside_since": self._outside_since,
+            "outside_count": self._outside_count,
+            "comp": self._comp,
+            "cosines": dict(self._cosines),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore :meth:`state_dict`."""
+        self.state = state["state"]
+        self.plateaus = [list(plateau) for plateau in state["plateaus"]]
+        self._outside_since, self._outside_count = state["outside_since"], state["outside_count"]
+        self._comp, self._cosines = state["comp"], dict(state["cosines"])
+
+    def _reasons(self) -> str:
+        """What is wrong now, in words; empty if nothing is."""
+        found = []
+        floor, comp = self.floor, self._comp
+        if floor is not None and comp is not None and abs(comp - floor) <= self.loss_margin * floor:
+            found.append(f"loss {comp:.4f} at ln(M) = {floor:.4f}")
+        if self._cosines:
+            mean = sum(self._cosines.values()) / len(self._cosines)
+            if mean > self.cosine_threshold:
+                found.append(f"pairwise cosine {mean:.4f}")
+        return ", ".join(found)
+
+    def _leave(self) -> None:
+        plateau = self.plateaus[-1]
+        plateau[1] = self._outside_since
+        duration = (self._outside_since or 0) - (plateau[0] or 0)
+        _LOG.warning(
+            "Update %s: left the plateau after %d updates%s.",
+            self._outside_since, duration, " (it had been called dead)" if self.state == "dead" else "",
+        )  # fmt: skip
+        self.state, self._outside_since, self._outside_count = "learning", None, 0

@@ -1,0 +1,96 @@
+"""Every number of the downstream stage, with the paper's values as defaults."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class DownstreamConfig:
+    """Settings of SAC on a frozen encoder (CRPTpro, hyper-parameter table; Proto-RL's released agent).
+
+    One update per agent step once ``random_agent_steps`` transitions are stored. ``env_steps`` counts
+    un-repeated simulator steps, ``agent_steps`` decisions.
+    """
+
+    env_steps: int = 500_000
+    """budget in simulator steps; episodes are whole, so the last one may end a little later"""
+    action_repeat: int = 2
+    """simulator steps per decision"""
+    seed: int = 0
+    """seeds initialisation, environment, exploration, replay sampling, shifts, bonus and evaluation"""
+    batch_size: int = 512
+    """transitions per update"""
+    replay_capacity: int = 40_000
+    """transitions kept; the oldest go first"""
+    random_agent_steps: int = 1_000
+    """decisions taken uniformly at random before the first update"""
+    discount: float = 0.99
+    """per agent step; only true terminations stop bootstrapping, time limits never do"""
+    learning_rate: float = 1e-4
+    """of the three Adam optimisers (actor, critic, temperature)"""
+    initial_temperature: float = 0.1
+    """SAC's alpha at the start"""
+    actor_update_interval: int = 2
+    """updates between two actor and temperature steps"""
+    critic_tau: float = 0.01
+    """share of the critic that enters its target at each target update"""
+    target_update_interval: int = 2
+    """updates between two target updates"""
+    shift_pad: int = 4
+    """random shift of at most so many pixels in each direction"""
+    intrinsic_reward_coef: float = 0.2
+    """weight of the prototype-kNN bonus (the paper's beta); 0 switches it off"""
+    knn_k: int = 3
+    """the bonus is the distance to the k-th nearest candidate"""
+    queue_size: int = 2_048
+    """candidates kept, a multiple of the number of prototypes"""
+    reset_queue: bool = False
+    """start with an empty candidate queue although the artifact brings one"""
+    eval_interval_env_steps: int = 10_000
+    """simulator steps between two evaluations; the first is at 0, the last at the end"""
+    eval_episodes: int = 10
+    """episodes per evaluation"""
+    video_episodes: int = 0
+    """episodes per evaluation that are written as video (needs the `video` extra)"""
+    checkpoint_interval_env_steps: int = 10_000
+    """simulator steps between two checkpoints, taken at episode ends"""
+    log_interval_env_steps: int = 1_000
+    """simulator steps between two rows of training metrics"""
+    quality: Literal["exact", "fast"] = "exact"
+    """render quality"""
+    features: Literal["auto", "dense", "reencode"] = "auto"
+    """how shifted features are had: cut from dense maps stored once per observation, or encoded at every update"""
+    precision: Literal["auto", "fp32", "bf16"] = "auto"
+    """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it"""
+    device: str = "cpu"
+    """where networks and features live"""
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot run.
+
+        Raises:
+            ValueError: naming the setting, its value and what is allowed.
+        """
+        for name in (
+            "env_steps", "action_repeat", "batch_size", "replay_capacity", "actor_update_interval",
+            "target_update_interval", "knn_k", "queue_size", "eval_interval_env_steps", "eval_episodes",
+            "checkpoint_interval_env_steps", "log_interval_env_steps",
+        ):  # fmt: skip
+            if getattr(self, name) < 1:
+                raise ValueError(f"`{name}` must be at least 1, got {getattr(self, name)}.")
+        for name in ("discount", "critic_tau"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"`{name}` must be in [0, 1], got {getattr(self, name)}.")
+        for name in ("learning_rate", "initial_temperature"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"`{name}` must be positive, got {getattr(self, name)}.")
+        for name in ("random_agent_steps", "shift_pad", "intrinsic_reward_coef", "video_episodes"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"`{name}` must not be negative, got {getattr(self, name)}.")
+        if self.replay_capacity < self.random_agent_steps:
+            raise ValueError(
+                f"`replay_capacity` ({self.replay_capacity}) must hold the {self.random_agent_steps} transitions "
+                "of `random_agent_steps`, or no update would ever start."
+            )

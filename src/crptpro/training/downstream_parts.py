@@ -1,0 +1,144 @@
+"""Build what the downstream loop is made of, from an artifact and an environment."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torchrl.envs import EnvBase
+
+from crptpro.cards import require_disk
+from crptpro.data import FrameReplay
+from crptpro.modules import (
+    PixelEncoder,
+    SquashedGaussianActor,
+    TwinCritic,
+    resolve_precision,
+    set_compute_dtype,
+)
+from crptpro.objectives import RADSACLoss
+from crptpro.pretrained import Pretrained
+from crptpro.training.downstream_config import DownstreamConfig
+from crptpro.training.frozen_features import FrozenFeatures
+from crptpro.training.rad_sac_learner import RADSACLearner
+from crptpro.transforms import PrototypeReward, choose_feature_mode
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Everything that learns or remembers in a downstream run."""
+
+    encoder: PixelEncoder
+    actor: SquashedGaussianActor
+    learner: RADSACLearner
+    replay: FrameReplay
+    features: FrozenFeatures
+    bonus: PrototypeReward | None
+    feature_mode: Literal["dense", "reencode"]
+
+
+def build_parts(
+    pretrained: Pretrained,
+    env: EnvBase,
+    config: DownstreamConfig,
+    generators: Mapping[str, torch.Generator],
+    run_dir: Path,
+) -> Parts:
+    """Build networks, replay, features and bonus; the encoder, projector and prototypes are frozen.
+
+    Raises:
+        PretrainedError: if the artifact was made for other images than the environment's.
+        DiskSpaceError: if the replay's frames do not fit the disk.
+    """
+    channels, image_size, _ = env.observation_spec["pixels"].shape
+    pretrained.require(image_size=image_size, frame_stack=channels // 3)
+    dtype = resolve_precision(config.precision, config.device)
+    frozen = [m for m in (pretrained.encoder, pretrained.projector, pretrained.prototypes) if m is not None]
+    for module in frozen:
+        set_compute_dtype(module.requires_grad_(False).eval().to(config.device), dtype)
+
+    feature_dim, action_dim = pretrained.encoder.feature_dim, env.action_spec.shape[-1]
+    actor = SquashedGaussianActor(feature_dim, action_dim).to(config.device)
+    critic = TwinCritic(feature_dim, action_dim).to(config.device)
+    loss = RADSACLoss(
+        actor,
+        critic,
+        gamma=config.discount,
+        alpha_init=config.initial_temperature,
+        generator=generators["policy"],
+    )
+    set_compute_dtype(loss, dtype)
+    learner = RADSACLearner(
+        loss,
+        learning_rate=config.learning_rate,
+        critic_tau=config.critic_tau,
+        actor_update_interval=config.actor_update_interval,
+        target_update_interval=config.target_update_interval,
+    )
+
+    replay = _build_replay(env, config, generators["replay"], run_dir)
+    observations = min(replay.live_rows, _agent_steps(config))
+    mode, reason = choose_feature_mode(
+        config.features, pretrained.encoder, observations, dtype, pad=config.shift_pad, device=config.device
+    )
+    logger.info("features: %s", reason)
+    features = FrozenFeatures(
+        pretrained.encoder,
+        replay,
+        mode=mode,
+        pad=config.shift_pad,
+        generator=generators["shift"],
+        device=config.device,
+    )
+    bonus = _build_bonus(pretrained, config, generators["bonus"])
+    return Parts(pretrained.encoder, actor, learner, replay, features, bonus, mode)
+
+
+def _build_replay(
+    env: EnvBase, config: DownstreamConfig, generator: torch.Generator, run_dir: Path
+) -> FrameReplay:
+    _, height, width = env.observation_spec["pixels"].shape
+    # A checkpoint holds cursors, not frames: whatever it refers to must outlive the next one, and the one after
+    # that while it is being written.
+    slack = 2 * (config.checkpoint_interval_env_steps // config.action_repeat) + 2_000
+    stored = min(config.replay_capacity + slack, _agent_steps(config))
+    require_disk(run_dir, stored * 3 * height * width, f"the replay of {stored:,} observations")
+    replay = FrameReplay(
+        config.replay_capacity,
+        frame_shape=(3, height, width),
+        action_dim=env.action_spec.shape[-1],
+        path=run_dir / "replay",
+        slack=slack,
+        frame_stack=env.observation_spec["pixels"].shape[0] // 3,
+    )
+    replay.set_rng(generator)
+    return replay
+
+
+def _agent_steps(config: DownstreamConfig) -> int:
+    return -(-config.env_steps // config.action_repeat)
+
+
+def _build_bonus(
+    pretrained: Pretrained, config: DownstreamConfig, generator: torch.Generator
+) -> PrototypeReward | None:
+    if config.intrinsic_reward_coef == 0:
+        return None
+    if pretrained.prototypes is None or pretrained.projector is None:
+        logger.info("no exploration bonus: the artifact has no prototypes")
+        return None
+    return PrototypeReward(
+        pretrained.projector,
+        pretrained.prototypes,
+        intrinsic_reward_coef=config.intrinsic_reward_coef,
+        knn_k=config.knn_k,
+        queue_size=config.queue_size,
+        queue=None if config.reset_queue else pretrained.queue,
+        generator=generator,
+    )

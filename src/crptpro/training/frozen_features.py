@@ -1,0 +1,91 @@
+"""What the frozen encoder makes of observations: of the live one to act on, and of sampled ones under a shift."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from crptpro.data import FrameReplay
+from crptpro.modules import PixelEncoder
+from crptpro.transforms import DenseShiftCache, DenseShiftFeatures
+
+
+class FrozenFeatures:
+    """Two ways to the same features: cut from dense maps kept per observation, or encoded whenever needed.
+
+    Args:
+        encoder: frozen, already in its compute dtype.
+        replay: where observations live; dense maps are kept for all that it can hold.
+        mode: ``"dense"`` or ``"reencode"``; see :func:`crptpro.transforms.choose_feature_mode`.
+        pad: largest random shift in pixels.
+        generator: source of the shifts.
+        device: where features live.
+    """
+
+    def __init__(
+        self,
+        encoder: PixelEncoder,
+        replay: FrameReplay,
+        *,
+        mode: Literal["dense", "reencode"],
+        pad: int,
+        generator: torch.Generator,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.encoder = encoder
+        self.replay = replay
+        self.mode = mode
+        self.device = torch.device(device)
+        self.cache: DenseShiftCache | None = None
+        if mode == "dense":
+            self.cache = DenseShiftCache(
+                encoder, replay.live_rows, pad=pad, dtype=encoder.compute_dtype, device=device
+            )
+        self.shifted = DenseShiftFeatures(
+            self.cache, mode=mode, encoder=encoder, pad=pad, generator=generator, reuse_output=True
+        )
+
+    @torch.no_grad()
+    def observe(self, pixels: Tensor, row: int) -> Tensor:
+        """Take in the observation that was just stored and return its un-shifted features.
+
+        Args:
+            pixels: uint8 ``[C, H, W]``.
+            row: its row in the replay, as counted since the start of the run.
+
+        Returns:
+            ``[1, feature_dim]``.
+        """
+        if self.cache is None:
+            return self.encoder(pixels.unsqueeze(0).to(self.device))
+        slot = row % self.cache.slots
+        self.cache.write(slot, pixels)
+        return self.cache.center(torch.tensor([slot]))
+
+    def sample(self, batch_size: int) -> TensorDictBase:
+        """Sample transitions with ``features`` and ``("next", "features")``, each observation under its own shift.
+
+        The features are valid until the next call.
+        """
+        batch = self.replay.sample(batch_size, pixels=self.cache is None)
+        if self.cache is None:
+            batch = batch.to(self.device)
+        else:
+            for key in ("rows", ("next", "rows")):
+                batch.set(key, batch.get(key) % self.cache.slots)
+        return self.shifted(batch)
+
+    def rebuild(self, *, progress: bool = True) -> None:
+        """Encode again every stored observation, after the replay was restored from a checkpoint.
+
+        One by one, as they were encoded when they entered: a convolution may round differently in a batch.
+        """
+        if self.cache is None:
+            return
+        rows = self.replay.stored_rows()
+        for row in tqdm(rows, desc="encode replay", unit="obs", leave=False, disable=None if progress else True):
+            self.cache.write(row % self.cache.slots, self.replay.observation(row))

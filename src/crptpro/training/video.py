@@ -1,0 +1,50 @@
+"""Evaluation videos: useful, optional, and never a reason for a run to fail."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from functools import cache
+from pathlib import Path
+
+from torch import Tensor
+
+logger = logging.getLogger(__name__)
+
+
+def write_video(pictures: Tensor, path: str | Path, *, pictures_per_s: int = 25) -> Path | None:
+    """Write an MP4, or say once why not.
+
+    Args:
+        pictures: RGB, uint8 ``[T, 3, H, W]``.
+        path: file to write; written aside and renamed.
+        pictures_per_s: playback rate.
+
+    Returns:
+        The file, or ``None`` if the ``video`` extra is missing or encoding failed (a warning says which).
+    """
+    if importlib.util.find_spec("imageio_ffmpeg") is None:
+        _warn_once("no video is written: install the extra with `pip install 'crptpro[video]'`.")
+        return None
+    import imageio.v2 as imageio
+
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}")
+    try:
+        # Nearest-neighbour enlargement keeps 84 pixels visible on a screen; the codec wants even sizes.
+        large = pictures.repeat_interleave(4, -1).repeat_interleave(4, -2).permute(0, 2, 3, 1).numpy()
+        with imageio.get_writer(temporary, format="FFMPEG", fps=pictures_per_s, macro_block_size=4) as writer:
+            for picture in large:
+                writer.append_data(picture)
+        temporary.replace(path)
+    except (OSError, RuntimeError, ValueError) as reason:
+        temporary.unlink(missing_ok=True)
+        _warn_once(f"no video is written: {reason}")
+        return None
+    return path
+
+
+@cache
+def _warn_once(message: str) -> None:
+    logger.warning(message)

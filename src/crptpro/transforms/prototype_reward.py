@@ -1,0 +1,262 @@
+"""The exploration bonus of CRPTpro: how far a new state is from what the prototypes recently picked."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.data.tensor_specs import Composite, Unbounded
+from torchrl.envs.transforms import Transform
+
+from crptpro.objectives.functional import knn_distance
+from crptpro.transforms.keys import as_key_list, with_next, without_next
+
+
+class PrototypeReward(Transform):
+    r"""Add the prototype-kNN exploration bonus to the reward (CRPTpro, Eq. 10-11).
+
+    .. math:: r = r_\mathrm{ext} + \beta \hat r
+
+    With :math:`z_i` the l2-normalised projections of a batch of next observations and :math:`c_j` the
+    l2-normalised prototypes, each call
+
+    1. draws one candidate per prototype,
+       :math:`i_j \sim \mathrm{Categorical}_i(\mathrm{softmax}_i(c_j \cdot z_i / T))`;
+    2. puts the M vectors :math:`z_{i_j}` into the first-in-first-out queue Q;
+    3. then takes :math:`\hat r_i = \lVert z_i - \mathrm{NN}_k(z_i; Q) \rVert_2`, in [0, 2].
+
+    As in the released agent (liuxin0824/CRPTpro ``proto.py``), copies of a sample that were just drawn
+    count as neighbours, so a sample drawn k times or more gets exactly 0 (about 8 % of a batch of 512 with
+    512 prototypes and k = 3), and rows of the queue not yet filled are zero vectors at distance 1.
+
+    Works on replay batches (``forward``, keys under ``"next"``) and on environments. The candidates come
+    from the batch at hand: on a single environment that is one sample, which fills the queue with itself
+    and earns 0 unless ``knn_exclude_self``; use replay batches or many environments. Never put it on
+    evaluation environments. Stored rewards are never changed. Nothing depends on training mode.
+
+    Args:
+        projector: maps features to the latent space, frozen; None if ``in_keys`` already names projections.
+        prototypes: M prototypes, a :class:`~crptpro.modules.Prototypes` or a tensor ``[M, D]``, any row
+            length.
+        intrinsic_reward_coef: :math:`\beta`.
+        knn_k: k, counted with copies of the sample itself.
+        queue_size: length of Q, a multiple of M.
+        candidate_temperature: T. 1 is close to uniform, because cosines lie in [-1, 1].
+        knn_exclude_self: ignore entries that this very call copied from the sample.
+        reward_norm: ``"rms"`` divides :math:`\hat r` by the root of the running mean of its square (all
+            calls so far, this one included). Deviation: neither the paper nor the released code normalises;
+            None does not.
+        in_keys: one key, features ``[*, feature_dim]`` (or projections ``[*, D]``) of the next observation.
+        out_keys: one key for :math:`\hat r`, of the reward's shape.
+        reward_key: :math:`r_\mathrm{ext}`, ``[*, 1]``; None writes :math:`\hat r` only.
+        out_reward_key: where :math:`r_\mathrm{ext} + \beta \hat r` goes; ``reward_key`` when None.
+        queue: ``[queue_size, D]`` to start from, such as a checkpoint's; zeros when None.
+        queue_pointer: row of ``queue`` that is overwritten first.
+        generator: source of the draws; the global generator of the device when None. Not part of the state
+            dict.
+
+    Keys name entries of an environment's step; in replay batches they are read and written under
+    ``"next"``. A leading ``"next"`` in a key is therefore ignored.
+
+    Raises:
+        ValueError: a queue size that is no multiple of M, a queue of another shape, more than one key,
+            non-positive ``knn_k`` or ``candidate_temperature``, or an unknown ``reward_norm``.
+    """
+
+    queue: Tensor
+    queue_pointer: Tensor
+    reward_square_sum: Tensor
+    reward_count: Tensor
+
+    def __init__(
+        self,
+        projector: nn.Module | None,
+        prototypes: nn.Module | Tensor,
+        *,
+        intrinsic_reward_coef: float = 0.2,
+        knn_k: int = 3,
+        queue_size: int = 2048,
+        candidate_temperature: float = 1.0,
+        knn_exclude_self: bool = False,
+        reward_norm: Literal["rms"] | None = None,
+        in_keys: NestedKey | list[NestedKey] = "features",
+        out_keys: NestedKey | list[NestedKey] = "intrinsic_reward",
+        reward_key: NestedKey | None = "reward",
+        out_reward_key: NestedKey | None = None,
+        queue: Tensor | None = None,
+        queue_pointer: int = 0,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        in_keys, out_keys = as_key_list(in_keys), as_key_list(out_keys)
+        if len(in_keys) != 1 or len(out_keys) != 1:
+            raise ValueError(f"PrototypeReward reads and writes one key each, got {in_keys} and {out_keys}.")
+        if reward_norm not in (None, "rms"):
+            raise ValueError(f"reward_norm must be None or 'rms', got {reward_norm!r}.")
+        if candidate_temperature <= 0:
+            raise ValueError(f"candidate_temperature must be positive, got {candidate_temperature}.")
+        weight = prototypes if isinstance(prototypes, Tensor) else prototypes.get_parameter("weight")
+        num_prototypes, latent_dim = weight.shape
+        if queue_size < 1 or queue_size % num_prototypes:
+            raise ValueError(
+                f"queue_size must be a multiple of num_prototypes, got {queue_size} and {num_prototypes}."
+            )
+        if not 1 <= knn_k <= queue_size:
+            raise ValueError(f"knn_k must lie in 1..queue_size, got {knn_k} with queue_size {queue_size}.")
+        if queue is not None and queue.shape != (queue_size, latent_dim):
+            raise ValueError(
+                f"expected a queue of shape {(queue_size, latent_dim)}, got {tuple(queue.shape)}."
+            )
+        super().__init__(
+            in_keys=[without_next(k) for k in in_keys], out_keys=[without_next(k) for k in out_keys]
+        )
+        self.projector = projector
+        if isinstance(prototypes, Tensor):
+            self.register_buffer("prototypes", prototypes.detach().clone())
+        else:
+            self.prototypes = prototypes
+        self.intrinsic_reward_coef = intrinsic_reward_coef
+        self.knn_k = knn_k
+        self.candidate_temperature = candidate_temperature
+        self.knn_exclude_self = knn_exclude_self
+        self.reward_norm = reward_norm
+        self.reward_key = None if reward_key is None else without_next(reward_key)
+        self.out_reward_key = self.reward_key if out_reward_key is None else without_next(out_reward_key)
+        self.generator = generator
+        start = torch.zeros(queue_size, latent_dim, device=weight.device) if queue is None else queue
+        self.register_buffer("queue", start.detach().to(weight.device, torch.float32, copy=True))
+        self.register_buffer("queue_pointer", torch.tensor(queue_pointer % queue_size, device=weight.device))
+        self.register_buffer("reward_square_sum", torch.zeros((), dtype=torch.float64, device=weight.device))
+        self.register_buffer("reward_count", torch.zeros((), dtype=torch.int64, device=weight.device))
+
+    def reset_queue(self) -> None:
+        """Empty the queue: all rows zero, pointer at the first. The running statistics of ``"rms"`` stay."""
+        self.queue.zero_()
+        self.queue_pointer.zero_()
+
+    @torch.no_grad()
+    def intrinsic_reward(self, features: Tensor) -> Tensor:
+        r"""Insert this batch's candidates into the queue and return the bonus before :math:`\beta`.
+
+        Args:
+            features: ``[B, feature_dim]``, or ``[B, D]`` without a projector; any floating dtype.
+
+        Returns:
+            float32 ``[B]``.
+        """
+        latents = features if self.projector is None else self.projector(features)
+        latents = F.normalize(latents.float(), dim=-1)
+        prototypes = self.prototypes
+        weight = prototypes if isinstance(prototypes, Tensor) else prototypes.get_parameter("weight")
+        scores = F.normalize(weight.float(), dim=-1) @ latents.T
+        candidates = draw_candidates(scores / self.candidate_temperature, self.generator)
+        count = candidates.shape[0]
+        rows = (self.queue_pointer + torch.arange(count, device=latents.device)) % self.queue.shape[0]
+        self.queue.index_copy_(0, rows, latents[candidates])
+        self.queue_pointer.add_(count).remainder_(self.queue.shape[0])
+        if self.knn_exclude_self:
+            reward = self._distance_to_others(latents, rows, candidates)
+        else:
+            reward = knn_distance(latents, self.queue, k=self.knn_k)
+        if self.reward_norm == "rms":
+            self.reward_square_sum.add_(reward.double().square().sum())
+            self.reward_count.add_(reward.numel())
+            mean_square = self.reward_square_sum / self.reward_count
+            reward = reward / mean_square.sqrt().clamp_min(1e-8).to(reward.dtype)
+        return reward
+
+    def _distance_to_others(self, latents: Tensor, rows: Tensor, candidates: Tensor) -> Tensor:
+        distances = torch.cdist(latents, self.queue)
+        # Copies of a sample made by this call are infinitely far from it.
+        distances[candidates, rows] = torch.inf
+        kth = distances.topk(self.knn_k, dim=-1, largest=False).values[:, -1]
+        # Too few other entries (tiny batches in a tiny queue): no estimate, no bonus.
+        return torch.where(kth.isinf(), torch.zeros_like(kth), kth)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Add the bonus to a sampled batch, under ``"next"``.
+
+        Raises:
+            KeyError: features or reward are missing.
+        """
+        in_key, out_key = with_next(self.in_keys[0]), with_next(self.out_keys[0])
+        reward_key = None if self.reward_key is None else with_next(self.reward_key)
+        out_reward_key = None if self.out_reward_key is None else with_next(self.out_reward_key)
+        return self._add_bonus(tensordict, in_key, out_key, reward_key, out_reward_key)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._add_bonus(
+            next_tensordict, self.in_keys[0], self.out_keys[0], self.reward_key, self.out_reward_key
+        )
+
+    def _add_bonus(
+        self,
+        tensordict: TensorDictBase,
+        in_key: NestedKey,
+        out_key: NestedKey,
+        reward_key: NestedKey | None,
+        out_reward_key: NestedKey | None,
+    ) -> TensorDictBase:
+        features = tensordict.get(in_key, None)
+        reward = None if reward_key is None else tensordict.get(reward_key, None)
+        for key, value in ((in_key, features), (reward_key, reward)):
+            if key is not None and value is None:
+                present = list(tensordict.keys(True, True))
+                raise KeyError(
+                    f"PrototypeReward found no {key!r} among {present}; set in_keys or reward_key."
+                )
+        bonus = self.intrinsic_reward(features.reshape(-1, features.shape[-1]))
+        bonus = bonus.reshape(*features.shape[:-1], 1) if reward is None else bonus.to(reward).view_as(reward)
+        tensordict.set(out_key, bonus)
+        if reward is not None:
+            # A new tensor: the sampled reward may share memory with the storage.
+            tensordict.set(out_reward_key, reward + self.intrinsic_reward_coef * bonus)
+        return tensordict
+
+    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
+        """Register the bonus and the total, both unbounded.
+
+        Raises:
+            KeyError: the environment has no such reward.
+        """
+        if self.reward_key is not None and self.reward_key not in reward_spec.keys(True, True):
+            raise KeyError(f"PrototypeReward found no {self.reward_key!r} in the rewards {reward_spec}.")
+        if self.reward_key is None:
+            shape, dtype, device = (*reward_spec.shape, 1), torch.float32, reward_spec.device
+        else:
+            external = reward_spec[self.reward_key]
+            shape, dtype, device = external.shape, external.dtype, external.device
+        reward_spec[self.out_keys[0]] = Unbounded(shape=shape, dtype=dtype, device=device)
+        if self.out_reward_key is not None:
+            reward_spec[self.out_reward_key] = Unbounded(shape=shape, dtype=dtype, device=device)
+        return reward_spec
+
+    def clone(self) -> PrototypeReward:
+        """Return a transform without parent, with its own queue; networks and generator are shared."""
+        copy = super().clone()
+        for name in ("queue", "queue_pointer", "reward_square_sum", "reward_count"):
+            copy._buffers[name] = getattr(self, name).clone()
+        return copy
+
+
+def draw_candidates(logits: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """Draw one sample per prototype with probability softmax over the batch.
+
+    By inversion of the cumulative distribution: one uniform number per prototype, no host synchronisation.
+
+    Args:
+        logits: ``[M, B]``.
+        generator: source of the draws, on any device; the global generator of the logits' device when None.
+
+    Returns:
+        int64 ``[M]`` in ``{0, ..., B - 1}``.
+    """
+    cumulative = logits.softmax(dim=-1).cumsum(dim=-1)
+    source = logits.device if generator is None else generator.device
+    uniform = torch.rand(logits.shape[0], 1, generator=generator, device=source).to(logits.device)
+    drawn = torch.searchsorted(cumulative, uniform * cumulative[:, -1:], right=True)
+    # Rounding may carry a draw just below 1 past the last sample.
+    return drawn.squeeze(-1).clamp_max(logits.shape[1] - 1)

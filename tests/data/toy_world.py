@@ -1,0 +1,154 @@
+"""A world without a simulator: its pixels are a function of seed, time and actions, so every byte can be predicted."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from crptpro.data import Episode
+from crptpro.domains import Domain
+
+
+class ToyEnv(EnvBase):
+    """Episodes of ``lengths(seed)`` transitions; ends by truncation if the length is even, else by termination."""
+
+    def __init__(
+        self,
+        lengths: Callable[[int], int],
+        *,
+        seed: int = 0,
+        image_size: int = 8,
+        physics_state: bool = False,
+        on_step: Callable[[int], None] = lambda count: None,
+    ):
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
+        self.lengths, self.on_step, self.image_size = lengths, on_step, image_size
+        self.physics_state, self.episode_seed, self.resets, self.steps = physics_state, seed, 0, 0
+        observation = {"pixels": Bounded(0, 255, shape=(3, image_size, image_size), dtype=torch.uint8)}
+        if physics_state:
+            observation["qpos"] = Unbounded(shape=(2,), dtype=torch.float64)
+            observation["qvel"] = Unbounded(shape=(1,), dtype=torch.float64)
+        self.observation_spec = Composite(observation)
+        self.action_spec = Bounded(-1.0, 1.0, shape=(2,), dtype=torch.float32)
+        self.reward_spec = Unbounded(shape=(1,), dtype=torch.float32)
+        flag = Categorical(2, shape=(1,), dtype=torch.bool)
+        self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone())
+
+    def _observe(self) -> dict[str, torch.Tensor]:
+        rng = np.random.default_rng([self.episode_seed, self.count, int(abs(self.total) * 1e6)])
+        shape = (3, self.image_size, self.image_size)
+        found = {"pixels": torch.from_numpy(rng.integers(0, 256, shape, dtype=np.uint8))}
+        if self.physics_state:
+            found["qpos"] = torch.tensor([self.count, self.total], dtype=torch.float64)
+            found["qvel"] = torch.tensor([float(self.episode_seed)], dtype=torch.float64)
+        return found
+
+    def _flags(self, terminated: bool, truncated: bool) -> dict[str, torch.Tensor]:
+        flags = {"done": terminated or truncated, "terminated": terminated, "truncated": truncated}
+        return {name: torch.tensor([value]) for name, value in flags.items()}
+
+    def _reset(self, tensordict: TensorDict | None = None, **kwargs: object) -> TensorDict:
+        self.count, self.total, self.resets = 0, 0.0, self.resets + 1
+        return TensorDict({**self._observe(), **self._flags(False, False)}, batch_size=[])
+
+    def _step(self, tensordict: TensorDict) -> TensorDict:
+        self.count += 1
+        self.steps += 1
+        self.on_step(self.count)
+        self.total += float(tensordict["action"].sum())
+        length = self.lengths(self.episode_seed)
+        is_last = self.count >= length
+        flags = self._flags(is_last and length % 2 == 1, is_last and length % 2 == 0)
+        reward = torch.tensor([self.total], dtype=torch.float32)
+        return TensorDict({**self._observe(), "reward": reward, **flags}, batch_size=[])
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.episode_seed = seed or 0
+
+
+def fixed_length(seed: int) -> int:
+    return 10
+
+
+def variable_length(seed: int) -> int:
+    return 3 + seed % 9
+
+
+def _pause_like_a_renderer(count: int) -> None:
+    time.sleep(0.01)
+
+
+def _die(count: int) -> None:
+    if count == 5:
+        os._exit(7)
+
+
+def _hang(count: int) -> None:
+    if count == 5:
+        time.sleep(1000)
+
+
+def _fail(count: int) -> None:
+    if count == 5:
+        raise ValueError("the simulator exploded")
+
+
+def make_fixed(*, seed: int, image_size: int, physics_state: bool) -> EnvBase:
+    return ToyEnv(fixed_length, seed=seed, image_size=image_size, physics_state=physics_state)
+
+
+def make_variable(*, seed: int, image_size: int, physics_state: bool) -> EnvBase:
+    return ToyEnv(variable_length, seed=seed, image_size=image_size, physics_state=physics_state)
+
+
+def make_slow(*, seed: int, image_size: int) -> EnvBase:
+    return ToyEnv(variable_length, seed=seed, image_size=image_size, on_step=_pause_like_a_renderer)
+
+
+def make_dying(*, seed: int, image_size: int) -> EnvBase:
+    return ToyEnv(fixed_length, seed=seed, image_size=image_size, on_step=_die)
+
+
+def make_hanging(*, seed: int, image_size: int) -> EnvBase:
+    return ToyEnv(fixed_length, seed=seed, image_size=image_size, on_step=_hang)
+
+
+def make_failing(*, seed: int, image_size: int) -> EnvBase:
+    return ToyEnv(fixed_length, seed=seed, image_size=image_size, on_step=_fail)
+
+
+FIXED = Domain("toy-fixed", "toy-fixed_go", make=make_fixed, episode_env_steps=20)
+VARIABLE = Domain("toy-variable", "toy-variable_go", make=make_variable)
+SLOW = Domain("toy-slow", "toy-slow_go", make=make_slow)
+DYING = Domain("toy-dying", "toy-dying_go", make=make_dying)
+HANGING = Domain("toy-hanging", "toy-hanging_go", make=make_hanging)
+FAILING = Domain("toy-failing", "toy-failing_go", make=make_failing)
+
+
+def random_episode(length: int, *, size: int = 6, seed: int = 0, action_dim: int = 2, state: bool = True) -> Episode:
+    """An episode of random bytes; ends by truncation."""
+    rng = np.random.default_rng(seed)
+    truncated = np.zeros(length, dtype=bool)
+    truncated[-1] = True
+    physics = {"qpos": rng.normal(size=(length + 1, 4)), "qvel": rng.normal(size=(length + 1, 3))}
+    return Episode(
+        pixels=rng.integers(0, 256, (length + 1, 3, size, size), dtype=np.uint8),
+        action=rng.uniform(-1, 1, (length, action_dim)).astype(np.float32),
+        reward=rng.normal(size=length).astype(np.float32),
+        terminated=np.zeros(length, dtype=bool),
+        truncated=truncated,
+        state=physics if state else {},
+    )
+
+
+def data_bytes(path: Path) -> dict[str, bytes]:
+    """The bytes of every data file of a dataset."""
+    return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*.memmap"))}

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from crptpro import artifact
+from crptpro.artifact import read_artifact, write_artifact
+from crptpro.errors import PretrainedError
+
+
+def write(path: Path, value: float = 1.0) -> Path:
+    layer = nn.Linear(2, 3)
+    nn.init.constant_(layer.weight, value)
+    return write_artifact(path, {"layer": layer}, card={"task": "walker"}, format_name="test", version=2)
+
+
+def read(path: Path) -> tuple[dict, dict]:
+    return read_artifact(path, format_name="test", version=2, error=PretrainedError)
+
+
+def test_weights_and_card_round_trip(tmp_path: Path) -> None:
+    card, tensors = read(write(tmp_path / "a", 2.5))
+    assert card["task"] == "walker"
+    assert card["format"] == "test"
+    assert set(tensors) == {"layer.weight", "layer.bias"}
+    torch.testing.assert_close(tensors["layer.weight"], torch.full((3, 2), 2.5), rtol=0, atol=0)
+
+
+def test_writing_again_replaces_the_artifact_and_leaves_nothing_else(tmp_path: Path) -> None:
+    write(tmp_path / "a", 1.0)
+    write(tmp_path / "a", 2.0)
+    assert read(tmp_path / "a")[1]["layer.weight"][0, 0] == 2
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_failed_write_keeps_the_old_artifact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path / "a", 1.0)
+
+    def full_disk(*args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(artifact, "write_json", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        write(tmp_path / "a", 2.0)
+    assert read(tmp_path / "a")[1]["layer.weight"][0, 0] == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_kill_between_the_two_renames_loses_nothing(tmp_path: Path) -> None:
+    write(tmp_path / "a", 1.0)
+    (tmp_path / "a").rename(artifact._previous(tmp_path / "a"))
+    assert read(tmp_path / "a")[1]["layer.weight"][0, 0] == 1
+
+
+def truncate(path: Path) -> None:
+    weights = path / "weights.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-4])
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (shutil.rmtree, "does not exist"),
+        (lambda p: (p / "card.json").unlink(), "card.json does not exist"),
+        (lambda p: (p / "weights.safetensors").unlink(), "weights.safetensors is missing"),
+        (truncate, "truncated, damaged or replaced"),
+    ],
+)
+def test_each_kind_of_damage_is_named(tmp_path: Path, damage, message: str) -> None:
+    write(tmp_path / "a")
+    damage(tmp_path / "a")
+    with pytest.raises(PretrainedError, match=message):
+        read(tmp_path / "a")
+
+
+def test_an_artifact_of_another_kind_or_a_newer_version_is_refused(tmp_path: Path) -> None:
+    write(tmp_path / "a")
+    with pytest.raises(PretrainedError, match="is a 'test', expected 'agent'"):
+        read_artifact(tmp_path / "a", format_name="agent", version=2, error=PretrainedError)
+    with pytest.raises(PretrainedError, match="format version 2; this crptpro reads up to 1"):
+        read_artifact(tmp_path / "a", format_name="test", version=1, error=PretrainedError)

@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from crptpro import cards
+from crptpro.errors import DatasetError, DiskSpaceError
+
+
+def test_provenance_names_every_package_that_can_change_a_number() -> None:
+    content = cards.provenance()
+    assert {"torch", "torchrl", "tensordict", "dm-control", "mujoco", "crptpro", "python"} <= set(content["versions"])
+    assert "not installed" not in [content["versions"][p] for p in ("torch", "torchrl", "crptpro")]
+    assert content["hardware"]["ram_bytes"] > 0
+    json.dumps(content)
+
+
+def test_json_round_trips_and_leaves_no_temporary_file(tmp_path: Path) -> None:
+    cards.write_json(tmp_path / "sub" / "card.json", {"b": 1, "a": [1, 2]})
+    assert cards.read_json(tmp_path / "sub" / "card.json") == {"a": [1, 2], "b": 1}
+    assert [p.name for p in (tmp_path / "sub").iterdir()] == ["card.json"]
+
+
+def test_a_write_that_fails_keeps_the_old_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "card.json"
+    cards.write_json(path, {"a": 1})
+
+    def full_disk(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(cards.os, "fsync", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        cards.write_json(path, {"a": 2})
+    assert cards.read_json(path) == {"a": 1}
+    assert [p.name for p in tmp_path.iterdir()] == ["card.json"]
+
+
+@pytest.mark.parametrize(("text", "message"), [("{", "cannot be read as JSON"), ("[1]", "holds a list")])
+def test_a_damaged_card_is_named(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "card.json").write_text(text)
+    with pytest.raises(DatasetError, match=message):
+        cards.read_json(tmp_path / "card.json", error=DatasetError)
+
+
+def test_a_missing_card_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"card\.json does not exist"):
+        cards.read_json(tmp_path / "card.json", error=DatasetError)
+
+
+def test_a_disk_that_cannot_hold_the_data_is_refused_with_both_sizes(tmp_path: Path) -> None:
+    with pytest.raises(DiskSpaceError, match=r"collection needs .* GB, but .* has .* GB free"):
+        cards.require_disk(tmp_path / "not" / "yet", 10**18, "collection")
+    cards.require_disk(tmp_path / "not" / "yet", 1, "collection")

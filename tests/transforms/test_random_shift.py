@@ -1,0 +1,172 @@
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+import torch.nn.functional as F
+from fake_pixel_env import FakePixelEnv
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import TransformedEnv
+
+from crptpro.transforms import RandomShift, draw_offsets, random_shift
+from crptpro.transforms.random_shift import _shift_by_gather
+
+
+def pad_then_slice(pixels, offsets, pad):
+    padded = F.pad(pixels.double(), (pad,) * 4, mode="replicate").to(pixels.dtype)
+    height, width = pixels.shape[-2:]
+    crops = [padded[i, :, r : r + height, c : c + width] for i, (r, c) in enumerate(offsets.tolist())]
+    return torch.stack(crops)
+
+
+def every_offset(pad):
+    side = torch.arange(2 * pad + 1)
+    return torch.cartesian_prod(side, side)
+
+
+@pytest.mark.parametrize("shift", [random_shift, lambda x, o, pad: _shift_by_gather(x, o, pad)])
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("pad", [4, 1, 0])
+def test_every_shift_equals_replicate_padding_and_slicing(shift, dtype, pad):
+    offsets = every_offset(pad)
+    pixels = torch.randint(0, 256, (len(offsets), 3, 11, 14)).to(dtype)
+    shifted = shift(pixels, offsets, pad=pad)
+    assert shifted.dtype == dtype
+    assert torch.equal(shifted, pad_then_slice(pixels, offsets, pad))
+
+
+def test_a_shift_larger_than_the_image_repeats_its_border():
+    pixels = torch.randint(0, 256, (81, 2, 3, 2), dtype=torch.uint8)
+    assert torch.equal(random_shift(pixels, every_offset(4)), pad_then_slice(pixels, every_offset(4), 4))
+
+
+def test_all_channels_of_a_sample_share_one_shift():
+    ramp = torch.arange(12 * 12, dtype=torch.float32).view(1, 1, 12, 12).expand(5, 9, 12, 12)
+    shifted = random_shift(ramp, draw_offsets(5, 4, torch.Generator().manual_seed(1)))
+    assert torch.equal(shifted, shifted[:, :1].expand_as(shifted))
+
+
+def test_non_contiguous_and_empty_batches_are_shifted():
+    pixels = torch.randint(0, 256, (10, 12, 12, 3), dtype=torch.uint8).permute(0, 3, 1, 2)[::2]
+    offsets = draw_offsets(5, 4)
+    assert torch.equal(random_shift(pixels, offsets), pad_then_slice(pixels, offsets, 4))
+    assert random_shift(pixels[:0], offsets[:0]).shape == (0, 3, 12, 12)
+
+
+def test_gradients_flow_back_to_the_pixels_that_stayed_in_view():
+    pixels = torch.rand(1, 1, 4, 4, requires_grad=True)
+    random_shift(pixels, torch.tensor([[0, 1]]), pad=1).sum().backward()
+    # Moved down by one row: the first row shows twice and the last not at all.
+    assert torch.equal(pixels.grad[0, 0].sum(1), torch.tensor([8.0, 4.0, 4.0, 0.0]))
+
+
+def test_the_result_never_shares_memory_with_the_input():
+    pixels = torch.zeros(2, 1, 6, 6, dtype=torch.uint8)
+    random_shift(pixels, torch.full((2, 2), 4)).fill_(9)
+    assert not pixels.any()
+
+
+def test_offsets_are_uniform_over_all_81_shifts():
+    draws = 81 * 400
+    offsets = draw_offsets(draws, 4, torch.Generator().manual_seed(0))
+    counts = torch.bincount(offsets[:, 0] * 9 + offsets[:, 1], minlength=81).double()
+    chi_square = ((counts - 400) ** 2 / 400).sum()
+    assert 45 < chi_square < 130  # 80 degrees of freedom: 0.1 % on either side
+
+
+@pytest.mark.parametrize("bad", [[[9, 0]], [[0, -1]]])
+def test_an_offset_outside_the_padding_is_refused(bad):
+    with pytest.raises(ValueError, match=r"0\.\.8"):
+        random_shift(torch.zeros(1, 1, 8, 8), torch.tensor(bad))
+
+
+def test_shapes_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="offsets"):
+        random_shift(torch.zeros(2, 1, 8, 8), torch.zeros(3, 2, dtype=torch.int64))
+    with pytest.raises(ValueError, match="pad"):
+        RandomShift(pad=-1)
+    with pytest.raises(ValueError, match="length"):
+        RandomShift(in_keys=["a", "b"], out_keys=["c"])
+
+
+def batch(*lead):
+    pixels = torch.randint(0, 256, (*lead, 9, 12, 12), dtype=torch.uint8)
+    return TensorDict({"pixels": pixels, "next": {"pixels": pixels.clone()}}, batch_size=lead)
+
+
+def test_keys_draw_independent_shifts_from_the_generator_in_order():
+    td = batch(6)
+    before = td.clone()
+    RandomShift(generator=torch.Generator().manual_seed(7))(td)
+    draws = torch.Generator().manual_seed(7)
+    for key in ("pixels", ("next", "pixels")):
+        assert torch.equal(td[key], random_shift(before[key], draw_offsets(6, 4, draws)))
+    assert not torch.equal(td["pixels"], td["next", "pixels"])
+
+
+def test_samples_draw_independent_shifts():
+    same = torch.randint(0, 256, (1, 9, 12, 12), dtype=torch.uint8).expand(64, 9, 12, 12).clone()
+    shifted = RandomShift(generator=torch.Generator().manual_seed(0))(TensorDict(pixels=same))["pixels"]
+    assert len(shifted.flatten(1).unique(dim=0)) > 30
+
+
+@pytest.mark.parametrize("lead", [(), (5,), (2, 3)])
+def test_any_leading_batch_is_accepted(lead):
+    td = batch(*lead)
+    shifted = RandomShift(generator=torch.Generator().manual_seed(3))(td.clone())["pixels"]
+    offsets = draw_offsets(td.numel(), 4, torch.Generator().manual_seed(3))
+    flat = td["pixels"].reshape(-1, 9, 12, 12)
+    assert torch.equal(shifted, random_shift(flat, offsets).reshape(td["pixels"].shape))
+
+
+def test_evaluation_mode_changes_nothing():
+    td = batch(16)
+    on, off = (RandomShift(generator=torch.Generator().manual_seed(5)) for _ in range(2))
+    assert torch.equal(on.train()(td.clone())["pixels"], off.eval()(td.clone())["pixels"])
+    assert not torch.equal(off(td.clone())["pixels"], td["pixels"])
+
+
+def test_next_pixels_are_optional_by_default_but_named_keys_are_required():
+    RandomShift()(TensorDict(pixels=torch.zeros(2, 3, 8, 8)))
+    with pytest.raises(KeyError, match="next"):
+        RandomShift(in_keys=["pixels", ("next", "pixels")])(TensorDict(pixels=torch.zeros(2, 3, 8, 8)))
+    with pytest.raises(KeyError, match="pixels"):
+        RandomShift()(TensorDict(frames=torch.zeros(2, 3, 8, 8)))
+
+
+def test_a_new_out_key_keeps_the_original():
+    td = batch(4)
+    before = td["pixels"].clone()
+    RandomShift(in_keys="pixels", out_keys=("augmented", "pixels"))(td)
+    assert torch.equal(td["pixels"], before)
+    assert td["augmented", "pixels"].shape == before.shape
+
+
+def test_a_replay_buffer_shifts_samples_and_leaves_its_storage_alone():
+    buffer = ReplayBuffer(storage=LazyTensorStorage(32), batch_size=16)
+    buffer.extend(batch(32))
+    stored = buffer[:].clone()
+    buffer.append_transform(RandomShift(generator=torch.Generator().manual_seed(0)))
+    sampled = buffer.sample()
+    assert sampled["pixels"].dtype == torch.uint8
+    assert torch.equal(buffer._storage[:]["pixels"], stored["pixels"])
+    assert torch.equal(buffer._storage[:]["next", "pixels"], stored["next", "pixels"])
+
+
+def test_an_environment_shifts_resets_and_steps():
+    env = TransformedEnv(FakePixelEnv(), RandomShift(out_keys=["shifted", ("next", "shifted")]))
+    rollout = env.rollout(3)
+    for td in (rollout, rollout["next"]):
+        for original, shifted in zip(td["pixels"], td["shifted"]):
+            candidates = random_shift(original.expand(81, *original.shape), every_offset(4))
+            assert (candidates == shifted).flatten(1).all(1).any()
+
+
+def test_pickling_keeps_the_place_in_the_random_stream():
+    transform = RandomShift(generator=torch.Generator().manual_seed(2))
+    transform(batch(3))
+    copy = pickle.loads(pickle.dumps(transform))
+    td = batch(8)
+    assert torch.equal(transform(td.clone())["pixels"], copy(td.clone())["pixels"])
