@@ -129,7 +129,9 @@ def main(config: Config) -> None:
     env = make_env(config.task, seed=config.seed, quality=config.quality)
     final_seed = derive_seed(config.seed, "quickstart")
     trained, _ = evaluate(result.policy, env, episodes=config.episodes, seed=final_seed)
-    chance, _ = evaluate(uniform_policy(env, seed=config.seed), env, episodes=config.episodes, seed=final_seed)
+    chance, _ = evaluate(
+        uniform_policy(env, seed=config.seed), env, episodes=config.episodes, seed=final_seed
+    )
     env.close()
 
     # 5. what happened
@@ -153,7 +155,8 @@ def main(config: Config) -> None:
         summary=verdict + f" This call took {seconds / 60:.1f} minutes.",
         tables={
             "Episode returns": [
-                {"policy": name} | {k: f"{v:.1f}" for k, v in values.items()} for name, values in scores.items()
+                {"policy": name} | {k: f"{v:.1f}" for k, v in values.items()}
+                for name, values in scores.items()
             ],
         },
         figures={
@@ -165,7 +168,9 @@ def main(config: Config) -> None:
                 title=config.task,
             ),
             "Sampled observations, oldest to newest picture": plot_stacks(datasets, out / "stacks.png"),
-            "Embeddings by domain": plot_embeddings(embeddings, out / "embeddings.png", title="frozen encoder + projector"),
+            "Embeddings by domain": plot_embeddings(
+                embeddings, out / "embeddings.png", title="frozen encoder + projector"
+            ),
         },
         caveats=[
             f"{config.pretrain_updates:,} updates on {config.transitions:,} transitions per domain are about 1 % of the "

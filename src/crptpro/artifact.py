@@ -50,7 +50,9 @@ def write_artifact(
     for name, module in modules.items():
         state = module.state_dict() if isinstance(module, nn.Module) else module
         # A clone: safetensors refuses tensors that share storage, as slices of one buffer do.
-        tensors.update({f"{name}.{key}": value.detach().cpu().contiguous().clone() for key, value in state.items()})
+        tensors.update(
+            {f"{name}.{key}": value.detach().cpu().contiguous().clone() for key, value in state.items()}
+        )
     temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
     try:
         weights = temporary / WEIGHTS_FILE
@@ -85,12 +87,18 @@ def read_artifact(
     path = Path(path)
     _recover(path)
     if not path.is_dir():
-        raise error(f"{path} does not exist or is not a directory; expected one with {WEIGHTS_FILE} and {CARD_FILE}.")
+        raise error(
+            f"{path} does not exist or is not a directory; expected one with {WEIGHTS_FILE} and {CARD_FILE}."
+        )
     card = read_json(path / CARD_FILE, error=error)
     if card.get("format") != format_name:
-        raise error(f"{path} is a {card.get('format', 'directory of unknown format')!r}, expected {format_name!r}.")
+        raise error(
+            f"{path} is a {card.get('format', 'directory of unknown format')!r}, expected {format_name!r}."
+        )
     if card.get("version", 0) > version:
-        raise error(f"{path} has format version {card['version']}; this crptpro reads up to {version}. Upgrade crptpro.")
+        raise error(
+            f"{path} has format version {card['version']}; this crptpro reads up to {version}. Upgrade crptpro."
+        )
     weights = path / WEIGHTS_FILE
     if not weights.exists():
         raise error(f"{weights} is missing; the artifact is incomplete. Copy the whole directory.")

@@ -8,14 +8,16 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, arg, subcommand
 
 from crptpro.console import run_main
 from crptpro.domains import GROUPS
 from crptpro.errors import CRPTproError, UnknownNameError
+from crptpro.loggers import RunLogger, WandbOptions
+from crptpro.seeding import seed_everything
 from crptpro.training.downstream_config import DownstreamConfig
 
 logger = logging.getLogger(__name__)
@@ -39,6 +41,15 @@ class Logging:
     """W&B tags"""
     tensorboard: bool = False
     """also write TensorBoard event files"""
+
+    def open(self, run_dir: Path, config: Any) -> RunLogger:
+        """Open the record of a run, and its mirrors."""
+        options = None
+        if self.wandb != "off":
+            options = WandbOptions(
+                project=self.wandb_project, group=self.wandb_group, tags=self.wandb_tags, mode=self.wandb
+            )
+        return RunLogger(run_dir, config=config, wandb=options, tensorboard=self.tensorboard)
 
 
 @dataclass(frozen=True)
@@ -126,7 +137,8 @@ class Pretrain:
 
     def run(self) -> None:
         """Pre-train, or continue, and write the artifact."""
-        from crptpro.objectives import build_loss
+        from crptpro.modules import PixelEncoder
+        from crptpro.objectives import get_method
         from crptpro.pretrained import save_pretrained
         from crptpro.training import pretrain
 
@@ -135,8 +147,9 @@ class Pretrain:
             for name in ("assignment_temperature", "intr_loss_coef")
             if (value := getattr(self, name)) is not None
         }
-        loss = build_loss(self.method, seed=self.seed, **options)
-        with run_logger(self.out, self.logging, self) as records:
+        seed_everything(self.seed)
+        loss = get_method(self.method).build(PixelEncoder(), **options)
+        with self.logging.open(self.out, self) as records:
             pretrain(
                 loss,
                 list(self.datasets),
@@ -205,7 +218,7 @@ class Downstream:
     """directory of the pretrained encoder, or `random-encoder` for the untrained control"""
     out: Path
     """run directory: eval.csv, train.csv, checkpoints, and the agent in OUT/agent"""
-    config: Annotated[DownstreamConfig, arg(name="")] = DownstreamConfig()
+    config: Annotated[DownstreamConfig, arg(name="")] = field(default_factory=DownstreamConfig)
     """every number of the stage"""
     logging: Logging = Logging()
     """mirrors"""
@@ -217,8 +230,10 @@ class Downstream:
 
         is_random = self.pretrained == RANDOM_ENCODER
         artifact = random_pretrained(seed=self.config.seed) if is_random else self.pretrained
-        with run_logger(self.out, self.logging, self) as records:
-            result = train_downstream(self.task, artifact, run_dir=self.out, config=self.config, logger=records)
+        with self.logging.open(self.out, self) as records:
+            result = train_downstream(
+                self.task, artifact, run_dir=self.out, config=self.config, logger=records
+            )
         logger.info("agent: %s", result.agent_path)
 
 
@@ -249,7 +264,9 @@ class Evaluate:
 
         is_random = self.agent == "random-policy"
         if is_random and self.task is None:
-            raise CRPTproError("The random policy has no task of its own; name one with --task, e.g. --task walker_run.")
+            raise CRPTproError(
+                "The random policy has no task of its own; name one with --task, e.g. --task walker_run."
+            )
         agent, card = (None, {}) if is_random else load_agent(self.agent)
         task = self.task or card["task"]
         env = make_env(task, seed=self.seed, quality=self.quality)
@@ -281,3 +298,20 @@ def expand_groups(names: Sequence[str]) -> list[str]:
     if not expanded:
         raise UnknownNameError(f"Name at least one domain, task or group ({', '.join(GROUPS)}).")
     return list(dict.fromkeys(expanded))
+
+
+def main() -> None:
+    """Entry point of the ``crptpro`` command."""
+    commands = tyro.conf.OmitSubcommandPrefixes[
+        Annotated[Doctor, subcommand("doctor")]
+        | Annotated[Collect, subcommand("collect")]
+        | Annotated[Pretrain, subcommand("pretrain")]
+        | Annotated[Finetune, subcommand("finetune")]
+        | Annotated[Downstream, subcommand("downstream")]
+        | Annotated[Evaluate, subcommand("evaluate")]
+    ]
+    run_main(lambda: tyro.cli(commands, prog="crptpro", description=DESCRIPTION).run())
+
+
+DESCRIPTION = """Cross-domain random pre-training with prototypes for reinforcement learning from pixels.
+Start with `crptpro doctor`, then collect, pretrain and downstream; each stage continues where it was killed."""

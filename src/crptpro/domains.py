@@ -1,4 +1,4 @@
-"""What a domain and a task are: the paper's eight domains and groups A-D, every other suite task, and your own."""
+"""What a domain and a task are: the paper's domains and groups A-D, the rest of dm_control, and your own."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Domain:
         name: Name of the domain, and of its dataset directory.
         task: Task used for collection, a name that :func:`crptpro.envs.make_env` understands.
         action_repeat: Default number of env steps per agent step.
-        camera: Camera index or name that is rendered by default.
+        camera: Camera index or name that is rendered by default; ``None`` leaves it to the environment.
         make: For a world of your own: a callable that is given, by keyword, those of ``seed`` (int),
             ``image_size`` (int, pixels), ``action_repeat`` (int), ``camera``, ``quality`` and
             ``physics_state`` (bool) that its signature names, and returns an unbatched TorchRL
@@ -47,7 +47,7 @@ class Domain:
     name: str
     task: str
     action_repeat: int = 2
-    camera: int | str = 0
+    camera: int | str | None = 0
     make: Callable[..., EnvBase] | None = None
     episode_env_steps: int | None = None
     source: Literal["suite", "manipulation", "gymnasium", "own"] = "own"
@@ -143,15 +143,19 @@ def register_domain(domain: Domain) -> Domain:
         CRPTproError: if the domain has no ``make``, or its name belongs to the paper's domains or tasks.
     """
     if domain.make is None and domain.source == "own":
-        raise CRPTproError(f"Domain {domain.name!r} has no make; pass make=<function that builds the environment>.")
+        raise CRPTproError(
+            f"Domain {domain.name!r} has no make; pass make=<function that builds the environment>."
+        )
     for name in (domain.name, domain.task):
         if name in PAPER_DOMAINS or name in TASKS or name.startswith(GYMNASIUM_PREFIX):
-            raise CRPTproError(f"{name!r} is one of the built-in names; register the domain under another one.")
+            raise CRPTproError(
+                f"{name!r} is one of the built-in names; register the domain under another one."
+            )
     try:
         pickle.dumps(domain)
     except Exception as reason:
         logger.warning(
-            "Domain %r cannot be sent to worker processes (%s); define its make at the top level of a module.",
+            "Domain %r cannot be sent to worker processes (%s); define its make at a module's top level.",
             domain.name, reason,
         )  # fmt: skip
     _registered[domain.name] = domain
@@ -225,7 +229,7 @@ def _gymnasium_domain(name: str) -> Domain:
         near = difflib.get_close_matches(env_id, gymnasium.registry, n=5, cutoff=0.5)
         hint = f" Nearest: {', '.join(GYMNASIUM_PREFIX + n for n in near)}." if near else ""
         raise UnknownNameError(f"Gymnasium has no environment {env_id!r}.{hint}") from None
-    return Domain(name, name, episode_env_steps=spec.max_episode_steps, source="gymnasium")
+    return Domain(name, name, camera=None, episode_env_steps=spec.max_episode_steps, source="gymnasium")
 
 
 def _without_manipulation_prefix(name: str) -> str:

@@ -1,4 +1,4 @@
-"""A world without a simulator: its pixels are a function of seed, time and actions, so every byte can be predicted."""
+"""A world without a simulator: its pixels are a function of seed, time and actions alone."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from crptpro.domains import Domain
 
 
 class ToyEnv(EnvBase):
-    """Episodes of ``lengths(seed)`` transitions; ends by truncation if the length is even, else by termination."""
+    """Episodes of ``lengths(seed)`` transitions; an even length ends by truncation, an odd by termination."""
 
     def __init__(
         self,
@@ -133,7 +133,9 @@ HANGING = Domain("toy-hanging", "toy-hanging_go", make=make_hanging)
 FAILING = Domain("toy-failing", "toy-failing_go", make=make_failing)
 
 
-def random_episode(length: int, *, size: int = 6, seed: int = 0, action_dim: int = 2, state: bool = True) -> Episode:
+def random_episode(
+    length: int, *, size: int = 6, seed: int = 0, action_dim: int = 2, state: bool = True
+) -> Episode:
     """An episode of random bytes; ends by truncation."""
     rng = np.random.default_rng(seed)
     truncated = np.zeros(length, dtype=bool)

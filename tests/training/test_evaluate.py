@@ -34,12 +34,16 @@ class CountingPixels(EnvBase):
         self.count += 1
         done = torch.tensor([self.count == 3])
         reward = tensordict["action"].sum().reshape(1) + self.seeds[-1] % 7
-        return TensorDict({"pixels": self._pixels(), "reward": reward, "done": done, "terminated": done & False}, [])
+        return TensorDict(
+            {"pixels": self._pixels(), "reward": reward, "done": done, "terminated": done & False}, []
+        )
 
 
 def test_returns_are_summed_per_episode_and_each_episode_has_its_own_seed() -> None:
     env = CountingPixels()
-    episodes, videos = evaluate(lambda pixels: torch.tensor([0.25, 0.25]), env, episodes=2, seed=5, progress=False)
+    episodes, videos = evaluate(
+        lambda pixels: torch.tensor([0.25, 0.25]), env, episodes=2, seed=5, progress=False
+    )
     seeds = [derive_seed(5, "episode", e) for e in range(2)]
     assert [e.seed for e in episodes] == seeds
     assert [e.episode_return for e in episodes] == [3 * (0.5 + s % 7) for s in seeds]
@@ -48,7 +52,9 @@ def test_returns_are_summed_per_episode_and_each_episode_has_its_own_seed() -> N
 
 
 def test_recorded_pictures_are_the_newest_of_each_observation() -> None:
-    _, videos = evaluate(lambda pixels: torch.zeros(2), CountingPixels(), episodes=2, record_episodes=1, progress=False)
+    _, videos = evaluate(
+        lambda pixels: torch.zeros(2), CountingPixels(), episodes=2, record_episodes=1, progress=False
+    )
     assert len(videos) == 1
     assert videos[0].shape == (4, 3, 4, 4)
     assert videos[0][:, 0, 0, 0].tolist() == [0, 1, 2, 3]
@@ -56,13 +62,19 @@ def test_recorded_pictures_are_the_newest_of_each_observation() -> None:
 
 def test_policy_sees_the_observation_it_acts_on() -> None:
     seen = []
-    evaluate(lambda p: seen.append(int(p[0, 0, 0])) or torch.zeros(2), CountingPixels(), episodes=1, progress=False)
+    evaluate(
+        lambda p: seen.append(int(p[0, 0, 0])) or torch.zeros(2), CountingPixels(), episodes=1, progress=False
+    )
     assert seen == [0, 1, 2]
 
 
 def test_the_uniform_policy_covers_the_action_range_and_follows_its_seed() -> None:
     env = CountingPixels()
-    policy, again, other = uniform_policy(env, seed=0), uniform_policy(env, seed=0), uniform_policy(env, seed=1)
+    policy, again, other = (
+        uniform_policy(env, seed=0),
+        uniform_policy(env, seed=0),
+        uniform_policy(env, seed=1),
+    )
     actions = torch.stack([policy(torch.empty(0)) for _ in range(400)])
     assert actions.shape == (400, 2)
     assert actions.min() < -0.9

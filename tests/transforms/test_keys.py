@@ -19,3 +19,7 @@ def test_a_tuple_is_one_nested_key_and_a_list_is_several():
     assert as_key_list(("next", "pixels")) == [("next", "pixels")]
     assert as_key_list(["next", "pixels"]) == ["next", "pixels"]
     assert as_key_list("pixels") == ["pixels"]
+
+
+def test_a_tuple_that_holds_tuples_is_several_keys():
+    assert as_key_list(("pixels", ("next", "pixels"))) == ["pixels", ("next", "pixels")]

@@ -50,8 +50,8 @@ def read_card(path: str | Path) -> dict[str, Any]:
         )
     if card["frames"] != card["transitions"] + card["episodes"] or card["transitions"] < 1:
         raise DatasetError(
-            f"{path / CARD_FILE} is damaged: {card['frames']} frames do not fit {card['transitions']} transitions "
-            f"in {card['episodes']} episodes, which have one frame more than transitions each."
+            f"{path / CARD_FILE} is damaged: {card['frames']} frames do not fit {card['transitions']} "
+            f"transitions in {card['episodes']} episodes, which have one frame more than transitions each."
         )
     for file, expected in layout.sizes(card["transitions"], card["frames"]).items():
         file_path = path / file

@@ -1,4 +1,4 @@
-"""Decoupled random collection: a uniform random policy fills one dataset per domain, once, before any learning."""
+"""Decoupled random collection: a uniform random policy fills one dataset per domain, before any learning."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ import shutil
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from torchrl.envs import EnvBase
 
 from crptpro.cards import require_disk
 from crptpro.data.collect_pool import Worker, WorkerPool
 from crptpro.data.collect_progress import CollectProgress
-from crptpro.data.collection import DomainCollection, dataset_path
+from crptpro.data.collection import DomainCollection
+from crptpro.data.incoming import dataset_path
 from crptpro.domains import Domain, get_domain
 from crptpro.errors import DatasetError
 
@@ -36,7 +37,7 @@ def collect_random(
     stall_timeout_s: float = 300.0,
     progress: bool = True,
 ) -> Path:
-    """Collect one domain's dataset with a uniform random policy, or continue a collection that was interrupted.
+    """Collect one domain's dataset with a uniform random policy, or continue an interrupted collection.
 
     The paper (section "Decoupled random collection") takes b = 100,000 transitions per domain. See
     :func:`collect_group` for everything else.
@@ -76,10 +77,11 @@ def collect_group(
 ) -> dict[str, Path]:
     """Collect the datasets of several domains with one pool of processes shared by all of them.
 
-    Every episode has its own seeds, derived from ``seed``, the domain and the episode's index, so the same seed
-    gives the same actions and, on one machine and backend, the same pixels, whatever the number of workers and
-    however often the collection was interrupted. The dataset is episodes 0, 1, 2, ... until they hold
-    ``transitions`` transitions; the last one is cut to fit. A complete dataset is returned at once.
+    Every episode has its own seeds, derived from ``seed``, the domain and the episode's index, so the same
+    seed gives the same actions and, on one machine and backend, the same pixels, whatever the number of
+    workers and however often the collection was interrupted. The dataset is episodes 0, 1, 2, ... until they
+    hold ``transitions`` transitions; the last one is cut to fit, and an endless one after 1000. A complete
+    dataset is returned at once.
 
     The environments live in spawned processes, so a script needs the usual ``if __name__ == "__main__":``.
 
@@ -120,7 +122,7 @@ def collect_group(
             if path in paths.values():
                 raise DatasetError(f"Two of the domains would be collected into {path}; collect them apart.")
             paths[domain.name] = path
-            settings = {
+            settings: dict[str, Any] = {
                 "image_size": image_size,
                 "action_repeat": domain.action_repeat if action_repeat is None else action_repeat,
                 "camera": domain.camera if camera is None else camera,
@@ -146,11 +148,12 @@ def collect_group(
 def _announce(collections: dict[str, DomainCollection], root: Path) -> None:
     sizes = {name: collection.missing_bytes() for name, collection in collections.items()}
     require_disk(root, sum(sizes.values()), f"Collecting {', '.join(sizes)}")
-    free = shutil.disk_usage(root).free
+    probe = next(iter(collections.values())).path
+    free = shutil.disk_usage(probe).free
     for name, collection in collections.items():
         missing = collection.target - collection.transitions
         logger.info(
-            "%s: %.1f GB for %s transitions into %s, %.1f GB free",
+            "%s: %.2g GB for %s transitions into %s, %.1f GB free",
             name, sizes[name] / 1e9, f"{missing:,}", collection.path, free / 1e9,
         )  # fmt: skip
 

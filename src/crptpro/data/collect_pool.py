@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import multiprocessing
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -59,7 +62,8 @@ class WorkerPool:
                 process = context.Process(
                     target=worker_main, args=(theirs, factories), name=f"collect-{index}", daemon=True
                 )
-                process.start()
+                with _interrupts_ignored():
+                    process.start()
                 theirs.close()
                 self.workers.append(Worker(index, process, ours))
         except BaseException:
@@ -101,19 +105,17 @@ class WorkerPool:
         for worker in self.workers:
             if worker.job is not None and now - worker.heard_s > self._stall_timeout_s:
                 raise RenderingError(
-                    f"{worker.describe()} has given no sign of life for {self._stall_timeout_s:.0f} s; a render "
-                    "driver that hangs is the usual cause. Every finished episode is kept: run the same command "
-                    "again, with fewer workers or another backend (MUJOCO_GL=osmesa, or egl)."
+                    f"{worker.describe()} has given no sign of life for {self._stall_timeout_s:.0f} s; a "
+                    "render driver that hangs is the usual cause. Every finished episode is kept: run the "
+                    "same command again, with fewer workers or another backend (MUJOCO_GL=osmesa, or egl)."
                 )
 
     def close(self) -> None:
         """Stop all processes: idle ones are told to, busy ones are ended."""
         for worker in self.workers:
             if worker.job is None:
-                try:
+                with contextlib.suppress(OSError):
                     worker.connection.send(None)
-                except OSError:
-                    pass
             else:
                 worker.process.terminate()
         deadline = time.monotonic() + 5.0
@@ -144,15 +146,29 @@ class WorkerPool:
         how = (
             f"was killed by signal {-code}" if code is not None and code < 0 else f"exited with status {code}"
         )
-        hint = (
-            "Out of memory is the usual cause of signal 9."
-            if code == -9
-            else 'A script that collects needs `if __name__ == "__main__":` around its main program, because the '
-            "processes import it; otherwise look at the messages above."
-        )
+        if code == -9:
+            hint = "Out of memory is the usual cause of signal 9."
+        else:
+            hint = (
+                'A script that collects needs `if __name__ == "__main__":` around its main program, because '
+                "the processes import it; otherwise look at the messages above."
+            )
         return CRPTproError(
             f"{worker.describe()} {how}. {hint} Every finished episode is kept: run the same command again."
         )
+
+
+@contextlib.contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Let a process that is started inside ignore Ctrl-C from its first moment; the parent decides what it ends."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _failure(worker: Worker, kind: str, message: str, trace: str) -> CRPTproError:

@@ -27,11 +27,17 @@ class CollectProgress:
         width = max(map(len, totals), default=0)
         self._bars = {
             name: tqdm(
-                total=total, initial=initial[name], desc=name.ljust(width), unit=" transitions", position=position,
-                disable=None if is_shown else True, dynamic_ncols=True, smoothing=0.05,
+                total=total,
+                initial=initial[name],
+                desc=name.ljust(width),
+                unit=" transitions",
+                position=position,
+                disable=None if is_shown else True,
+                dynamic_ncols=True,
+                smoothing=0.05,
             )
             for position, (name, total) in enumerate(totals.items())
-        }  # fmt: skip
+        }
 
     def update(self, name: str, transitions: int) -> None:
         """Show that ``transitions`` of a domain exist."""

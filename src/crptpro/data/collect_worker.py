@@ -136,7 +136,8 @@ def episode_from_rollout(rollout: TensorDictBase, *, is_cut: bool = False) -> Ep
     """Turn a TorchRL rollout ``[T]`` of single frames into an :class:`Episode` of T + 1 frames.
 
     Args:
-        rollout: With ``pixels``, ``action``, ``("next", ...)`` and, if the world has them, ``qpos`` and ``qvel``.
+        rollout: With ``pixels``, ``action``, ``("next", ...)`` and, if the world has them, ``qpos`` and
+            ``qvel``.
         is_cut: The environment did not end the episode itself.
     """
 
@@ -147,9 +148,7 @@ def episode_from_rollout(rollout: TensorDictBase, *, is_cut: bool = False) -> Ep
     def per_transition(key: str) -> np.ndarray:
         return rollout.get(("next", key)).reshape(len(rollout)).numpy()
 
-    state_names = [
-        name for name in ("qpos", "qvel") if name in rollout and rollout.get(name).shape[-1]
-    ]
+    state_names = [name for name in ("qpos", "qvel") if name in rollout and rollout.get(name).shape[-1]]
     return Episode(
         pixels=per_frame("pixels"),
         action=rollout.get("action").numpy(),

@@ -2,42 +2,53 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
-import re
-import shutil
 import time
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from crptpro.cards import provenance, read_json, versions, write_json
 from crptpro.data.card import read_card
 from crptpro.data.collect_worker import EpisodeJob
 from crptpro.data.episode import Episode
 from crptpro.data.episode_writer import EpisodeWriter
+from crptpro.data.incoming import (
+    drop_all_incoming,
+    drop_incoming,
+    lock_directory,
+    read_incoming,
+    write_incoming,
+)
 from crptpro.data.layout import (
-    CARD_FILE, COLLECTION_FILE, FORMAT, VERSION, Layout, estimate_bytes, write_tensordict_metadata,
-)  # fmt: skip
+    CARD_FILE,
+    COLLECTION_FILE,
+    FORMAT,
+    VERSION,
+    Layout,
+    estimate_bytes,
+    write_tensordict_metadata,
+)
 from crptpro.errors import DatasetError
 from crptpro.seeding import derive_seed
 
 logger = logging.getLogger(__name__)
 
-INCOMING = ".incoming"
+#: Transitions after which an episode is truncated, unless the domain's own are known to be longer. It keeps a world
+#: that never ends an episode (LQR) from becoming one episode of 100,000 transitions, which would not fit in memory.
+LONGEST_EPISODE = 1000
 
 
 class DomainCollection:
     """Collects the episodes 0, 1, 2, ... of one domain until they hold the transitions asked for.
 
-    Episodes may arrive in any order and are appended in order; one that is early waits on disk. Thus the dataset
-    depends on ``request`` alone, and a kill costs only the episodes that were running.
+    Episodes may arrive in any order and are appended in order; one that is early waits on disk. Thus the
+    dataset depends on ``request`` alone, and a kill costs only the episodes that were running.
 
     Args:
         path: The dataset's directory.
-        request: What is asked for: domain, task, seed, transitions, image_size, action_repeat, camera, quality.
+        request: What is asked for: domain, task, seed, transitions, image_size, action_repeat, camera,
+            quality.
         episode_agent_steps: Usual length of an episode, ``None`` if unknown. It only saves work.
 
     Raises:
@@ -48,8 +59,10 @@ class DomainCollection:
         self.path, self.request = path, request
         self.name: str = request["domain"]
         self.target: int = request["transitions"]
-        self.render: dict[str, Any] = {}
+        self._is_noted = False
+        self._last_append_s = time.monotonic()
         self._usual_length = episode_agent_steps
+        self._longest = max(LONGEST_EPISODE, episode_agent_steps or 0)
         self._seen_lengths: set[int] = set()
         self._running: dict[int, int] = {}
         self._waiting: dict[int, Episode] = {}
@@ -66,7 +79,7 @@ class DomainCollection:
                 f"{path} is not empty and not a collection. Choose another directory or empty it."
             )
         path.mkdir(parents=True, exist_ok=True)
-        self._lock = _lock(path)
+        self._lock = lock_directory(path)
         try:
             self._resume()
         except BaseException:
@@ -115,7 +128,7 @@ class DomainCollection:
             episode=episode,
             env_seed=derive_seed(seed, "collect", self.name, episode),
             action_seed=derive_seed(seed, "collect-actions", self.name, episode),
-            limit=needed,
+            limit=min(needed, self._longest),
         )
 
     def note_progress(self, episode: int, transitions: int) -> None:
@@ -133,12 +146,13 @@ class DomainCollection:
             before = session["render"].get("backend")
             if before is not None and card.get("backend", before) != before:
                 raise DatasetError(
-                    f"{self.path} was begun with the render backend {before!r}, now it is {card['backend']!r}: their "
-                    f"pixels differ. Continue with MUJOCO_GL={before}, or remove the directory to begin anew."
+                    f"{self.path} was begun with the render backend {before!r}, now it is "
+                    f"{card['backend']!r}: their pixels differ. Continue with MUJOCO_GL={before}, or remove "
+                    "the directory to begin anew."
                 )
-        if self.render:
+        if self._is_noted:
             return
-        self.render = card
+        self._is_noted = True
         if self._sessions and self._sessions[-1]["versions"] != versions():
             logger.warning("%s is continued with other package versions; its card lists both.", self.path)
         self._sessions.append({"versions": versions(), "render": card})
@@ -160,7 +174,7 @@ class DomainCollection:
         assert self._writer is not None
         self._waiting[index] = episode
         if index != self._writer.episodes:
-            _write_incoming(self.path / INCOMING / f"{index:06d}.npz", episode)
+            write_incoming(self.path, index, episode)
         self._append_ready()
 
     def close(self) -> None:
@@ -180,14 +194,14 @@ class DomainCollection:
         ):
             index = writer.episodes
             needed = self.target - writer.transitions
-            if episode.is_cut and len(episode) < needed:
+            if episode.is_cut and len(episode) < min(needed, self._longest):
                 # It was stopped in the belief that earlier episodes would be longer: it is collected again.
                 self._usual_length = None
             else:
                 now = time.monotonic()
                 writer.append(episode.cut(needed), wall_s=now - self._last_append_s)
                 self._last_append_s = now
-            (self.path / INCOMING / f"{index:06d}.npz").unlink(missing_ok=True)
+            drop_incoming(self.path, index)
             if index == writer.episodes:
                 return
         if writer.transitions >= self.target:
@@ -198,7 +212,7 @@ class DomainCollection:
         assert writer is not None
         transitions, frames = writer.transitions, writer.frames
         write_tensordict_metadata(self.path, writer.layout, transitions, frames)
-        shutil.rmtree(self.path / INCOMING, ignore_errors=True)
+        drop_all_incoming(self.path)
         card = {
             "format": FORMAT,
             "version": VERSION,
@@ -212,6 +226,7 @@ class DomainCollection:
             "last_episode_cut": writer.entries[-1].is_cut,
             "crc32": [entry.crc32 for entry in writer.entries],
             "wall_time_s": round(sum(entry.wall_s for entry in writer.entries), 1),
+            "longest_episode": self._longest,
             "policy": "uniform random in [-1, 1]",
             "render": self._sessions[-1]["render"] if self._sessions else {},
             "sessions": self._sessions,
@@ -224,7 +239,6 @@ class DomainCollection:
 
     def _resume(self) -> None:
         state_path = self.path / COLLECTION_FILE
-        self._last_append_s = time.monotonic()
         if not state_path.exists():
             self._write_state()
             return
@@ -239,12 +253,8 @@ class DomainCollection:
             return
         self._open_writer(Layout.from_dict(state["layout"]))
         assert self._writer is not None
-        for file in sorted((self.path / INCOMING).glob("*.npz")):
-            index = int(file.stem)
-            episode = _read_incoming(file)
-            if episode is None or episode.layout != self._writer.layout or index < self._writer.episodes:
-                file.unlink()
-            else:
+        for index, episode in read_incoming(self.path):
+            if episode.layout == self._writer.layout and index >= self._writer.episodes:
                 self._waiting[index] = episode
         logger.info("%s: continuing after %d of %d transitions", self.name, self.transitions, self.target)
         self._append_ready()
@@ -283,44 +293,3 @@ class DomainCollection:
             return self._usual_length
         usual = next(iter(self._seen_lengths)) if len(self._seen_lengths) == 1 else 1
         return max(usual, self._running[episode])
-
-
-def dataset_path(root: str | Path, domain_name: str) -> Path:
-    """Return the directory of a domain's dataset: its name, with what a file system may refuse replaced by ``-``."""
-    return Path(root) / re.sub(r"[^\w.+-]+", "-", domain_name)
-
-
-def _lock(path: Path) -> int:
-    handle = os.open(path / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(handle)
-        raise DatasetError(f"Another process is collecting into {path}. Wait for it, or end it.") from None
-    return handle
-
-
-def _write_incoming(path: Path, episode: Episode) -> None:
-    path.parent.mkdir(exist_ok=True)
-    arrays = {
-        name: getattr(episode, name) for name in ("pixels", "action", "reward", "terminated", "truncated")
-    }
-    arrays |= {f"state_{name}": values for name, values in episode.state.items()}
-    temporary = path.with_suffix(".new")
-    with open(temporary, "wb") as file:
-        np.savez(file, is_cut=episode.is_cut, **arrays)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
-
-
-def _read_incoming(path: Path) -> Episode | None:
-    try:
-        with np.load(path) as arrays:  # checks the archive's checksums
-            content = dict(arrays)
-    except Exception:
-        return None
-    state = {
-        name.removeprefix("state_"): content.pop(name) for name in list(content) if name.startswith("state_")
-    }
-    return Episode(is_cut=bool(content.pop("is_cut")), state=state, **content)

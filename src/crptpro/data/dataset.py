@@ -22,11 +22,12 @@ from crptpro.errors import DatasetError
 class FrameDataset(ReplayBuffer):
     """The random-policy frames of one domain, sampled as pairs of consecutive stacks (x_t, x_t+1).
 
-    ``sample(B)`` draws uniformly, with replacement, from all transitions and returns a TensorDict ``[B]`` with
-    ``pixels`` and ``("next", "pixels")`` uint8 ``[B, 3k, H, W]`` (oldest to newest, equal to what a live frame stack
-    showed, episode starts included), ``action`` float32 ``[B, A]``, ``("next", "reward")`` float32 ``[B, 1]``,
-    ``("next", "done" | "terminated" | "truncated")`` bool ``[B, 1]``, and ``row``, ``step``, ``episode``: the frame
-    row, the position in the episode and the episode's index. A pair never crosses an episode.
+    ``sample(B)`` draws uniformly, with replacement, from all transitions and returns a TensorDict ``[B]``
+    with ``pixels`` and ``("next", "pixels")`` uint8 ``[B, 3k, H, W]`` (oldest to newest, equal to what a live
+    frame stack showed, episode starts included), ``action`` float32 ``[B, A]``, ``("next", "reward")``
+    float32 ``[B, 1]``, ``("next", "done" | "terminated" | "truncated")`` bool ``[B, 1]``, and ``row``,
+    ``step``, ``episode``: the frame row, the position in the episode and the episode's index. A pair never
+    crosses an episode.
 
     Frames are mapped from disk without write access, so several processes can open one dataset at once.
 
@@ -34,8 +35,8 @@ class FrameDataset(ReplayBuffer):
         storage: What to read, see :class:`~crptpro.data.FrameStorage`.
         batch_size: Default of ``sample()``.
         generator: Source of randomness; torch's global generator if ``None``.
-        **kwargs: Further arguments of TorchRL's ``ReplayBuffer`` (``prefetch``, ``transform``, ``sampler``, ...).
-            Prefetching threads may hand out the batches of one generator in another order.
+        **kwargs: Further arguments of TorchRL's ``ReplayBuffer`` (``prefetch``, ``transform``, ``sampler``,
+            ...). Prefetching threads may hand out the batches of one generator in another order.
     """
 
     def __init__(
@@ -71,8 +72,8 @@ class FrameDataset(ReplayBuffer):
             path: Its directory.
             batch_size: Default of ``sample()``.
             frame_stack: Frames per stack; the card's (3) if ``None``.
-            device: ``"cpu"`` maps the frames from disk; another device holds a copy of them and samples there. It
-                needs a generator of the same device.
+            device: ``"cpu"`` maps the frames from disk; another device holds a copy of them and samples
+                there. It needs a generator of the same device.
             **kwargs: See the class.
 
         Raises:
@@ -103,7 +104,7 @@ class FrameDataset(ReplayBuffer):
 
     @property
     def frames(self) -> TensorDictBase:
-        """All frame rows, TensorDict ``[F]``: ``pixels`` uint8 ``[F, C, H, W]`` and, if stored, ``qpos``, ``qvel``."""
+        """All frame rows, TensorDict ``[F]``: ``pixels`` uint8 ``[F, C, H, W]``, ``qpos`` and ``qvel``."""
         return self._storage.frames
 
     @property
@@ -118,7 +119,10 @@ class FrameDataset(ReplayBuffer):
         return gather_stacks(frames, rows.reshape(-1, 1)).view(*rows.shape, *frames.shape[1:])
 
     def physics_at(self, rows: Tensor) -> TensorDict:
-        """Return the physical state at frame rows of any shape: float64 ``qpos`` ``[*, nq]``, ``qvel`` ``[*, nv]``.
+        """Return the physical state at frame rows of any shape.
+
+        Returns:
+            TensorDict ``[*]`` of float64 ``qpos`` ``[*, nq]`` and ``qvel`` ``[*, nv]``.
 
         Raises:
             DatasetError: if the domain has no physical state.

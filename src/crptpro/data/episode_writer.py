@@ -1,4 +1,4 @@
-"""Whole episodes appended to raw files, each made durable by a journal line: a kill loses at most the open one."""
+"""Whole episodes appended to raw files and sealed by a journal line: a kill loses at most the open one."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def read_journal(path: Path) -> list[JournalEntry]:
 class EpisodeWriter:
     """Appends episodes 0, 1, 2, ... to a dataset directory.
 
-    The bytes of an episode are written and synced before its journal line, so the journal never promises what is
-    not there. Opening truncates every file to the last journaled episode whose bytes are intact.
+    The bytes of an episode are written and synced before its journal line, so the journal never promises what
+    is not there. Opening truncates every file to the last journaled episode whose bytes are intact.
 
     Args:
         root: The dataset's directory; created if missing.
@@ -118,8 +118,9 @@ class EpisodeWriter:
         """
         if episode.layout != self.layout or len(episode) < 1:
             raise DatasetError(
-                f"{self.root} holds rows of {self.layout.to_dict()}, but episode {self.episodes} brings "
-                f"{len(episode)} transitions of {episode.layout.to_dict()}. Collect it into another directory."
+                f"{self.root} holds rows of {self.layout.to_dict()}, but episode {self.episodes} "
+                f"brings {len(episode)} transitions of {episode.layout.to_dict()}. Collect it into another "
+                "directory."
             )
         rows = episode.rows(episode=self.episodes, first_row=self.frames)
         checksum = 0
@@ -129,7 +130,7 @@ class EpisodeWriter:
                     rows[column.key], dtype=np.dtype(column.dtype).newbyteorder("<")
                 )
                 content = content.reshape(-1).view(np.uint8)
-                checksum = zlib.crc32(content, checksum)
+                checksum = zlib.crc32(content.data, checksum)
                 _write_all(self._files[column.key], content)
             for file in self._files.values():
                 os.fsync(file)
@@ -165,7 +166,8 @@ class EpisodeWriter:
             if reason.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise DiskSpaceError(
                     f"The disk under {self.root} is full after {self.transitions} transitions "
-                    f"({self.episodes} whole episodes), which are kept. Free space and run the same command again."
+                    f"({self.episodes} whole episodes), which are kept. Free space and run the same command "
+                    "again."
                 ) from reason
             raise DatasetError(f"{self.root} cannot be written: {reason}.") from reason
         except BaseException:

@@ -1,7 +1,8 @@
-"""Frame stacks rebuilt from single frames: equal to a live stack, never reaching before the episode's start."""
+"""Frame stacks rebuilt from single frames: equal to a live stack, never reaching into another episode."""
 
 from __future__ import annotations
 
+import contextlib
 import mmap
 from pathlib import Path
 
@@ -32,18 +33,41 @@ def stack_rows(row: Tensor, step: Tensor, frame_stack: int) -> Tensor:
 def gather_stacks(frames: Tensor, rows: Tensor) -> Tensor:
     """Gather ``[B, k]`` frame rows into stacks ``[B, k * C, H, W]``; contiguous, the dtype of ``frames``.
 
-    Two separate gathers for an observation and its successor are faster than one of the k + 1 frames they share:
-    the shared block would have to be copied again to be contiguous, and handing out overlapping views would let an
-    in-place edit of one change the other.
+    Two separate gathers for an observation and its successor are faster than one of the k + 1 frames they
+    share: the shared block would have to be copied again to be contiguous, and handing out overlapping views
+    would let an in-place edit of one change the other.
     """
     batch, stack = rows.shape
     channels, *size = frames.shape[1:]
-    flat = frames.reshape(len(frames), -1).index_select(0, rows.reshape(-1))
-    return flat.view(batch, stack * channels, *size)
+    flat = frames.reshape(len(frames), -1)
+    stacks = _empty(batch * stack, flat.shape[1], flat)
+    torch.index_select(flat, 0, rows.reshape(-1), out=stacks)
+    return stacks.view(batch, stack * channels, *size)
+
+
+def _empty(rows: int, row_bytes: int, like: Tensor) -> Tensor:
+    """Allocate ``[rows, row_bytes]``, in huge pages above 8 MiB on the CPU.
+
+    The C library returns large blocks to the system when they are freed. Mapping them again page by page for
+    every batch can take four times as long as the gather itself (measured: 43 against 11 ms for 512 pairs of
+    84 x 84).
+    """
+    size = rows * row_bytes
+    if (
+        like.device.type != "cpu"
+        or like.dtype != torch.uint8
+        or size <= 2**23
+        or not hasattr(mmap, "MADV_HUGEPAGE")
+    ):
+        return like.new_empty(rows, row_bytes)
+    block = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    with contextlib.suppress(OSError):  # a kernel without huge pages: slower, not wrong
+        block.madvise(mmap.MADV_HUGEPAGE)
+    return torch.frombuffer(block, dtype=torch.uint8).view(rows, row_bytes)
 
 
 def map_column(path: Path, column: Column, rows: int) -> Tensor:
-    """Map a column's file without write access: the tensor costs no memory, and writing to it leaves the file alone.
+    """Map a column's file without write access: it costs no memory, and writing to it leaves the file alone.
 
     Raises:
         DatasetError: if the file is missing or does not have exactly the expected size.

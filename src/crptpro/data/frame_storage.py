@@ -35,13 +35,14 @@ class FrameStorage(TensorStorage):
     """A read-only TorchRL storage over frames stored once; its length is the number of transitions.
 
     ``get(index)`` returns a TensorDict with ``pixels`` and ``("next", "pixels")`` uint8 ``[*, k * C, H, W]``
-    (k frames, oldest to newest), every per-transition column, and so works with any TorchRL sampler:
+    (k frames, oldest to newest), every per-transition column, and so works with any TorchRL sampler::
 
-        >>> storage = FrameStorage.open("data/walker")  # doctest: +SKIP
-        >>> rb = ReplayBuffer(storage=storage, sampler=RandomSampler(), batch_size=512)  # doctest: +SKIP
+        storage = FrameStorage.open("data/walker")
+        rb = ReplayBuffer(storage=storage, sampler=RandomSampler(), batch_size=512)
 
-    The stack of transition i is made of rows ``row[i] - min(j, step[i])``, j = k-1 .. 0, and that of its successor
-    ends at ``row[i] + 1``; both lie inside the episode, because an episode of T transitions has T + 1 frames.
+    The stack of transition i is made of rows ``row[i] - min(j, step[i])``, j = k-1 .. 0, and that of its
+    successor ends at ``row[i] + 1``; both lie inside the episode, because an episode of T transitions has T +
+    1 frames.
 
     Args:
         frames: TensorDict ``[F]`` with ``pixels`` uint8 ``[F, C, H, W]`` and optional physical state.
@@ -120,7 +121,9 @@ class FrameStorage(TensorStorage):
         if positions.dtype is torch.bool:
             return positions.nonzero().squeeze(-1)
         positions = positions.long()
-        if positions.numel() and not (-length <= int(positions.min()) and int(positions.max()) < length):
+        # On a GPU the comparison would wait for the device; there the gather itself checks its indices.
+        is_checked = positions.numel() and positions.device.type == "cpu"
+        if is_checked and not (-length <= int(positions.min()) and int(positions.max()) < length):
             raise IndexError(f"index {index} is out of range for {length} transitions.")
         return torch.where(positions < 0, positions + length, positions)
 

@@ -1,4 +1,4 @@
-"""Where the bytes of a dataset lie: one row per frame, one row per transition, raw files a TensorDict can map."""
+"""Where the bytes of a dataset lie: one row per frame, one per transition, in files a TensorDict can map."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class Layout:
 
 
 def estimate_bytes(transitions: int, image_size: int, episode_agent_steps: int | None) -> int:
-    """Estimate a dataset's size before its action and state sizes are known (1 kB per transition for them)."""
+    """Estimate a dataset's size before its action and state sizes are known (taken as 1 kB)."""
     episodes = -(-transitions // (episode_agent_steps or 100))
     return (transitions + episodes) * 3 * image_size**2 + transitions * 1000
 

@@ -27,28 +27,31 @@ class _EpisodeOnlyWriter(ImmutableDatasetWriter):
 class FrameReplay(ReplayBuffer):
     """Online replay of transitions whose frames are stored once, in RAM or on disk.
 
-    40,000 transitions of 84 x 84 frames take 0.85 GB instead of the 5.1 GB of stored stacks. Transitions leave first
-    in, first out. A sampled pair never crosses an episode nor the place where the ring is being overwritten.
+    40,000 transitions of 84 x 84 frames take 0.85 GB instead of the 5.1 GB of stored stacks. Transitions
+    leave first in, first out. A sampled pair never crosses an episode nor the place where the ring is being
+    overwritten.
 
-    A ring on disk is its own checkpoint: :meth:`state_dict` holds a few counters, and loading one restores exactly
-    the content of its moment, provided that at most ``slack`` frames were written since. With checkpoints every n
-    transitions, of which the last two are kept, ``slack >= 2 * n`` (plus a frame per episode) is enough.
+    A ring on disk is its own checkpoint: :meth:`state_dict` holds a few counters, and loading one restores
+    exactly the content of its moment, provided that at most ``slack`` frames were written since. With
+    checkpoints every n transitions, of which the last two are kept, ``slack >= 2 * n`` (plus a frame per
+    episode) is enough.
 
     Args:
-        capacity: Most transitions that can be sampled. Very short episodes (below 50 transitions) lower it, because
-            each has one frame more than transitions.
+        capacity: Most transitions that can be sampled. Very short episodes (below 50 transitions) lower it,
+            because each has one frame more than transitions.
         frame_shape: ``(C, H, W)`` of a single frame.
         action_dim: A, length of an action.
         path: Directory of the ring's files; RAM if ``None``. It must not be shared by two running buffers.
         slack: Frames that may be written after a checkpoint before it is worthless; 0 if there are none.
         frame_stack: k, frames per stack.
-        extra_features: Further quantities per observation, name to ``(shape, dtype)``; given as keyword arguments to
-            :meth:`begin_episode` and :meth:`append`, sampled as ``name`` and ``("next", name)``.
+        extra_features: Further quantities per observation, name to ``(shape, dtype)``; given as keyword
+            arguments to :meth:`begin_episode` and :meth:`append`, sampled as ``name`` and ``("next", name)``.
         batch_size: Default of :meth:`sample`.
         generator: Source of randomness; torch's global generator if ``None``.
 
     Raises:
         DiskSpaceError: if the disk cannot hold the ring.
+        CheckpointError: if ``path`` holds a ring of another size.
 
     Examples:
         >>> replay = FrameReplay(capacity=100, frame_shape=(3, 4, 4), action_dim=1)
@@ -87,6 +90,7 @@ class FrameReplay(ReplayBuffer):
             **extra,
         }
         self._extra = tuple(extra)
+        self._frame_shape = torch.Size(frame_shape)
         if path is not None and not (Path(path) / "pixels.memmap").exists():
             row_bytes = sum(torch.Size(shape).numel() * dtype.itemsize for shape, dtype in columns.values())
             require_disk(path, (window + slack) * row_bytes, f"A replay of {capacity} transitions")
@@ -116,6 +120,18 @@ class FrameReplay(ReplayBuffer):
     def frame_slots(self) -> int:
         """Number of frame rows; every slot that is returned or sampled lies in ``[0, frame_slots)``."""
         return self._storage.rows
+
+    @property
+    def window(self) -> int:
+        """Rows that sampled transitions and the newest observation lie in; at most ``frame_slots``."""
+        return self._storage.window
+
+    def numbers_at(self, slots: Tensor) -> Tensor:
+        """Return how many frames were stored before those in ``slots``, int64 ``[B]``.
+
+        Unlike slots, numbers are never used again; those of live observations differ modulo :attr:`window`.
+        """
+        return self._storage.numbers_at(slots)
 
     def begin_episode(self, frame: Tensor, **features: Any) -> int:
         """Store the first frame of an episode, whether or not the previous one had ended.
@@ -179,8 +195,9 @@ class FrameReplay(ReplayBuffer):
 
         Returns:
             TensorDict ``[B]``: ``pixels`` and ``("next", "pixels")`` uint8 ``[B, k * C, H, W]``, ``action``,
-            ``("next", "reward" | "done" | "terminated" | "truncated")`` ``[B, 1]``, ``index`` (0 is the oldest valid
-            transition), ``row`` and ``("next", "row")``: the slots of the two observations' newest frames.
+            ``("next", "reward" | "done" | "terminated" | "truncated")`` ``[B, 1]``, ``index`` (0 is the
+            oldest valid transition), ``row`` and ``("next", "row")``: the slots of the two observations'
+            newest frames.
         """
         self._storage.reads_pixels = pixels
         try:
@@ -193,7 +210,7 @@ class FrameReplay(ReplayBuffer):
         return self._storage.stacks_at(slots)
 
     def live_slots(self) -> Tensor:
-        """Return the slots of all observations that a sample can refer to, and of the newest one, oldest first."""
+        """Return the slots of the observations that a sample can refer to and of the newest, oldest first."""
         return self._storage.live_slots()
 
     def flush(self) -> None:
@@ -209,11 +226,18 @@ class FrameReplay(ReplayBuffer):
         """Restore the content of the moment the state was taken; the generator's state is the caller's.
 
         Raises:
-            CheckpointError: if the ring has another size, or was overwritten by more than ``slack`` frames since.
+            CheckpointError: if the ring has another size, or was overwritten by more than ``slack`` frames
+                since.
         """
         self._storage.load_state_dict(state_dict["ring"])
 
     def _row(self, frame: Tensor, features: Mapping[str, Any]) -> dict[str, Any]:
+        frame = torch.as_tensor(frame)
+        if frame.dtype != torch.uint8 or frame.shape != self._frame_shape:
+            raise ValueError(
+                f"A frame must be uint8 {tuple(self._frame_shape)}, the newest single frame, "
+                f"got {frame.dtype} {tuple(frame.shape)}."
+            )
         if set(features) != set(self._extra):
             raise ValueError(
                 f"Every observation needs the features {sorted(self._extra)}, got {sorted(features)}."

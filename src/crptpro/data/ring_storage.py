@@ -1,8 +1,9 @@
-"""The ring behind :class:`~crptpro.data.FrameReplay`: frame rows that transitions refer to, evicted first in, first out."""
+"""The ring behind :class:`~crptpro.data.FrameReplay`: frame rows, and the transitions between them."""
 
 from __future__ import annotations
 
 import mmap
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,8 +16,7 @@ from torchrl.data import TensorStorage
 from torchrl.data.replay_buffers.checkpointers import StorageCheckpointerBase
 
 from crptpro.data.frame_stacks import gather_stacks, stack_rows
-from crptpro.errors import CheckpointError
-
+from crptpro.errors import CheckpointError, DiskSpaceError
 
 _OWN = ("pixels", "step", "number", "row_of")
 
@@ -56,9 +56,9 @@ class RingCheckpointer(StorageCheckpointerBase):
 class RingStorage(TensorStorage):
     """Frame rows in a ring of ``window + slack`` rows, and the valid transitions among them.
 
-    A row holds one frame, and the transition that starts at it, if one does. A transition is valid while it is
-    among the newest ``capacity`` and all its frames are among the newest ``window`` rows. So a state from a moment
-    ago needs no row that was overwritten since, as long as at most ``slack`` rows were.
+    A row holds one frame, and the transition that starts at it, if one does. A transition is valid while it
+    is among the newest ``capacity`` and all its frames are among the newest ``window`` rows. So a state from
+    a moment ago needs no row that was overwritten since, as long as at most ``slack`` rows were.
 
     Args:
         capacity: Most transitions that are valid at once.
@@ -108,7 +108,7 @@ class RingStorage(TensorStorage):
         return self._write_row(values)
 
     def write_next(self, transition: Mapping[str, Any], values: Mapping[str, Any], *, is_last: bool) -> int:
-        """Write the transition from the newest frame, and the frame it leads to; returns that frame's slot."""
+        """Write the transition from the newest frame and the frame it leads to; returns that one's slot."""
         start = self.cursors.frames - 1
         for name, value in transition.items():
             self._storage.get(name)[start % self.rows] = torch.as_tensor(value)
@@ -173,7 +173,7 @@ class RingStorage(TensorStorage):
         row = self._storage.get("row_of")[number] % self.rows
         following = (row + 1) % self.rows
         batch = TensorDict({"index": flat, "row": row, ("next", "row"): following}, batch_size=flat.shape)
-        for name in self._storage.keys():
+        for name in self._storage.keys():  # noqa: SIM118 - iterating a TensorDict yields rows
             if name in _OWN:
                 continue
             column = self._storage.get(name)
@@ -191,6 +191,10 @@ class RingStorage(TensorStorage):
         """Return the observations whose newest frames lie in ``slots``, uint8 ``[B, k * C, H, W]``."""
         rows = stack_rows(slots, self._storage.get("step")[slots], self.frame_stack) % self.rows
         return gather_stacks(self._storage.get("pixels"), rows)
+
+    def numbers_at(self, slots: Tensor) -> Tensor:
+        """Return how many frames were stored before those in ``slots``."""
+        return self._storage.get("number")[slots] - 1
 
     def live_slots(self) -> Tensor:
         """Return the slots of all observations of valid transitions, and of the newest one, oldest first."""
@@ -241,20 +245,16 @@ class RingStorage(TensorStorage):
         self.cursors = cursors
 
     def _check_rows(self, cursors: RingCursors) -> None:
-        """Make sure that every row a state refers to still holds what it held then."""
-        if cursors.transitions == cursors.oldest:
-            return
-        row_of = self._storage.get("row_of")[torch.arange(cursors.oldest, cursors.transitions) % self.rows]
-        first = max(0, cursors.frames - self.window)
-        needed = torch.arange(max(first, int(row_of[0]) - self.frame_stack + 1), cursors.frames)
-        number = self._storage.get("number")[needed % self.rows]
-        lost = int((number != needed + 1).sum())
-        if lost or int(row_of[0]) < first or bool((row_of.diff() < 1).any()) or int(row_of[-1]) >= cursors.frames:
-            since = int(self._storage.get("number").max()) - cursors.frames
+        """Make sure that every row of a state's window still holds what it held then."""
+        needed = torch.arange(max(0, cursors.frames - self.window), cursors.frames)
+        number = self._storage.get("number")
+        lost = int((number[needed % self.rows] != needed + 1).sum())
+        if lost:
+            since = int(number.max()) - cursors.frames
             raise CheckpointError(
-                f"{lost or 'Some'} rows that the checkpoint of {self.path} needs are gone: {since} frames were "
-                f"written after it, with a slack of {self.slack}, or the files were replaced. "
-                "Use a newer checkpoint, or a larger slack."
+                f"{lost} rows that the checkpoint of {self.path} needs are gone: {since} frames were "
+                f"written after it, with a slack of {self.slack}, or the files were replaced. Use a newer "
+                "checkpoint, or a larger slack."
             )
 
     def _empty(self) -> None:
@@ -265,10 +265,19 @@ class RingStorage(TensorStorage):
         if self.path is None:
             return torch.zeros(rows, *shape, dtype=dtype)
         size = rows * torch.Size(shape).numel() * dtype.itemsize
-        with open(self.path / f"{name}.memmap", "a+b") as file:
-            if file.seek(0, 2) != size:
-                file.truncate(0)
-                file.truncate(size)
+        path = self.path / f"{name}.memmap"
+        with open(path, "a+b") as file:
+            found = file.seek(0, 2)
+            if found not in (0, size):
+                raise CheckpointError(
+                    f"{path} has {found:,} bytes, this replay needs {size:,}: it belongs to a replay of another "
+                    "size. Use the capacity and slack it was written with, or another directory."
+                )
+            try:
+                # Reserved, not sparse: a disk that fills up later would end the process by a bus error.
+                os.posix_fallocate(file.fileno(), 0, size)
+            except OSError as reason:
+                raise DiskSpaceError(f"{path} needs {size / 1e9:.2f} GB: {reason}. Free space.") from reason
             mapped = mmap.mmap(file.fileno(), size)
         self._maps.append(mapped)
         return torch.frombuffer(mapped, dtype=dtype).view(rows, *shape)

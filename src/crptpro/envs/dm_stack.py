@@ -1,4 +1,4 @@
-"""dm_control worlds: action scaling, action repeat below the camera, one persistent camera, time limits told apart."""
+"""dm_control worlds: scaled actions, action repeat below one persistent camera, time limits told apart."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from crptpro.domains import Domain
+from crptpro.domains import SUITE_TASKS, Domain
+from crptpro.envs.mujoco_log import route_mujoco_warnings
 from crptpro.envs.rendering import first_frame_watchdog
-from crptpro.envs.simulator import Outcome
-from crptpro.errors import CRPTproError
+from crptpro.envs.simulator import ActionRange, Outcome
+from crptpro.errors import CRPTproError, UnknownNameError
 
 if TYPE_CHECKING:
     import dm_env
 
 Quality = Literal["exact", "fast"]
 
-#: Side of the shadow map, texels, that ``quality="fast"`` uses instead of the model's own 2048 (suite) or 4096
-#: (manipulation). On software GL the shadow map is half the cost of a frame; fewer than 1 % of pixels change.
+#: Side of the shadow map, texels, that ``quality="fast"`` uses instead of the model's own 2048 (suite) or
+#: 4096 (manipulation). On software GL the shadow map is half the cost of a frame; fewer than 1 % of pixels
+#: change.
 FAST_SHADOW_SIZE = {"suite": 512, "manipulation": 1024}
 
 
@@ -30,6 +32,7 @@ def load_dm_env(domain: Domain) -> dm_env.Environment:
     if domain.source == "manipulation":
         from dm_control import manipulation
 
+        route_mujoco_warnings()
         env = manipulation.load(f"{domain.task}_vision", seed=0)
         # The built-in camera renders at every env step, twice per agent step; SceneCamera replaces it. The
         # switch takes effect at the first reset, which compiles the model anew.
@@ -38,17 +41,21 @@ def load_dm_env(domain: Domain) -> dm_env.Environment:
         return env
     from dm_control import suite
 
-    name = domain.task.removeprefix(f"{domain.name}_")
-    if name not in {task for _, task in suite.ALL_TASKS if _ == domain.name}:
+    route_mujoco_warnings()
+    world = next((world for world, tasks in SUITE_TASKS.items() if domain.task in tasks), None)
+    if world is None:
+        raise UnknownNameError(f"Domain {domain.name!r} has the task {domain.task!r}, which the suite lacks.")
+    name = domain.task.removeprefix(f"{world}_")
+    if (world, name) not in suite.ALL_TASKS:
         name = domain.task  # lqr_2_1 is a task of the domain lqr under its full name
-    return suite.load(domain.name, name, task_kwargs={"random": 0})
+    return suite.load(world, name, task_kwargs={"random": 0})
 
 
 class SceneCamera:
     """One dm_control ``Camera`` kept alive over steps and resets.
 
-    ``physics.render`` builds and frees a camera and its scene for every image; this one is rebuilt only when the
-    model changes, as composer environments do at every reset. The pixels are identical.
+    ``physics.render`` builds and frees a camera and its scene for every image; this one is rebuilt only
+    when the model changes, as composer environments do at every reset. The pixels are identical.
 
     Args:
         image_size: H = W, pixels.
@@ -82,23 +89,22 @@ class SceneCamera:
             model.vis.quality.shadowsize = min(self._shadow_size, model.vis.quality.shadowsize)
         model.vis.global_.offwidth = max(self._image_size, model.vis.global_.offwidth)
         model.vis.global_.offheight = max(self._image_size, model.vis.global_.offheight)
-        try:
-            self._camera = Camera(physics, self._image_size, self._image_size, camera_id=self._camera_id)
-        except ValueError as reason:
-            names = [model.id2name(index, "camera") or str(index) for index in range(model.ncam)]
+        names = [model.id2name(index, "camera") or str(index) for index in range(model.ncam)]
+        if self._camera_id not in (*names, *range(-1, model.ncam)):
             raise CRPTproError(
-                f"This model has no camera {self._camera_id!r} ({reason}). It has: {', '.join(names)}; "
-                "-1 is the free camera."
-            ) from None
+                f"This model has no camera {self._camera_id!r}. It has {', '.join(names) or 'none'}, or 0 to "
+                f"{model.ncam - 1}; -1 is the free camera."
+            )
+        self._camera = Camera(physics, self._image_size, self._image_size, camera_id=self._camera_id)
         self._model = model
 
 
 class DmControlSimulator:
     """A dm_control environment as a :class:`~crptpro.envs.simulator.Simulator`.
 
-    Actions are mapped affinely from [-1, 1] to the actuators' ranges (they differ for quadruped and manipulation).
-    Rewards of the repeated env steps are summed without discount. A time limit (dm_env: last step with discount 1)
-    is a truncation, anything else that ends an episode a termination.
+    Actions are mapped affinely from [-1, 1] to the actuators' ranges (they differ for quadruped and
+    manipulation). Rewards of the repeated env steps are summed without discount. A time limit (dm_env: last
+    step with discount 1) is a truncation, anything else that ends an episode a termination.
 
     Args:
         env: ``dm_env.Environment`` with ``physics`` and either ``task.random`` (suite) or ``random_state``
@@ -106,6 +112,9 @@ class DmControlSimulator:
         camera: Draws the images.
         action_repeat: Env steps per agent step, at least 1.
         description: Goes into the card as it is.
+
+    Raises:
+        CRPTproError: if an actuator has no bounds.
     """
 
     def __init__(
@@ -116,17 +125,19 @@ class DmControlSimulator:
         action_repeat: int = 2,
         description: dict[str, Any] | None = None,
     ):
-        from dm_control.suite.wrappers import action_scale
-
         self._env = env
-        self._scaled = action_scale.Wrapper(env, -1.0, 1.0)
+        spec = env.action_spec()
+        low, high = (np.broadcast_to(bound, spec.shape) for bound in (spec.minimum, spec.maximum))
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+            raise CRPTproError(f"The actuators have no bounds ({spec}), so [-1, 1] cannot be mapped to them.")
+        self._to_actuators = ActionRange(low, high, spec.dtype)
         self._camera = camera
         self._action_repeat = action_repeat
         self._description = description or {}
-        self._first_frame = True
+        self._is_first_frame = True
         self._closed = False
-        self.action_size = int(np.prod(env.action_spec().shape))
-        self.state_size = (env.physics.model.nq, env.physics.model.nv)
+        self.action_size = int(np.prod(spec.shape))
+        self.state_size: tuple[int, int] | None = (env.physics.model.nq, env.physics.model.nv)
 
     def seed(self, seed: int) -> None:
         """Re-seed the generator that the task draws from, without resetting."""
@@ -140,9 +151,10 @@ class DmControlSimulator:
 
     def step(self, action: np.ndarray) -> Outcome:
         """Repeat the action, summing rewards, up to the end of the episode."""
+        command = self._to_actuators(action)
         reward = 0.0
         for _ in range(self._action_repeat):
-            time_step = self._scaled.step(action)
+            time_step = self._env.step(command)
             reward += time_step.reward or 0.0
             if time_step.last():
                 is_time_limit = time_step.discount == 1.0
@@ -151,10 +163,10 @@ class DmControlSimulator:
 
     def render(self) -> np.ndarray:
         """Return the current image, uint8 ``[H, W, 3]``."""
-        if self._first_frame:
+        if self._is_first_frame:
             with first_frame_watchdog():
                 image = self._camera.render(self._env.physics)
-            self._first_frame = False
+            self._is_first_frame = False
             return image
         return self._camera.render(self._env.physics)
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from torchrl.envs import CatFrames, EnvBase, TransformedEnv
+from torchrl.envs import CatFrames, EnvBase
 
 from crptpro.domains import GYMNASIUM_PREFIX, Domain, get_domain
 from crptpro.envs.dm_stack import FAST_SHADOW_SIZE, DmControlSimulator, Quality, SceneCamera, load_dm_env
 from crptpro.envs.gymnasium_env import GymnasiumSimulator
-from crptpro.envs.own_env import make_own_env
+from crptpro.envs.own_env import make_own_env, with_transform
 from crptpro.envs.pixel_env import PixelEnv
 from crptpro.envs.rendering import backend_card, first_frame_watchdog, select_backend
 from crptpro.errors import CRPTproError, RenderingError
@@ -31,11 +31,12 @@ def make_env(
 ) -> EnvBase:
     """Build an unbatched CPU environment that renders once per agent step.
 
-    Output keys: ``pixels`` uint8 ``[3 * frame_stack, H, W]``, oldest to newest (a reset repeats its first frame);
-    ``action`` float32 ``[A]`` in [-1, 1]; ``("next", "reward")`` float32 ``[1]``, summed over the repeated env steps;
-    ``done``, ``terminated``, ``truncated`` (time limits truncate). Consecutive frames are ``action_repeat`` env steps
-    apart. ``env.set_seed(s)`` re-seeds the simulator without resetting, and the next ``reset`` starts the episode
-    that belongs to ``s``. ``env.card()`` says what shaped the pixels. ``env.close()`` frees the render context.
+    Output keys: ``pixels`` uint8 ``[3 * frame_stack, H, W]``, oldest to newest (a reset repeats its first
+    frame); ``action`` float32 ``[A]`` in [-1, 1]; ``("next", "reward")`` float32 ``[1]``, summed over the
+    repeated env steps; ``done``, ``terminated``, ``truncated`` (time limits truncate). Consecutive frames
+    are ``action_repeat`` env steps apart. ``env.set_seed(s)`` re-seeds the simulator without resetting, and
+    the next ``reset`` starts the episode that belongs to ``s``. ``env.card()`` says what shaped the pixels.
+    ``env.close()`` frees the render context.
 
     Args:
         task: Any name that :func:`crptpro.domains.get_domain` knows, or a :class:`~crptpro.domains.Domain`.
@@ -44,8 +45,8 @@ def make_env(
         action_repeat: Env steps per agent step; ``None`` takes the domain's (2).
         frame_stack: Frames per observation; 1 gives the single frame ``[3, H, W]``.
         camera: Camera index or name; ``None`` takes the domain's.
-        quality: ``"exact"`` renders the model as it is; ``"fast"`` uses smaller shadow maps, up to twice as fast on
-            software GL, with fewer than 1 % of the pixels changed.
+        quality: ``"exact"`` renders the model as it is; ``"fast"`` uses smaller shadow maps, up to twice as
+            fast on software GL, with fewer than 1 % of the pixels changed.
         physics_state: Also emit ``qpos`` and ``qvel``, float64, where the world has a MuJoCo state.
 
     Raises:
@@ -55,21 +56,22 @@ def make_env(
     """
     domain = get_domain(task)
     action_repeat = domain.action_repeat if action_repeat is None else action_repeat
-    _check_options(image_size=image_size, action_repeat=action_repeat, frame_stack=frame_stack, quality=quality)
+    _check_options(quality, image_size=image_size, action_repeat=action_repeat, frame_stack=frame_stack)
     settings: dict[str, Any] = {
-        "image_size": image_size, "action_repeat": action_repeat, "quality": quality, "physics_state": physics_state,
+        "image_size": image_size, "action_repeat": action_repeat, "quality": quality,
+        "camera": domain.camera if camera is None else camera, "physics_state": physics_state,
     }  # fmt: skip
     env: EnvBase
     if domain.source == "own":
-        env = make_own_env(domain, seed=seed, camera=domain.camera if camera is None else camera, **settings)
+        env = make_own_env(domain, seed=seed, **settings)
     elif domain.source == "gymnasium":
-        env = _make_gymnasium_env(domain, camera=camera, **settings)
+        env = _make_gymnasium_env(domain, **settings)
     else:
-        env = _make_dm_env(domain, camera=domain.camera if camera is None else camera, **settings)
+        env = _make_dm_env(domain, **settings)
     env.set_seed(seed)
     if frame_stack == 1:
         return env
-    return TransformedEnv(env, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
+    return with_transform(env, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
 
 
 def episode_length(task: str | Domain, *, action_repeat: int | None = None) -> int | None:
@@ -79,8 +81,8 @@ def episode_length(task: str | Domain, *, action_repeat: int | None = None) -> i
     return None if domain.episode_env_steps is None else -(-domain.episode_env_steps // repeat)
 
 
-def _check_options(*, image_size: int, action_repeat: int, frame_stack: int, quality: str) -> None:
-    for name, value in (("image_size", image_size), ("action_repeat", action_repeat), ("frame_stack", frame_stack)):
+def _check_options(quality: str, **counts: int) -> None:
+    for name, value in counts.items():
         if value < 1:
             raise CRPTproError(f"{name} must be at least 1, got {value}.")
     if quality not in ("exact", "fast"):

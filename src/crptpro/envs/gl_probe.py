@@ -1,7 +1,7 @@
 """Render one small scene with the backend that MUJOCO_GL names and describe it as JSON on standard output.
 
-Run as a script in a process of its own, because a broken GL driver may hang or crash. It imports MuJoCo alone,
-to stay below a second or two.
+Run as a script in a process of its own, because a broken GL driver may hang or crash. It imports MuJoCo
+alone, to stay below a second or two.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ SCENE = """
   <asset><texture name="t" type="2d" builtin="checker" rgb1="1 0 0" rgb2="0 0 1" width="64" height="64"/>
     <material name="m" texture="t" texrepeat="4 4"/></asset>
   <worldbody>
-    <light pos="0 0 3"/><geom type="plane" size="2 2 .1" material="m"/><geom type="sphere" size=".4" pos="0 0 .4"/>
-    <camera name="c" pos="0 -2 2" xyaxes="1 0 0 0 .7 .7"/>
+    <light pos="0 0 3"/><geom type="plane" size="2 2 .1" material="m"/><geom type="sphere" size=".4" pos="0
+    0 .4"/> <camera name="c" pos="0 -2 2" xyaxes="1 0 0 0 .7 .7"/>
   </worldbody>
 </mujoco>
 """

@@ -1,4 +1,4 @@
-"""Try a GL backend in processes of its own: a driver may fail, crash or hang, and none of it may reach the caller."""
+"""Try a GL backend in a process of its own: a driver may fail, crash or hang without harm to the caller."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ _SYNONYMS = {
 PROBE_COMMAND = (sys.executable, str(Path(__file__).with_name("gl_probe.py")))
 
 REMEDIES = {
-    "egl": "Install EGL (Debian, Ubuntu: apt-get install libegl1 libgl1-mesa-dri), or the GPU's driver with its GL parts.",
-    "osmesa": "Install OSMesa (Debian, Ubuntu: apt-get install libosmesa6).",
+    "egl": "Install EGL (Debian, Ubuntu: apt-get install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri), or "
+    "the GL parts of the GPU's driver.",
+    "osmesa": "Install OSMesa (Debian 12, Ubuntu: apt-get install libosmesa6).",
     "glfw": "GLFW needs a display; on a machine without one use MUJOCO_GL=egl or MUJOCO_GL=osmesa.",
 }  # fmt: skip
 
@@ -49,8 +50,8 @@ def canonical_backend(text: str) -> str:
     backend = _SYNONYMS.get(text.strip().lower())
     if backend is None:
         raise RenderingError(
-            f"MUJOCO_GL={text} is not a GL backend. Set it to egl (GPU or Mesa), osmesa (software) or glfw (needs a "
-            "display), or unset it and the first that renders is taken."
+            f"MUJOCO_GL={text} is not a GL backend. Set it to egl (GPU or Mesa), osmesa (software) or glfw "
+            "(needs a display), or unset it and the first that renders is taken."
         )
     return backend
 
@@ -83,7 +84,10 @@ def attempt_backend(backend: str, *, timeout_s: float, processes: int = 1) -> At
         if returncode is None:
             return Attempt(backend, False, is_timeout=True)
         if returncode != 0:
-            return Attempt(backend, False, reason=_last_line(stderr, returncode), remedy=REMEDIES[backend])
+            reason = _last_line(stderr, returncode)
+            has_conflict = "PYOPENGL_PLATFORM" in reason
+            remedy = "Unset PYOPENGL_PLATFORM." if has_conflict else REMEDIES[backend]
+            return Attempt(backend, False, reason=reason, remedy=remedy)
         try:
             answer = json.loads(stdout.strip().splitlines()[-1])
         except (json.JSONDecodeError, IndexError):
@@ -108,8 +112,8 @@ def run_isolated(
     with contextlib.ExitStack() as stack:
         jobs: list[tuple[subprocess.Popen[bytes], IO[bytes], IO[bytes]]] = []
         for command in commands:
-            out = stack.enter_context(tempfile.TemporaryFile())
-            err = stack.enter_context(tempfile.TemporaryFile())
+            out: IO[bytes] = stack.enter_context(tempfile.TemporaryFile())
+            err: IO[bytes] = stack.enter_context(tempfile.TemporaryFile())
             process = subprocess.Popen(
                 command, env=_environment(backend), stdin=subprocess.DEVNULL, stdout=out, stderr=err,
                 start_new_session=True,

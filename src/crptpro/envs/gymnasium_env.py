@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from typing import Any
 
 import numpy as np
@@ -10,19 +9,19 @@ import torch
 import torch.nn.functional as F
 
 from crptpro.domains import GYMNASIUM_PREFIX
+from crptpro.envs.mujoco_log import route_mujoco_warnings
 from crptpro.envs.rendering import first_frame_watchdog
-from crptpro.envs.simulator import Outcome
+from crptpro.envs.simulator import ActionRange, Outcome
 from crptpro.errors import CRPTproError, RenderingError
-
-logger = logging.getLogger(__name__)
 
 
 class GymnasiumSimulator:
     """A Gymnasium environment as a :class:`~crptpro.envs.simulator.Simulator`.
 
-    Images are what ``render_mode="rgb_array"`` returns, resized without aliasing (bilinear with the filter widened to
-    the scale). Rewards of the repeated steps are summed; Gymnasium's own truncation and termination are kept. The
-    action repeat comes on top of any frame skip of the environment.
+    Images are what ``render_mode="rgb_array"`` returns, resized without aliasing (bilinear with the filter
+    widened to the scale); Gymnasium's MuJoCo environments render at twice ``image_size``, others at their
+    own size. Rewards of the repeated steps are summed; Gymnasium's own truncation and termination are kept.
+    The action repeat comes on top of any frame skip of the environment.
 
     Args:
         env_id: Id in Gymnasium's registry.
@@ -46,21 +45,18 @@ class GymnasiumSimulator:
         shadow_size: int | None = None,
         description: dict[str, Any] | None = None,
     ):
-        self._env = _make(env_id, camera)
+        self._env = _make(env_id, camera, supersampled_size=2 * image_size)
         self._image_size = image_size
         self._action_repeat = action_repeat
         self._description = description or {}
         self._seed: int | None = None
-        self._first_frame = True
+        self._is_first_frame = True
         space = _require_bounded_vector(self._env.action_space, env_id)
-        self._low = np.asarray(space.low, dtype=np.float64)
-        self._scale = (np.asarray(space.high, dtype=np.float64) - self._low) / 2.0
-        self._action_dtype = space.dtype
+        self._to_actuators = ActionRange(space.low, space.high, space.dtype)
         self.action_size = int(np.prod(space.shape))
-        self._data = getattr(self._env.unwrapped, "data", None)
-        has_state = hasattr(self._data, "qpos") and hasattr(self._data, "qvel")
-        self.state_size = (self._data.qpos.size, self._data.qvel.size) if has_state else None
-        model = getattr(self._env.unwrapped, "model", None)
+        self._data: Any = getattr(self._env.unwrapped, "data", None)
+        self.state_size = _state_size(self._data)
+        model: Any = getattr(self._env.unwrapped, "model", None)
         if shadow_size is not None and hasattr(model, "vis"):
             model.vis.quality.shadowsize = min(shadow_size, model.vis.quality.shadowsize)
 
@@ -75,11 +71,10 @@ class GymnasiumSimulator:
 
     def step(self, action: np.ndarray) -> Outcome:
         """Repeat the action, summing rewards, up to the end of the episode."""
-        scaled = self._low + self._scale * (action.astype(np.float64).reshape(self._low.shape) + 1.0)
-        scaled = scaled.astype(self._action_dtype)
+        command = self._to_actuators(action)
         total = 0.0
         for _ in range(self._action_repeat):
-            _, reward, terminated, truncated, _ = self._env.step(scaled)
+            _, reward, terminated, truncated, _ = self._env.step(command)
             total += float(reward)
             if terminated or truncated:
                 break
@@ -88,15 +83,25 @@ class GymnasiumSimulator:
 
     def render(self) -> np.ndarray:
         """Return the current image, uint8 ``[H, W, 3]``."""
-        if self._first_frame:
-            with first_frame_watchdog():
-                image = self._env.render()
-            self._first_frame = False
+        if self._is_first_frame:
+            image = self._render_first()
+            self._is_first_frame = False
         else:
             image = self._env.render()
-        if not (isinstance(image, np.ndarray) and image.ndim == 3 and image.shape[2] == 3):
-            raise RenderingError(f"{self._env.spec.id} rendered {type(image).__name__} instead of an RGB image.")
         return resize(image, self._image_size)
+
+    def _render_first(self) -> np.ndarray:
+        import gymnasium
+
+        name = self._env.spec.id
+        with first_frame_watchdog():
+            try:
+                image = self._env.render()
+            except (ImportError, gymnasium.error.Error) as reason:
+                raise RenderingError(f"{name} does not render: {reason}") from None
+        if not (isinstance(image, np.ndarray) and image.ndim == 3 and image.shape[2] == 3):
+            raise RenderingError(f"{name} rendered {type(image).__name__} instead of an RGB image.")
+        return image
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Return ``qpos`` and ``qvel``, float64."""
@@ -123,19 +128,29 @@ def resize(image: np.ndarray, size: int) -> np.ndarray:
     return small[0].round_().clamp_(0, 255).to(torch.uint8).permute(1, 2, 0).numpy()
 
 
-def _make(env_id: str, camera: int | str | None) -> Any:
+def _state_size(data: Any) -> tuple[int, int] | None:
+    has_state = hasattr(data, "qpos") and hasattr(data, "qvel")
+    return (data.qpos.size, data.qvel.size) if has_state else None
+
+
+def _make(env_id: str, camera: int | str | None, *, supersampled_size: int) -> Any:
     import gymnasium
 
+    name = f"{GYMNASIUM_PREFIX}{env_id}"
     options: dict[str, Any] = {}
     if camera is not None:
         options["camera_name" if isinstance(camera, str) else "camera_id"] = camera
+    if str(gymnasium.spec(env_id).entry_point).startswith("gymnasium.envs.mujoco"):
+        # Their 480 x 480 by default costs twice the time on software GL and ends as the same few pixels.
+        options.update(width=supersampled_size, height=supersampled_size)
+        route_mujoco_warnings()
     try:
         return gymnasium.make(env_id, render_mode="rgb_array", disable_env_checker=True, **options)
     except TypeError as reason:
-        hint = " It takes no camera; leave camera unset." if options else ""
-        raise CRPTproError(f"{GYMNASIUM_PREFIX}{env_id} cannot be made with rgb_array rendering: {reason}.{hint}") from None
-    except gymnasium.error.DependencyNotInstalled as reason:
-        raise CRPTproError(f"{GYMNASIUM_PREFIX}{env_id} lacks a package: {reason}") from None
+        hint = " It takes no camera; leave camera unset." if camera is not None else ""
+        raise CRPTproError(f"{name} cannot be made with rgb_array rendering: {reason}.{hint}") from None
+    except (ImportError, gymnasium.error.Error) as reason:
+        raise CRPTproError(f"{name} cannot be made: {reason}") from None
 
 
 def _require_bounded_vector(space: Any, env_id: str) -> Any:
@@ -144,8 +159,8 @@ def _require_bounded_vector(space: Any, env_id: str) -> Any:
     name = f"{GYMNASIUM_PREFIX}{env_id}"
     if not isinstance(space, gymnasium.spaces.Box):
         raise CRPTproError(
-            f"{name} has {type(space).__name__} actions. Only continuous actions are supported (a Box); wrap it, and "
-            "make it known with register_domain."
+            f"{name} has {type(space).__name__} actions. Only continuous actions are supported (a "
+            "Box); wrap it, and make it known with register_domain."
         )
     if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
         raise CRPTproError(

@@ -6,7 +6,7 @@ import inspect
 from typing import Any
 
 import torch
-from torchrl.envs import Compose, DoubleToFloat, EnvBase, PermuteTransform, TransformedEnv
+from torchrl.envs import DoubleToFloat, EnvBase, PermuteTransform, Transform, TransformedEnv
 from torchrl.envs.transforms import SelectTransform
 
 from crptpro.domains import Domain
@@ -16,7 +16,7 @@ _OFFERED = ("seed", "image_size", "action_repeat", "camera", "quality", "physics
 
 
 def make_own_env(domain: Domain, **settings: Any) -> EnvBase:
-    """Call ``domain.make`` with those of the settings that it names, check what it returns, and make pixels CHW.
+    """Call ``domain.make`` with the settings that it names, check what it returns, and make pixels CHW.
 
     Keys other than ``pixels`` (and ``qpos``, ``qvel`` if asked for) are dropped.
 
@@ -30,7 +30,7 @@ def make_own_env(domain: Domain, **settings: Any) -> EnvBase:
     layout = _check(domain, env, image_size=settings["image_size"])
     state = ("qpos", "qvel") if settings["physics_state"] else ()
     kept = [key for key in ("pixels", *state) if key in env.observation_spec.keys(True, True)]
-    transforms: list[Any] = []
+    transforms: list[Transform] = []
     if set(kept) != set(env.observation_spec.keys(True, True)):
         transforms.append(SelectTransform(*kept))
     if layout == "HWC":
@@ -40,7 +40,16 @@ def make_own_env(domain: Domain, **settings: Any) -> EnvBase:
         actions = {"in_keys_inv": ["action"]} if is_double else {"in_keys_inv": []}
         rewards = ["reward"] if env.reward_spec.dtype == torch.float64 else []
         transforms.append(DoubleToFloat(in_keys=rewards, **actions))
-    return TransformedEnv(env, Compose(*transforms)) if transforms else env
+    for transform in transforms:
+        env = with_transform(env, transform)
+    return env
+
+
+def with_transform(env: EnvBase, transform: Transform) -> EnvBase:
+    """Return ``env`` with one more transform, nesting nothing (TorchRL warns about nested environments)."""
+    return (
+        env.append_transform(transform) if isinstance(env, TransformedEnv) else TransformedEnv(env, transform)
+    )
 
 
 def _accepted(make: Any, settings: dict[str, Any]) -> dict[str, Any]:
@@ -59,7 +68,7 @@ def _check(domain: Domain, env: Any, *, image_size: int) -> str:
         raise refuse(f"is a {type(env).__name__}; make must return a TorchRL EnvBase")
     if env.batch_size != torch.Size([]):
         raise refuse(f"has batch size {tuple(env.batch_size)}; it must be unbatched")
-    if "pixels" not in env.observation_spec.keys():
+    if "pixels" not in set(env.observation_spec.keys()):
         raise refuse(f"emits {sorted(map(str, env.observation_spec.keys()))}, but no 'pixels'")
     spec = env.observation_spec["pixels"]
     if spec.dtype != torch.uint8:
@@ -67,13 +76,15 @@ def _check(domain: Domain, env: Any, *, image_size: int) -> str:
     layouts = {(3, image_size, image_size): "CHW", (image_size, image_size, 3): "HWC"}
     layout = layouts.get(tuple(spec.shape))
     if layout is None:
-        raise refuse(f"emits pixels of shape {tuple(spec.shape)}; expected one RGB image, {' or '.join(map(str, layouts))}")
+        expected = " or ".join(map(str, layouts))
+        raise refuse(f"emits pixels of shape {tuple(spec.shape)}; expected one RGB image, {expected}")
     action = env.action_spec
-    low, high = getattr(action.space, "low", None), getattr(action.space, "high", None)
+    low: Any = getattr(action.space, "low", None)
+    high: Any = getattr(action.space, "high", None)
     if not action.dtype.is_floating_point or low is None or len(action.shape) != 1:
         raise refuse(f"has the action {action}; it must be a bounded float vector")
     if not ((low == -1).all() and (high == 1).all()):
-        raise refuse("has action bounds other than [-1, 1]; add torchrl.envs.ActionScaling or scale the actions in make")
+        raise refuse("has action bounds other than [-1, 1]; let make scale the actions")
     if tuple(env.reward_spec.shape) != (1,):
         raise refuse(f"has rewards of shape {tuple(env.reward_spec.shape)}; expected (1,)")
     return layout

@@ -17,8 +17,8 @@ class PixelEnv(EnvBase):
     """Unbatched CPU environment: ``pixels`` uint8 ``[3, H, W]``, ``action`` float32 ``[A]`` in [-1, 1].
 
     ``reset`` and ``step`` render exactly once each. Reward is float32 ``[1]``; ``terminated`` and
-    ``truncated`` are told apart and ``done`` is their disjunction. With ``physics_state`` also ``qpos`` float64
-    ``[nq]`` and ``qvel`` float64 ``[nv]``, where the simulator has them.
+    ``truncated`` are told apart and ``done`` is their disjunction. With ``physics_state`` also ``qpos``
+    float64 ``[nq]`` and ``qvel`` float64 ``[nv]``, where the simulator has them.
 
     Args:
         simulator: The world; owned by the environment from now on.

@@ -1,4 +1,4 @@
-"""Which GL backend renders: chosen once, proven by a real frame under a time limit, and written into every card."""
+"""Which GL backend renders: chosen once, proven by a frame under a time limit, written into every card."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ PROOF_VARIABLE = "CRPTPRO_GL_PROOF"
 TIMEOUT_VARIABLE = "CRPTPRO_GL_TIMEOUT_S"
 
 ALTERNATIVES = (
-    "Alternatives: MUJOCO_GL=osmesa (software, no GPU driver involved), MUJOCO_EGL_DEVICE_ID=<number> (another GPU), "
-    f"fewer worker processes, or a longer {TIMEOUT_VARIABLE} on a machine that is merely slow."
+    "Alternatives: MUJOCO_GL=osmesa (software, no GPU driver involved), MUJOCO_EGL_DEVICE_ID=<number> "
+    f"(another GPU), fewer worker processes, or a longer {TIMEOUT_VARIABLE} on a machine that is merely slow."
 )
 HANG_CAUSE = (
-    "The usual cause is a GPU driver that hangs when several processes hold EGL contexts at once (NVIDIA 580.x does, "
-    "google-deepmind/mujoco issue 3444), or one left behind by a killed run."
+    "The usual cause is a GPU driver that hangs when several processes hold EGL contexts at once (NVIDIA "
+    "580.x does, google-deepmind/mujoco issue 3444), or one left behind by a killed run."
 )
 
 
 def select_backend(
     preference: str | None = None, timeout_s: float | None = None, *, processes: int = 1
 ) -> str:
-    """Choose the GL backend, prove that it renders, and set ``MUJOCO_GL``; call it before importing dm_control.
+    """Choose the GL backend, prove that it renders, set ``MUJOCO_GL``; call it before importing dm_control.
 
-    A ``MUJOCO_GL`` that the user has set is never overridden, only proven. Otherwise ``preference`` is taken, or
-    EGL, OSMesa and (with a display) GLFW are tried in this order. The proof is a frame with content, rendered in a
-    process of its own within the time limit. It holds for this process and its children, so it is made once. With
-    software GL, ``LP_NUM_THREADS=1`` is set unless the user has set it: more threads cost a third more CPU time per
-    frame and hardly gain any.
+    A ``MUJOCO_GL`` that the user has set is never overridden, only proven. Otherwise ``preference`` is
+    taken, or EGL, OSMesa and (with a display) GLFW are tried in this order. The proof is a frame with
+    content, rendered in a process of its own within the time limit. It holds for this process and its
+    children, so it is made once. With software GL, ``LP_NUM_THREADS=1`` is set unless the user has set it:
+    more threads cost a third more CPU time per frame and hardly gain any.
 
     Args:
         preference: ``"egl"``, ``"osmesa"`` or ``"glfw"``.
@@ -53,36 +53,41 @@ def select_backend(
     Raises:
         RenderingError: naming, for every backend tried, what went wrong and what to do.
     """
-    timeout_s = _default_timeout_s() if timeout_s is None else timeout_s
+    timeout_s = default_timeout_s() if timeout_s is None else timeout_s
     proof = _proof()
     requested = _requested_by_user(proof)
     if preference is not None and preference not in BACKENDS:
         raise RenderingError(f"There is no GL backend {preference!r}; choose one of {', '.join(BACKENDS)}.")
     if requested is not None and preference not in (None, requested):
-        logger.warning("MUJOCO_GL=%s is set and kept; the preferred backend %s is not used.", requested, preference)
+        logger.warning("MUJOCO_GL=%s is set and kept; %s is not used.", requested, preference)
     wanted = requested or preference
     imported = _imported_backend()
     if imported is not None and wanted not in (None, imported):
         raise RenderingError(
-            f"dm_control was already imported with the backend {imported!r}, so {wanted!r} cannot be used in this "
-            f"process any more. Set MUJOCO_GL={wanted}, or make the first environment, before importing dm_control."
+            f"dm_control was already imported with the backend {imported!r}, so {wanted!r} cannot be used in "
+            f"this process any more. Set MUJOCO_GL={wanted}, or make the first environment, before "
+            "importing dm_control."
         )
-    if proof and proof["processes"] >= processes and proof["backend"] == (wanted or imported or proof["backend"]):
-        if requested is None:
-            os.environ["MUJOCO_GL"] = proof["backend"]
+    only = wanted or imported
+    candidates = (only,) if only else platform_candidates()
+    if proof and proof["processes"] >= processes and proof["backend"] in candidates:
+        os.environ["MUJOCO_GL"] = proof["backend"]
         return proof["backend"]
-
-    candidates = (wanted,) if wanted else (imported,) if imported else _platform_candidates()
+    if proof and proof["backend"] in candidates:  # those before it have failed already
+        candidates = candidates[candidates.index(proof["backend"]) :]
     failures: list[Attempt] = []
     for backend in candidates:
         attempt = attempt_backend(backend, timeout_s=timeout_s, processes=processes)
         if attempt.is_ok:
             _accept(attempt, processes=processes, chosen_by="user" if requested else "crptpro")
             for failure in failures:
-                logger.warning("%s Rendering with %s instead.", _explain(failure, timeout_s), backend)
+                logger.warning(
+                    "%s Rendering with %s instead.", explain(failure, timeout_s, processes), backend
+                )
             return backend
         failures.append(attempt)
-    raise RenderingError(_nothing_renders(failures, timeout_s, requested=requested, imported=imported))
+    details = [explain(failure, timeout_s, processes) for failure in failures]
+    raise RenderingError("\n  ".join([_nothing_renders(requested, imported), *details]))
 
 
 def backend_card() -> dict[str, Any]:
@@ -100,13 +105,15 @@ def backend_card() -> dict[str, Any]:
 
 @contextmanager
 def first_frame_watchdog(timeout_s: float | None = None) -> Iterator[None]:
-    """Log an error that names the cause if the body, which makes a context and renders, does not return in time.
+    """Log an error that names the cause if the body, which renders a first frame, does not return in time.
 
-    A call that hangs inside the driver cannot be interrupted from Python, so the process is left as it is; what
-    starts workers should end those that log this.
+    A call that hangs inside the driver cannot be interrupted from Python, so the process is left as it is;
+    what starts workers should end those that log this.
     """
-    timeout_s = _default_timeout_s() if timeout_s is None else timeout_s
-    message = f"Process {os.getpid()} has waited {timeout_s:g} s for its first frame. {HANG_CAUSE} {ALTERNATIVES}"
+    timeout_s = default_timeout_s() if timeout_s is None else timeout_s
+    message = (
+        f"Process {os.getpid()} has waited {timeout_s:g} s for its first frame. {HANG_CAUSE} {ALTERNATIVES}"
+    )
     timer = threading.Timer(timeout_s, logger.error, args=(message,))
     timer.daemon = True
     timer.start()
@@ -116,7 +123,8 @@ def first_frame_watchdog(timeout_s: float | None = None) -> Iterator[None]:
         timer.cancel()
 
 
-def _default_timeout_s() -> float:
+def default_timeout_s() -> float:
+    """Return the seconds a first frame may take."""
     text = os.environ.get(TIMEOUT_VARIABLE, "60")
     try:
         return float(text)
@@ -139,7 +147,9 @@ def _requested_by_user(proof: dict[str, Any] | None) -> str | None:
         return None
     backend = canonical_backend(text)
     if backend == "off":
-        raise RenderingError(f"MUJOCO_GL={text} switches rendering off; unset it, or set it to egl or osmesa.")
+        raise RenderingError(
+            f"MUJOCO_GL={text} switches rendering off; unset it, or set it to egl or osmesa."
+        )
     return backend
 
 
@@ -149,7 +159,8 @@ def _imported_backend() -> str | None:
     return name if name in BACKENDS else None
 
 
-def _platform_candidates() -> tuple[str, ...]:
+def platform_candidates() -> tuple[str, ...]:
+    """Return the backends worth trying here, best first."""
     if not sys.platform.startswith("linux"):
         return ("glfw",)
     has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -157,8 +168,8 @@ def _platform_candidates() -> tuple[str, ...]:
 
 
 def _accept(attempt: Attempt, *, processes: int, chosen_by: str) -> None:
-    if chosen_by == "crptpro":
-        os.environ["MUJOCO_GL"] = attempt.backend
+    # A user's spelling ("EGL", "on") becomes the one that dm_control and Gymnasium both understand.
+    os.environ["MUJOCO_GL"] = attempt.backend
     if attempt.answer.get("gl_kind") == "software":
         os.environ.setdefault("LP_NUM_THREADS", "1")
     proof = {**attempt.answer, "backend": attempt.backend, "processes": processes, "chosen_by": chosen_by}
@@ -166,21 +177,21 @@ def _accept(attempt: Attempt, *, processes: int, chosen_by: str) -> None:
     logger.info("GL backend %s: %s", attempt.backend, attempt.answer.get("gl_renderer"))
 
 
-def _explain(attempt: Attempt, timeout_s: float) -> str:
+def explain(attempt: Attempt, timeout_s: float, processes: int = 1) -> str:
+    """Return in one sentence or two why an attempt failed and what to do."""
     if attempt.is_timeout:
-        return f"{attempt.backend}: the first frame did not arrive within {timeout_s:g} s. {HANG_CAUSE} {ALTERNATIVES}"
+        where = f" from each of {processes} simultaneous processes" if processes > 1 else ""
+        what = f"{attempt.backend}: the first frame did not arrive{where} within {timeout_s:g} s."
+        return f"{what} {HANG_CAUSE} {ALTERNATIVES}"
     return f"{attempt.backend}: {attempt.reason} {attempt.remedy}".strip()
 
 
-def _nothing_renders(
-    failures: list[Attempt], timeout_s: float, *, requested: str | None, imported: str | None
-) -> str:
-    lines = ["No GL backend renders a frame."]
+def _nothing_renders(requested: str | None, imported: str | None) -> str:
     if requested:
-        lines = [f"MUJOCO_GL={os.environ['MUJOCO_GL']} was set by you, is kept, and does not render a frame."]
-    elif imported:
-        lines = [
-            f"dm_control was imported with the backend {imported!r} before one could be chosen, and it does not render "
-            "a frame. Make the first environment before importing dm_control, or set MUJOCO_GL."
-        ]
-    return "\n  ".join([*lines, *(_explain(failure, timeout_s) for failure in failures)])
+        return f"MUJOCO_GL={os.environ['MUJOCO_GL']} was set by you, is kept, and does not render a frame."
+    if imported:
+        return (
+            f"dm_control was imported with the backend {imported!r} before one could be chosen, and it does "
+            "not render a frame. Make the first environment before importing dm_control, or set MUJOCO_GL."
+        )
+    return "No GL backend renders a frame."

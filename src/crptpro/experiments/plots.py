@@ -59,7 +59,11 @@ def plot_pretraining(record: str | Path, out: str | Path, *, num_prototypes: int
 
 
 def plot_learning_curves(
-    records: Mapping[str, str | Path], out: str | Path, *, baseline: tuple[float, float] | None = None, title: str = ""
+    records: Mapping[str, str | Path],
+    out: str | Path,
+    *,
+    baseline: tuple[float, float] | None = None,
+    title: str = "",
 ) -> Path:
     """Draw mean episode return against env steps, with one standard deviation over episodes.
 
@@ -77,7 +81,10 @@ def plot_learning_curves(
             returns[env_steps].append(episode_return)
         x = sorted(returns)
         mean = [sum(returns[s]) / len(returns[s]) for s in x]
-        std = [math.sqrt(sum((r - m) ** 2 for r in returns[s]) / max(len(returns[s]) - 1, 1)) for s, m in zip(x, mean)]
+        std = [
+            math.sqrt(sum((r - m) ** 2 for r in returns[s]) / max(len(returns[s]) - 1, 1))
+            for s, m in zip(x, mean)
+        ]
         episodes = {len(returns[s]) for s in x}
         counts = "-".join(str(n) for n in sorted(episodes))
         (line,) = axis.plot(x, mean, marker="o", markersize=3, label=f"{label} ({counts} episodes per point)")

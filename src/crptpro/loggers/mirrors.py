@@ -75,7 +75,7 @@ class WandbMirror:
     def __init__(self, options: WandbOptions, run_dir: Path, config: Mapping[str, Any]) -> None:
         import wandb
 
-        self._wandb = wandb
+        self._wandb: Any = wandb
         mode = wandb_mode(options.mode)
         try:
             self._run = self._start(options, run_dir, config, mode)
@@ -99,9 +99,7 @@ class WandbMirror:
 
     def video(self, name: str, path: Path, counters: Mapping[str, int]) -> None:
         """Upload a video file beside the next row."""
-        self._run.log(
-            {**counters, name: self._wandb.Video(str(path), format=path.suffix.lstrip("."))}, commit=False
-        )
+        self._run.log({**counters, name: self._wandb.Video(str(path))}, commit=False)
 
     def artifact(self, path: Path, *, name: str, kind: str) -> None:
         """Upload a file or directory as a W&B artifact."""

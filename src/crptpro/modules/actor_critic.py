@@ -34,7 +34,7 @@ class FeatureTrunk(nn.Module):
         self.norm.reset_parameters()
 
     def forward(self, features: Tensor) -> Tensor:
-        """Map ``[*, feature_dim]`` (any floating dtype) to ``[*, bottleneck_dim]`` in the parameters' dtype."""
+        """Map ``[*, feature_dim]``, any floating dtype, to ``[*, bottleneck_dim]`` in the weights' dtype."""
         return self.norm(linear_in(features, self.linear.weight, self.linear.bias, self.compute_dtype))
 
 
@@ -49,23 +49,22 @@ class MLP(nn.Module):
 
     def __init__(self, in_dim: int, hidden_dim: int, out_dim: int) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(
-            [nn.Linear(in_dim, hidden_dim), nn.Linear(hidden_dim, hidden_dim), nn.Linear(hidden_dim, out_dim)]
-        )
+        self.first = nn.Linear(in_dim, hidden_dim)
+        self.middle = nn.Linear(hidden_dim, hidden_dim)
+        self.last = nn.Linear(hidden_dim, out_dim)
         self.compute_dtype: torch.dtype = torch.float32
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
         """Orthogonal weights, zero biases."""
-        for layer in self.layers:
+        for layer in (self.first, self.middle, self.last):
             orthogonal_linear_(layer)
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Map ``[*, in_dim]`` to ``[*, out_dim]``; only the wide middle product runs in ``compute_dtype``."""
-        first, middle, last = self.layers
-        hidden = F.relu(first(inputs))
-        hidden = F.relu(linear_in(hidden, middle.weight, middle.bias, self.compute_dtype))
-        return last(hidden)
+        hidden = F.relu(self.first(inputs))
+        hidden = F.relu(linear_in(hidden, self.middle.weight, self.middle.bias, self.compute_dtype))
+        return self.last(hidden)
 
 
 class SquashedGaussianActor(nn.Module):
@@ -168,7 +167,8 @@ class TwinCritic(nn.Module):
         super().__init__()
         self.action_dim = action_dim
         self.trunk = FeatureTrunk(feature_dim, bottleneck_dim)
-        self.heads = nn.ModuleList(MLP(bottleneck_dim + action_dim, hidden_dim, 1) for _ in range(2))
+        self.q1 = MLP(bottleneck_dim + action_dim, hidden_dim, 1)
+        self.q2 = MLP(bottleneck_dim + action_dim, hidden_dim, 1)
         self.config: dict[str, Any] = {
             "feature_dim": feature_dim,
             "action_dim": action_dim,
@@ -180,8 +180,8 @@ class TwinCritic(nn.Module):
     def reset_parameters(self) -> None:
         """Orthogonal weights (gain 1), zero biases."""
         self.trunk.reset_parameters()
-        for head in self.heads:
-            head.reset_parameters()
+        self.q1.reset_parameters()
+        self.q2.reset_parameters()
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
         """Return both action values.
@@ -195,7 +195,7 @@ class TwinCritic(nn.Module):
         """
         bottleneck = self.trunk(features)
         inputs = torch.cat([bottleneck, action.to(bottleneck.dtype)], dim=-1)
-        return torch.cat([head(inputs) for head in self.heads], dim=-1)
+        return torch.cat([self.q1(inputs), self.q2(inputs)], dim=-1)
 
 
 def squash_log_std(raw: Tensor, bounds: tuple[float, float]) -> Tensor:
@@ -226,7 +226,7 @@ def squashed_gaussian(loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor
 
 
 def standard_normal_like(like: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Standard normal values with the shape, dtype and device of ``like``, from a generator if one is given."""
+    """Standard normal values shaped, typed and placed like ``like``, from a generator if one is given."""
     if generator is None:
         return torch.randn_like(like)
     values = torch.randn(like.shape, generator=generator, dtype=like.dtype, device=generator.device)

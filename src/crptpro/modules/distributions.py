@@ -52,7 +52,7 @@ class SquashedGaussian(Distribution):
         """What TorchRL's deterministic exploration takes."""
         return self.mode
 
-    def rsample(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> Tensor:
+    def rsample(self, sample_shape: torch.Size | list[int] | tuple[int, ...] = ()) -> Tensor:
         """Draw reparameterised actions ``[*sample_shape, *, A]``."""
         loc = self.loc.expand(*sample_shape, *self.loc.shape)
         action, log_prob = squashed_gaussian(loc, self.scale.expand_as(loc), standard_normal_like(loc, None))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -100,9 +100,14 @@ class PixelEncoder(nn.Module):
     @torch.no_grad()
     def reset_parameters(self) -> None:
         """Draw orthogonal kernels (gain sqrt 2) and zero the biases."""
-        for conv in self.convs:
+        for conv in self.conv_layers:
             nn.init.orthogonal_(conv.weight, gain=math.sqrt(2.0))
-            nn.init.zeros_(conv.bias)
+            nn.init.zeros_(cast(Tensor, conv.bias))
+
+    @property
+    def conv_layers(self) -> list[nn.Conv2d]:
+        """The convolutions in order, each followed by a ReLU."""
+        return cast("list[nn.Conv2d]", list(self.convs))
 
     @property
     def is_dense_shift_compatible(self) -> bool:
@@ -129,7 +134,8 @@ class PixelEncoder(nn.Module):
         expected = (self.in_channels, self.image_size, self.image_size)
         if tuple(pixels.shape[-3:]) != expected:
             raise ValueError(
-                f"PixelEncoder expects pixels of shape [*, {', '.join(map(str, expected))}], got {tuple(pixels.shape)}."
+                f"PixelEncoder was built for pixels of shape [*, {', '.join(map(str, expected))}], "
+                f"got {tuple(pixels.shape)}."
             )
         return self.feature_map(pixels).flatten(-3)
 
@@ -152,7 +158,6 @@ class PixelEncoder(nn.Module):
         return maps.reshape(*lead, *maps.shape[1:])
 
     def _convolve(self, images: Tensor) -> Tensor:
-        master = self.convs[0].weight.dtype
         low = self.compute_dtype != torch.float32
         if low:
             x = images.to(self.compute_dtype)
@@ -160,12 +165,12 @@ class PixelEncoder(nn.Module):
                 # In pixel units: 127.5 and its differences to 0..255 are exact in bfloat16.
                 x = x - self.pixel_offset / self.pixel_scale
         else:
-            x = images.to(master) * self.pixel_scale
+            x = images.to(self.conv_layers[0].weight.dtype) * self.pixel_scale
             if self.pixel_offset:
                 x = x - self.pixel_offset
         x = x.contiguous(memory_format=torch.channels_last)
-        for index, conv in enumerate(self.convs):
-            weight, bias = conv.weight, conv.bias
+        for index, conv in enumerate(self.conv_layers):
+            weight, bias = conv.weight, cast(Tensor, conv.bias)
             if low:
                 weight = weight * self.pixel_scale if index == 0 else weight
                 weight, bias = weight.to(self.compute_dtype), bias.to(self.compute_dtype)

@@ -1,10 +1,10 @@
-"""Which number format the big convolutions and matrix products run in, and the switch that sets it everywhere."""
+"""The number format of the big convolutions and matrix products, and the switch that sets it everywhere."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar, cast
 
 import torch
 import torch.nn.functional as F
@@ -69,7 +69,7 @@ def set_compute_dtype(module: _Module, dtype: torch.dtype) -> _Module:
         raise ValueError(f"compute dtype must be torch.float32 or torch.bfloat16, got {dtype}.")
     for network in _all_modules(module, set()):
         if hasattr(network, "compute_dtype"):
-            network.compute_dtype = dtype
+            cast(Any, network).compute_dtype = dtype
     return module
 
 

@@ -76,7 +76,7 @@ class PretrainingLoss(LossModule):
         self._out_keys = values
 
     def target_state(self) -> dict[str, dict[str, Tensor]]:
-        """State dictionary of every target network, by network name (``{"encoder": {"convs.0.weight": ...}}``).
+        """State dictionary of every target network by its name: ``{"encoder": {"convs.0.weight": ...}}``.
 
         The tensors are the live ones, not copies. Empty for a loss without targets.
         """
@@ -116,38 +116,49 @@ class PretrainingLoss(LossModule):
         self._in_keys = None
 
     def _read_pair(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None, torch.Size]:
-        """Images flattened to one batch dimension without masked rows, the mask, and the original batch shape."""
+        """Images with one batch dimension and without masked rows; the mask; the original batch shape."""
         observation = tensordict.get(self.tensor_keys.observation)
         next_observation = tensordict.get(self.tensor_keys.next_observation)
         for key, value in zip(self.in_keys, (observation, next_observation)):
             if value is None:
-                raise KeyError(f"{type(self).__name__} needs the entry {key!r}; set_keys() names another one.")
+                raise KeyError(
+                    f"{type(self).__name__} needs the entry {key!r}; set_keys() names another one."
+                )
         lead = observation.shape[:-3]
         observation = observation.reshape(-1, *observation.shape[-3:])
         next_observation = next_observation.reshape(-1, *next_observation.shape[-3:])
-        valid = self._valid_rows(tensordict)
+        valid = valid_rows(self, tensordict)
         if valid is not None:
             # Dropped, not multiplied by zero: batch-wise normalisations couple all rows.
             observation, next_observation = observation[valid], next_observation[valid]
         return observation, next_observation, valid, lead
 
-    def _valid_rows(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Validity of each row ``[B]`` from the mask entries of ``loss_mask_key``, None if there is none."""
-        names = self.loss_mask_key
-        valid = None
-        for key in AUTO_LOSS_MASK_KEYS if names == "auto" else [] if names is None else [names]:
-            mask = tensordict.get(key, None)
-            if mask is not None:
-                valid = mask.reshape(-1) if valid is None else valid & mask.reshape(-1)
-        return valid
-
     def _reduce_rows(self, rows: Tensor, valid: Tensor | None, lead: torch.Size) -> Tensor:
-        """Reduce per-row values of :meth:`_read_pair`'s rows; ``"none"`` restores the batch shape, 0 where masked."""
+        """Reduce values of :meth:`_read_pair`'s rows; ``"none"`` restores the batch shape, 0 where masked."""
         if self.reduction == "none":
             if valid is not None:
                 rows = rows.new_zeros(valid.shape).masked_scatter(valid, rows)
             return rows.reshape(lead)
         return rows.sum() if self.reduction == "sum" else rows.sum() / max(rows.numel(), 1)
+
+
+def valid_rows(loss: LossModule, tensordict: TensorDictBase) -> Tensor | None:
+    """Which rows of a batch count, from the mask entries that ``loss.loss_mask_key`` names.
+
+    Args:
+        loss: any loss.
+        tensordict: its input.
+
+    Returns:
+        Flat bool ``[B]`` over all batch dimensions, or None if the batch has no mask.
+    """
+    names = loss.loss_mask_key
+    valid = None
+    for key in AUTO_LOSS_MASK_KEYS if names == "auto" else [] if names is None else [names]:
+        mask = tensordict.get(key, None)
+        if mask is not None:
+            valid = mask.reshape(-1) if valid is None else valid & mask.reshape(-1)
+    return valid
 
 
 def _reset(network: nn.Module) -> None:

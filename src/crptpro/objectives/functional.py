@@ -1,8 +1,8 @@
 """The mathematics of every objective as free functions on plain tensors.
 
-``scores`` are cosine similarities before division by a temperature. Nothing here holds state, mutates its input,
-synchronises with the host, or repairs bad numbers: non-finite input gives non-finite output, and the training loops
-check finiteness.
+``scores`` are cosine similarities before division by a temperature. Nothing here holds state, mutates its
+input, synchronises with the host, or repairs bad numbers: non-finite input gives non-finite output, and the
+training loops check finiteness.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ DispersionReduction = Literal["mean_all", "sum", "mean_offdiag"]
 
 @torch.no_grad()
 def sinkhorn_knopp(scores: Tensor, *, temperature: float | Tensor = 0.1, iterations: int = 3) -> Tensor:
-    r"""Soft assignments whose mass is spread evenly over the prototypes (CRPTpro Eq. 4-6; SwaV, arXiv 2006.09882).
+    r"""Soft assignments with evenly loaded prototypes (CRPTpro Eq. 4-6; SwaV, arXiv 2006.09882).
 
-    Starts from :math:`\exp(s/\tau)`, alternately scales the prototype marginal to 1/M and the sample marginal to 1/B,
-    and ends with each sample's assignments summing to 1. No gradient.
+    Starts from :math:`\exp(s/\tau)`, alternately scales the prototype marginal to 1/M and the sample marginal
+    to 1/B, and ends with each sample's assignments summing to 1. No gradient.
 
-    Computed in the log domain, in float32 or wider. That equals the exponentiated form of the released code wherever
-    that one is finite, and needs none of its guards: a sample whose scores all underflow keeps its assignments.
+    Computed in the log domain, in float32 or wider: equal to the exponentiated form of the released code
+    wherever that is finite, and without need of its guards against overflow and empty rows.
 
-    Deviation: the paper's Eq. 4 prints the scores without the exponential, which would divide by sums near zero.
+    Deviation: the paper's Eq. 4 prints the scores without the exponential; it would divide by sums near 0.
 
     Args:
         scores: ``[B, M]`` cosine similarities.
@@ -52,10 +52,10 @@ def comparative_loss(
     temperature: float | Tensor = 0.1,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    r"""Cross-entropy between target assignments and predicted ones (CRPTpro Eq. 7-8).
+    r"""Cross-entropy between target assignments and predicted ones (CRPTpro Eq. 1 and 7).
 
-    :math:`L_{comp} = -\frac1B\sum_i\sum_j q_{ij}\log\mathrm{softmax}_j(s_{ij}/\tau)`. At uniform prediction it equals
-    ln M (6.238 for 512); a run that stays there has learned nothing.
+    :math:`L_{comp} = -\frac1B\sum_i\sum_j q_{ij}\log\mathrm{softmax}_j(s_{ij}/\tau)`. At uniform prediction
+    it equals ln M (6.238 for 512); a run that stays there has learned nothing.
 
     Args:
         student_scores: ``[B, M]`` cosine similarities, with gradient.
@@ -75,16 +75,16 @@ def prototype_dispersion(
 ) -> Tensor:
     r"""Intrinsic loss that pushes prototypes apart (CRPTpro Eq. 9).
 
-    :math:`L_{intr} = \frac1{M^2}\sum_{j\ne k}\frac{\mathrm{sg}(c_j)\cdot c_k}{\mathrm{sg}(c_j\cdot c_k) + w}`. The left
-    factor and the denominator carry no gradient, so row k receives
+    :math:`L_{intr} = \frac1{M^2}\sum_{j\ne k} \mathrm{sg}(c_j)\cdot c_k / (\mathrm{sg}(c_j\cdot c_k) + w)`.
+    The left factor and the denominator carry no gradient, so row k receives
     :math:`\frac1{M^2}\sum_{j\ne k}\mathrm{sg}(c_j)/(s_{jk}+w)`.
 
-    Deviation: the paper prints a sum; its own table only fits the mean over all M x M entries, which is the default
-    (the sum equals it times M^2).
+    Deviation: the paper prints a sum; its own table only fits the mean over all M x M entries, which is the
+    default (the sum equals it times M^2).
 
     Args:
-        prototypes: ``[M, D]`` unit rows. Whether the gradient passes through their normalisation is the caller's
-            choice (:meth:`crptpro.modules.Prototypes.unit_weight`).
+        prototypes: ``[M, D]`` unit rows. Whether the gradient passes through their normalisation is the
+            caller's choice (:meth:`crptpro.modules.Prototypes.unit_weight`).
         offset: w, larger than 1 so that the denominator stays positive.
         reduction: ``"mean_all"`` divides by M^2 (the zeroed diagonal counts), ``"mean_offdiag"`` by M(M-1),
             ``"sum"`` by nothing.
@@ -108,8 +108,8 @@ def prototype_dispersion(
 def knn_distances(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
     """Euclidean distances to the k nearest keys, ascending.
 
-    The neighbours are found with a matrix product, which cannot resolve distances near zero; the k distances are then
-    taken again from the differences, so that a key equal to the query is at exactly 0.
+    The neighbours are found with a matrix product, which cannot resolve distances near zero; the k distances
+    are then taken again from the differences, so that a key equal to the query is at exactly 0.
 
     Args:
         queries: ``[N, D]``.
@@ -161,10 +161,10 @@ def particle_reward(
     scale: float | Tensor = 1.0,
     clip: float = 0.0,
 ) -> Tensor:
-    r"""Particle entropy estimate :math:`\log(1 + \overline{\mathrm{relu}(d/scale - clip)})` (APT, arXiv 2103.04551).
+    r"""Particle entropy: :math:`\log(1 + \overline{\mathrm{relu}(d/scale - clip)})` (APT, arXiv 2103.04551).
 
-    Form of rll-research/url_benchmark ``utils.py``: division and clipping act on each distance, the average over the
-    k neighbours comes after, the logarithm last.
+    Form of rll-research/url_benchmark ``utils.py``: division and clipping act on each distance, the average
+    over the k neighbours comes after, the logarithm last.
 
     Args:
         features: ``[N, D]``.
@@ -199,16 +199,18 @@ def info_nce(
 
     Args:
         anchors: ``[B, D]``.
-        positives: ``[B, D]``. Normalise both beforehand where the method asks for cosines (SimCLR yes, ATC no).
+        positives: ``[B, D]``. Normalise both beforehand where the method asks for cosines (SimCLR yes, ATC
+            no).
         temperature: divides the inner products.
-        negatives: ``"positives"`` compares each anchor with all B positives (ATC); ``"both"`` compares each of the 2B
-            views with the other 2B - 1 (SimCLR).
-        valid: ``[B]`` bool; rows that are False do not count, but their positives stay as negatives. Rows of both
-            views for ``"both"``.
+        negatives: ``"positives"`` compares each anchor with all B positives (ATC); ``"both"`` compares each
+            of the 2B views with the other 2B - 1 (SimCLR).
+        valid: ``[B]`` bool; rows that are False do not count, but their positives stay as negatives. Rows of
+            both views for ``"both"``.
         reduction: over the rows; the mean is over valid rows, 0 if there is none.
 
     Returns:
-        Scalar; for ``"none"`` ``[B]``, or ``[2B]`` for ``negatives="both"``, zero where invalid. Non-negative, nats.
+        Scalar; for ``"none"`` ``[B]``, or ``[2B]`` for ``negatives="both"``, zero where invalid.
+        Non-negative, nats.
 
     Raises:
         ValueError: unknown ``negatives``.
@@ -237,12 +239,12 @@ def becl_loss(
     eps: float = 1e-6,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    r"""Behaviour contrastive loss (BeCL, Rooshy-yang/BeCL ``agent/becl.py``); its reward is ``exp(-loss)`` per row.
+    r"""Behaviour contrastive loss (Rooshy-yang/BeCL ``agent/becl.py``); the reward is ``exp(-loss)`` per row.
 
-    Features are l2-normalised. Row i has one positive: the first other row with the same skill, or, where no other
-    row has it, the first other row, as in the released code.
-    :math:`\ell_i = -\log(pos_i / (\sum_{j\ne i} e^{s_{ij}} + \epsilon) + \epsilon)`, similarities over the temperature
-    with the row's maximum subtracted.
+    Features are l2-normalised. Row i has one positive: the first other row with the same skill, or, where no
+    other row has it, the first other row, as in the released code.
+    :math:`\ell_i = -\log(pos_i / (\sum_{j\ne i} e^{s_{ij}} + \epsilon) + \epsilon)`, similarities over the
+    temperature with the row's maximum subtracted.
 
     Args:
         features: ``[B, D]``, B at least 2.

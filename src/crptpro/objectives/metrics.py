@@ -22,6 +22,8 @@ def assignment_entropy(assignments: Tensor) -> Tensor:
 def prototypes_in_use(assignments: Tensor) -> Tensor:
     """Number of prototypes that are the largest assignment of at least one sample, as a float scalar.
 
+    In a collapsed run all assignments tie and the count is rounding; read it beside the entropy.
+
     Args:
         assignments: ``[B, M]``.
     """
@@ -56,8 +58,8 @@ def prototype_ane(prototypes: Tensor) -> Tensor:
 def prototype_kne(prototypes: Tensor, *, k: int = 3) -> Tensor:
     """Mean over prototypes of the cosine to the k-th nearest other prototype (the paper's KNE).
 
-    The paper does not state k. With k = 3, 512 spread vectors in 128 dimensions give about +0.2; its negative values
-    only fit a median-like k near M / 2.
+    The paper does not state k. With k = 3, 512 spread vectors in 128 dimensions give about +0.2; its negative
+    values only fit a median-like k near M / 2.
 
     Args:
         prototypes: ``[M, D]`` unit rows.

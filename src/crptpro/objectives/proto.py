@@ -1,8 +1,8 @@
-"""CRPTpro's self-supervised loss: swapped prototype prediction across one time step, plus prototype dispersion."""
+"""CRPTpro's self-supervised loss: prototype prediction across one time step, and prototype dispersion."""
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import torch
 import torch.nn.functional as F
@@ -22,7 +22,7 @@ from crptpro.objectives.functional import (
 
 
 class ProtoLoss(PretrainingLoss):
-    r"""Prototype representation learning of CRPTpro (arXiv 2302.05614, Sec. III; liuxin0824/CRPTpro ``proto.py``).
+    r"""Prototype representation learning of CRPTpro (arXiv 2302.05614; liuxin0824/CRPTpro ``proto.py``).
 
     :math:`L = L_{comp} + \alpha L_{intr}` with
 
@@ -30,15 +30,15 @@ class ProtoLoss(PretrainingLoss):
       :math:`\hat z' = g_{\bar\theta}(f_{\bar\theta}(x_{t+1}))/\|\cdot\|` (no gradient),
     * :math:`L_{comp} = -\frac1B\sum_i q_i\cdot\log\mathrm{softmax}(\hat u_i C^T/\tau)`,
       :math:`q = \mathrm{sinkhorn}(\hat z' C^T)` (no gradient),
-    * :math:`L_{intr}` the prototype dispersion of :func:`~crptpro.objectives.functional.prototype_dispersion`.
+    * :math:`L_{intr}` = :func:`~crptpro.objectives.functional.prototype_dispersion` of the prototypes.
 
-    ``loss_comp`` that stays at ln M (6.238 for 512 prototypes), or ``embedding_cosine`` that stays near 1, is a dead
-    run. Images must already be augmented. Normalisation, softmax and Sinkhorn always run in float32 or wider.
-    Non-finite weights or latents propagate to the loss; the training loop raises
+    ``loss_comp`` that stays at ln M (6.238 for 512 prototypes), or ``embedding_cosine`` that stays near 1, is
+    a dead run. Images must already be augmented. Normalisation, softmax and Sinkhorn always run in float32 or
+    wider. Non-finite weights or latents propagate to the loss; the training loop raises
     :class:`~crptpro.errors.NonFiniteError`. A batch of one is legal and uninformative (uniform assignments).
 
-    Call :meth:`before_update` before each forward of a training loop: it keeps the prototype rows at unit length, as
-    the released code does in place. ``forward`` itself never writes to a parameter.
+    Call :meth:`before_update` before each forward of a training loop: it keeps the prototype rows at unit
+    length, as the released code does in place. ``forward`` itself never writes to a parameter.
 
     Args:
         encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
@@ -58,9 +58,9 @@ class ProtoLoss(PretrainingLoss):
         reduction: of ``loss_comp`` over the batch; ``loss_intr`` has no batch and stays a scalar.
 
     Returns (``forward``):
-        Scalars ``loss_comp`` and ``loss_intr`` (already times alpha; their sum is minimised) and, detached, ``comp``,
-        ``intr`` (without alpha), ``assignment_entropy`` (nats), ``prototypes_in_use`` (count), ``embedding_cosine``
-        (mean pairwise cosine of the online latents), ``prototype_ane``.
+        Scalars ``loss_comp`` and ``loss_intr`` (already times alpha; their sum is minimised) and, detached,
+        ``comp``, ``intr`` (without alpha), ``assignment_entropy`` (nats), ``prototypes_in_use`` (count),
+        ``embedding_cosine`` (mean pairwise cosine of the online latents), ``prototype_ane``.
 
     Examples:
         >>> from crptpro.modules import PixelEncoder
@@ -121,7 +121,7 @@ class ProtoLoss(PretrainingLoss):
         super().__init__(reduction=reduction)
         _check_options(offset, intr_reduction, temperature, assignment_temperature, sinkhorn_iterations)
         if projector is None:
-            projector = Projector(encoder.feature_dim, latent_dim)
+            projector = Projector(cast(int, encoder.feature_dim), latent_dim)
         if predictor is None:
             predictor = Predictor(latent_dim, hidden_dim)
         if prototypes is None:
@@ -151,9 +151,10 @@ class ProtoLoss(PretrainingLoss):
         pixels, next_pixels, valid, lead = self._read_pair(tensordict)
         latents, predictions = self._online(pixels)
         targets = self._target(next_pixels)
-        # Float32 also inside a caller's autocast region.
+        # The prototypes' precision from here on, also in a caller's autocast region or after a half-precision head.
         with torch.autocast(device_type=latents.device.type, enabled=False):
             unit = self._unit_prototypes()
+            latents, predictions, targets = (x.to(unit.dtype) for x in (latents, predictions, targets))
             assignments = self._assign(targets, unit.detach())
             scores = F.normalize(predictions, dim=-1) @ unit.T  # (B, D) x (D, M) -> (B, M)
             rows = comparative_loss(scores, assignments, temperature=self.temperature, reduction="none")
@@ -211,7 +212,9 @@ def _check_options(
     if not offset > 1:
         raise ValueError(f"offset must exceed 1, the largest negative cosine, got {offset}.")
     if intr_reduction not in ("mean_all", "sum", "mean_offdiag"):
-        raise ValueError(f"intr_reduction must be 'mean_all', 'sum' or 'mean_offdiag', got {intr_reduction!r}.")
+        raise ValueError(
+            f"intr_reduction must be 'mean_all', 'sum' or 'mean_offdiag', got {intr_reduction!r}."
+        )
     for name, value in (("temperature", temperature), ("assignment_temperature", assignment_temperature)):
         if value is not None and not value > 0:
             raise ValueError(f"{name} must be positive, got {value}.")

@@ -15,6 +15,8 @@ from torchrl.objectives import SACLoss, ValueEstimators
 
 from crptpro.modules import SquashedGaussianActor, TwinCritic
 from crptpro.modules.distributions import SquashedGaussian
+from crptpro.objectives.base import valid_rows
+from crptpro.objectives.functional import reduce_batch
 
 
 class RADSACLoss(SACLoss):
@@ -27,19 +29,20 @@ class RADSACLoss(SACLoss):
     * ``loss_actor`` = mean(alpha log pi(a|h) - min(Q1, Q2)(h, a)), gradient to the actor only;
     * ``loss_alpha`` = mean(exp(log_alpha) * sg(-log pi - target_entropy)), gradient to ``log_alpha`` only.
 
-    Features never receive a gradient. What differs from ``SACLoss``: squared error; the temperature loss of the
-    released code (not its logarithm); the log-std squash and pre-tanh log-probability of
-    :class:`~crptpro.modules.SquashedGaussianActor`; one trunk under both Q heads, so the critic is one network with two
-    outputs instead of a stack of two; and the separate steps :meth:`critic_loss` and :meth:`actor_and_temperature_loss`,
-    because the actor, the temperature and the target are updated every second time, against the critic just stepped::
+    Features never receive a gradient. What differs from ``SACLoss``: squared error; the temperature loss of
+    the released code (not its logarithm); the log-std squash and pre-tanh log-probability of
+    :class:`~crptpro.modules.SquashedGaussianActor`; one trunk under both Q heads, so the critic is one
+    network with two outputs instead of a stack of two; and the separate steps :meth:`critic_loss` and
+    :meth:`actor_and_temperature_loss`, because the actor, the temperature and the target are updated every
+    second time, against the critic just stepped::
 
         loss.critic_loss(td)["loss_qvalue"].backward(); critic_optimizer.step()
         if update % 2 == 0:
             out = loss.actor_and_temperature_loss(td)   # backward each, step both
             target_updater.step()                       # SoftUpdate(loss, tau=0.01)
 
-    Deviation: the released code bootstraps with 0.99 always. Here ``terminated`` cuts the bootstrap and ``truncated``
-    does not, which is the same for every DeepMind Control task.
+    Deviation: the released code bootstraps with 0.99 always. Here ``terminated`` cuts the bootstrap and
+    ``truncated`` does not, which is the same for every DeepMind Control task.
 
     Args:
         actor: on features.
@@ -47,25 +50,25 @@ class RADSACLoss(SACLoss):
         gamma: discount per agent step.
         alpha_init: initial temperature.
         target_entropy: in nats; None for minus the action dimension.
-        observation: key of the features; also read under ``"next"``. Change it, and the keys of action, reward,
-            done and terminated, with ``set_keys``.
-        generator: source of all action noise; torch's global generator if None. Not part of the state dictionary.
+        observation: key of the features; also read under ``"next"``. Change it, and the keys of action,
+            reward, done and terminated, with ``set_keys``.
+        generator: source of all action noise; torch's global generator if None. Not part of the state
+            dictionary.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (per-row losses).
 
     Returns (``forward``):
-        ``loss_actor``, ``loss_qvalue``, ``loss_alpha`` and, detached scalars, ``alpha``, ``entropy`` (-log pi, nats),
-        ``q_mean``, ``target_q_mean``, ``td_error`` (mean absolute). Non-finite input propagates; the training loop
-        checks. Batches of any shape, one row included.
+        ``loss_actor``, ``loss_qvalue``, ``loss_alpha`` and, detached scalars, ``alpha``, ``entropy`` (-log
+        pi, nats), ``q_mean``, ``target_q_mean``, ``td_error`` (mean absolute). Non-finite input propagates;
+        the training loop checks. Batches of any shape, one row included.
 
     Examples:
         >>> actor = SquashedGaussianActor(6, 2, hidden_dim=8)
         >>> loss = RADSACLoss(actor, TwinCritic(6, 2, hidden_dim=8))
         >>> from torchrl.objectives import SoftUpdate
         >>> updater = SoftUpdate(loss, tau=0.01)
-        >>> def step():
-        ...     done = torch.zeros(4, 1, dtype=torch.bool)
-        ...     return {"features": torch.randn(4, 6), "reward": torch.ones(4, 1), "done": done, "terminated": done}
-        >>> td = TensorDict({"features": torch.randn(4, 6), "action": torch.zeros(4, 2), "next": step()}, [4])
+        >>> h, reward, done = torch.randn(4, 6), torch.ones(4, 1), torch.zeros(4, 1, dtype=torch.bool)
+        >>> after = {"features": h, "reward": reward, "done": done, "terminated": done}
+        >>> td = TensorDict({"features": h, "action": torch.zeros(4, 2), "next": after}, [4])
         >>> loss(td)["loss_qvalue"].shape
         torch.Size([])
     """
@@ -82,6 +85,7 @@ class RADSACLoss(SACLoss):
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
+    _out_keys: list[NestedKey] | None
 
     default_out_keys = (
         "loss_actor",
@@ -116,8 +120,8 @@ class RADSACLoss(SACLoss):
         super().__init__(
             policy,
             TensorDictModule(critic, in_keys=[observation, "action"], out_keys=["state_action_value"]),
-            # Not 1 or 2: any count makes SACLoss stack the parameters into new ones, and for a single module draw them
-            # anew, losing the orthogonal initialisation and the identity with ``critic``.
+            # Not 1 or 2: any count makes SACLoss stack the parameters into new ones, and for a single module
+            # draw them anew, losing the orthogonal initialisation and the identity with ``critic``.
             num_qvalue_nets=0,
             loss_function="l2",
             alpha_init=alpha_init,
@@ -151,13 +155,14 @@ class RADSACLoss(SACLoss):
         return critic.update(self.actor_and_temperature_loss(tensordict)).select(*self.default_out_keys)
 
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not written to."""
+        """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not changed."""
         loss, metadata = self.qvalue_v2_loss(tensordict)
+        valid = valid_rows(self, tensordict)
         out = {
             "loss_qvalue": loss,
-            "q_mean": metadata["q"].mean(),
-            "target_q_mean": metadata["target_q"].mean(),
-            "td_error": metadata["td_error"].mean(),
+            "q_mean": _mean_of_rows(metadata["q"].mean(-1), valid),
+            "target_q_mean": _mean_of_rows(metadata["target_q"], valid),
+            "td_error": _mean_of_rows(metadata["td_error"], valid),
         }
         return TensorDict(out, batch_size=[])
 
@@ -171,15 +176,18 @@ class RADSACLoss(SACLoss):
             "loss_actor": loss_actor,
             "loss_alpha": loss_alpha,
             "alpha": self._alpha,
-            "entropy": -log_prob.mean(),
+            "entropy": -_mean_of_rows(log_prob, valid_rows(self, tensordict)),
         }
         return TensorDict(out, batch_size=[])
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Critic loss and detached per-row metadata (``td_error``, ``q``, ``target_q``)."""
+        tensordict = self._without_masked_values(tensordict)
         target = self._compute_target_v2(tensordict)  # (B,)
         with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
-            values = self.critic(self._features(tensordict), tensordict.get(self.tensor_keys.action))  # (B, 2)
+            values = self.critic(
+                self._features(tensordict), tensordict.get(self.tensor_keys.action)
+            )  # (B, 2)
         errors = values - target.unsqueeze(-1)
         # Sum over the two heads of the mean over the batch.
         loss = self._reduce_loss(
@@ -192,6 +200,7 @@ class RADSACLoss(SACLoss):
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Actor loss and the detached log-probability of its actions."""
+        tensordict = self._without_masked_values(tensordict)
         features = self._features(tensordict)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             action, log_prob = self.actor.sample(features, generator=self.generator)
@@ -225,6 +234,24 @@ class RADSACLoss(SACLoss):
     def _features(self, tensordict: TensorDictBase) -> Tensor:
         return tensordict.get(self.tensor_keys.observation).detach()
 
+    def _make_vmap(self) -> None:
+        # SACLoss vectorises over a stack of critics; here there is one, and the vmap closure cannot be pickled.
+        pass
+
+    def _without_masked_values(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The batch with zeros in masked rows: a NaN there would survive a zero weight in the backward."""
+        valid = valid_rows(self, tensordict)
+        if valid is None:
+            return tensordict
+        clean = tensordict.copy()
+        for key in self.in_keys:
+            value = tensordict.get(key, None)
+            if value is not None:
+                flat = value.reshape(valid.shape[0], -1)
+                flat = torch.where(valid.unsqueeze(-1), flat, torch.zeros_like(flat))
+                clean.set(key, flat.reshape(value.shape))
+        return clean
+
     def _set_in_keys(self) -> None:
         keys = self.tensor_keys
         following = (keys.observation, keys.reward, keys.done, keys.terminated)
@@ -242,10 +269,15 @@ class RADSACLoss(SACLoss):
 
     @torch.no_grad()
     def reset_parameters_recursive(self) -> None:
-        """Re-initialise actor and critic, copy the critic into its target, and restore the initial temperature."""
+        """Re-initialise actor and critic, copy the critic into its target, restore the first temperature."""
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             self.actor.reset_parameters()
         with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
             self.critic.reset_parameters()
         self.target_qvalue_network_params.data.update_(self.qvalue_network_params.data)
         self.log_alpha.copy_(self.alpha_init.log())
+
+
+def _mean_of_rows(values: Tensor, valid: Tensor | None) -> Tensor:
+    """Mean over the rows that count, of any batch shape."""
+    return reduce_batch(values.reshape(-1), "mean", valid)

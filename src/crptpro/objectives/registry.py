@@ -69,7 +69,8 @@ class Method:
     def build(self, encoder: nn.Module, **options: Any) -> LossModule:
         """Build the loss on ``encoder``; ``options`` override the preset's own.
 
-        The result remembers this method's name, so that :func:`method_defaults` returns this method's defaults.
+        The result remembers this method's name, so that :func:`method_defaults` returns this method's
+        defaults.
         """
         loss = self.loss_class(encoder, **{**self.loss_options, **options})
         loss.method_name = self.name
@@ -104,7 +105,9 @@ def register_method(
     """
     taken = _METHODS.get(name)
     if taken is not None and taken.loss_class is not loss_class:
-        raise ValueError(f"The method {name!r} is already registered for {taken.loss_class.__name__}; choose another.")
+        raise ValueError(
+            f"The method {name!r} is already registered for {taken.loss_class.__name__}; choose another."
+        )
     method = Method(name, loss_class, defaults or MethodDefaults(), dict(loss_options or {}), is_preset)
     _METHODS[name] = method
     return method
@@ -135,8 +138,8 @@ def methods(*, presets: bool = False) -> list[str]:
 def method_defaults(loss: LossModule | type[LossModule]) -> MethodDefaults:
     """Training defaults of a loss, its class, or the nearest registered base class.
 
-    A loss built by name has that method's defaults. A user's own, unregistered loss gets the generic ones, with
-    ``encoder_tau`` None if it has no target networks.
+    A loss built by name has that method's defaults. A user's own, unregistered loss gets the generic ones,
+    with ``encoder_tau`` None if it has no target networks.
     """
     named = _METHODS.get(getattr(loss, "method_name", None) or "")
     loss_class = loss if isinstance(loss, type) else type(loss)

@@ -62,12 +62,16 @@ def load_agent(path: str | Path) -> tuple[PixelAgent, dict[str, Any]]:
     Raises:
         CheckpointError: if the directory is missing, damaged, or not an agent.
     """
-    card, tensors = read_artifact(path, format_name=AGENT_FORMAT, version=AGENT_VERSION, error=CheckpointError)
+    card, tensors = read_artifact(
+        path, format_name=AGENT_FORMAT, version=AGENT_VERSION, error=CheckpointError
+    )
     encoder = PixelEncoder(**card["modules"]["encoder"])
     actor = SquashedGaussianActor(**card["modules"]["actor"])
     for name, module in (("encoder", encoder), ("actor", actor)):
         prefix = f"{name}."
-        module.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
+        module.load_state_dict(
+            {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+        )
         module.requires_grad_(False).eval()
     return PixelAgent(encoder, actor), card
 

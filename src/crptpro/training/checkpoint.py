@@ -14,9 +14,11 @@ import logging
 import numbers
 import os
 import re
+import signal
+import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 import torch
 
@@ -72,11 +74,11 @@ class CheckpointDir:
             DiskSpaceError: if the disk or quota is full. Earlier checkpoints are untouched.
         """
         plain = _plain(state, "state")
-        self._make_directory()
-        for leftover in self.path.glob(f"{_PARTIAL}*"):
-            leftover.unlink(missing_ok=True)
         partial = self.path / f"{_PARTIAL}{os.getpid()}"
         try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            for leftover in self.path.glob(f"{_PARTIAL}*"):
+                leftover.unlink(missing_ok=True)
             digest = self._write(plain, partial)
             if _sha256(partial) != digest:
                 raise CheckpointError(f"{partial} does not read back as it was written; check the disk.")
@@ -120,11 +122,6 @@ class CheckpointDir:
         entries = self._entries()
         return entries[-1][0] if entries else None
 
-    def clear(self) -> None:
-        """Remove every checkpoint of this directory, newest last, and nothing else."""
-        for _, _, path in self._entries():
-            path.unlink(missing_ok=True)
-
     def _entries(self) -> list[tuple[int, str, Path]]:
         """(counter, sha256, path), oldest first; the file time orders two files of one counter."""
         found = []
@@ -140,17 +137,11 @@ class CheckpointDir:
             if path not in keep:
                 path.unlink(missing_ok=True)
 
-    def _make_directory(self) -> None:
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-        except OSError as reason:
-            raise self._write_error(reason) from reason
-
     @staticmethod
     def _write(state: dict[str, Any], path: Path) -> str:
         with open(path, "wb") as file:
             writer = _HashingWriter(file)
-            torch.save(state, writer)
+            torch.save(state, cast(IO[bytes], writer))  # it needs nothing but write and flush
             if writer.error is not None:
                 raise writer.error
             file.flush()
@@ -213,6 +204,42 @@ def exclusive(directory: str | Path) -> Iterator[None]:
         except (ImportError, OSError):  # not POSIX, or a file system without locks: run unguarded
             pass
         yield
+
+
+class StopRequest:
+    """While active, Ctrl-C and SIGTERM ask the loop to stop between two updates instead of tearing one.
+
+    A second Ctrl-C stops at once. Outside the main thread, where Python delivers no signals, it does nothing.
+
+    Attributes:
+        signal: the signal received, or ``None``.
+    """
+
+    def __init__(self) -> None:
+        self.signal: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> StopRequest:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._receive)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        self._before = {}
+
+    def leave(self) -> None:
+        """End the program the way the signal would have: KeyboardInterrupt, or exit status 143."""
+        if self.signal == signal.SIGTERM:
+            raise SystemExit(128 + signal.SIGTERM)
+        raise KeyboardInterrupt
+
+    def _receive(self, number: int, frame: object) -> None:
+        if self.signal is not None:
+            raise KeyboardInterrupt
+        self.signal = number
 
 
 def sync_directory(path: Path) -> None:

@@ -15,7 +15,7 @@ class DownstreamConfig:
     """
 
     env_steps: int = 500_000
-    """budget in simulator steps; episodes are whole, so the last one may end a little later"""
+    """budget in simulator steps; an episode still running then is cut"""
     action_repeat: int = 2
     """simulator steps per decision"""
     seed: int = 0

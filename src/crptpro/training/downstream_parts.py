@@ -11,7 +11,6 @@ from typing import Literal
 import torch
 from torchrl.envs import EnvBase
 
-from crptpro.cards import require_disk
 from crptpro.data import FrameReplay
 from crptpro.modules import (
     PixelEncoder,
@@ -83,7 +82,7 @@ def build_parts(
     )
 
     replay = _build_replay(env, config, generators["replay"], run_dir)
-    observations = min(replay.live_rows, _agent_steps(config))
+    observations = min(replay.window, _agent_steps(config))
     mode, reason = choose_feature_mode(
         config.features, pretrained.encoder, observations, dtype, pad=config.shift_pad, device=config.device
     )
@@ -107,8 +106,6 @@ def _build_replay(
     # A checkpoint holds cursors, not frames: whatever it refers to must outlive the next one, and the one after
     # that while it is being written.
     slack = 2 * (config.checkpoint_interval_env_steps // config.action_repeat) + 2_000
-    stored = min(config.replay_capacity + slack, _agent_steps(config))
-    require_disk(run_dir, stored * 3 * height * width, f"the replay of {stored:,} observations")
     replay = FrameReplay(
         config.replay_capacity,
         frame_shape=(3, height, width),

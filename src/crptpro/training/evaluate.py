@@ -67,7 +67,9 @@ def evaluate(
         raise ValueError(f"`episodes` must be at least 1, got {episodes}.")
     results: list[Episode] = []
     videos: list[Tensor] = []
-    bar = tqdm(range(episodes), desc="evaluate", unit="episode", leave=False, disable=None if progress else True)
+    bar = tqdm(
+        range(episodes), desc="evaluate", unit="episode", leave=False, disable=None if progress else True
+    )
     for episode in bar:
         episode_seed = derive_seed(seed, "episode", episode)
         env.set_seed(episode_seed)

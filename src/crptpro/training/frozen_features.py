@@ -43,28 +43,34 @@ class FrozenFeatures:
         self.cache: DenseShiftCache | None = None
         if mode == "dense":
             self.cache = DenseShiftCache(
-                encoder, replay.live_rows, pad=pad, dtype=encoder.compute_dtype, device=device
+                encoder, replay.window, pad=pad, dtype=encoder.compute_dtype, device=device
             )
         self.shifted = DenseShiftFeatures(
-            self.cache, mode=mode, encoder=encoder, pad=pad, generator=generator, reuse_output=True
+            self.cache,
+            mode=mode,
+            encoder=encoder,
+            pad=pad,
+            slot_keys=("cache_slot", ("next", "cache_slot")),
+            generator=generator,
+            reuse_output=True,
         )
 
     @torch.no_grad()
-    def observe(self, pixels: Tensor, row: int) -> Tensor:
+    def observe(self, pixels: Tensor, slot: int) -> Tensor:
         """Take in the observation that was just stored and return its un-shifted features.
 
         Args:
             pixels: uint8 ``[C, H, W]``.
-            row: its row in the replay, as counted since the start of the run.
+            slot: where the replay stored its newest frame.
 
         Returns:
             ``[1, feature_dim]``.
         """
         if self.cache is None:
             return self.encoder(pixels.unsqueeze(0).to(self.device))
-        slot = row % self.cache.slots
-        self.cache.write(slot, pixels)
-        return self.cache.center(torch.tensor([slot]))
+        rows = self._cache_slots(torch.tensor([slot]))
+        self.cache.write(rows, pixels.unsqueeze(0))
+        return self.cache.center(rows)
 
     def sample(self, batch_size: int) -> TensorDictBase:
         """Sample transitions with ``features`` and ``("next", "features")``, each observation under its own shift.
@@ -75,8 +81,8 @@ class FrozenFeatures:
         if self.cache is None:
             batch = batch.to(self.device)
         else:
-            for key in ("rows", ("next", "rows")):
-                batch.set(key, batch.get(key) % self.cache.slots)
+            batch.set("cache_slot", self._cache_slots(batch["row"]))
+            batch.set(("next", "cache_slot"), self._cache_slots(batch["next", "row"]))
         return self.shifted(batch)
 
     def rebuild(self, *, progress: bool = True) -> None:
@@ -86,6 +92,14 @@ class FrozenFeatures:
         """
         if self.cache is None:
             return
-        rows = self.replay.stored_rows()
-        for row in tqdm(rows, desc="encode replay", unit="obs", leave=False, disable=None if progress else True):
-            self.cache.write(row % self.cache.slots, self.replay.observation(row))
+        slots = self.replay.live_slots().tolist()
+        for slot in tqdm(
+            slots, desc="encode replay", unit="obs", leave=False, disable=None if progress else True
+        ):
+            one = torch.tensor([slot])
+            self.cache.write(self._cache_slots(one), self.replay.observations_at(one))
+
+    def _cache_slots(self, slots: Tensor) -> Tensor:
+        # Live observations are among the newest `window` rows, so their numbers differ modulo `window`. The ring
+        # itself is longer by its slack, for which no maps are kept.
+        return self.replay.numbers_at(slots) % self.replay.window

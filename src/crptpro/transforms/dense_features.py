@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -58,9 +59,9 @@ class DenseShiftFeatures(Transform):
         encoder: nn.Module | None = None,
         projector: nn.Module | None = None,
         pad: int = 4,
-        slot_keys: NestedKey | list[NestedKey] = SLOT_KEYS,
-        pixel_keys: NestedKey | list[NestedKey] = PIXEL_KEYS,
-        out_keys: NestedKey | list[NestedKey] = FEATURE_KEYS,
+        slot_keys: NestedKey | Sequence[NestedKey] = SLOT_KEYS,
+        pixel_keys: NestedKey | Sequence[NestedKey] = PIXEL_KEYS,
+        out_keys: NestedKey | Sequence[NestedKey] = FEATURE_KEYS,
         embedding_keys: list[NestedKey | None] | None = None,
         features_dtype: torch.dtype | None = None,
         reuse_output: bool = False,

@@ -173,6 +173,8 @@ def crop_rows(
         )
     if maps.device.type != "cpu":
         return _crop_by_index(maps, rows, offsets, phases, (extra + 1, height, width), out)
+    # Channels first although channels last would copy in longer runs: the features must come in (C, H, W)
+    # order, and turning a batch around costs three times the whole copy.
     crops = empty_on_huge_pages(shape, maps.dtype) if out is None else out
     source = as_numpy_bits(maps)
     target = as_numpy_bits(crops).reshape(batch, channels, height, width)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
@@ -42,8 +44,8 @@ class FrozenEncoder(ModuleTransform):
         self,
         encoder: nn.Module,
         *,
-        in_keys: NestedKey | list[NestedKey] = "pixels",
-        out_keys: NestedKey | list[NestedKey] = "features",
+        in_keys: NestedKey | Sequence[NestedKey] = "pixels",
+        out_keys: NestedKey | Sequence[NestedKey] = "features",
     ) -> None:
         in_keys, out_keys = as_key_list(in_keys), as_key_list(out_keys)
         if len(in_keys) != len(out_keys):

@@ -23,10 +23,16 @@ def without_next(key: NestedKey) -> NestedKey:
 
 
 def as_key_list(keys: NestedKey | Sequence[NestedKey]) -> list[NestedKey]:
-    """Return a list of keys. As in TorchRL, a string or a tuple is one (nested) key and a list is several.
+    """Return a list of keys.
+
+    As in TorchRL, a string or a tuple of strings is one (nested) key and a list is several. A tuple that
+    holds tuples can only be meant as several.
 
     Examples:
         >>> as_key_list(("next", "pixels"))
         [('next', 'pixels')]
+        >>> as_key_list(("pixels", ("next", "pixels")))
+        ['pixels', ('next', 'pixels')]
     """
-    return [unravel_key(key) for key in (keys if isinstance(keys, list) else [keys])]
+    is_one = isinstance(keys, str) or (isinstance(keys, tuple) and all(isinstance(k, str) for k in keys))
+    return [unravel_key(key) for key in ([keys] if is_one else keys)]

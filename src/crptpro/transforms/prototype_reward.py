@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -83,8 +84,8 @@ class PrototypeReward(Transform):
         candidate_temperature: float = 1.0,
         knn_exclude_self: bool = False,
         reward_norm: Literal["rms"] | None = None,
-        in_keys: NestedKey | list[NestedKey] = "features",
-        out_keys: NestedKey | list[NestedKey] = "intrinsic_reward",
+        in_keys: NestedKey | Sequence[NestedKey] = "features",
+        out_keys: NestedKey | Sequence[NestedKey] = "intrinsic_reward",
         reward_key: NestedKey | None = "reward",
         out_reward_key: NestedKey | None = None,
         queue: Tensor | None = None,
@@ -172,9 +173,11 @@ class PrototypeReward(Transform):
         distances = torch.cdist(latents, self.queue)
         # Copies of a sample made by this call are infinitely far from it.
         distances[candidates, rows] = torch.inf
-        kth = distances.topk(self.knn_k, dim=-1, largest=False).values[:, -1]
+        nearest = distances.topk(self.knn_k, dim=-1, largest=False)
+        # The matrix product in cdist cannot resolve small distances: take this one again from the difference.
+        kth = (latents - self.queue[nearest.indices[:, -1]]).norm(dim=-1)
         # Too few other entries (tiny batches in a tiny queue): no estimate, no bonus.
-        return torch.where(kth.isinf(), torch.zeros_like(kth), kth)
+        return torch.where(nearest.values[:, -1].isinf(), torch.zeros_like(kth), kth)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add the bonus to a sampled batch, under ``"next"``.

@@ -145,8 +145,8 @@ class RandomShift(Transform):
     def __init__(
         self,
         pad: int = 4,
-        in_keys: NestedKey | list[NestedKey] | None = None,
-        out_keys: NestedKey | list[NestedKey] | None = None,
+        in_keys: NestedKey | Sequence[NestedKey] | None = None,
+        out_keys: NestedKey | Sequence[NestedKey] | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
         keys = DEFAULT_KEYS if in_keys is None else as_key_list(in_keys)

@@ -1,0 +1,305 @@
+"""The downstream loop: act, store, update; between episodes evaluate and checkpoint."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import step_mdp
+from tqdm.auto import tqdm
+
+from crptpro.errors import NonFiniteError
+from crptpro.loggers import RunLogger
+from crptpro.pretrained import Pretrained
+from crptpro.seeding import derive_seed, global_rng_state, seed_everything, set_global_rng_state
+from crptpro.training.agent import PixelAgent, save_agent
+from crptpro.training.checkpoint import CheckpointDir
+from crptpro.training.downstream_config import DownstreamConfig
+from crptpro.training.downstream_parts import Parts, build_parts
+from crptpro.training.evaluate import evaluate, summarize
+from crptpro.training.pretrain.fingerprint import require_same
+from crptpro.training.video import write_video
+
+logger = logging.getLogger(__name__)
+
+EnvFactory = Callable[..., EnvBase]
+
+DELAYED_METRICS = frozenset({"loss_actor", "loss_alpha", "alpha", "entropy"})
+"""Metrics that only the delayed updates report."""
+
+
+class DownstreamRun:
+    """One run: what it is made of, where it stands, and how it goes on.
+
+    Args:
+        task: what to learn.
+        pretrained: the frozen encoder, and prototypes for the bonus.
+        run_dir: replay, records, checkpoints and agent.
+        config: every number.
+        records: where metrics go.
+        progress: show bars.
+        env_factory: makes the environments.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        pretrained: Pretrained,
+        run_dir: Path,
+        config: DownstreamConfig,
+        records: RunLogger,
+        *,
+        progress: bool,
+        env_factory: EnvFactory,
+    ) -> None:
+        self.task, self.config, self.run_dir, self.progress = task, config, run_dir, progress
+        seed_everything(derive_seed(config.seed, "downstream"))
+        encoder = pretrained.encoder
+        settings = {
+            "quality": config.quality,
+            "action_repeat": config.action_repeat,
+            "image_size": encoder.image_size,
+            "frame_stack": encoder.in_channels // 3,
+        }
+        self.env = env_factory(task, seed=config.seed, **settings)
+        self.make_eval_env = lambda: env_factory(task, seed=config.seed, **settings)
+        self.eval_env: EnvBase | None = None
+        self.generators = {
+            name: torch.Generator().manual_seed(derive_seed(config.seed, "downstream", name))
+            for name in ("replay", "shift", "bonus", "policy", "random_actions")
+        }
+        self.parts: Parts = build_parts(pretrained, self.env, config, self.generators, run_dir)
+        self.records = records
+        self.pretrained_identity = pretrained.identity()
+        self.agent_steps = self.updates = self.episodes = 0
+        self.last_eval = -1
+        self.next_eval, self.next_checkpoint = 0, config.checkpoint_interval_env_steps
+        self.sums: dict[str, Tensor] = {}
+        self.summed_updates = 0
+
+    @property
+    def env_steps(self) -> int:
+        return self.agent_steps * self.config.action_repeat
+
+    # --- the loop -----------------------------------------------------------------------------------------------
+
+    def train(self, checkpoints: CheckpointDir | None) -> None:
+        """Alternate evaluations, checkpoints and episodes until the budget is spent."""
+        config = self.config
+        bar = tqdm(
+            total=config.env_steps,
+            initial=self.env_steps,
+            desc=self.task,
+            unit="env step",
+            leave=False,
+            disable=None if self.progress else True,
+        )
+        try:
+            while True:
+                is_finished = self.env_steps >= config.env_steps
+                is_new = self.last_eval != self.env_steps
+                if is_new and (self.env_steps >= self.next_eval or is_finished):
+                    self.evaluate()
+                    self.last_eval = self.env_steps
+                    self.next_eval = self._after(config.eval_interval_env_steps)
+                if checkpoints is not None and (
+                    self.env_steps >= self.next_checkpoint or (is_finished and is_new)
+                ):
+                    self.next_checkpoint = self._after(config.checkpoint_interval_env_steps)
+                    self.save(checkpoints)
+                if is_finished:
+                    return
+                self.run_episode(bar)
+        finally:
+            bar.close()
+
+    def _after(self, interval: int) -> int:
+        return (self.env_steps // interval + 1) * interval
+
+    def run_episode(self, bar: tqdm) -> None:
+        """Act for one episode, or to the end of the budget, with one update per decision."""
+        config, parts = self.config, self.parts
+        self.env.set_seed(derive_seed(config.seed, "downstream", "episode", self.episodes))
+        observation = self.env.reset()
+        slot = parts.replay.begin_episode(observation["pixels"][-3:])
+        features = parts.features.observe(observation["pixels"], slot)
+        episode_return, agent_steps, done = 0.0, 0, False
+        while not done and self.env_steps < config.env_steps:
+            action = self.act(features)
+            if self.agent_steps >= config.random_agent_steps:
+                self.update()
+            observation["action"] = action
+            transition = self.env.step(observation)
+            following = transition["next"]
+            slot = parts.replay.append(
+                action,
+                following["reward"],
+                following["terminated"],
+                following["truncated"],
+                following["pixels"][-3:],
+            )
+            features = parts.features.observe(following["pixels"], slot)
+            episode_return += following["reward"].item()
+            agent_steps += 1
+            self.agent_steps += 1
+            done = bool(following["done"].item())
+            observation = step_mdp(transition)
+            bar.update(config.action_repeat)
+            if self.env_steps % config.log_interval_env_steps < config.action_repeat:
+                self.log_training()
+        self.episodes += 1
+        row = {"episode_return": episode_return, "episode_agent_steps": agent_steps}
+        self.records.log(row, stream="episodes", env_steps=self.env_steps, episodes=self.episodes)
+
+    @torch.no_grad()
+    def act(self, features: Tensor) -> Tensor:
+        """Return the next action: uniform at first, then a sample of the policy."""
+        if self.agent_steps < self.config.random_agent_steps:
+            shape = self.env.action_spec.shape
+            return torch.rand(shape, generator=self.generators["random_actions"]) * 2 - 1
+        action, _ = self.parts.actor.sample(features, generator=self.generators["policy"])
+        return action.squeeze(0).float().cpu().clamp(-1, 1)
+
+    def update(self) -> None:
+        """Sample, shift, encode, add the bonus, and let the learner step."""
+        parts = self.parts
+        batch: TensorDictBase = parts.features.sample(self.config.batch_size)
+        if parts.bonus is not None:
+            batch = parts.bonus(batch)
+        metrics = parts.learner.update(batch, agent_step=self.agent_steps)
+        if parts.bonus is not None:
+            metrics["intrinsic_reward"] = batch["next", "intrinsic_reward"].mean()
+        for key, value in metrics.items():
+            self.sums[key] = self.sums.get(key, 0) + value.detach()
+        self.summed_updates += 1
+        self.updates += 1
+
+    # --- records ------------------------------------------------------------------------------------------------
+
+    def log_training(self) -> None:
+        """Write the mean of every metric over the updates since the last row."""
+        if self.summed_updates == 0:
+            return
+        means = {}
+        for key, total in self.sums.items():
+            count = self.summed_updates
+            if key in DELAYED_METRICS:
+                count = max(1, count // self.config.actor_update_interval)
+            means[key] = (total / count).item()
+            if not math.isfinite(means[key]):
+                raise NonFiniteError(
+                    f"{key} became {means[key]} before update {self.updates} of {self.task}. The last checkpoint is "
+                    "kept; a smaller learning rate or precision='fp32' usually helps."
+                )
+        self.sums, self.summed_updates = {}, 0
+        self.records.log(means, stream="train", env_steps=self.env_steps, updates=self.updates)
+
+    def evaluate(self) -> None:
+        """Run whole deterministic episodes in an environment of their own and record each."""
+        config = self.config
+        self.eval_env = self.eval_env or self.make_eval_env()
+        episodes, videos = evaluate(
+            self.agent(),
+            self.eval_env,
+            episodes=config.eval_episodes,
+            seed=derive_seed(config.seed, "downstream", "evaluation", self.env_steps),
+            record_episodes=config.video_episodes,
+            progress=self.progress,
+        )
+        counters = {"env_steps": self.env_steps, "agent_steps": self.agent_steps, "updates": self.updates}
+        for e in episodes:
+            row = {"episode_return": e.episode_return, "episode_agent_steps": e.agent_steps, "seed": e.seed}
+            self.records.log(row, stream="eval", episode=e.episode, **counters)
+        for index, pictures in enumerate(videos):
+            path = self.run_dir / "videos" / f"env_steps_{self.env_steps:08d}_episode_{index}.mp4"
+            if write_video(pictures, path) is not None:
+                self.records.video("eval/video", path, env_steps=self.env_steps)
+        scores = summarize(episodes)
+        self.records.event(
+            f"{self.task}: {self.env_steps:,} env steps, {self.updates:,} updates, "
+            f"return {scores['mean']:.1f} ± {scores['std']:.1f} over {len(episodes)} episodes"
+        )
+
+    def agent(self) -> PixelAgent:
+        """Return the policy as it is now."""
+        return PixelAgent(self.parts.encoder, self.parts.actor)
+
+    def save_agent(self) -> Path:
+        """Write the agent as it is now, with a card."""
+        card = {
+            "task": self.task,
+            "env_steps": self.env_steps,
+            "config": dataclasses.asdict(self.config),
+            "pretrained": self.pretrained_identity,
+            "feature_mode": self.parts.feature_mode,
+        }
+        path = save_agent(self.run_dir / "agent", self.agent(), card=card)
+        self.records.artifact(path, name="agent", kind="agent")
+        return path
+
+    def close(self) -> None:
+        """Free the render contexts."""
+        for env in (self.env, self.eval_env):
+            if env is not None:
+                env.close()
+
+    # --- checkpoints --------------------------------------------------------------------------------------------
+
+    COUNTERS = ("agent_steps", "updates", "episodes", "last_eval", "next_eval", "next_checkpoint")
+
+    def fingerprint(self) -> dict[str, Any]:
+        """Return everything that must agree for a checkpoint to be continued; budgets may grow."""
+        settings = dataclasses.asdict(self.config)
+        for free in ("env_steps", "device"):
+            settings.pop(free)
+        return {"task": self.task, **settings, "pretrained": self.pretrained_identity}
+
+    def save(self, checkpoints: CheckpointDir) -> None:
+        """Write everything a resumed run needs; frames are already on disk, in the replay's own files."""
+        self.log_training()
+        state = {
+            "fingerprint": self.fingerprint(),
+            "counters": {name: getattr(self, name) for name in self.COUNTERS},
+            "learner": self.parts.learner.state_dict(),
+            "bonus": None if self.parts.bonus is None else self.parts.bonus.state_dict(),
+            "replay": self.parts.replay.state_dict(),
+            "generators": {name: generator.get_state() for name, generator in self.generators.items()},
+            "global_rng": global_rng_state(),
+            "records": self.records.state_dict(),
+        }
+        checkpoints.save(state, counter=self.agent_steps)
+
+    def resume(self, checkpoints: CheckpointDir) -> None:
+        """Continue from the newest checkpoint, if there is one.
+
+        Raises:
+            CheckpointError: if it belongs to a run with other settings.
+        """
+        state = checkpoints.load_latest()
+        if state is None:
+            return
+        require_same(state["fingerprint"], self.fingerprint(), self.run_dir)
+        for name, value in state["counters"].items():
+            setattr(self, name, value)
+        self.parts.learner.load_state_dict(state["learner"])
+        if self.parts.bonus is not None:
+            self.parts.bonus.load_state_dict(state["bonus"])
+        self.parts.replay.load_state_dict(state["replay"])
+        for name, generator in self.generators.items():
+            generator.set_state(state["generators"][name])
+        set_global_rng_state(state["global_rng"])
+        self.records.load_state_dict(state["records"])
+        if self.next_eval == -1 and self.env_steps < self.config.env_steps:
+            self.next_eval = self._after(
+                self.config.eval_interval_env_steps
+            )  # a finished run with a larger budget
+        logger.info("%s: continuing from %s env steps", self.task, f"{self.env_steps:,}")
+        self.parts.features.rebuild(progress=self.progress)

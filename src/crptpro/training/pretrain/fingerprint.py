@@ -1,0 +1,61 @@
+"""What must agree for a checkpoint to be continued, and the words for what does not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from crptpro.errors import CheckpointError
+
+
+def describe_loss(loss: LossModule) -> dict[str, Any]:
+    """Return a loss's class, plain options, coefficients and tensor shapes."""
+    described: dict[str, Any] = {"class": f"{type(loss).__module__}.{type(loss).__qualname__}"}
+    for name, value in sorted(vars(loss).items()):
+        if not name.startswith("_") and name != "training" and isinstance(value, (bool, int, float, str)):
+            described[name] = value
+    for name in sorted(getattr(loss, "_schedulable_buffers", ())):
+        value = getattr(loss, name, None)
+        described[name] = value.item() if isinstance(value, Tensor) and value.numel() == 1 else value
+    for name, value in loss.state_dict().items():
+        if isinstance(value, Tensor):
+            described[f"shape of {name}"] = f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
+    return {name: value for name, value in described.items() if not isinstance(value, Tensor)}
+
+
+def require_same(saved: Mapping[str, Any], now: Mapping[str, Any], where: Any) -> None:
+    """Refuse a checkpoint of other settings.
+
+    Raises:
+        CheckpointError: naming each setting that differs, with both values.
+    """
+    old, new = _flatten(saved), _flatten(now)
+    missing = "absent"
+    differing = [
+        f"{name} was {old.get(name, missing)!r}, now {new.get(name, missing)!r}"
+        for name in sorted({*old, *new})
+        if old.get(name, missing) != new.get(name, missing)
+    ]
+    if differing:
+        more = f" (and {len(differing) - 5} more)" if len(differing) > 5 else ""
+        raise CheckpointError(
+            f"{where} holds a run with other settings: {'; '.join(differing[:5])}{more}. "
+            "Use the same settings to continue it, or another run directory."
+        )
+
+
+def _flatten(value: Any, prefix: str = "") -> dict[str, Any]:
+    if isinstance(value, Mapping):
+        items = [(str(key), item) for key, item in value.items()]
+    elif isinstance(value, (list, tuple)):
+        items = [(f"[{index}]", item) for index, item in enumerate(value)]
+    else:
+        return {prefix: value}
+    flat: dict[str, Any] = {}
+    for key, item in items:
+        joiner = "" if key.startswith("[") or not prefix else "."
+        flat.update(_flatten(item, f"{prefix}{joiner}{key}"))
+    return flat

@@ -1,0 +1,195 @@
+"""One update of any pre-training loss: forward, checks, Adam, target networks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.objectives import LossModule, SoftUpdate
+
+from crptpro.errors import NonFiniteError
+from crptpro.objectives import MethodDefaults
+
+
+class Learner:
+    """Loss, optimiser and target updater of a run.
+
+    Args:
+        loss: sums its ``loss*`` entries.
+        defaults: Adam, schedule and clipping of the method.
+        learning_rate: peak learning rate.
+        encoder_tau: EMA rate of the targets, every update; ``None`` for none.
+        updates: length of the run, for the schedule.
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        defaults: MethodDefaults,
+        *,
+        learning_rate: float,
+        encoder_tau: float | None,
+        updates: int,
+    ) -> None:
+        self.loss = loss
+        self.defaults = defaults
+        self.learning_rate = learning_rate
+        self.encoder_tau = encoder_tau if has_targets(loss) else None
+        self.updates = updates
+        parameters = [p for p in loss.parameters() if p.requires_grad]
+        if not parameters:
+            raise ValueError(
+                f"{type(loss).__name__} has no parameters that require a gradient; nothing to train."
+            )
+        self.parameters = parameters
+        self.optimizer = torch.optim.Adam(
+            parameters,
+            lr=learning_rate,
+            betas=defaults.betas,
+            eps=defaults.eps,
+            weight_decay=defaults.weight_decay,
+            fused=True if parameters[0].is_cuda else None,
+        )
+        self.updater = None if self.encoder_tau is None else _keep_targets(loss, self.encoder_tau)
+        self.names: list[str] = []
+        self._loss_count = 0
+        # Reading a loss from a GPU would wait for it at every update; there, `check` looks at intervals.
+        self.is_deferred = parameters[0].device.type != "cpu"
+        self._first_bad: Tensor | None = None
+
+    def update(self, batch: TensorDictBase, *, index: int, domain: str) -> Tensor:
+        """Do update number ``index`` (from 0) and return the scalars of ``names`` as float64, on the device.
+
+        Raises:
+            NonFiniteError: on the CPU, before the weights change; on other devices :meth:`check` raises
+                later.
+        """
+        if callable(hook := getattr(self.loss, "before_update", None)):
+            hook()
+        out = self.loss(batch)
+        if not self.names:
+            self._name_outputs(out)
+        terms = [out.get(name) for name in self.names]
+        total = sum(terms[: self._loss_count])
+        values = torch.stack([term.detach().reshape(()).float() for term in terms]).double()
+        self._watch(values, index, domain)
+        self._set_learning_rate(index)
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        if self.defaults.grad_clip is not None:
+            torch.nn.utils.clip_grad_norm_(self.parameters, self.defaults.grad_clip)
+        self.optimizer.step()
+        if self.updater is not None:
+            self.updater.step()
+        return values
+
+    def check(self, done: int) -> None:
+        """Raise if any update so far had a non-finite loss, or a parameter is not finite now.
+
+        Args:
+            done: updates done, for the message.
+
+        Raises:
+            NonFiniteError: naming the first update and its term, or the parameter.
+        """
+        if self._first_bad is not None:
+            bad = [(int(u), name) for u, name in zip(self._first_bad.tolist(), self.names) if u >= 0]
+            if bad:
+                index, name = min(bad)
+                raise NonFiniteError(_explain(f"Update {index + 1}: {name} is not finite"))
+        for name, parameter in self.loss.named_parameters():
+            if not torch.isfinite(parameter.detach().sum()) and not torch.isfinite(parameter.detach()).all():
+                raise NonFiniteError(_explain(f"After update {done} the parameter {name} is not finite"))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return weights, targets and optimiser state."""
+        return {"loss": self.loss.state_dict(), "optimizer": self.optimizer.state_dict(), "names": self.names}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore :meth:`state_dict`."""
+        self.loss.load_state_dict(state["loss"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.names = list(state["names"])
+        self._loss_count = sum(name.startswith("loss") for name in self.names)
+
+    def _name_outputs(self, out: TensorDictBase) -> None:
+        """Loss terms first, then diagnostics; both must be scalars."""
+        keys = [key for key in out.keys(include_nested=False) if isinstance(key, str)]
+        terms = [key for key in keys if key.startswith("loss")]
+        if not terms:
+            raise ValueError(
+                f"{type(self.loss).__name__} returned no `loss_*` entry, only {keys}; nothing to minimise."
+            )
+        for term in terms:
+            if out.get(term).numel() != 1:
+                shape = tuple(out.get(term).shape)
+                raise ValueError(f"{term} has shape {shape}; build the loss with a reduction to a scalar.")
+        rest = [key for key in keys if key not in terms and getattr(out.get(key), "numel", lambda: 0)() == 1]
+        self.names, self._loss_count = [*terms, *rest], len(terms)
+
+    def _watch(self, values: Tensor, index: int, domain: str) -> None:
+        finite = torch.isfinite(values)
+        if not self.is_deferred:
+            for name, value, is_finite in zip(
+                self.names[: self._loss_count], values.tolist(), finite.tolist()
+            ):
+                if not is_finite:
+                    raise NonFiniteError(
+                        _explain(f"Update {index + 1} on domain {domain!r}: {name} is {value}")
+                    )
+            return
+        # No host synchronisation here: the first bad update of each term is remembered on the device.
+        if self._first_bad is None:
+            self._first_bad = torch.full((self._loss_count,), -1, device=values.device)
+        is_first = ~finite[: self._loss_count] & (self._first_bad < 0)
+        self._first_bad = torch.where(is_first, index, self._first_bad)
+
+    def _set_learning_rate(self, index: int) -> None:
+        if self.defaults.schedule == "constant":
+            return
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate * warmup_cosine(
+                index, self.defaults.warmup_updates, self.updates
+            )
+
+
+def warmup_cosine(index: int, warmup: int, updates: int) -> float:
+    """Factor on the learning rate at update ``index`` (from 0): linear from 0, then half a cosine to 0 (ATC).
+
+    Examples:
+        >>> [round(warmup_cosine(i, 2, 6), 2) for i in range(6)]
+        [0.0, 0.5, 1.0, 0.85, 0.5, 0.15]
+    """
+    if index < warmup:
+        return index / warmup
+    progress = (index - warmup) / max(updates - warmup, 1)
+    return (1 + math.cos(math.pi * min(progress, 1.0))) / 2
+
+
+def has_targets(loss: LossModule) -> bool:
+    """Whether the loss has target networks for ``SoftUpdate``."""
+    return any(name.startswith("target_") and name.endswith("_params") for name, _ in loss.named_children())
+
+
+def _keep_targets(loss: LossModule, tau: float) -> SoftUpdate:
+    """Build the updater without its side effect of overwriting the targets, which fine-tuning keeps."""
+    names = [
+        name for name, _ in loss.named_children() if name.startswith("target_") and name.endswith("_params")
+    ]
+    # Read past LossModule's attribute access, which warns about targets that have no updater yet.
+    kept = {name: loss._modules[name].data.clone() for name in names}
+    updater = SoftUpdate(loss, tau=tau)
+    for name, target in kept.items():
+        getattr(loss, name).data.update_(target)
+    return updater
+
+
+def _explain(what: str) -> str:
+    return (
+        f"{what}. Training stopped and the last checkpoint is kept. "
+        "Lower the learning rate, use precision='fp32', or check the data."
+    )

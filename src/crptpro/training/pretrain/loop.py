@@ -1,0 +1,129 @@
+"""The pre-training loop: cyclic over domains, logged, checkpointed, resumable at any moment."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.objectives import LossModule
+
+from crptpro.loggers import RunLogger
+from crptpro.modules import resolve_precision, set_compute_dtype
+from crptpro.modules.precision import Precision
+from crptpro.objectives import method_defaults
+from crptpro.seeding import derive_seed
+from crptpro.training.checkpoint import exclusive
+from crptpro.training.pretrain.learner import Learner
+from crptpro.training.pretrain.result import PretrainResult
+from crptpro.training.pretrain.run import PretrainRun
+from crptpro.training.pretrain.sources import Augment, Augmenter, open_sources
+
+
+def pretrain(
+    loss: LossModule,
+    datasets: Any,
+    *,
+    updates: int | None = None,
+    batch_size: int | None = None,
+    learning_rate: float | None = None,
+    encoder_tau: float | None = None,
+    seed: int = 0,
+    augment: Augment = "random_shift",
+    precision: Precision = "auto",
+    device: str | torch.device = "cpu",
+    run_dir: str | Path | None = None,
+    logger: RunLogger | None = None,
+    log_interval: int = 100,
+    checkpoint_interval: int | None = None,
+    resume: bool = True,
+    patience_updates: int = 5_000,
+    progress: bool = True,
+) -> PretrainResult:
+    """Train a self-supervised loss on the datasets of several domains (CRPTpro, Sec. III; algorithm 1).
+
+    Update u uses dataset u mod N only: one batch, one Adam step, one EMA step of the targets. Any
+    ``LossModule`` works that returns scalar ``loss_*`` terms for a batch with ``pixels`` and
+    ``("next", "pixels")``; a method ``before_update()``, if it has one, is called before each forward. The
+    loss is trained in place; its ``training_record`` afterwards says how, for the artifact's card.
+
+    With ``run_dir`` the run can be killed at any moment: the same call with a newly built loss continues from
+    the last checkpoint and, on the CPU with the same number of threads, gives the same weights as an
+    uninterrupted one. A larger ``updates`` extends a finished run. Ctrl-C and SIGTERM write a checkpoint,
+    then end the program.
+
+    Args:
+        loss: the objective with its networks.
+        datasets: one or several (sequence, or mapping of domain names): directories,
+            :class:`~crptpro.data.FrameDataset`, or any TorchRL ``ReplayBuffer`` whose samples have the
+            loss's keys.
+        updates: encoder updates in total over all domains; the method's default is 50,000.
+        batch_size: transitions per update; default 512.
+        learning_rate: of Adam; default 1e-4.
+        encoder_tau: EMA rate of the target networks; default 0.05.
+        seed: seeds sampling, shifts, and what the loss draws; torch's global generator is left as it was.
+        augment: ``"random_shift"`` (4 pixels, replicated border; independent per image and per sample),
+            ``"none"``, or a function of a batch and a generator.
+        precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (bf16 where the hardware multiplies it natively).
+        device: where to train. Directories are then opened on it: a GPU holds a copy of the frames.
+        run_dir: record (``pretrain.csv``, ``metrics.jsonl``) and checkpoints; ``None`` writes nothing.
+        logger: used instead of a local record in ``run_dir``, e.g. one that mirrors to W&B.
+        log_interval: updates between two rows; each holds means over the updates since the last.
+        checkpoint_interval: updates between two checkpoints; ``None``: about every five minutes. The end of
+            the run is always one.
+        resume: continue what ``run_dir`` holds; ``False`` refuses a directory that holds a run.
+        patience_updates: length of a plateau after which the run is called dead.
+        progress: show a bar (never in log files).
+
+    Returns:
+        Final metrics, the verdict on collapse, and the logged rows.
+
+    Raises:
+        CheckpointError: if ``run_dir`` holds a run with other settings (named), all its checkpoints are
+            damaged, or another process is running in it.
+        NonFiniteError: naming update, domain and term; the last checkpoint is kept.
+        DatasetError: if a dataset is unusable or lacks an entry that the loss reads.
+        DiskSpaceError: if the disk cannot hold the checkpoints.
+    """
+    defaults = method_defaults(loss)
+    settings: dict[str, Any] = {
+        "updates": defaults.updates if updates is None else updates,
+        "batch_size": defaults.batch_size if batch_size is None else batch_size,
+        "log_interval": log_interval,
+        "checkpoint_interval": checkpoint_interval,
+    }
+    for name, value in settings.items():
+        if value is not None and value < 1:
+            raise ValueError(f"`{name}` must be at least 1, got {value}.")
+    device = torch.device(device)
+    dtype = resolve_precision(precision, device)
+    cuda = [device.index or 0] if device.type == "cuda" else []
+    loss.to(device).train()
+    with contextlib.ExitStack() as stack:
+        stack.callback(set_compute_dtype, loss, torch.float32)
+        set_compute_dtype(loss, dtype)
+        stack.enter_context(torch.random.fork_rng(devices=cuda))
+        torch.manual_seed(derive_seed(seed, "pretrain", "loss"))
+        if run_dir is not None:
+            stack.enter_context(exclusive(run_dir))
+            logger = logger or stack.enter_context(RunLogger(run_dir))
+        run = PretrainRun(
+            loss,
+            open_sources(datasets, seed=seed, device=device),
+            Augmenter(augment, seed=seed),
+            learner=Learner(
+                loss,
+                defaults,
+                learning_rate=defaults.lr if learning_rate is None else learning_rate,
+                encoder_tau=defaults.encoder_tau if encoder_tau is None else encoder_tau,
+                updates=settings["updates"],
+            ),
+            settings={**settings, "seed": seed, "patience_updates": patience_updates},
+            device=device,
+            precision="bf16" if dtype == torch.bfloat16 else "fp32",
+            logger=logger,
+            run_dir=None if run_dir is None else Path(run_dir),
+        )
+        run.prepare(resume=resume)
+        return run.train(progress=progress)

@@ -1,0 +1,37 @@
+"""What a pre-training run returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class PretrainResult:
+    """How a pre-training run ended.
+
+    Attributes:
+        updates: encoder updates done in total, over all domains and all resumptions.
+        resumed_from: update at which this call continued; 0 for a fresh run.
+        seconds: training time in total, all resumptions included.
+        precision: ``"fp32"`` or ``"bf16"``, as resolved.
+        metrics: the last row of the record: means since the row before it.
+        collapse: verdict of :class:`~crptpro.training.collapse.CollapseMonitor`.
+        history: the rows logged by this call, oldest first.
+        run_dir: where record and checkpoints are; ``None`` if nothing was written.
+    """
+
+    updates: int
+    resumed_from: int
+    seconds: float
+    precision: str
+    metrics: dict[str, float]
+    collapse: dict[str, Any]
+    history: list[dict[str, Any]] = field(default_factory=list, repr=False)
+    run_dir: Path | None = None
+
+    @property
+    def is_dead(self) -> bool:
+        """Whether training ended on a plateau or with collapsed embeddings."""
+        return self.collapse["verdict"] == "dead"

@@ -1,0 +1,272 @@
+"""One pre-training run: its updates, its record, its checkpoints."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.objectives import LossModule
+from tqdm.auto import tqdm
+
+from crptpro.cards import require_disk
+from crptpro.errors import CheckpointError
+from crptpro.loggers import RunLogger
+from crptpro.seeding import global_rng_state, set_global_rng_state
+from crptpro.training.checkpoint import CheckpointDir, StopRequest
+from crptpro.training.collapse import CollapseMonitor
+from crptpro.training.pretrain.fingerprint import describe_loss, require_same
+from crptpro.training.pretrain.learner import Learner
+from crptpro.training.pretrain.result import PretrainResult
+from crptpro.training.pretrain.sources import Augmenter, Source, keys_read
+from crptpro.training.pretrain.window import Window, cosine_threshold, memory_row, num_prototypes
+
+_LOG = logging.getLogger(__name__)
+
+STREAM = "pretrain"
+CHECKPOINTS = "checkpoints"
+CHECKPOINT_SECONDS = 300.0
+
+
+class PretrainRun:
+    """State of one call of :func:`~crptpro.training.pretrain`: what is done, logged and checkpointed.
+
+    Args:
+        loss: on ``device``, in its compute dtype.
+        sources: the datasets in cyclic order.
+        augmenter: applied to every batch.
+        learner: does the updates.
+        settings: ``updates``, ``batch_size``, intervals, ``seed``, ``patience_updates``.
+        device: where to train.
+        precision: for the record.
+        logger: record, if any.
+        run_dir: directory of the checkpoints, if any.
+    """
+
+    def __init__(
+        self,
+        loss: LossModule,
+        sources: list[Source],
+        augmenter: Augmenter,
+        *,
+        learner: Learner,
+        settings: dict[str, Any],
+        device: torch.device,
+        precision: str,
+        logger: RunLogger | None,
+        run_dir: Path | None,
+    ) -> None:
+        self.loss, self.sources, self.augmenter, self.learner = loss, sources, augmenter, learner
+        self.settings, self.device, self.precision = settings, device, precision
+        self.logger, self.run_dir = logger, run_dir
+        self.domains = [source.name for source in sources]
+        self.window = Window(loss, self.domains)
+        self.monitor = CollapseMonitor(
+            num_prototypes(loss),
+            patience_updates=settings["patience_updates"],
+            cosine_threshold=cosine_threshold(loss),
+        )
+        self.keys = keys_read(loss)
+        self.checkpoints = None if run_dir is None else CheckpointDir(run_dir / CHECKPOINTS)
+        self.history: list[dict[str, Any]] = []
+        self.done = self.resumed_from = 0
+        self.saved_at: int | None = None
+        self.earlier_seconds = 0.0
+        self.started = self.row_started = self.saved_time = time.monotonic()
+        self.row_updates = 0
+        self.fingerprint = self._fingerprint()
+
+    @property
+    def seconds(self) -> float:
+        """Training time so far, resumptions included."""
+        return self.earlier_seconds + time.monotonic() - self.started
+
+    def prepare(self, *, resume: bool) -> None:
+        """Continue from the newest checkpoint, or clear the record for a fresh start."""
+        state = None
+        if self.checkpoints is not None:
+            if not resume and self.checkpoints.latest_counter() is not None:
+                raise CheckpointError(
+                    f"{self.run_dir} already holds a run. Choose another directory, or resume it."
+                )
+            state = self.checkpoints.load_latest()
+        if state is not None:
+            self._load(state)
+            return
+        if self.checkpoints is not None:
+            if self.logger is not None:  # rows of an attempt that was killed before its first checkpoint
+                self.logger.truncate_to(STREAM, "updates", -1)
+            size = sum(p.numel() * p.element_size() for p in self.loss.parameters())
+            # Weights, targets and two Adam moments; two checkpoints kept while a third is written.
+            require_disk(self.checkpoints.path, 4 * 3 * size, "Checkpointing this run")
+
+    def train(self, *, progress: bool) -> PretrainResult:
+        """Do the updates that are left and say how it went."""
+        total, interval = self.settings["updates"], self.settings["log_interval"]
+        bar = tqdm(
+            total=total, initial=self.done, desc="pretrain", unit="update", disable=None if progress else True
+        )
+        with StopRequest() as stop, bar:
+            while self.done < total:
+                self._update(interval)
+                bar.update()
+                if self.done % interval == 0:
+                    self.learner.check(self.done)
+                    row = self._log()
+                    self.window.close()
+                    bar.set_postfix(loss=f"{row['loss']:.4f}", refresh=False)
+                if self.done == total or stop.signal is not None or self._checkpoint_is_due():
+                    self.save()
+                if stop.signal is not None:
+                    kept = (
+                        "a checkpoint was written" if self.checkpoints else "nothing is kept without run_dir"
+                    )
+                    _LOG.warning("Stopped at update %d of %d; %s.", self.done, total, kept)
+                    stop.leave()
+        return self._finish()
+
+    def save(self) -> None:
+        """Write a checkpoint of everything that a resumed run needs."""
+        self.learner.check(self.done)
+        if self.checkpoints is None or self.saved_at == self.done:
+            return
+        state = {
+            "fingerprint": self.fingerprint,
+            "updates": self.done,
+            "seconds": self.seconds,
+            "learner": self.learner.state_dict(),
+            "sources": {source.name: source.state_dict() for source in self.sources},
+            "augment": self.augmenter.generator.get_state(),
+            "global_rng": global_rng_state(),
+            "window": self.window.state_dict(),
+            "monitor": self.monitor.state_dict(),
+            "logger": None if self.logger is None else self.logger.state_dict([STREAM]),
+        }
+        self.checkpoints.save(state, counter=self.done)
+        self.saved_at, self.saved_time = self.done, time.monotonic()
+
+    def _load(self, state: dict[str, Any]) -> None:
+        require_same(state["fingerprint"], self.fingerprint, self.run_dir)
+        if state["updates"] > self.settings["updates"]:
+            raise CheckpointError(
+                f"{self.run_dir} has done {state['updates']} updates, {self.settings['updates']} are asked: "
+                "ask for at least as many, or choose another run directory."
+            )
+        self.done = self.resumed_from = self.saved_at = state["updates"]
+        self.row_updates = self.done
+        self.earlier_seconds = state["seconds"]
+        self.learner.load_state_dict(state["learner"])
+        for source in self.sources:
+            source.load_state_dict(state["sources"][source.name])
+        self.augmenter.generator.set_state(state["augment"])
+        set_global_rng_state(state["global_rng"])
+        self.window.load_state_dict(state["window"], self.device)
+        self.monitor.load_state_dict(state["monitor"])
+        if self.logger is not None and state["logger"] is not None:
+            self.logger.load_state_dict(state["logger"])
+        if self.done < self.settings["updates"]:
+            _LOG.info("Pre-training continues from update %d.", self.done)
+
+    def _update(self, log_interval: int) -> None:
+        domain = self.done % len(self.sources)
+        batch = self.sources[domain].sample(self.settings["batch_size"], self.keys)
+        batch = self.augmenter(batch.to(self.device))
+        values = self.learner.update(batch, index=self.done, domain=self.domains[domain])
+        self.window.add(values, domain)
+        self.done += 1
+        is_last_of_window = -self.done % log_interval < len(self.sources)
+        is_last_of_run = self.settings["updates"] - self.done < len(self.sources)
+        if (is_last_of_window or is_last_of_run) and "embedding_cosine" not in self.learner.names:
+            self.window.probe(batch, domain)
+
+    def _log(self) -> dict[str, float]:
+        row = self._row()
+        self.monitor.observe(self.done, comp=_comp(row), cosine=self.window.cosines or None)
+        self._write(row)
+        return row
+
+    def _row(self) -> dict[str, float]:
+        now = time.monotonic()
+        row = self.window.row(self.learner.names)
+        if self.done > max(self.row_updates, self.resumed_from) and now > self.row_started:
+            row["updates_per_s"] = (self.done - self.row_updates) / (now - self.row_started)
+        return {**row, **memory_row(self.device)}
+
+    def _write(self, row: dict[str, float]) -> None:
+        self.row_started, self.row_updates = time.monotonic(), self.done
+        self.history.append({"updates": self.done, **row})
+        if self.logger is not None:
+            self.logger.log(row, stream=STREAM, updates=self.done)
+
+    def _checkpoint_is_due(self) -> bool:
+        interval = self.settings["checkpoint_interval"]
+        if interval is not None:
+            return self.done % interval == 0
+        return time.monotonic() - self.saved_time >= CHECKPOINT_SECONDS
+
+    def _finish(self) -> PretrainResult:
+        if self.done % self.settings["log_interval"]:
+            # A last row for the part of a window; it is not in the checkpoint, so an extended run takes it
+            # back.
+            row = self._log()
+        else:
+            row = self.history[-1] if self.history else self._last_row()
+        metrics = {name: value for name, value in row.items() if name != "updates"}
+        verdict = self.monitor.finish(self.done)
+        seconds = self.seconds
+        self.loss.training_record = {
+            "updates": self.done,
+            "seconds": round(seconds, 1),
+            "precision": self.precision,
+            "device": str(self.device),
+            "settings": {
+                key: value for key, value in self.fingerprint.items() if key not in ("loss", "datasets")
+            },
+            "datasets": [source.facts() for source in self.sources],
+            "metrics": metrics,
+            "collapse": verdict,
+            "started_from": getattr(self.loss, "started_from", None),
+            "previous_training": getattr(self.loss, "previous_training", None),
+        }
+        return PretrainResult(
+            updates=self.done,
+            resumed_from=self.resumed_from,
+            seconds=seconds,
+            precision=self.precision,
+            metrics=metrics,
+            collapse=verdict,
+            history=self.history,
+            run_dir=self.run_dir,
+        )
+
+    def _last_row(self) -> dict[str, Any]:
+        rows = [] if self.logger is None else self.logger.rows(STREAM)
+        return {key: value for key, value in rows[-1].items() if key != "unix_time_s"} if rows else {}
+
+    def _fingerprint(self) -> dict[str, Any]:
+        learner = self.learner
+        schedule = learner.defaults.schedule
+        return {
+            "batch_size": self.settings["batch_size"],
+            "learning_rate": learner.learning_rate,
+            "betas": list(learner.defaults.betas),
+            "eps": learner.defaults.eps,
+            "weight_decay": learner.defaults.weight_decay,
+            "grad_clip": learner.defaults.grad_clip,
+            "schedule": schedule,
+            # A schedule is stretched over the run, so a run with one cannot be extended.
+            "updates": None if schedule == "constant" else self.settings["updates"],
+            "encoder_tau": learner.encoder_tau,
+            "seed": self.settings["seed"],
+            "augment": self.augmenter.name,
+            "precision": self.precision,
+            "loss": describe_loss(self.loss),
+            "datasets": [source.identity() for source in self.sources],
+        }
+
+
+def _comp(row: dict[str, float]) -> float | None:
+    """The comparative loss in nats, without its coefficient."""
+    return row.get("comp", row.get("loss_comp"))

@@ -1,0 +1,254 @@
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+from crptpro.envs import gl_process, rendering
+from crptpro.envs.rendering import PROOF_VARIABLE, backend_card, first_frame_watchdog, select_backend
+from crptpro.errors import RenderingError
+
+LLVMPIPE = {
+    "gl_vendor": "Mesa", "gl_renderer": "llvmpipe", "gl_version": "4.5", "gl_kind": "software", "alive": True,
+}  # fmt: skip
+ANSWER = f"print({json.dumps(json.dumps(LLVMPIPE))})"
+
+Probe = Callable[[str], Path]
+
+
+@pytest.fixture(autouse=True)
+def _no_backend_yet(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(rendering, "_imported_backend", lambda: None)
+    with mock.patch.dict(os.environ):
+        for name in ("MUJOCO_GL", PROOF_VARIABLE, "LP_NUM_THREADS", "DISPLAY", "WAYLAND_DISPLAY"):
+            os.environ.pop(name, None)
+        yield
+
+
+@pytest.fixture
+def probe(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Probe:
+    """Replace the program that renders; the returned file records the backend of every start."""
+    record = tmp_path / "started"
+
+    def install(code: str) -> Path:
+        prelude = (
+            f"import os, sys, time; b = os.environ['MUJOCO_GL']; open({str(record)!r}, 'a').write(b + ' ')\n"
+        )
+        command = (sys.executable, "-S", "-c", prelude + code)
+        monkeypatch.setattr(gl_process, "PROBE_COMMAND", command)
+        return record
+
+    return install
+
+
+def test_the_first_backend_that_renders_is_taken_and_proven_once(probe: Probe) -> None:
+    started = probe(ANSWER)
+    assert select_backend() == "egl"
+    assert select_backend() == "egl"
+    assert os.environ["MUJOCO_GL"] == "egl"
+    assert started.read_text().split() == ["egl"]
+
+
+def test_the_proof_reaches_child_processes_through_the_environment(probe: Probe) -> None:
+    probe(ANSWER)
+    select_backend()
+    assert json.loads(os.environ[PROOF_VARIABLE])["gl_renderer"] == "llvmpipe"
+    assert backend_card() == {
+        "backend": "egl", "gl_vendor": "Mesa", "gl_renderer": "llvmpipe", "gl_version": "4.5",
+        "gl_kind": "software",
+    }  # fmt: skip
+
+
+def test_a_users_mujoco_gl_is_kept_and_proven(probe: Probe, caplog: pytest.LogCaptureFixture) -> None:
+    os.environ["MUJOCO_GL"] = "osmesa"
+    started = probe(ANSWER)
+    with caplog.at_level(logging.WARNING):
+        assert select_backend("egl") == "osmesa"
+    assert os.environ["MUJOCO_GL"] == "osmesa"
+    assert started.read_text().split() == ["osmesa"]
+    assert "egl is not used" in caplog.text
+
+
+def test_a_users_mujoco_gl_is_kept_even_if_it_does_not_render(probe: Probe) -> None:
+    os.environ["MUJOCO_GL"] = "egl"
+    started = probe("sys.exit(ANSWER if b == 'osmesa' else 'no EGL display')")
+    with pytest.raises(RenderingError, match=r"MUJOCO_GL=egl was set by you.*\n.*no EGL display"):
+        select_backend()
+    assert started.read_text().split() == ["egl"]
+    assert os.environ["MUJOCO_GL"] == "egl"
+
+
+def test_a_users_spelling_becomes_the_one_that_every_library_understands(probe: Probe) -> None:
+    os.environ["MUJOCO_GL"] = "EGL"
+    probe(ANSWER)
+    assert select_backend() == "egl"
+    assert os.environ["MUJOCO_GL"] == "egl"
+
+
+def test_a_value_that_is_no_backend_is_one_clear_error_and_starts_nothing(probe: Probe) -> None:
+    os.environ["MUJOCO_GL"] = "nonsense"
+    started = probe(ANSWER)
+    with pytest.raises(RenderingError, match=r"MUJOCO_GL=nonsense .*egl.*osmesa.*glfw"):
+        select_backend()
+    assert not started.exists()
+
+
+def test_rendering_switched_off_is_said(probe: Probe) -> None:
+    os.environ["MUJOCO_GL"] = "off"
+    probe(ANSWER)
+    with pytest.raises(RenderingError, match="switches rendering off"):
+        select_backend()
+
+
+def test_an_unknown_preference_is_refused(probe: Probe) -> None:
+    probe(ANSWER)
+    with pytest.raises(RenderingError, match="'vulkan'"):
+        select_backend("vulkan")
+
+
+def test_a_preference_is_taken_and_may_change_later(probe: Probe) -> None:
+    started = probe(ANSWER)
+    assert select_backend("osmesa") == "osmesa"
+    assert select_backend("egl") == "egl"
+    assert started.read_text().split() == ["osmesa", "egl"]
+
+
+def test_the_next_backend_is_taken_and_the_failure_of_the_first_is_said(
+    probe: Probe, caplog: pytest.LogCaptureFixture
+) -> None:
+    probe(f"if b == 'egl': sys.exit('ImportError: no libEGL')\n{ANSWER}")
+    with caplog.at_level(logging.WARNING):
+        assert select_backend() == "osmesa"
+    assert "no libEGL" in caplog.text
+    assert "apt-get install libegl1" in caplog.text
+
+
+def test_when_nothing_renders_every_reason_is_given(probe: Probe) -> None:
+    probe("sys.exit(f'{b} is broken')")
+    with pytest.raises(RenderingError, match=r"(?s)No GL backend.*egl is broken.*osmesa is broken"):
+        select_backend()
+
+
+def test_glfw_is_only_tried_with_a_display(probe: Probe) -> None:
+    os.environ["DISPLAY"] = ":0"
+    started = probe("sys.exit(1)")
+    with pytest.raises(RenderingError):
+        select_backend()
+    assert started.read_text().split() == ["egl", "osmesa", "glfw"]
+
+
+def test_a_hung_first_frame_is_ended_and_named_with_its_cause_and_the_alternatives(
+    probe: Probe, tmp_path: Path
+) -> None:
+    os.environ["MUJOCO_GL"] = "egl"
+    probe(f"open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(600)")
+    start = time.monotonic()
+    with pytest.raises(RenderingError) as caught:
+        select_backend(timeout_s=1.0)
+    assert time.monotonic() - start < 10
+    for part in ("did not arrive within 1 s", "several processes hold EGL contexts", "MUJOCO_GL=osmesa"):
+        assert part in str(caught.value)
+    assert not Path(f"/proc/{(tmp_path / 'pid').read_text()}").exists()
+
+
+def test_a_backend_that_hangs_gives_way_to_one_that_renders(
+    probe: Probe, caplog: pytest.LogCaptureFixture
+) -> None:
+    started = probe(f"if b == 'egl': time.sleep(600)\n{ANSWER}")
+    with caplog.at_level(logging.WARNING):
+        assert select_backend(timeout_s=1.0) == "osmesa"
+    assert "egl: the first frame did not arrive" in caplog.text
+    assert select_backend(timeout_s=1.0, processes=2) == "osmesa"
+    assert started.read_text().split() == ["egl", "osmesa", "osmesa", "osmesa"], (
+        "the hang was waited for twice"
+    )
+
+
+def test_the_time_limit_can_be_set_from_outside(probe: Probe) -> None:
+    probe("time.sleep(600)")
+    os.environ.update({"MUJOCO_GL": "osmesa", rendering.TIMEOUT_VARIABLE: "0.2"})
+    with pytest.raises(RenderingError, match=r"within 0\.2 s"):
+        select_backend()
+    os.environ[rendering.TIMEOUT_VARIABLE] = "soon"
+    with pytest.raises(RenderingError, match="'soon'"):
+        select_backend()
+
+
+def test_a_crashing_driver_is_named(probe: Probe) -> None:
+    os.environ["MUJOCO_GL"] = "egl"
+    probe("os.kill(os.getpid(), 11)")
+    with pytest.raises(RenderingError, match="SIGSEGV"):
+        select_backend()
+
+
+def test_a_frame_without_content_is_no_proof(probe: Probe) -> None:
+    os.environ["MUJOCO_GL"] = "egl"
+    probe(f"print({json.dumps(json.dumps({**LLVMPIPE, 'alive': False}))})")
+    with pytest.raises(RenderingError, match="without content"):
+        select_backend()
+
+
+def test_several_processes_are_proven_at_the_same_time(probe: Probe, tmp_path: Path) -> None:
+    # Each waits until all three have started, so only simultaneous processes can answer.
+    started = probe(
+        f"while len(open({str(tmp_path / 'started')!r}).read().split()) < 3: time.sleep(0.01)\n{ANSWER}"
+    )
+    assert select_backend(processes=3, timeout_s=20) == "egl"
+    assert select_backend(processes=2) == "egl"
+    assert len(started.read_text().split()) == 3
+
+
+def test_a_backend_that_dm_control_was_imported_with_is_said(
+    probe: Probe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rendering, "_imported_backend", lambda: "glfw")
+    probe("sys.exit('no display')")
+    with pytest.raises(RenderingError, match="already imported with the backend 'glfw'"):
+        select_backend("egl")
+    with pytest.raises(RenderingError, match=r"(?s)imported with the backend 'glfw' before.*no display"):
+        select_backend()
+
+
+def test_software_gl_gets_one_thread_unless_the_user_says_otherwise(probe: Probe) -> None:
+    probe(ANSWER)
+    select_backend()
+    assert os.environ["LP_NUM_THREADS"] == "1"
+    del os.environ[PROOF_VARIABLE]
+    os.environ["LP_NUM_THREADS"] = "4"
+    select_backend()
+    assert os.environ["LP_NUM_THREADS"] == "4"
+
+
+def test_hardware_gl_leaves_the_threads_alone(probe: Probe) -> None:
+    probe(f"print({json.dumps(json.dumps({**LLVMPIPE, 'gl_kind': 'hardware'}))})")
+    select_backend()
+    assert "LP_NUM_THREADS" not in os.environ
+
+
+def test_the_watchdog_names_a_slow_first_frame_and_is_silent_about_a_quick_one(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with caplog.at_level(logging.ERROR):
+        with first_frame_watchdog(timeout_s=30):
+            pass
+        assert not caplog.records
+        with first_frame_watchdog(timeout_s=0.05):
+            time.sleep(0.3)
+    assert "first frame" in caplog.text
+    assert "MUJOCO_GL=osmesa" in caplog.text
+
+
+@pytest.mark.gl
+def test_a_real_backend_renders_and_describes_itself() -> None:
+    backend = select_backend()
+    card = backend_card()
+    assert card["backend"] == backend
+    assert card["gl_vendor"] not in ("", "unknown")
+    assert card["gl_kind"] in ("software", "hardware")

@@ -1,0 +1,58 @@
+"""Choosing and setting the compute dtype."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from crptpro.modules import (
+    PixelEncoder,
+    SquashedGaussianActor,
+    TwinCritic,
+    resolve_precision,
+    set_compute_dtype,
+)
+from crptpro.modules import precision as precision_module
+from crptpro.modules.precision import linear_in
+from crptpro.objectives import ProtoLoss, RADSACLoss
+
+
+def test_named_precisions_are_taken_literally() -> None:
+    assert resolve_precision("fp32", "cpu") == torch.float32
+    assert resolve_precision("bf16", "cpu") == torch.bfloat16
+    with pytest.raises(ValueError, match="'half'"):
+        resolve_precision("half", "cpu")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("capable", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])
+def test_auto_follows_the_cpu(monkeypatch: pytest.MonkeyPatch, capable: bool, dtype: torch.dtype) -> None:
+    monkeypatch.setattr(precision_module, "_cpu_multiplies_bf16", lambda: capable)
+    assert resolve_precision("auto", "cpu") == dtype
+
+
+@pytest.mark.parametrize(("capability", "dtype"), [((7, 5), torch.float32), ((9, 0), torch.bfloat16)])
+def test_auto_follows_the_gpu(monkeypatch: pytest.MonkeyPatch, capability, dtype: torch.dtype) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
+    assert resolve_precision("auto", "cuda:0") == dtype
+
+
+def test_set_compute_dtype_reaches_the_networks_of_a_loss() -> None:
+    encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=12)
+    loss = set_compute_dtype(ProtoLoss(encoder, num_prototypes=8, latent_dim=4, hidden_dim=8), torch.bfloat16)
+    assert loss.encoder.compute_dtype == loss.projector.compute_dtype == torch.bfloat16
+    actor, critic = SquashedGaussianActor(6, 2, hidden_dim=8), TwinCritic(6, 2, hidden_dim=8)
+    set_compute_dtype(RADSACLoss(actor, critic), torch.bfloat16)
+    assert actor.trunk.compute_dtype == critic.q2.compute_dtype == torch.bfloat16
+    assert all(p.dtype == torch.float32 for p in [*loss.parameters(), *actor.parameters()])
+
+
+def test_other_dtypes_are_refused() -> None:
+    with pytest.raises(ValueError, match="float16"):
+        set_compute_dtype(PixelEncoder(3, image_size=21), torch.float16)
+
+
+def test_linear_in_adds_the_bias_in_full_precision() -> None:
+    x, weight, bias = torch.zeros(1, 4), torch.randn(2, 4), torch.tensor([1.0009765625, 0.1])
+    assert torch.equal(linear_in(x, weight, bias, torch.bfloat16)[0], bias)
+    torch.testing.assert_close(linear_in(x, weight, None, torch.float32), F.linear(x, weight))

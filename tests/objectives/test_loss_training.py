@@ -1,0 +1,224 @@
+"""Gradients, targets, state and compilation as TorchRL expects them, for every loss (see ``loss_cases.py``)."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import warnings
+
+import pytest
+import torch
+from loss_cases import CASES, LossCase, assert_same, run, total
+from torchrl.objectives import SoftUpdate
+
+pytestmark = [
+    pytest.mark.parametrize("case", CASES, ids=str),
+    pytest.mark.filterwarnings("ignore:No target network updater"),
+]
+
+
+# L5 ------------------------------------------------------------------------------------------------------
+
+
+def test_each_loss_term_reaches_exactly_its_parameters(case: LossCase) -> None:
+    groups = set.union(*case.routing.values())
+    for key, expected in case.routing.items():
+        loss = case.make()
+        run(loss, case.batch())[key].sum().backward()
+        reached = set()
+        for name, parameter in loss.named_parameters():
+            group = name.split(".")[0]
+            assert group in groups, name
+            if parameter.grad is not None and parameter.grad.any():
+                reached.add(group)
+                assert group in expected, f"{key} reaches {name}"
+            elif group in expected:
+                assert "bias" in name, f"{key} does not reach {name}"
+        assert reached == expected
+
+
+def test_targets_and_diagnostics_carry_no_gradient(case: LossCase) -> None:
+    loss = case.make()
+    out = run(loss, case.batch())
+    for key, value in out.items():
+        assert value.requires_grad == key.startswith("loss_"), key
+    total(out).backward()
+    for name, value in loss.state_dict(keep_vars=True).items():
+        if name.startswith("target_"):
+            assert not value.requires_grad
+            assert value.grad is None
+    assert not any(name.startswith("target_") for name, _ in loss.named_parameters())
+
+
+# L6 ------------------------------------------------------------------------------------------------------
+
+
+def test_state_dict_round_trip_restores_outputs(case: LossCase) -> None:
+    first, second = case.make(seed=0), case.make(seed=1)
+    td = case.batch()
+    assert not torch.equal(total(run(first, td)), total(run(second, td)))
+    second.load_state_dict(first.state_dict())
+    assert_same(run(second, td), run(first, td))
+
+
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss))])
+def test_copies_are_equal_and_independent(case: LossCase, duplicate) -> None:
+    loss, td = case.make(), case.batch()
+    expected = run(loss, td)
+    twin = duplicate(loss)
+    assert_same(run(twin, td), expected)
+    with torch.no_grad():
+        for parameter in twin.parameters():
+            parameter.mul_(2)
+    assert_same(run(loss, td), expected)
+
+
+def test_networks_of_a_copy_hold_the_copied_parameters(case: LossCase) -> None:
+    twin = copy.deepcopy(case.make())
+    own = {id(parameter) for parameter in twin.parameters()}
+    for name, module in vars(twin).items():
+        if isinstance(module, torch.nn.Module):
+            assert {id(p) for p in module.parameters()} <= own, name
+
+
+# L7 ------------------------------------------------------------------------------------------------------
+
+
+def test_soft_update_moves_targets_by_tau(case: LossCase) -> None:
+    loss = case.make()
+    updater = SoftUpdate(loss, tau=0.05)
+    with torch.no_grad():
+        for parameter in loss.parameters():
+            parameter.add_(torch.randn_like(parameter))
+    before = {k: v.clone() for k, v in loss.state_dict().items()}
+    updater.step()
+    after = loss.state_dict()
+    targets = [name for name in after if name.startswith("target_")]
+    assert {name.removeprefix("target_").split("_params")[0] for name in targets} == set(case.targets)
+    for name in targets:
+        source = before[name.removeprefix("target_")]
+        torch.testing.assert_close(after[name], before[name] + 0.05 * (source - before[name]))
+
+
+def test_no_warning_once_an_updater_exists(case: LossCase) -> None:
+    loss = case.make()
+    SoftUpdate(loss, tau=0.05)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        run(loss, case.batch())
+
+
+def test_targets_loaded_after_the_updater_was_built_are_kept(case: LossCase) -> None:
+    first = case.make()
+    with torch.no_grad():
+        for parameter in first.parameters():
+            parameter.add_(1.0)
+    second = case.make(seed=1)
+    SoftUpdate(second, tau=0.05)
+    second.load_state_dict(first.state_dict())
+    for name, value in first.state_dict().items():
+        assert torch.equal(second.state_dict()[name], value), name
+
+
+# L8 ------------------------------------------------------------------------------------------------------
+
+
+def test_reset_changes_every_parameter_and_target(case: LossCase) -> None:
+    loss = case.make()
+    with torch.no_grad():
+        for name, value in loss.state_dict(keep_vars=True).items():
+            if "_params" in name or name == "log_alpha":
+                value.add_(1000.0)
+    loss.reset_parameters_recursive()
+    for name, value in loss.state_dict().items():
+        if "_params" in name or name == "log_alpha":
+            assert value.abs().max() < 100, name
+        if name.startswith("target_"):
+            assert torch.equal(value, loss.state_dict()[name.removeprefix("target_")]), name
+
+
+# L9, L10 -------------------------------------------------------------------------------------------------
+
+
+def test_double_precision_runs_in_double(case: LossCase) -> None:
+    loss = case.make().to(torch.float64)
+    td = case.batch().apply(lambda value: value.double() if value.is_floating_point() else value)
+    out = run(loss, td)
+    assert all(value.dtype == torch.float64 for key, value in out.items() if key.startswith("loss_"))
+    total(out).backward()
+    assert all(p.grad.dtype == torch.float64 for p in loss.parameters() if p.grad is not None)
+
+
+def test_compiled_forward_equals_eager(case: LossCase) -> None:
+    loss, td = case.make(), case.batch()
+    SoftUpdate(loss, tau=0.05)
+    expected = run(loss, td)
+    total(expected).backward()
+    gradients = {name: p.grad.clone() for name, p in loss.named_parameters()}
+    loss.zero_grad()
+    out = run(torch.compile(loss, fullgraph=True, backend="aot_eager"), td)
+    assert_same(out, expected)
+    total(out).backward()
+    for name, parameter in loss.named_parameters():
+        torch.testing.assert_close(parameter.grad, gradients[name])
+
+
+# L12 ------------------------------------------------------------------------------------------------
+
+
+def test_masked_rows_do_not_count_whatever_they_hold(case: LossCase) -> None:
+    count, kept = 6, [0, 1, 3, 5]
+    clean = case.batch(count)
+    loss = case.make(**({"generator": torch.Generator()} if case.name == "RADSACLoss" else {}))
+    mask = torch.zeros(count, 1, dtype=torch.bool)
+    mask[kept] = True
+    garbage = clean.clone()
+    for key in case.masked:
+        value = garbage[key].float()
+        value[~mask.squeeze(-1)] = float("nan")
+        garbage[key] = value
+    garbage["collector", "mask"] = mask
+    out = run(loss, garbage)
+    total(out).backward()
+    assert all(value.isfinite().all() for value in out.values())
+    assert all(p.grad.isfinite().all() for p in loss.parameters() if p.grad is not None)
+    loss.reduction = "none"
+    assert not run(loss, garbage)[case.per_row[0]][~mask.squeeze(-1)].any()
+    loss.loss_mask_key = None
+    assert run(loss, garbage)[case.per_row[0]].isnan().any()
+
+
+def test_one_row_is_a_legal_batch(case: LossCase) -> None:
+    loss = case.make()
+    out = run(loss, case.batch(1))
+    total(out).backward()
+    assert all(value.isfinite().all() for value in out.values())
+
+
+def test_non_finite_parameters_propagate_to_the_loss(case: LossCase) -> None:
+    loss = case.make()
+    with torch.no_grad():
+        next(p for name, p in loss.named_parameters() if "weight" in name).fill_(float("nan"))
+    assert total(run(loss, case.batch())).isnan()
+
+
+def test_twenty_adam_updates_lower_the_loss(case: LossCase) -> None:
+    loss, td = case.make(), case.batch()
+    updater = SoftUpdate(loss, tau=0.05)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
+    key = next(iter(case.routing))
+    first = run(loss, td)[key].item()
+    for _ in range(20):
+        if hasattr(loss, "before_update"):
+            loss.before_update()
+        optimizer.zero_grad()
+        total(run(loss, td)).backward()
+        optimizer.step()
+        updater.step()
+    assert run(loss, td)[key].item() < 0.9 * first
+
+
+def test_same_seed_gives_the_same_loss_and_another_seed_does_not(case: LossCase) -> None:
+    td = case.batch()
+    assert_same(run(case.make(seed=3), td), run(case.make(seed=3), td))
+    assert not torch.equal(total(run(case.make(seed=3), td)), total(run(case.make(seed=4), td)))

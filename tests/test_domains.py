@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+import logging
+import pickle
+import sys
+
+import pytest
+
+from crptpro import domains
+from crptpro.domains import GROUPS, PAPER_DOMAINS, TASKS, Domain, get_domain, known_names, register_domain
+from crptpro.errors import CRPTproError, UnknownNameError
+
+
+def make_nothing(seed: int) -> None: ...
+
+
+@pytest.fixture(autouse=True)
+def _empty_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(domains, "_registered", {})
+
+
+def test_groups_are_those_of_the_paper() -> None:
+    assert GROUPS == {
+        "A": ("cheetah", "walker", "quadruped"),
+        "B": ("cartpole", "pendulum", "manipulation"),
+        "C": ("manipulation", "hopper", "finger"),
+        "D": ("walker", "pendulum", "hopper"),
+    }
+    assert {name for group in GROUPS.values() for name in group} == set(PAPER_DOMAINS)
+
+
+def test_tasks_are_the_eight_of_the_paper() -> None:
+    assert TASKS == {
+        "cheetah_run": "cheetah", "walker_run": "walker", "quadruped_run": "quadruped",
+        "cartpole_swingup_sparse": "cartpole", "pendulum_swingup": "pendulum", "reach_duplo": "manipulation",
+        "hopper_hop": "hopper", "finger_spin": "finger",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "domain", "task"),
+    [
+        ("cheetah", "cheetah", "cheetah_run"),
+        ("walker_stand", "walker", "walker_stand"),
+        ("manip_reach_duplo", "manipulation", "reach_duplo"),
+        ("manipulation_reach_duplo", "manipulation", "reach_duplo"),
+        ("reach_duplo_vision", "manipulation", "reach_duplo"),
+        ("manip_lift_brick", "manipulation", "lift_brick"),
+        ("ball_in_cup_catch", "ball_in_cup", "ball_in_cup_catch"),
+        ("acrobot", "acrobot", "acrobot_swingup"),
+        ("lqr_2_1", "lqr", "lqr_2_1"),
+        ("gymnasium:HalfCheetah-v5", "gymnasium:HalfCheetah-v5", "gymnasium:HalfCheetah-v5"),
+    ],
+)
+def test_a_name_leads_to_its_domain_and_task(name: str, domain: str, task: str) -> None:
+    found = get_domain(name)
+    assert (found.name, found.task) == (domain, task)
+
+
+def test_tasks_of_a_domain_share_its_camera() -> None:
+    assert get_domain("quadruped_walk").camera == get_domain("quadruped").camera == 2
+    assert get_domain("reach_site").camera == "front_close"
+    assert get_domain("gymnasium:HalfCheetah-v5").camera is None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "near"),
+    [
+        ("cheeta", "cheetah"),
+        ("walker_wolk", "walker_walk"),
+        ("reach_dupplo", "reach_duplo"),
+        ("Finger-Spin", "finger_spin"),
+        ("gymnasium:HalfCheeta-v5", "gymnasium:HalfCheetah-v5"),
+    ],
+)
+def test_an_unknown_name_answers_with_the_nearest_known_one(wrong: str, near: str) -> None:
+    with pytest.raises(UnknownNameError, match=near) as caught:
+        get_domain(wrong)
+    assert wrong.removeprefix("gymnasium:") in str(caught.value)
+
+
+def test_a_name_like_no_other_answers_with_the_domains() -> None:
+    with pytest.raises(UnknownNameError, match="Domains: cheetah, walker"):
+        get_domain("zzzz")
+
+
+def test_a_registered_domain_is_found_by_name_and_by_task() -> None:
+    own = register_domain(Domain("lander", "lander_soft", make=make_nothing))
+    assert get_domain("lander") is own
+    assert get_domain("lander_soft") is own
+    assert "lander" in known_names()
+    with pytest.raises(UnknownNameError, match="lander"):
+        get_domain("landr")
+
+
+def test_a_domain_is_its_own_name() -> None:
+    own = Domain("lander", "lander", make=make_nothing)
+    assert get_domain(own) is own
+
+
+def test_a_domain_travels_to_another_process() -> None:
+    for domain in (*PAPER_DOMAINS.values(), Domain("lander", "lander", make=make_nothing)):
+        assert pickle.loads(pickle.dumps(domain)) == domain
+
+
+def test_registering_what_cannot_travel_warns(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        register_domain(Domain("lander", "lander", make=lambda seed: None))  # type: ignore[arg-type,return-value]
+    assert "top level" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["walker", "reach_duplo", "gymnasium:Own-v0"])
+def test_built_in_names_cannot_be_taken(name: str) -> None:
+    with pytest.raises(CRPTproError, match="built-in"):
+        register_domain(Domain(name, "own", make=make_nothing))
+
+
+def test_a_domain_without_make_cannot_be_registered() -> None:
+    with pytest.raises(CRPTproError, match="no make"):
+        register_domain(Domain("lander", "lander"))
+
+
+def test_looking_up_names_does_not_import_dm_control(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The import would fix the render backend before it can be chosen.
+    monkeypatch.setitem(sys.modules, "dm_control", None)  # makes "import dm_control" raise
+    get_domain("dog_run")
+    get_domain("manip_place_cradle")
+    with pytest.raises(UnknownNameError):
+        get_domain("nothing_like_it")
+
+
+@pytest.mark.gl
+def test_the_written_task_tables_are_those_of_the_installed_dm_control() -> None:
+    from crptpro.envs.rendering import select_backend
+
+    select_backend()
+    from dm_control import manipulation, suite
+
+    written = {(domain, task) for domain, tasks in domains.SUITE_TASKS.items() for task in tasks}
+    assert written == {(d, f"{d}_{t.removeprefix(f'{d}_')}") for d, t in suite.ALL_TASKS}
+    vision = {name.removesuffix("_vision") for name in manipulation.ALL if name.endswith("_vision")}
+    assert set(domains.MANIPULATION_TASKS) == vision

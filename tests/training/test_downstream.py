@@ -1,0 +1,179 @@
+from __future__ import annotations
+
+import csv
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from torchrl.envs import CatFrames, EnvBase, TransformedEnv
+from toy_world import ToyEnv
+
+from crptpro.errors import CheckpointError, PretrainedError
+from crptpro.modules import PixelEncoder, Projector, Prototypes
+from crptpro.pretrained import Pretrained, random_pretrained
+from crptpro.training import DownstreamConfig, load_agent, train_downstream
+
+EPISODE = 10
+SMALL = DownstreamConfig(
+    env_steps=120,
+    batch_size=8,
+    replay_capacity=40,
+    random_agent_steps=12,
+    queue_size=16,
+    eval_interval_env_steps=40,
+    eval_episodes=2,
+    checkpoint_interval_env_steps=20,
+    log_interval_env_steps=20,
+    precision="fp32",
+)
+
+
+def small_pretrained() -> Pretrained:
+    torch.manual_seed(0)
+    encoder = PixelEncoder(channels=(4, 4), strides=(2, 1), image_size=16)
+    return Pretrained(encoder, projector=Projector(encoder.feature_dim, 4), prototypes=Prototypes(8, 4))
+
+
+def toy_env(task: str, *, seed: int, image_size: int, frame_stack: int, **settings: object) -> EnvBase:
+    env = ToyEnv(lambda _: EPISODE, seed=seed, image_size=image_size)
+    return TransformedEnv(env, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
+
+
+def train(run_dir: Path | None, pretrained: Pretrained | None = None, **overrides: object):
+    return train_downstream(
+        "toy",
+        small_pretrained() if pretrained is None else pretrained,
+        run_dir=run_dir,
+        config=SMALL,
+        env_factory=toy_env,
+        progress=False,
+        **overrides,
+    )
+
+
+def rows_without_time(rows: list[dict]) -> list[dict]:
+    return [{k: v for k, v in row.items() if "time" not in k} for row in rows]
+
+
+def test_a_run_evaluates_at_every_interval_and_at_both_ends(tmp_path: Path) -> None:
+    result = train(tmp_path)
+    assert result.env_steps == 120
+    assert [row["env_steps"] for row in result.evaluations] == [0, 0, 40, 40, 80, 80, 120, 120]
+    assert {row["episode"] for row in result.evaluations} == {0, 1}
+    assert result.evaluations[-1]["updates"] == 60 - 12
+    agent, card = load_agent(tmp_path / "agent")
+    pixels = torch.randint(0, 256, (9, 16, 16), dtype=torch.uint8)
+    torch.testing.assert_close(agent(pixels), result.policy(pixels), rtol=0, atol=0)
+    assert card["task"] == "toy"
+
+
+def test_training_changes_the_actor_and_leaves_the_encoder_projector_and_prototypes_alone(
+    tmp_path: Path,
+) -> None:
+    pretrained, untouched = small_pretrained(), small_pretrained()
+    first = train(tmp_path / "a", pretrained, env_steps=20)  # 10 decisions: no update yet
+    later = train(tmp_path / "b", small_pretrained())
+    before, after = first.policy.actor.state_dict(), later.policy.actor.state_dict()
+    assert any(not torch.equal(before[k], after[k]) for k in before)
+    for trained, reference in (
+        (later.policy.encoder, untouched.encoder),
+        (pretrained.projector, untouched.projector),
+        (pretrained.prototypes, untouched.prototypes),
+    ):
+        for key, value in reference.state_dict().items():
+            torch.testing.assert_close(trained.state_dict()[key], value, rtol=0, atol=0)
+
+
+def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path: Path) -> None:
+    first, second, other = train(tmp_path / "a"), train(tmp_path / "b"), train(tmp_path / "c", seed=1)
+    assert rows_without_time(first.evaluations) == rows_without_time(second.evaluations)
+    assert rows_without_time(first.evaluations) != rows_without_time(other.evaluations)
+
+
+@pytest.mark.parametrize("features", ["dense", "reencode"])
+def test_stopping_and_resuming_gives_the_numbers_of_an_uninterrupted_run(
+    tmp_path: Path, features: str
+) -> None:
+    whole = train(tmp_path / "whole", features=features)
+    train(tmp_path / "parts", features=features, env_steps=60)
+    resumed = train(tmp_path / "parts", features=features)
+    assert resumed.env_steps == whole.env_steps
+    for key, value in whole.policy.actor.state_dict().items():
+        torch.testing.assert_close(resumed.policy.actor.state_dict()[key], value, rtol=0, atol=0)
+    # The shorter budget made the first part end with an evaluation of its own, at 60 env steps.
+    kept = [row for row in resumed.evaluations if row["env_steps"] != 60]
+    assert rows_without_time(kept) == rows_without_time(whole.evaluations)
+
+
+def test_dense_and_reencoded_features_train_the_same_agent(tmp_path: Path) -> None:
+    first_rows = []
+    for mode in ("dense", "reencode"):
+        train(tmp_path / mode, features=mode)
+        with open(tmp_path / mode / "train.csv", newline="") as file:
+            first_rows.append(next(csv.DictReader(file)))
+    dense, reencoded = first_rows
+    assert dense.keys() == reencoded.keys()
+    for key in ("loss_qvalue", "loss_actor", "q_mean", "entropy", "intrinsic_reward"):
+        assert float(dense[key]) == pytest.approx(float(reencoded[key]), rel=1e-3), key
+
+
+def test_a_finished_run_returns_its_result_without_doing_anything_again(tmp_path: Path) -> None:
+    first = train(tmp_path)
+    record = (tmp_path / "eval.csv").read_bytes()
+    again = train(tmp_path)
+    assert (tmp_path / "eval.csv").read_bytes() == record
+    assert again.evaluations == first.evaluations
+
+
+def test_an_artifact_without_prototypes_trains_without_bonus_and_says_so_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    encoder = {"channels": (4, 4), "strides": (2, 1), "image_size": 16}
+    with caplog.at_level("INFO", logger="crptpro"):
+        train(tmp_path, random_pretrained(seed=0, **encoder))
+    assert caplog.text.count("no exploration bonus") == 1
+    assert "intrinsic_reward" not in (tmp_path / "train.csv").read_text()
+
+
+def test_the_bonus_is_logged_when_there_are_prototypes(tmp_path: Path) -> None:
+    train(tmp_path)
+    assert "intrinsic_reward" in (tmp_path / "train.csv").read_text().splitlines()[0]
+
+
+def test_other_settings_do_not_continue_a_run(tmp_path: Path) -> None:
+    train(tmp_path, env_steps=40)
+    with pytest.raises(CheckpointError, match="batch_size was 8, now 4"):
+        train(tmp_path, batch_size=4)
+
+
+def test_a_directory_with_a_run_is_not_overwritten_when_resuming_is_off(tmp_path: Path) -> None:
+    train(tmp_path, env_steps=40)
+    with pytest.raises(CheckpointError, match="already holds a run"):
+        train(tmp_path, resume=False)
+
+
+def test_an_agent_is_refused_as_a_pretrained_encoder(tmp_path: Path) -> None:
+    train(tmp_path, env_steps=40)
+    with pytest.raises(PretrainedError, match="agent"):
+        train(tmp_path / "next", tmp_path / "agent")
+
+
+def test_without_a_directory_nothing_is_kept_but_the_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    result = train(None, env_steps=40)
+    assert result.agent_path is None
+    assert len(result.evaluations) == 4
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("batch_size", 0), ("discount", 1.5), ("learning_rate", 0.0), ("random_agent_steps", 50)],
+)
+def test_settings_that_cannot_run_are_named_with_their_value(setting: str, value: float) -> None:
+    with pytest.raises(ValueError, match=rf"`?{setting}`?.*{value}|{value}.*`{setting}`"):
+        dataclasses.replace(SMALL, **{setting: value})
