@@ -10,7 +10,7 @@ import pytest
 import crptpro
 
 PACKAGE = Path(crptpro.__file__).parent
-FOUNDATION = ["errors", "seeding", "cards", "artifact", "console", "loggers"]
+FOUNDATION = ["errors", "seeding", "cards", "artifact", "console", "loggers", "downstream_config"]
 ORDER = [
     "domains", "envs", "data", "modules", "objectives", "transforms", "training.evaluate", "training.checkpoint",
     "training.collapse", "training.pretrain", "pretrained", "training", "analysis", "experiments", "doctor", "cli",

@@ -18,7 +18,7 @@ from crptpro.domains import GROUPS
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.loggers import RunLogger, WandbOptions
 from crptpro.seeding import seed_everything
-from crptpro.training.downstream_config import DownstreamConfig
+from crptpro.downstream_config import DownstreamConfig
 
 logger = logging.getLogger(__name__)
 

@@ -117,6 +117,16 @@ def test_slots_address_the_observations(tmp_path):
     assert referred <= set(replay.live_slots().tolist())
 
 
+def test_numbers_of_live_observations_differ_modulo_the_window(tmp_path):
+    replay = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path, slack=13)
+    driver = Driver(replay, length=7)
+    for _ in range(40):
+        driver.write(3)
+        numbers = replay.numbers_at(replay.live_slots())
+        assert len((numbers % replay.window).unique()) == len(numbers)
+        assert numbers[-1] == driver.number - 1
+
+
 def test_written_slots_are_the_sampled_ones():
     replay = FrameReplay(10, frame_shape=(3, 2, 2), action_dim=1)
     first = replay.begin_episode(frame(0))

@@ -56,14 +56,24 @@ def test_a_plateau_beyond_patience_is_dead_and_can_still_recover(caplog: pytest.
     assert "called dead" in caplog.text
 
 
-def test_training_that_ends_on_a_plateau_is_dead_however_short(caplog: pytest.LogCaptureFixture) -> None:
+def test_training_that_ends_on_a_short_plateau_is_announced_but_not_called_dead(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     monitor = CollapseMonitor(512)
     monitor.observe(100, comp=UNIFORM, cosine=0.5)
     verdict = monitor.finish(150)
-    assert verdict["verdict"] == "dead"
+    assert verdict["verdict"] == "plateau"
     assert verdict["plateau_updates"] == 50
-    assert "DEAD RUN" in caplog.text
-    assert monitor.state == "plateau"  # an extended run goes on from here
+    assert [r.levelname for r in caplog.records] == ["WARNING"]
+    assert "has not begun to learn" in caplog.text
+
+
+def test_training_that_ends_beyond_patience_is_called_dead(caplog: pytest.LogCaptureFixture) -> None:
+    monitor = CollapseMonitor(512, patience_updates=100)
+    for updates in (100, 300):
+        monitor.observe(updates, comp=UNIFORM)
+    assert monitor.finish(300)["verdict"] == "dead"
+    assert "DEAD RUN: training ended" in caplog.text
 
 
 def test_a_loss_without_prototypes_is_watched_by_its_cosine() -> None:

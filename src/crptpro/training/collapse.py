@@ -18,8 +18,9 @@ class CollapseMonitor:
     A comparative loss of ln(M) (6.238 for 512 prototypes) means that predictions or assignments are uniform;
     a mean pairwise cosine near 1 means that every observation has the same embedding. Small trials of the
     paper's loss stay there for about 1,200 updates and then leave, so being there is a ``plateau`` at first
-    (announced once, as expected to pass) and ``dead`` only when it lasts longer than ``patience_updates`` or
-    to the end of training.
+    (announced once, as expected to pass) and ``dead`` only when it lasts longer than ``patience_updates``.
+    Training that ends on a plateau that is still short has proved neither: its verdict stays ``plateau``, which is
+    announced as an encoder that has not begun to learn.
 
     Args:
         num_prototypes: M; ``None`` for a loss without prototypes, which is watched by cosine only.
@@ -101,13 +102,13 @@ class CollapseMonitor:
         """Return the judgement after ``updates`` updates as JSON-able values; changes nothing.
 
         Returns:
-            ``verdict`` (``"learning"``, or ``"dead"`` if training ends on a plateau), ``plateaus`` (entry and
-            exit updates), ``plateau_updates`` (their total length), ``ln_num_prototypes``, the last ``comp``
-            and ``cosine`` per domain, and ``collapsed_domains`` (those above the threshold).
+            ``verdict`` (``"learning"``, ``"plateau"`` or ``"dead"``), ``plateaus`` (entry and exit updates),
+            ``plateau_updates`` (their total length), ``ln_num_prototypes``, the last ``comp`` and ``cosine`` per
+            domain, and ``collapsed_domains`` (those above the threshold).
         """
         length = sum((updates if leave is None else leave) - (enter or 0) for enter, leave in self.plateaus)
         return {
-            "verdict": "learning" if self.state == "learning" else "dead",
+            "verdict": self.state,
             "plateaus": [{"entered": enter, "left": leave} for enter, leave in self.plateaus],
             "plateau_updates": length,
             "ln_num_prototypes": self.floor,
@@ -119,11 +120,17 @@ class CollapseMonitor:
     def finish(self, updates: int) -> dict[str, Any]:
         """Announce how training ended and return :meth:`verdict`."""
         verdict = self.verdict(updates)
-        if verdict["verdict"] == "dead":
-            entered = self.plateaus[-1][0]
+        if self.state == "dead":
             _LOG.error(
-                "DEAD RUN: training ended at update %d on a plateau entered at update %s (%s). Small trials "
-                "of the paper's loss needed about 1,200 updates to leave it; train longer or check the data.",
+                "DEAD RUN: training ended at update %d on a plateau entered at update %s (%s). "
+                "Do not use this encoder; check the data and the temperatures.",
+                updates, self.plateaus[-1][0], self._reasons() or "not left yet",
+            )  # fmt: skip
+        elif self.state == "plateau":
+            entered = self.plateaus[-1][0] or 0
+            _LOG.warning(
+                "Training ended at update %d on a plateau entered at update %d (%s): the encoder has not begun to "
+                "learn. That may pass (small trials of the paper's loss took about 1,200 updates); train longer.",
                 updates, entered, self._reasons() or "not left yet",
             )  # fmt: skip
         elif verdict["collapsed_domains"]:

@@ -15,7 +15,7 @@ from crptpro.loggers import RunLogger
 from crptpro.pretrained import Pretrained, load_pretrained
 from crptpro.training.agent import PixelAgent
 from crptpro.training.checkpoint import CheckpointDir, exclusive
-from crptpro.training.downstream_config import DownstreamConfig
+from crptpro.downstream_config import DownstreamConfig
 from crptpro.training.downstream_run import DownstreamRun, EnvFactory
 
 

@@ -21,7 +21,7 @@ from crptpro.modules import (
 )
 from crptpro.objectives import RADSACLoss
 from crptpro.pretrained import Pretrained
-from crptpro.training.downstream_config import DownstreamConfig
+from crptpro.downstream_config import DownstreamConfig
 from crptpro.training.frozen_features import FrozenFeatures
 from crptpro.training.rad_sac_learner import RADSACLearner
 from crptpro.transforms import PrototypeReward, choose_feature_mode

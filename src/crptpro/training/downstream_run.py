@@ -22,7 +22,7 @@ from crptpro.pretrained import Pretrained
 from crptpro.seeding import derive_seed, global_rng_state, seed_everything, set_global_rng_state
 from crptpro.training.agent import PixelAgent, save_agent
 from crptpro.training.checkpoint import CheckpointDir
-from crptpro.training.downstream_config import DownstreamConfig
+from crptpro.downstream_config import DownstreamConfig
 from crptpro.training.downstream_parts import Parts, build_parts
 from crptpro.training.evaluate import evaluate, summarize
 from crptpro.training.pretrain.fingerprint import require_same
