@@ -31,13 +31,32 @@ def configure_logging(level: int = logging.INFO) -> None:
 
 
 def run_main(main: Callable[[], object]) -> None:
-    """Run a program: expected errors become one line and exit status 1, Ctrl-C exits with 130."""
+    """Run a program: expected errors become one line and exit status 1, Ctrl-C exits with 130.
+
+    Expected are this library's own errors, a setting it refuses, and a file that cannot be read or written.
+    Anything else is a defect and keeps its traceback.
+    """
     configure_logging()
     try:
         main()
-    except CRPTproError as error:
+    except (CRPTproError, ValueError, OSError) as error:
+        if not _is_expected(error):
+            raise
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from None
     except KeyboardInterrupt:
         print("interrupted; the same command continues from the last checkpoint.", file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def _is_expected(error: Exception) -> bool:
+    if isinstance(error, CRPTproError):
+        return True
+    if isinstance(error, OSError):
+        return error.filename is not None  # the message names the file
+    # A ValueError that this library's own code raised names a setting; one from below is a defect.
+    origin = error.__traceback__
+    while origin is not None and origin.tb_next is not None:
+        origin = origin.tb_next
+    module = "" if origin is None else origin.tb_frame.f_globals.get("__name__", "")
+    return module.split(".")[0] == "crptpro"

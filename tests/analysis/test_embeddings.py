@@ -25,5 +25,5 @@ def test_components_agree_with_the_eigenvectors_of_the_covariance() -> None:
 
 
 def test_too_many_components_are_refused_with_the_limit_in_the_message() -> None:
-    with pytest.raises(ValueError, match="at most min.* = 3, got 4"):
+    with pytest.raises(ValueError, match=r"at most min.* = 3, got 4"):
         principal_components(torch.randn(3, 10), components=4)

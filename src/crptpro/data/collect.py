@@ -111,10 +111,12 @@ def collect_group(
         raise DatasetError(f"transitions and workers must be at least 1, got {transitions} and {workers}.")
     # Imported late: nothing that reads datasets needs the simulators.
     from crptpro.envs import episode_length, make_env
+    from crptpro.envs.rendering import select_backend
 
     root = Path(root)
     paths: dict[str, Path] = {}
     factories: dict[str, Callable[[], EnvBase]] = {}
+    needs_gl: set[str] = set()
     with ExitStack() as stack:
         collections: dict[str, DomainCollection] = {}
         for domain in map(get_domain, domains):
@@ -122,6 +124,8 @@ def collect_group(
             if path in paths.values():
                 raise DatasetError(f"Two of the domains would be collected into {path}; collect them apart.")
             paths[domain.name] = path
+            if domain.source != "own":
+                needs_gl.add(domain.name)
             settings: dict[str, Any] = {
                 "image_size": image_size,
                 "action_repeat": domain.action_repeat if action_repeat is None else action_repeat,
@@ -141,6 +145,9 @@ def collect_group(
             logger.info("%s: %s is complete", name, paths[name])
         if missing:
             _announce(missing, root)
+            if needs_gl & missing.keys():
+                # Proven here once, for as many renderers as will run: some drivers hang when several start together.
+                select_backend(processes=workers)
             _run(missing, factories, workers, stall_timeout_s, progress)
     return paths
 

@@ -91,9 +91,9 @@ def plot_learning_curves(
         low, high = [m - s for m, s in zip(mean, std)], [m + s for m, s in zip(mean, std)]
         axis.fill_between(x, low, high, alpha=0.2, color=line.get_color(), linewidth=0)
     if baseline is not None:
-        mean, std = baseline
-        axis.axhline(mean, color="0.4", linestyle="--", linewidth=1, label="uniform random policy")
-        axis.axhspan(mean - std, mean + std, color="0.4", alpha=0.15, linewidth=0)
+        center, spread = baseline
+        axis.axhline(center, color="0.4", linestyle="--", linewidth=1, label="uniform random policy")
+        axis.axhspan(center - spread, center + spread, color="0.4", alpha=0.15, linewidth=0)
     axis.set(xlabel="env steps", ylabel="episode return", title=title)
     axis.legend(fontsize=8)
     figure.savefig(out)

@@ -1,10 +1,10 @@
 """Training: offline pre-training, downstream SAC on a frozen encoder, evaluation, checkpoints."""
 
+from crptpro.downstream_config import DownstreamConfig
 from crptpro.training.agent import PixelAgent, load_agent, save_agent
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.downstream import DownstreamResult, train_downstream
-from crptpro.downstream_config import DownstreamConfig
 from crptpro.training.evaluate import Episode, evaluate, summarize, uniform_policy
 from crptpro.training.pretrain import PretrainResult, pretrain
 

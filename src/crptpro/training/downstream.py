@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from crptpro.downstream_config import DownstreamConfig
 from crptpro.envs import make_env
 from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
 from crptpro.pretrained import Pretrained, load_pretrained
 from crptpro.training.agent import PixelAgent
 from crptpro.training.checkpoint import CheckpointDir, exclusive
-from crptpro.downstream_config import DownstreamConfig
 from crptpro.training.downstream_run import DownstreamRun, EnvFactory
 
 

@@ -12,6 +12,7 @@ import torch
 from torchrl.envs import EnvBase
 
 from crptpro.data import FrameReplay
+from crptpro.downstream_config import DownstreamConfig
 from crptpro.modules import (
     PixelEncoder,
     SquashedGaussianActor,
@@ -21,7 +22,6 @@ from crptpro.modules import (
 )
 from crptpro.objectives import RADSACLoss
 from crptpro.pretrained import Pretrained
-from crptpro.downstream_config import DownstreamConfig
 from crptpro.training.frozen_features import FrozenFeatures
 from crptpro.training.rad_sac_learner import RADSACLearner
 from crptpro.transforms import PrototypeReward, choose_feature_mode

@@ -16,13 +16,13 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 from tqdm.auto import tqdm
 
+from crptpro.downstream_config import DownstreamConfig
 from crptpro.errors import NonFiniteError
 from crptpro.loggers import RunLogger
 from crptpro.pretrained import Pretrained
 from crptpro.seeding import derive_seed, global_rng_state, seed_everything, set_global_rng_state
 from crptpro.training.agent import PixelAgent, save_agent
 from crptpro.training.checkpoint import CheckpointDir
-from crptpro.downstream_config import DownstreamConfig
 from crptpro.training.downstream_parts import Parts, build_parts
 from crptpro.training.evaluate import evaluate, summarize
 from crptpro.training.pretrain.fingerprint import require_same
@@ -87,6 +87,7 @@ class DownstreamRun:
 
     @property
     def env_steps(self) -> int:
+        """Simulator steps taken so far."""
         return self.agent_steps * self.config.action_repeat
 
     # --- the loop -----------------------------------------------------------------------------------------------

@@ -34,9 +34,7 @@ def write_video(pictures: Tensor, path: str | Path, *, pictures_per_s: int = 25)
     try:
         # Nearest-neighbour enlargement keeps 84 pixels visible on a screen; the codec wants even sizes.
         large = pictures.repeat_interleave(4, -1).repeat_interleave(4, -2).permute(0, 2, 3, 1).numpy()
-        with imageio.get_writer(temporary, format="FFMPEG", fps=pictures_per_s, macro_block_size=4) as writer:
-            for picture in large:
-                writer.append_data(picture)
+        imageio.mimwrite(temporary, list(large), format="FFMPEG", fps=pictures_per_s, macro_block_size=4)
         temporary.replace(path)
     except (OSError, RuntimeError, ValueError) as reason:
         temporary.unlink(missing_ok=True)

@@ -69,7 +69,7 @@ class DenseShiftCache:
             self._embeddings = self._allocate((slots, (2 * pad + 1) ** 2, latent_dim), torch.float32)
         self._written = torch.zeros(slots, dtype=torch.bool)
         self.nbytes = self._maps.nbytes + (0 if self._embeddings is None else self._embeddings.nbytes)
-        logger.info(
+        logger.debug(
             "Dense-shift cache: %.2f GiB on %s when full (%d observations, %s).",
             self.nbytes / 2**30,
             self.device,

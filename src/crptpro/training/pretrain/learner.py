@@ -52,7 +52,7 @@ class Learner:
             betas=defaults.betas,
             eps=defaults.eps,
             weight_decay=defaults.weight_decay,
-            fused=True if parameters[0].is_cuda else None,
+            fused=True,
         )
         self.updater = None if self.encoder_tau is None else _keep_targets(loss, self.encoder_tau)
         self.names: list[str] = []

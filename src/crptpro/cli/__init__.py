@@ -2,54 +2,26 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional, arg, subcommand
 
+from crptpro.cli.evaluate import Evaluate, Quality
+from crptpro.cli.request import Logging, expand_groups, image_format, require_device
 from crptpro.console import run_main
-from crptpro.domains import GROUPS
-from crptpro.errors import CRPTproError, UnknownNameError
-from crptpro.loggers import RunLogger, WandbOptions
-from crptpro.seeding import seed_everything
+from crptpro.domains import get_domain
 from crptpro.downstream_config import DownstreamConfig
+from crptpro.seeding import seed_everything
 
 logger = logging.getLogger(__name__)
 
-Quality = Literal["exact", "fast"]
 Precision = Literal["auto", "fp32", "bf16"]
 RANDOM_ENCODER = "random-encoder"
-
-
-@dataclass(frozen=True)
-class Logging:
-    """Where metrics go besides the local CSV and JSONL records, which are always written."""
-
-    wandb: Literal["off", "auto", "offline", "online"] = "off"
-    """mirror to Weights & Biases; auto is online when logged in, else offline"""
-    wandb_project: str = "crptpro"
-    """W&B project"""
-    wandb_group: str | None = None
-    """W&B group"""
-    wandb_tags: tuple[str, ...] = ()
-    """W&B tags"""
-    tensorboard: bool = False
-    """also write TensorBoard event files"""
-
-    def open(self, run_dir: Path, config: Any) -> RunLogger:
-        """Open the record of a run, and its mirrors."""
-        options = None
-        if self.wandb != "off":
-            options = WandbOptions(
-                project=self.wandb_project, group=self.wandb_group, tags=self.wandb_tags, mode=self.wandb
-            )
-        return RunLogger(run_dir, config=config, wandb=options, tensorboard=self.tensorboard)
 
 
 @dataclass(frozen=True)
@@ -132,7 +104,7 @@ class Pretrain:
     """updates between two checkpoints"""
     log_interval: int = 50
     """updates between two rows of the record"""
-    logging: Logging = Logging()
+    logging: Logging = field(default_factory=Logging)
     """mirrors"""
 
     def run(self) -> None:
@@ -142,13 +114,16 @@ class Pretrain:
         from crptpro.pretrained import save_pretrained
         from crptpro.training import pretrain
 
+        # Whatever is wrong with the request is found before the run directory is made.
+        require_device(self.device)
+        image_size, frame_stack = image_format(self.datasets)
         options = {
             name: value
             for name in ("assignment_temperature", "intr_loss_coef")
             if (value := getattr(self, name)) is not None
         }
         seed_everything(self.seed)
-        loss = get_method(self.method).build(PixelEncoder(), **options)
+        loss = get_method(self.method).build(PixelEncoder(3 * frame_stack, image_size=image_size), **options)
         with self.logging.open(self.out, self) as records:
             pretrain(
                 loss,
@@ -189,23 +164,39 @@ class Finetune:
     """arithmetic of the convolutions and big matrix products"""
     device: str = "cpu"
     """where to train"""
+    checkpoint_interval: int = 500
+    """updates between two checkpoints"""
+    log_interval: int = 50
+    """updates between two rows of the record"""
+    logging: Logging = field(default_factory=Logging)
+    """mirrors"""
 
     def run(self) -> None:
         """Fine-tune, or continue, and write the artifact."""
-        from crptpro.pretrained import finetune, save_pretrained
+        from crptpro.pretrained import finetune, load_pretrained, save_pretrained
 
-        loss, _ = finetune(
-            self.pretrained,
-            self.dataset,
-            updates=self.updates,
-            batch_size=self.batch_size,
-            learning_rate=self.learning_rate,
-            seed=self.seed,
-            precision=self.precision,
-            device=self.device,
-            run_dir=self.out,
+        require_device(self.device)
+        image_size, frame_stack = image_format([self.dataset])
+        pretrained = load_pretrained(
+            self.pretrained, expect={"image_size": image_size, "frame_stack": frame_stack}
         )
-        logger.info("fine-tuned encoder: %s", save_pretrained(loss, self.out / "encoder"))
+        seed_everything(self.seed)
+        with self.logging.open(self.out, self) as records:
+            loss, _ = finetune(
+                pretrained,
+                self.dataset,
+                updates=self.updates,
+                batch_size=self.batch_size,
+                learning_rate=self.learning_rate,
+                seed=self.seed,
+                precision=self.precision,
+                device=self.device,
+                run_dir=self.out,
+                logger=records,
+                checkpoint_interval=self.checkpoint_interval,
+                log_interval=self.log_interval,
+            )
+            logger.info("fine-tuned encoder: %s", save_pretrained(loss, self.out / "encoder"))
 
 
 @dataclass(frozen=True)
@@ -220,84 +211,25 @@ class Downstream:
     """run directory: eval.csv, train.csv, checkpoints, and the agent in OUT/agent"""
     config: Annotated[DownstreamConfig, arg(name="")] = field(default_factory=DownstreamConfig)
     """every number of the stage"""
-    logging: Logging = Logging()
+    logging: Logging = field(default_factory=Logging)
     """mirrors"""
 
     def run(self) -> None:
         """Train, or continue."""
-        from crptpro.pretrained import random_pretrained
+        from crptpro.pretrained import load_pretrained, random_pretrained
         from crptpro.training import train_downstream
 
-        is_random = self.pretrained == RANDOM_ENCODER
-        artifact = random_pretrained(seed=self.config.seed) if is_random else self.pretrained
+        require_device(self.config.device)
+        get_domain(self.task)  # an unknown name is refused before the run directory is made
+        if self.pretrained == RANDOM_ENCODER:
+            artifact = random_pretrained(seed=self.config.seed)
+        else:
+            artifact = load_pretrained(self.pretrained)
         with self.logging.open(self.out, self) as records:
             result = train_downstream(
                 self.task, artifact, run_dir=self.out, config=self.config, logger=records
             )
         logger.info("agent: %s", result.agent_path)
-
-
-@dataclass(frozen=True)
-class Evaluate:
-    """Evaluate a trained agent, or the uniform random policy, for whole episodes."""
-
-    agent: Positional[str]
-    """directory of an agent (OUT/agent of a downstream run), or `random-policy`"""
-    task: str | None = None
-    """task to act in (default: the agent's own)"""
-    episodes: int = 10
-    """whole episodes"""
-    seed: int = 0
-    """seeds the episodes"""
-    quality: Quality = "exact"
-    """render quality"""
-    csv: Path | None = None
-    """write one row per episode here"""
-    video: Path | None = None
-    """write the first episode as MP4 here (needs the `video` extra)"""
-
-    def run(self) -> None:
-        """Print mean and deviation, and write what was asked for."""
-        from crptpro.envs import make_env
-        from crptpro.training import evaluate, load_agent, summarize, uniform_policy
-        from crptpro.training.video import write_video
-
-        is_random = self.agent == "random-policy"
-        if is_random and self.task is None:
-            raise CRPTproError(
-                "The random policy has no task of its own; name one with --task, e.g. --task walker_run."
-            )
-        agent, card = (None, {}) if is_random else load_agent(self.agent)
-        task = self.task or card["task"]
-        env = make_env(task, seed=self.seed, quality=self.quality)
-        policy = agent if agent is not None else uniform_policy(env, seed=self.seed)
-        episodes, videos = evaluate(
-            policy, env, episodes=self.episodes, seed=self.seed, record_episodes=int(self.video is not None)
-        )
-        env.close()
-        scores = summarize(episodes)
-        print(
-            f"{task}: {scores['mean']:.1f} ± {scores['std']:.1f} "
-            f"({scores['min']:.1f} to {scores['max']:.1f}) over {len(episodes)} episodes"
-        )
-        if self.csv is not None:
-            self.csv.parent.mkdir(parents=True, exist_ok=True)
-            with open(self.csv, "w", newline="") as file:
-                writer = csv.writer(file)
-                writer.writerow(["task", "agent", "episode", "episode_return", "agent_steps", "seed"])
-                writer.writerows(
-                    [task, self.agent, e.episode, e.episode_return, e.agent_steps, e.seed] for e in episodes
-                )
-        if self.video is not None:
-            write_video(videos[0], self.video)
-
-
-def expand_groups(names: Sequence[str]) -> list[str]:
-    """Replace group letters by their domains, keeping order and dropping repeats."""
-    expanded = [domain for name in names for domain in GROUPS.get(name, (name,))]
-    if not expanded:
-        raise UnknownNameError(f"Name at least one domain, task or group ({', '.join(GROUPS)}).")
-    return list(dict.fromkeys(expanded))
 
 
 def main() -> None:

@@ -1,0 +1,86 @@
+"""``crptpro evaluate``: whole episodes of a trained agent, or of chance."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from tyro.conf import Positional
+
+from crptpro.errors import CRPTproError
+
+Quality = Literal["exact", "fast"]
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Evaluate a trained agent, or the uniform random policy, for whole episodes."""
+
+    agent: Positional[str]
+    """directory of an agent (OUT/agent of a downstream run), or `random-policy`"""
+    task: str | None = None
+    """task to act in (default: the agent's own)"""
+    episodes: int = 10
+    """whole episodes"""
+    seed: int = 0
+    """seeds the episodes"""
+    quality: Quality | None = None
+    """render quality (default: the one the agent was trained with; exact for the random policy)"""
+    csv: Path | None = None
+    """write one row per episode here"""
+    video: Path | None = None
+    """write the first episode as MP4 here (needs the `video` extra)"""
+
+    def run(self) -> None:
+        """Print mean and deviation, and write what was asked for."""
+        from crptpro.envs import make_env
+        from crptpro.training import evaluate, load_agent, summarize, uniform_policy
+        from crptpro.training.video import write_video
+
+        is_random = self.agent == "random-policy"
+        if is_random and self.task is None:
+            raise CRPTproError(
+                "The random policy has no task of its own; name one with --task, e.g. --task walker_run."
+            )
+        agent, card = (None, {}) if is_random else load_agent(self.agent)
+        task = self.task or card["task"]
+        trained_with = card.get("config", {})
+        settings: dict[str, Any] = {"quality": self.quality or trained_with.get("quality", "exact")}
+        if agent is not None:
+            settings["image_size"] = agent.encoder.image_size
+            settings["frame_stack"] = agent.encoder.in_channels // 3
+            settings["action_repeat"] = trained_with.get("action_repeat", 2)
+        env = make_env(task, seed=self.seed, **settings)
+        try:
+            action_dim = env.action_spec.shape[-1]
+            if agent is not None and agent.actor.action_dim != action_dim:
+                raise CRPTproError(
+                    f"The agent was trained for {agent.actor.action_dim} actions ({card['task']}), "
+                    f"{task} has {action_dim}; choose a task of the agent's own domain."
+                )
+            episodes, videos = evaluate(
+                agent or uniform_policy(env, seed=self.seed),
+                env,
+                episodes=self.episodes,
+                seed=self.seed,
+                record_episodes=int(self.video is not None),
+            )
+        finally:
+            env.close()
+        scores = summarize(episodes)
+        print(
+            f"{task}: {scores['mean']:.1f} ± {scores['std']:.1f} "
+            f"({scores['min']:.1f} to {scores['max']:.1f}) over {len(episodes)} episodes"
+        )
+        if self.csv is not None:
+            self.csv.parent.mkdir(parents=True, exist_ok=True)
+            with open(self.csv, "w", newline="") as file:
+                writer = csv.writer(file)
+                writer.writerow(["task", "agent", "episode", "episode_return", "agent_steps", "seed"])
+                writer.writerows(
+                    [task, self.agent, e.episode, e.episode_return, e.agent_steps, e.seed] for e in episodes
+                )
+        if self.video is not None:
+            write_video(videos[0], self.video)

@@ -1,0 +1,88 @@
+"""What a command checks before it starts, so that a refused request leaves nothing behind, and its records."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from crptpro.domains import GROUPS
+from crptpro.errors import CRPTproError, DatasetError, UnknownNameError
+from crptpro.loggers import RunLogger, WandbOptions
+
+
+@dataclass(frozen=True)
+class Logging:
+    """Where metrics go besides the local CSV and JSONL records, which are always written."""
+
+    wandb: Literal["off", "auto", "offline", "online"] = "off"
+    """mirror to Weights & Biases; auto is online when logged in, else offline"""
+    wandb_project: str = "crptpro"
+    """W&B project"""
+    wandb_group: str | None = None
+    """W&B group"""
+    wandb_tags: tuple[str, ...] = ()
+    """W&B tags"""
+    tensorboard: bool = False
+    """also write TensorBoard event files"""
+
+    def open(self, run_dir: Path, config: Any) -> RunLogger:
+        """Open the record of a run, and its mirrors."""
+        options = None
+        if self.wandb != "off":
+            options = WandbOptions(
+                project=self.wandb_project, group=self.wandb_group, tags=self.wandb_tags, mode=self.wandb
+            )
+        return RunLogger(run_dir, config=config, wandb=options, tensorboard=self.tensorboard)
+
+
+def expand_groups(names: Sequence[str]) -> list[str]:
+    """Replace group letters by their domains, keeping order and dropping repeats.
+
+    Raises:
+        UnknownNameError: if no name is given.
+    """
+    expanded = [domain for name in names for domain in GROUPS.get(name, (name,))]
+    if not expanded:
+        raise UnknownNameError(f"Name at least one domain, task or group ({', '.join(GROUPS)}).")
+    return list(dict.fromkeys(expanded))
+
+
+def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
+    """Open every dataset and check that all show images of one form.
+
+    Returns:
+        Image size in pixels and frames per stack.
+
+    Raises:
+        DatasetError: if there is none, one cannot be read, or they differ.
+    """
+    from crptpro.data import FrameDataset
+
+    if not datasets:
+        raise DatasetError(
+            "Name at least one dataset directory, e.g. data/walker (made by `crptpro collect`)."
+        )
+    opened = {path: FrameDataset.open(path) for path in datasets}
+    sizes = {path: (dataset.card["image_size"], dataset.frame_stack) for path, dataset in opened.items()}
+    if len(set(sizes.values())) > 1:
+        listed = ", ".join(f"{path} has {size} px, {stack} frames" for path, (size, stack) in sizes.items())
+        raise DatasetError(f"One encoder needs images of one size and stack: {listed}.")
+    return next(iter(sizes.values()))
+
+
+def require_device(name: str) -> None:
+    """Make sure that this machine has a device.
+
+    Raises:
+        CRPTproError: with torch's reason.
+    """
+    import torch
+
+    try:
+        torch.empty(1, device=name)
+    except (RuntimeError, AssertionError, NotImplementedError) as reason:
+        raise CRPTproError(
+            f"Device {name!r} cannot be used ({str(reason).splitlines()[0]}); --device cpu always works."
+        ) from None
