@@ -27,6 +27,7 @@ import tyro
 from crptpro.console import run_main
 from crptpro.data import collect_group
 from crptpro.domains import GROUPS, get_domain
+from crptpro.loggers import RunLogger, WandbOptions
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import load_pretrained, random_pretrained, save_pretrained
@@ -84,6 +85,10 @@ class Config:
     device: str = "cpu"
     """where to train"""
 
+    # logging
+    wandb: Literal["off", "auto", "offline", "online"] = "off"
+    """mirror the records to Weights & Biases; auto is online when logged in, else offline"""
+
     # downstream
     downstream: DownstreamConfig = field(default_factory=DownstreamConfig)
     """SAC on the frozen encoder"""
@@ -94,6 +99,9 @@ def main(config: Config) -> None:
     seed_everything(config.seed)
     out = config.out
     domains = GROUPS[config.group]
+    wandb = None
+    if config.wandb != "off":
+        wandb = WandbOptions(group=f"group_{config.group}", tags=(config.pretrained,), mode=config.wandb)
 
     if config.pretrained == "random-encoder":
         pretrained = random_pretrained(seed=config.seed)
@@ -117,31 +125,36 @@ def main(config: Config) -> None:
             offset=config.offset,
         )
         run_dir = out / f"group_{config.group}_seed_{config.seed}"
-        pretrain(
-            loss,
-            datasets,
-            updates=config.updates,
-            batch_size=config.pretrain_batch_size,
-            learning_rate=config.pretrain_learning_rate,
-            encoder_tau=config.encoder_tau,
-            seed=config.seed,
-            precision=config.precision,
-            device=config.device,
-            run_dir=run_dir,
-        )
+        with RunLogger(run_dir, config=config, wandb=wandb) as logger:
+            pretrain(
+                loss,
+                datasets,
+                updates=config.updates,
+                batch_size=config.pretrain_batch_size,
+                learning_rate=config.pretrain_learning_rate,
+                encoder_tau=config.encoder_tau,
+                seed=config.seed,
+                precision=config.precision,
+                device=config.device,
+                run_dir=run_dir,
+                logger=logger,
+            )
         pretrained = load_pretrained(save_pretrained(loss, run_dir / "encoder"))
 
     for task in config.tasks or [get_domain(domain).task for domain in domains]:
-        train_downstream(
-            task,
-            pretrained,
-            run_dir=out / f"{task}_{config.pretrained}_seed_{config.seed}",
-            config=config.downstream,
-            seed=derive_seed(config.seed, "task", task),
-            quality=config.quality,
-            precision=config.precision,
-            device=config.device,
-        )
+        run_dir = out / f"{task}_{config.pretrained}_seed_{config.seed}"
+        with RunLogger(run_dir, config=config, wandb=wandb) as logger:
+            train_downstream(
+                task,
+                pretrained,
+                run_dir=run_dir,
+                config=config.downstream,
+                seed=derive_seed(config.seed, "task", task),
+                quality=config.quality,
+                precision=config.precision,
+                device=config.device,
+                logger=logger,
+            )
 
 
 if __name__ == "__main__":

@@ -26,6 +26,10 @@ class DownstreamConfig:
     """transitions kept; the oldest go first"""
     random_agent_steps: int = 1_000
     """decisions taken uniformly at random before the first update"""
+    bottleneck_dim: int = 50
+    """width that actor and critic first reduce the features to"""
+    hidden_dim: int = 1024
+    """width of the two hidden layers of actor and critic"""
     discount: float = 0.99
     """per agent step; only true terminations stop bootstrapping, time limits never do"""
     learning_rate: float = 1e-4
@@ -54,7 +58,7 @@ class DownstreamConfig:
     """episodes per evaluation"""
     video_episodes: int = 0
     """episodes per evaluation that are written as video (needs the `video` extra)"""
-    checkpoint_interval_env_steps: int = 10_000
+    checkpoint_interval_env_steps: int = 5_000
     """simulator steps between two checkpoints, taken at episode ends"""
     log_interval_env_steps: int = 1_000
     """simulator steps between two rows of training metrics"""
@@ -74,7 +78,8 @@ class DownstreamConfig:
             ValueError: naming the setting, its value and what is allowed.
         """
         for name in (
-            "env_steps", "action_repeat", "batch_size", "replay_capacity", "actor_update_interval",
+            "env_steps", "action_repeat", "batch_size", "replay_capacity", "bottleneck_dim", "hidden_dim",
+            "actor_update_interval",
             "target_update_interval", "knn_k", "queue_size", "eval_interval_env_steps", "eval_episodes",
             "checkpoint_interval_env_steps", "log_interval_env_steps",
         ):  # fmt: skip

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from crptpro.domains import GROUPS
+from crptpro.domains import GROUPS, get_domain
 from crptpro.errors import CRPTproError, DatasetError, UnknownNameError
 from crptpro.loggers import RunLogger, WandbOptions
 
@@ -41,11 +41,13 @@ def expand_groups(names: Sequence[str]) -> list[str]:
     """Replace group letters by their domains, keeping order and dropping repeats.
 
     Raises:
-        UnknownNameError: if no name is given.
+        UnknownNameError: if no name is given, or one that nobody knows.
     """
     expanded = [domain for name in names for domain in GROUPS.get(name, (name,))]
     if not expanded:
         raise UnknownNameError(f"Name at least one domain, task or group ({', '.join(GROUPS)}).")
+    for name in expanded:
+        get_domain(name)
     return list(dict.fromkeys(expanded))
 
 

@@ -211,12 +211,16 @@ class StopRequest:
 
     A second Ctrl-C stops at once. Outside the main thread, where Python delivers no signals, it does nothing.
 
+    Args:
+        announcement: logged when the request arrives, for loops that take a while to heed it.
+
     Attributes:
         signal: the signal received, or ``None``.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, announcement: str = "") -> None:
         self.signal: int | None = None
+        self._announcement = announcement
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> StopRequest:
@@ -240,6 +244,8 @@ class StopRequest:
         if self.signal is not None:
             raise KeyboardInterrupt
         self.signal = number
+        if self._announcement:
+            _LOG.warning(self._announcement)
 
 
 def sync_directory(path: Path) -> None:

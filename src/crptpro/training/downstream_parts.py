@@ -63,8 +63,9 @@ def build_parts(
         set_compute_dtype(module.requires_grad_(False).eval().to(config.device), dtype)
 
     feature_dim, action_dim = pretrained.encoder.feature_dim, env.action_spec.shape[-1]
-    actor = SquashedGaussianActor(feature_dim, action_dim).to(config.device)
-    critic = TwinCritic(feature_dim, action_dim).to(config.device)
+    widths = {"bottleneck_dim": config.bottleneck_dim, "hidden_dim": config.hidden_dim}
+    actor = SquashedGaussianActor(feature_dim, action_dim, **widths).to(config.device)
+    critic = TwinCritic(feature_dim, action_dim, **widths).to(config.device)
     loss = RADSACLoss(
         actor,
         critic,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from crptpro.loggers import RunLogger
 from crptpro.pretrained import Pretrained
 from crptpro.seeding import derive_seed, global_rng_state, seed_everything, set_global_rng_state
 from crptpro.training.agent import PixelAgent, save_agent
-from crptpro.training.checkpoint import CheckpointDir
+from crptpro.training.checkpoint import CheckpointDir, StopRequest
 from crptpro.training.downstream_parts import Parts, build_parts
 from crptpro.training.evaluate import evaluate, summarize
 from crptpro.training.pretrain.fingerprint import require_same
@@ -31,6 +30,8 @@ from crptpro.training.video import write_video
 logger = logging.getLogger(__name__)
 
 EnvFactory = Callable[..., EnvBase]
+
+STREAMS = ("train", "episodes", "eval")
 
 DELAYED_METRICS = frozenset({"loss_actor", "loss_alpha", "alpha", "entropy"})
 """Metrics that only the delayed updates report."""
@@ -103,7 +104,8 @@ class DownstreamRun:
             leave=False,
             disable=None if self.progress else True,
         )
-        try:
+        announcement = "Stopping at the end of this episode; press Ctrl-C again to stop at once."
+        with StopRequest(announcement) as stop, bar:
             while True:
                 is_finished = self.env_steps >= config.env_steps
                 is_new = self.last_eval != self.env_steps
@@ -118,9 +120,14 @@ class DownstreamRun:
                     self.save(checkpoints)
                 if is_finished:
                     return
+                if stop.signal is not None:
+                    if checkpoints is not None:
+                        self.save(checkpoints)
+                    logger.warning(
+                        "Stopped at %s of %s env steps.", f"{self.env_steps:,}", f"{config.env_steps:,}"
+                    )
+                    stop.leave()
                 self.run_episode(bar)
-        finally:
-            bar.close()
 
     def _after(self, interval: int) -> int:
         return (self.env_steps // interval + 1) * interval
@@ -189,19 +196,28 @@ class DownstreamRun:
         """Write the mean of every metric over the updates since the last row."""
         if self.summed_updates == 0:
             return
+        self.check_finite()
         means = {}
         for key, total in self.sums.items():
             count = self.summed_updates
             if key in DELAYED_METRICS:
                 count = max(1, count // self.config.actor_update_interval)
             means[key] = (total / count).item()
-            if not math.isfinite(means[key]):
-                raise NonFiniteError(
-                    f"{key} became {means[key]} before update {self.updates} of {self.task}. The last checkpoint is "
-                    "kept; a smaller learning rate or precision='fp32' usually helps."
-                )
         self.sums, self.summed_updates = {}, 0
         self.records.log(means, stream="train", env_steps=self.env_steps, updates=self.updates)
+
+    def check_finite(self) -> None:
+        """Refuse to log or keep a run that has diverged.
+
+        Raises:
+            NonFiniteError: naming the metric; the last checkpoint is kept.
+        """
+        for key, total in self.sums.items():
+            if not torch.isfinite(total):
+                raise NonFiniteError(
+                    f"{key} of {self.task} became {total.item()} at or before update {self.updates}. The last "
+                    "checkpoint is kept; a smaller learning rate or precision='fp32' usually helps."
+                )
 
     def evaluate(self) -> None:
         """Run whole deterministic episodes in an environment of their own and record each."""
@@ -265,7 +281,7 @@ class DownstreamRun:
 
     def save(self, checkpoints: CheckpointDir) -> None:
         """Write everything a resumed run needs; frames are already on disk, in the replay's own files."""
-        self.log_training()
+        self.check_finite()
         state = {
             "fingerprint": self.fingerprint(),
             "counters": {name: getattr(self, name) for name in self.COUNTERS},
@@ -274,7 +290,9 @@ class DownstreamRun:
             "replay": self.parts.replay.state_dict(),
             "generators": {name: generator.get_state() for name, generator in self.generators.items()},
             "global_rng": global_rng_state(),
-            "records": self.records.state_dict(),
+            "sums": self.sums,
+            "summed_updates": self.summed_updates,
+            "records": self.records.state_dict(STREAMS),
         }
         checkpoints.save(state, counter=self.agent_steps)
 
@@ -286,6 +304,8 @@ class DownstreamRun:
         """
         state = checkpoints.load_latest()
         if state is None:
+            for stream in STREAMS:  # rows of an attempt that was killed before its first checkpoint
+                self.records.truncate_to(stream, "env_steps", -1)
             return
         require_same(state["fingerprint"], self.fingerprint(), self.run_dir)
         for name, value in state["counters"].items():
@@ -297,6 +317,7 @@ class DownstreamRun:
         for name, generator in self.generators.items():
             generator.set_state(state["generators"][name])
         set_global_rng_state(state["global_rng"])
+        self.sums, self.summed_updates = state["sums"], state["summed_updates"]
         self.records.load_state_dict(state["records"])
         if self.next_eval == -1 and self.env_steps < self.config.env_steps:
             self.next_eval = self._after(

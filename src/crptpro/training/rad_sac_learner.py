@@ -45,7 +45,9 @@ class RADSACLearner:
             "actor": list(loss.actor.parameters()),
             "temperature": [loss.log_alpha],
         }
-        self.optimizers = {name: torch.optim.Adam(group, lr=learning_rate, fused=True) for name, group in groups.items()}
+        self.optimizers = {
+            name: torch.optim.Adam(group, lr=learning_rate, fused=True) for name, group in groups.items()
+        }
 
     def update(self, td: TensorDictBase, *, agent_step: int) -> dict[str, Tensor]:
         """Do one update on a batch.
