@@ -62,7 +62,7 @@ def main(config: Config) -> None:
         workers=config.workers,
         quality=config.quality,
     )
-    run_dir = config.out / config.domain
+    run_dir = config.out / f"finetune_{config.domain}"
     loss, _ = finetune(
         config.pretrained,
         dataset,

@@ -80,8 +80,14 @@ class Config:
     """random transitions"""
     updates: int = 300
     """encoder updates"""
+    pretrain_batch_size: int = 128
+    """transitions per encoder update"""
     env_steps: int = 4_000
     """simulator steps of SAC"""
+    random_agent_steps: int = 500
+    """decisions before the first SAC update"""
+    replay_capacity: int = 5_000
+    """transitions kept for replay"""
     batch_size: int = 128
     """transitions per SAC update"""
     out: Path = Path("runs/own_domain")
@@ -106,13 +112,22 @@ def main(config: Config) -> None:
         quality=config.quality,
     )
     loss = NextLatentLoss(PixelEncoder())
-    pretrain(loss, [dataset], updates=config.updates, seed=config.seed, run_dir=config.out / "pretrain")
+    pretrain(
+        loss,
+        [dataset],
+        updates=config.updates,
+        batch_size=config.pretrain_batch_size,
+        seed=config.seed,
+        run_dir=config.out / "pretrain",
+    )
     encoder = save_pretrained(loss, config.out / "encoder")
     train_downstream(
         config.world,
         encoder,
         run_dir=config.out / "downstream",
         env_steps=config.env_steps,
+        random_agent_steps=config.random_agent_steps,
+        replay_capacity=config.replay_capacity,
         batch_size=config.batch_size,
         learning_rate=1e-3,
         eval_interval_env_steps=2_000,

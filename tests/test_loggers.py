@@ -198,7 +198,10 @@ def test_the_config_is_kept_with_versions(tmp_path: Path) -> None:
         task: str = "walker_run"
         out: Path = Path("runs")
 
-    RunLogger(tmp_path, config=Config()).close()
+    with RunLogger(tmp_path, config=Config()) as logger:
+        # Not before the first row: a request that is refused must not replace the settings of the run it found.
+        assert not (tmp_path / "config.json").exists()
+        logger.log({"loss": 1.0}, stream="train", updates=1)
     written = json.loads((tmp_path / "config.json").read_text())
     assert written["config"] == {"task": "walker_run", "out": "runs"}
     assert "torch" in written["versions"]

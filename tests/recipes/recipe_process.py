@@ -11,7 +11,7 @@ from pathlib import Path
 RECIPES = Path(__file__).parents[2] / "recipes"
 SHORT_TASK = "gymnasium:Reacher-v5"
 """Real MuJoCo pixels with episodes of 25 decisions."""
-SHORT_EPISODE = 25
+MEASURED = {"unix_time_s", "updates_per_s", "resident_bytes", "gpu_bytes"}
 
 
 def command_of(recipe: str, *flags: object) -> list[str]:
@@ -42,15 +42,17 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def records(out: Path) -> dict[str, bytes]:
-    """The bytes of every record and every weight below a directory."""
-    names = ("*.csv", "*.jsonl", "*.safetensors", "*.memmap")
-    return {
-        str(path.relative_to(out)): path.read_bytes()
-        for name in names
-        for path in sorted(out.rglob(name))
-        if "replay" not in path.parts
-    }
+def records(out: Path) -> dict[str, object]:
+    """Every record (without wall time and memory, which the last row of a pre-training measures anew) and weight."""
+    kept: dict[str, object] = {}
+    for path in sorted(out.rglob("*")):
+        if path.suffix == ".csv":
+            kept[str(path.relative_to(out))] = [
+                {key: value for key, value in row.items() if key not in MEASURED} for row in rows(path)
+            ]
+        elif path.suffix in (".safetensors", ".memmap") and path.parent.name != "replay":
+            kept[str(path.relative_to(out))] = path.read_bytes()
+    return kept
 
 
 def free_replays(out: Path) -> None:

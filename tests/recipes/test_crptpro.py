@@ -47,14 +47,8 @@ def test_one_encoder_of_the_group_serves_the_task(out: Path) -> None:
     assert all(float(row["intrinsic_reward"]) >= 0 for row in training)
 
 
-def test_a_second_call_is_quick_and_the_control_needs_no_pretraining(out: Path) -> None:
+def test_a_second_call_is_quick_and_changes_no_record(out: Path) -> None:
     before, start = records(out), time.monotonic()
     run_recipe("crptpro", "--out", out, *PRETRAINING, *DOWNSTREAM)
     assert time.monotonic() - start < 40
     assert records(out) == before
-
-    run_recipe("crptpro", "--out", out, "--pretrained", "random-encoder", *DOWNSTREAM)
-    control = out / f"{SHORT_TASK}_random-encoder_seed_0"
-    assert [row["env_steps"] for row in rows(control / "eval.csv")] == ["0", "50", "80"]
-    assert "intrinsic_reward" not in rows(control / "train.csv")[0]
-    assert {key: value for key, value in records(out).items() if key in before} == before

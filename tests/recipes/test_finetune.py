@@ -29,14 +29,16 @@ def test_an_encoder_moves_to_one_domain_and_serves_its_task(tmp_path: Path) -> N
     out = tmp_path / "out"
     run_recipe("finetune", source, "--out", out, *FLAGS)
 
-    before, after = load_pretrained(source), load_pretrained(out / SHORT_TASK / "encoder")
+    (encoder,), (agent,) = out.rglob("encoder"), out.rglob("agent")
+    before, after = load_pretrained(source), load_pretrained(encoder)
     weights = [pretrained.encoder.state_dict() for pretrained in (before, after)]
     assert any(not torch.equal(weights[0][key], weights[1][key]) for key in weights[0])
     assert after.card["training"]["updates"] == 3
     assert after.card["training"]["started_from"] == before.identity()
-    _, card = load_agent(out / SHORT_TASK / "agent")
+    _, card = load_agent(agent)
+    assert card["task"] == SHORT_TASK
     assert card["pretrained"] == after.identity()
-    assert [row["env_steps"] for row in rows(out / SHORT_TASK / "eval.csv")] == ["0", "50"]
+    assert [row["env_steps"] for row in rows(agent.parent / "eval.csv")] == ["0", "50"]
 
     kept, start = records(out), time.monotonic()
     run_recipe("finetune", source, "--out", out, *FLAGS)

@@ -11,10 +11,17 @@ from crptpro.cards import git_revision, hardware, versions
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return a Markdown table; columns are the keys of the first row, in order."""
+    """Return a Markdown table; columns are the keys of the first row, in order. No rows give an empty string."""
+    if not rows:
+        return ""
     columns = list(rows[0])
     lines = ["| " + " | ".join(columns) + " |", "|" + " --- |" * len(columns)]
-    lines += ["| " + " | ".join(str(row.get(column, "")) for column in columns) + " |" for row in rows]
+    for row in rows:
+        cells = (str(row.get(column, "")).replace("|", "\\|") for column in columns)
+        lines.append("| " + " | ".join(cells) + " |")
+        "| " + " | ".join(str(row.get(column, "")).replace("|", "\\|") for column in columns) + " |"
+        for row in rows
+    ]
     return "\n".join(lines)
 
 

@@ -27,7 +27,7 @@ class RunLogger:
     Args:
         run_dir: directory of the run, created if missing; rows found there are continued.
         config: settings of the run, a mapping or a dataclass; kept in ``config.json`` with versions and
-            hardware.
+            hardware, from the first row on.
         wandb: mirror to Weights & Biases; ``None`` for not.
         tensorboard: mirror to TensorBoard (needs the ``tensorboard`` extra).
 
@@ -51,8 +51,8 @@ class RunLogger:
         self.run_dir = Path(run_dir)
         self.record = MetricRecord(self.run_dir)
         settings = _as_dict(config)
-        if settings:
-            write_json(self.run_dir / "config.json", {"config": settings, **provenance()})
+        # Written with the first row: a request that is refused must not replace the settings of the run it found.
+        self._unwritten_config = settings
         self._mirrors: list[Mirror] = []
         if wandb is not None:
             self._open("Weights & Biases", lambda: WandbMirror(wandb, self.run_dir, settings))
@@ -88,6 +88,9 @@ class RunLogger:
                     f"{key!r} cannot name a metric of {stream!r}: reserved, a counter, or not plain."
                 )
         values = {key: _scalar(key, value) for key, value in metrics.items() if value is not None}
+        if self._unwritten_config:
+            write_json(self.run_dir / "config.json", {"config": self._unwritten_config, **provenance()})
+            self._unwritten_config = {}
         row = self.record.total_rows
         integers = {name: int(value) for name, value in counters.items()}
         self.record.append(stream, integers, values)

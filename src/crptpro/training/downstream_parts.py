@@ -63,9 +63,10 @@ def build_parts(
         set_compute_dtype(module.requires_grad_(False).eval().to(config.device), dtype)
 
     feature_dim, action_dim = pretrained.encoder.feature_dim, env.action_spec.shape[-1]
-    widths = {"bottleneck_dim": config.bottleneck_dim, "hidden_dim": config.hidden_dim}
-    actor = SquashedGaussianActor(feature_dim, action_dim, **widths).to(config.device)
-    critic = TwinCritic(feature_dim, action_dim, **widths).to(config.device)
+    bottleneck, hidden = config.bottleneck_dim, config.hidden_dim
+    actor = SquashedGaussianActor(feature_dim, action_dim, bottleneck_dim=bottleneck, hidden_dim=hidden)
+    critic = TwinCritic(feature_dim, action_dim, bottleneck_dim=bottleneck, hidden_dim=hidden)
+    actor, critic = actor.to(config.device), critic.to(config.device)
     loss = RADSACLoss(
         actor,
         critic,

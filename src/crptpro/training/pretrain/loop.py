@@ -96,6 +96,10 @@ def pretrain(
     for name, value in settings.items():
         if value is not None and value < 1:
             raise ValueError(f"`{name}` must be at least 1, got {value}.")
+    if learning_rate is not None and not learning_rate > 0:
+        raise ValueError(f"`learning_rate` must be positive, got {learning_rate}.")
+    if encoder_tau is not None and not 0 <= encoder_tau <= 1:
+        raise ValueError(f"`encoder_tau` must be in [0, 1], got {encoder_tau}.")
     device = torch.device(device)
     dtype = resolve_precision(precision, device)
     cuda = [device.index or 0] if device.type == "cuda" else []

@@ -72,6 +72,7 @@ class PretrainRun:
         self.checkpoints = None if run_dir is None else CheckpointDir(run_dir / CHECKPOINTS)
         self.history: list[dict[str, Any]] = []
         self.done = self.resumed_from = 0
+        self.is_repeated = False
         self.saved_at: int | None = None
         self.earlier_seconds = 0.0
         self.started = self.row_started = self.saved_time = time.monotonic()
@@ -164,7 +165,10 @@ class PretrainRun:
         set_global_rng_state(state["global_rng"])
         self.window.load_state_dict(state["window"], self.device)
         self.monitor.load_state_dict(state["monitor"])
-        if self.logger is not None and state["logger"] is not None:
+        self.is_repeated = (
+            self.done == self.settings["updates"] and self._last_row().get("updates") == self.done
+        )
+        if self.logger is not None and state["logger"] is not None and not self.is_repeated:
             self.logger.load_state_dict(state["logger"])
         if self.done < self.settings["updates"]:
             _LOG.info("Pre-training continues from update %d.", self.done)
@@ -210,7 +214,9 @@ class PretrainRun:
         if self.done % self.settings["log_interval"]:
             # A last row for the part of a window; it is not in the checkpoint, so an extended run takes it
             # back.
-            row = self._log()
+            row = self._log() if not self.is_repeated else self._last_row()
+            if self.is_repeated:
+                self.monitor.observe(self.done, comp=_comp(row), cosine=self.window.cosines or None)
         else:
             row = self.history[-1] if self.history else self._last_row()
         metrics = {name: value for name, value in row.items() if name != "updates"}

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from tqdm import tqdm
+
+from crptpro.console import configure_logging, run_main
+from crptpro.downstream_config import DownstreamConfig
+from crptpro.errors import CRPTproError, DatasetError
+
+
+@pytest.fixture(autouse=True)
+def _logging_as_before() -> Iterator[None]:
+    """The console takes the library's logger over; later tests want it back."""
+    library = logging.getLogger("crptpro")
+    before = library.handlers[:], library.level, library.propagate
+    yield
+    library.handlers[:], library.propagate = before[0], before[2]
+    library.setLevel(before[1])
+
+
+def fails(error: BaseException) -> Callable[[], None]:
+    def main() -> None:
+        raise error
+
+    return main
+
+
+@pytest.mark.parametrize("error", [CRPTproError("no such thing"), DatasetError("no such thing")])
+def test_an_expected_error_is_one_line_and_exit_status_1(
+    error: CRPTproError, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        run_main(fails(error))
+    assert stopped.value.code == 1
+    assert capsys.readouterr() == ("", "error: no such thing\n")
+    assert stopped.value.__suppress_context__  # nothing is printed below it
+
+
+def test_a_setting_that_the_library_refuses_is_one_line_too(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        run_main(lambda: DownstreamConfig(batch_size=0))
+    assert stopped.value.code == 1
+    assert capsys.readouterr().err == "error: `batch_size` must be at least 1, got 0.\n"
+
+
+def test_a_file_that_cannot_be_opened_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        run_main((tmp_path / "absent").read_text)
+    assert str(tmp_path / "absent") in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("main", [
+    fails(KeyError("forgotten")),
+    fails(ValueError("raised by a caller")),
+    lambda: torch.zeros(2).reshape(3),
+    lambda: int("seven"),
+])  # fmt: skip
+def test_a_defect_keeps_its_traceback(main: Callable[[], object]) -> None:
+    with pytest.raises((KeyError, ValueError, RuntimeError)):
+        run_main(main)
+
+
+def test_an_interrupt_exits_with_130_and_says_how_to_go_on(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        run_main(fails(KeyboardInterrupt()))
+    assert stopped.value.code == 130
+    assert capsys.readouterr().err == "interrupted; the same command continues from the last checkpoint.\n"
+
+
+def test_events_are_plain_lines_and_warnings_are_marked(capsys: pytest.CaptureFixture[str]) -> None:
+    configure_logging()
+    configure_logging()  # twice does not print twice
+    library = logging.getLogger("crptpro.anything")
+    library.debug("unseen")
+    library.info("40 env steps")
+    library.warning("little memory")
+    assert capsys.readouterr() == ("", "40 env steps\nwarning: little memory\n")
+
+
+def test_a_line_does_not_break_a_running_bar(capsys: pytest.CaptureFixture[str]) -> None:
+    configure_logging()
+    with tqdm(total=3, disable=False, ncols=40, ascii=True, mininterval=0) as bar:
+        bar.update()
+        logging.getLogger("crptpro").info("in between")
+    lines = capsys.readouterr().err.replace("\r", "\n").splitlines()
+    assert "in between" in lines

@@ -1,0 +1,125 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from crptpro.data import FrameReplay
+from crptpro.modules import PixelEncoder
+from crptpro.training.frozen_features import FrozenFeatures
+
+SIZE, PAD, CAPACITY, SLACK = 16, 2, 12, 9
+LENGTHS = (7, 1, 5, 3, 9, 2, 4, 8, 1, 6, 7, 5)
+
+
+def make_encoder() -> PixelEncoder:
+    torch.manual_seed(0)
+    return PixelEncoder(channels=(4, 4), strides=(2, 1), image_size=SIZE).requires_grad_(False)
+
+
+class World:
+    """A replay of short episodes and the features of what is in it; the same for both ways to have them."""
+
+    def __init__(self, mode: str, path: Path | None = None) -> None:
+        self.encoder = make_encoder()
+        self.replay = FrameReplay(CAPACITY, frame_shape=(3, SIZE, SIZE), action_dim=1, path=path, slack=SLACK)
+        self.replay_rng, self.shift_rng = (torch.Generator().manual_seed(seed) for seed in (1, 2))
+        self.replay.set_rng(self.replay_rng)
+        self.features = FrozenFeatures(
+            self.encoder, self.replay, mode=mode, pad=PAD, generator=self.shift_rng
+        )
+        self.frames = torch.Generator().manual_seed(3)
+        self.slots_seen: list[int] = []
+
+    def frame(self) -> torch.Tensor:
+        return torch.randint(0, 256, (3, SIZE, SIZE), dtype=torch.uint8, generator=self.frames)
+
+    def play(self, length: int) -> None:
+        """One episode; every observation is taken in as the loop does, and checked against plain encoding."""
+        stack = [self.frame()] * 3
+        slot = self.replay.begin_episode(stack[-1])
+        self.observe(stack, slot)
+        for step in range(length):
+            stack = [*stack[1:], self.frame()]
+            slot = self.replay.append(torch.zeros(1), float(step), False, step == length - 1, stack[-1])
+            self.observe(stack, slot)
+
+    def observe(self, stack: list[torch.Tensor], slot: int) -> None:
+        pixels = torch.cat(stack)
+        self.slots_seen.append(slot)
+        torch.testing.assert_close(
+            self.features.observe(pixels, slot), self.encoder(pixels.unsqueeze(0)), rtol=1e-4, atol=1e-5
+        )
+
+    def sample(self) -> dict[str, torch.Tensor]:
+        batch = self.features.sample(16)
+        keys = ("features", ("next", "features"), ("next", "reward"), "index")
+        return {str(key): batch[key].clone() for key in keys}
+
+
+@pytest.mark.parametrize("mode", ["dense", "reencode"])
+def test_what_is_observed_is_encoded_plainly_while_the_ring_goes_round(mode: str) -> None:
+    world = World(mode)
+    for length in LENGTHS:
+        world.play(length)
+    assert len(world.slots_seen) > 1.5 * world.replay.frame_slots
+    assert world.replay.frame_slots == world.replay.window + SLACK
+
+
+def test_dense_equals_reencoded_for_the_same_generator_states_at_every_place_of_the_ring() -> None:
+    dense, plain = World("dense"), World("reencode")
+    for length in LENGTHS:
+        dense.play(length)
+        plain.play(length)
+        for _ in range(2):
+            ours, theirs = dense.sample(), plain.sample()
+            assert torch.equal(ours["index"], theirs["index"])
+            for key, value in theirs.items():
+                torch.testing.assert_close(ours[key], value, rtol=1e-4, atol=1e-5, msg=key)
+        assert torch.equal(dense.shift_rng.get_state(), plain.shift_rng.get_state())
+    assert max(dense.slots_seen) == dense.replay.frame_slots - 1
+    assert len(dense.replay) == CAPACITY
+
+
+@pytest.mark.parametrize("mode", ["dense", "reencode"])
+def test_an_observation_and_its_next_have_each_their_own_shift(mode: str) -> None:
+    world = World(mode)
+    picture = world.frame()
+    world.frame = lambda: picture  # every observation is the same, so features differ by their shifts alone
+    world.play(1)
+    batch = world.sample()
+    different = (batch["features"] != batch["('next', 'features')"]).any(-1)
+    assert different.sum() > 0
+    assert 1 < len(batch["features"].unique(dim=0)) <= (2 * PAD + 1) ** 2
+
+
+@pytest.mark.parametrize("mode", ["dense", "reencode"])
+def test_after_restoring_the_replay_rebuilding_gives_the_same_samples(tmp_path: Path, mode: str) -> None:
+    world = World(mode, tmp_path)
+    for length in LENGTHS[:-1]:
+        world.play(length)
+    state = world.replay.state_dict()
+    generators = [world.replay_rng.get_state(), world.shift_rng.get_state()]
+    expected = [world.sample() for _ in range(3)]
+    world.play(LENGTHS[-1])  # overwrites rows of the slack, as a run does until it is killed
+    del world
+
+    again = World(mode, tmp_path)
+    again.replay.load_state_dict(state)
+    again.replay_rng.set_state(generators[0])
+    again.shift_rng.set_state(generators[1])
+    again.features.rebuild(progress=False)
+    for sample in expected:
+        for key, value in again.sample().items():
+            assert torch.equal(value, sample[key]), key
+
+
+def test_without_rebuilding_a_restored_replay_has_no_dense_features(tmp_path: Path) -> None:
+    world = World("dense", tmp_path)
+    world.play(5)
+    state = world.replay.state_dict()
+    again = World("dense", tmp_path)
+    again.replay.load_state_dict(state)
+    with pytest.raises(IndexError, match="never written"):
+        again.sample()
