@@ -19,9 +19,6 @@ def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
     for row in rows:
         cells = (str(row.get(column, "")).replace("|", "\\|") for column in columns)
         lines.append("| " + " | ".join(cells) + " |")
-        "| " + " | ".join(str(row.get(column, "")).replace("|", "\\|") for column in columns) + " |"
-        for row in rows
-    ]
     return "\n".join(lines)
 
 
