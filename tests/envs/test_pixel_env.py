@@ -81,3 +81,16 @@ def test_closing_twice_is_harmless() -> None:
     env.close()
     env.close()
     assert env.is_closed
+
+
+def test_without_rendering_nothing_is_drawn_and_rewards_and_episodes_are_the_same() -> None:
+    simulators = FakeSimulator(), FakeSimulator()
+    looking, blind = (
+        PixelEnv(s, image_size=8, render=r).rollout(10) for s, r in zip(simulators, (True, False))
+    )
+    assert "render" in simulators[0].calls
+    assert "render" not in simulators[1].calls
+    for key in (("next", "reward"), ("next", "done"), ("next", "truncated")):
+        torch.testing.assert_close(blind[key], looking[key])
+    assert blind["next", "pixels"].eq(0).all()
+    check_env_specs(PixelEnv(FakeSimulator(), image_size=8, render=False))

@@ -52,6 +52,8 @@ class Evaluate:
             settings["image_size"] = agent.encoder.image_size
             settings["frame_stack"] = agent.encoder.in_channels // 3
             settings["action_repeat"] = trained_with.get("action_repeat", 2)
+        # Chance does not look; without a video there is nothing to draw.
+        settings["render"] = agent is not None or self.video is not None
         env = make_env(task, seed=self.seed, **settings)
         try:
             action_dim = env.action_spec.shape[-1]

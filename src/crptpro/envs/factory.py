@@ -28,6 +28,7 @@ def make_env(
     camera: int | str | None = None,
     quality: Quality = "exact",
     physics_state: bool = False,
+    render: bool = True,
 ) -> EnvBase:
     """Build an unbatched CPU environment that renders once per agent step.
 
@@ -48,6 +49,8 @@ def make_env(
         quality: ``"exact"`` renders the model as it is; ``"fast"`` uses smaller shadow maps, up to twice as
             fast on software GL, with fewer than 1 % of the pixels changed.
         physics_state: Also emit ``qpos`` and ``qvel``, float64, where the world has a MuJoCo state.
+        render: ``False`` leaves every image black, for policies that do not look: rewards and episodes are the
+            same, ten times sooner. Environments of your own draw all the same.
 
     Raises:
         UnknownNameError: for a task nobody knows.
@@ -65,9 +68,9 @@ def make_env(
     if domain.source == "own":
         env = make_own_env(domain, seed=seed, **settings)
     elif domain.source == "gymnasium":
-        env = _make_gymnasium_env(domain, **settings)
+        env = _make_gymnasium_env(domain, render=render, **settings)
     else:
-        env = _make_dm_env(domain, **settings)
+        env = _make_dm_env(domain, render=render, **settings)
     env.set_seed(seed)
     if frame_stack == 1:
         return env
@@ -97,6 +100,7 @@ def _make_dm_env(
     camera: int | str,
     quality: Quality,
     physics_state: bool,
+    render: bool,
 ) -> PixelEnv:
     select_backend()
     shadow_size = FAST_SHADOW_SIZE[domain.source] if quality == "fast" else None
@@ -107,7 +111,7 @@ def _make_dm_env(
     }  # fmt: skip
     scene_camera = SceneCamera(image_size, camera, shadow_size)
     simulator = DmControlSimulator(env, scene_camera, action_repeat=action_repeat, description=description)
-    return PixelEnv(simulator, image_size=image_size, physics_state=physics_state)
+    return PixelEnv(simulator, image_size=image_size, physics_state=physics_state, render=render)
 
 
 def _make_gymnasium_env(
@@ -118,6 +122,7 @@ def _make_gymnasium_env(
     camera: int | str | None,
     quality: Quality,
     physics_state: bool,
+    render: bool,
 ) -> PixelEnv:
     gl_card = _gymnasium_gl_card(domain.task)
     simulator = GymnasiumSimulator(
@@ -130,7 +135,7 @@ def _make_gymnasium_env(
             "task": domain.task, "image_size": image_size, "camera": camera, **gl_card, "quality": quality,
         },
     )  # fmt: skip
-    return PixelEnv(simulator, image_size=image_size, physics_state=physics_state)
+    return PixelEnv(simulator, image_size=image_size, physics_state=physics_state, render=render)
 
 
 def _gymnasium_gl_card(task: str) -> dict[str, Any]:

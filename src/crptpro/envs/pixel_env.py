@@ -24,11 +24,15 @@ class PixelEnv(EnvBase):
         simulator: The world; owned by the environment from now on.
         image_size: H = W, pixels.
         physics_state: Emit ``qpos`` and ``qvel``.
+        render: ``False`` leaves every image black and draws nothing.
     """
 
-    def __init__(self, simulator: Simulator, *, image_size: int, physics_state: bool = False):
+    def __init__(
+        self, simulator: Simulator, *, image_size: int, physics_state: bool = False, render: bool = True
+    ):
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
         self.simulator = simulator
+        self._render = render
         self._emit_state = physics_state and simulator.state_size is not None
         observation = {"pixels": Bounded(0, 255, shape=(3, image_size, image_size), dtype=torch.uint8)}
         if self._emit_state:
@@ -46,9 +50,12 @@ class PixelEnv(EnvBase):
         return self.simulator.card()
 
     def _observe(self) -> dict[str, torch.Tensor]:
-        # The transpose makes the copy that the simulator's reused buffer needs.
-        image = np.ascontiguousarray(self.simulator.render().transpose(2, 0, 1))
-        observation = {"pixels": torch.from_numpy(image)}
+        if self._render:
+            # The transpose makes the copy that the simulator's reused buffer needs.
+            image = np.ascontiguousarray(self.simulator.render().transpose(2, 0, 1))
+            observation = {"pixels": torch.from_numpy(image)}
+        else:
+            observation = {"pixels": self.observation_spec["pixels"].zero()}
         if self._emit_state:
             qpos, qvel = self.simulator.state()
             observation["qpos"] = torch.tensor(qpos, dtype=torch.float64)
