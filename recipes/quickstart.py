@@ -149,9 +149,10 @@ def main(config: Config) -> None:
     # 4. the trained agent against chance, on the same episodes
     logger.info("4/5 evaluate: %d episodes of the agent and of the uniform random policy", config.episodes)
     env = make_env(config.task, seed=config.seed, quality=config.quality)
-    policies = {
-        "trained agent": result.policy,
-        "uniform random policy": uniform_policy(env, seed=config.seed),
+    blind_env = make_env(config.task, seed=config.seed, render=False)  # chance does not look: nothing to draw
+    players = {
+        "trained agent": (result.policy, env),
+        "uniform random policy": (uniform_policy(env, seed=config.seed), blind_env),
     }
     scores = {}
     with RunLogger(out / "evaluation") as records:
