@@ -82,7 +82,7 @@ def test_embeddings_need_a_projector(encoder):
 
 def test_memory_is_announced_and_counted(encoder, caplog):
     projector, _ = small_heads(encoder, latent_dim=5)
-    with caplog.at_level(logging.INFO, logger="crptpro.transforms.shift_cache"):
+    with caplog.at_level(logging.DEBUG, logger="crptpro.transforms.shift_cache"):
         cache = DenseShiftCache(encoder, 100, projector=projector)
     assert "GiB" in caplog.text
     assert "100 observations" in caplog.text
