@@ -1,6 +1,6 @@
 """The whole of CRPTpro in small: collect at random, pre-train, freeze, learn a task, compare with chance.
 
-    python recipes/quickstart.py                    # about ten minutes on two CPU cores, no GPU, no display
+    python recipes/quickstart.py                    # ten to eleven minutes on two CPU cores, no GPU, no display
     python recipes/quickstart.py --out runs/other --seed 1
 
 Ends with runs/quickstart/report.md and its figures: the trained agent's mean return beside the uniform random
@@ -49,7 +49,7 @@ class Config:
     # data
     domains: tuple[str, ...] = ("walker", "cartpole", "finger")
     """domains the encoder is pre-trained on"""
-    transitions: int = 1_200
+    transitions: int = 2_000
     """random transitions per domain [100,000]"""
     workers: int = 2
     """collecting processes"""
@@ -57,7 +57,7 @@ class Config:
     """render quality; fast uses smaller shadow maps, less than 1 % of the pixels differ [exact]"""
 
     # pre-training
-    pretrain_updates: int = 360
+    pretrain_updates: int = 600
     """encoder updates over all domains [50,000]"""
     pretrain_batch_size: int = 128
     """transitions per update [512]"""
