@@ -13,7 +13,8 @@ PACKAGE = Path(crptpro.__file__).parent
 FOUNDATION = ["errors", "seeding", "cards", "artifact", "console", "loggers", "downstream_config"]
 ORDER = [
     "domains", "envs", "data", "modules", "objectives", "transforms", "training.evaluate", "training.checkpoint",
-    "training.collapse", "training.pretrain", "pretrained", "training", "analysis", "experiments", "doctor", "cli",
+    "training.fingerprint", "training.run_lock", "training.stop_request", "training.collapse", "training.pretrain",
+    "pretrained", "training", "analysis", "experiments", "doctor", "cli",
 ]  # fmt: skip
 FILES = sorted(PACKAGE.rglob("*.py"))
 

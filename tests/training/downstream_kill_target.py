@@ -6,6 +6,7 @@ prints the number of kills of each
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import random
 import signal
@@ -16,23 +17,17 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
 
 import torch
-from test_downstream import small_pretrained, toy_env
+from test_downstream import SMALL, small_pretrained, toy_env
 
-from crptpro.training import DownstreamConfig, train_downstream
+from crptpro.training import train_downstream
 
 torch.set_num_threads(1)
 
-CONFIG = DownstreamConfig(
+CONFIG = dataclasses.replace(
+    SMALL,
     env_steps=240,
-    batch_size=8,
-    replay_capacity=40,
-    random_agent_steps=12,
-    queue_size=16,
     eval_interval_env_steps=60,
-    eval_episodes=2,
-    checkpoint_interval_env_steps=20,
     log_interval_env_steps=14,
-    precision="fp32",
     hidden_dim=32,  # small networks: the time goes into what a kill can disturb
 )
 

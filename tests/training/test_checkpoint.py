@@ -3,9 +3,6 @@ from __future__ import annotations
 import errno
 import logging
 import os
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,7 +10,7 @@ import torch
 
 from crptpro.errors import CheckpointError, DiskSpaceError
 from crptpro.training import checkpoint
-from crptpro.training.checkpoint import CheckpointDir, StopRequest, exclusive
+from crptpro.training.checkpoint import CheckpointDir
 
 
 def _state(value: float) -> dict:
@@ -169,38 +166,3 @@ def test_leftovers_of_a_kill_are_ignored_and_removed(tmp_path: Path) -> None:
     assert checkpoints.load_latest() is None
     checkpoints.save(_state(1.0), counter=1)
     assert len(list(tmp_path.iterdir())) == 1
-
-
-def test_a_second_process_is_refused_and_a_dead_one_is_not_remembered(tmp_path: Path) -> None:
-    script = (
-        "import fcntl, sys, time\n"
-        "file = open(sys.argv[1], 'a')\n"
-        "fcntl.flock(file, fcntl.LOCK_EX); print('held', flush=True); time.sleep(60)"
-    )
-    command = [sys.executable, "-c", script, str(tmp_path / ".lock")]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout.readline() == "held\n"
-        with pytest.raises(CheckpointError, match="Another process"), exclusive(tmp_path):
-            pass
-        holder.kill()
-    with exclusive(tmp_path):
-        pass
-
-
-def test_a_signal_asks_and_a_second_one_insists() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    with StopRequest() as stop:
-        assert stop.signal is None
-        signal.raise_signal(signal.SIGINT)
-        assert stop.signal == signal.SIGINT
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_sigterm_leaves_with_its_exit_status() -> None:
-    with StopRequest() as stop:
-        signal.raise_signal(signal.SIGTERM)
-        with pytest.raises(SystemExit) as left:
-            stop.leave()
-    assert left.value.code == 143

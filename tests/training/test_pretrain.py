@@ -428,3 +428,11 @@ def test_impossible_numbers_are_refused() -> None:
         run(make_loss(), 0)
     with pytest.raises(ValueError, match="`augment` must be"):
         run(make_loss(), 1, augment="rotate")
+
+
+def test_a_dataset_of_other_images_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    dataset = make_dataset(0)
+    dataset.card = {"image_size": 84, "frame_stack": 3}
+    with pytest.raises(DatasetError, match=r"3 images of 84 px; the encoder takes 1 of 16 px"):
+        run(make_loss(), 2, {"dark": dataset}, run_dir=tmp_path / "run")
+    assert not (tmp_path / "run").exists()

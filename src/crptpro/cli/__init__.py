@@ -6,21 +6,20 @@ import logging
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 from tyro.conf import Positional, arg, subcommand
 
 from crptpro.cli.evaluate import Evaluate, Quality
-from crptpro.cli.request import Logging, expand_groups, image_format, require_device
+from crptpro.cli.pretraining import Finetune, Pretrain
+from crptpro.cli.request import Logging, expand_groups, require_device
 from crptpro.console import run_main
 from crptpro.domains import get_domain
 from crptpro.downstream_config import DownstreamConfig
-from crptpro.seeding import seed_everything
 
 logger = logging.getLogger(__name__)
 
-Precision = Literal["auto", "fp32", "bf16"]
 RANDOM_ENCODER = "random-encoder"
 
 
@@ -72,131 +71,6 @@ class Collect:
         )
         for name, path in paths.items():
             logger.info("%s: %s", name, path)
-
-
-@dataclass(frozen=True)
-class Pretrain:
-    """Pre-train one encoder on the datasets of several domains, one update per domain in turn."""
-
-    datasets: Positional[tuple[Path, ...]]
-    """dataset directories, e.g. data/walker data/cartpole"""
-    out: Annotated[Path, arg(name="out")]
-    """run directory: records and checkpoints, and the pretrained encoder in OUT/encoder"""
-    method: str = "crptpro"
-    """a registered method, e.g. crptpro or released-code"""
-    updates: int | None = None
-    """encoder updates over all domains (default: the method's, 50,000)"""
-    batch_size: int | None = None
-    """transitions per update (default: the method's, 512)"""
-    learning_rate: float | None = None
-    """of Adam (default: the method's, 1e-4)"""
-    assignment_temperature: float | None = None
-    """temperature of the Sinkhorn-Knopp targets (default: the student's, 0.1)"""
-    intr_loss_coef: float | None = None
-    """weight of the prototype dispersion loss (default: the method's, 5e-3)"""
-    seed: int = 0
-    """seeds initialisation, sampling and shifts"""
-    precision: Precision = "auto"
-    """arithmetic of the convolutions and big matrix products"""
-    device: str = "cpu"
-    """where to train"""
-    checkpoint_interval: int = 500
-    """updates between two checkpoints"""
-    log_interval: int = 50
-    """updates between two rows of the record"""
-    logging: Logging = field(default_factory=Logging)
-    """mirrors"""
-
-    def run(self) -> None:
-        """Pre-train, or continue, and write the artifact."""
-        from crptpro.modules import PixelEncoder
-        from crptpro.objectives import get_method
-        from crptpro.pretrained import save_pretrained
-        from crptpro.training import pretrain
-
-        # Whatever is wrong with the request is found before the run directory is made.
-        require_device(self.device)
-        image_size, frame_stack = image_format(self.datasets)
-        options = {
-            name: value
-            for name in ("assignment_temperature", "intr_loss_coef")
-            if (value := getattr(self, name)) is not None
-        }
-        seed_everything(self.seed)
-        loss = get_method(self.method).build(PixelEncoder(3 * frame_stack, image_size=image_size), **options)
-        with self.logging.open(self.out, self) as records:
-            pretrain(
-                loss,
-                list(self.datasets),
-                updates=self.updates,
-                batch_size=self.batch_size,
-                learning_rate=self.learning_rate,
-                seed=self.seed,
-                precision=self.precision,
-                device=self.device,
-                run_dir=self.out,
-                logger=records,
-                checkpoint_interval=self.checkpoint_interval,
-                log_interval=self.log_interval,
-            )
-            logger.info("pretrained encoder: %s", save_pretrained(loss, self.out / "encoder"))
-
-
-@dataclass(frozen=True)
-class Finetune:
-    """Continue pre-training on one domain from a pretrained encoder."""
-
-    pretrained: Positional[Path]
-    """directory of the pretrained encoder"""
-    dataset: Positional[Path]
-    """dataset directory of the one domain"""
-    out: Path
-    """run directory; the new encoder goes to OUT/encoder"""
-    updates: int = 2_000
-    """encoder updates (the paper: pendulum 2,000, manipulation 2,000, cartpole 3,000, cheetah 1,000, walker 500)"""
-    batch_size: int | None = None
-    """transitions per update (default: the method's)"""
-    learning_rate: float | None = None
-    """of Adam (default: the method's)"""
-    seed: int = 0
-    """seeds sampling and shifts"""
-    precision: Precision = "auto"
-    """arithmetic of the convolutions and big matrix products"""
-    device: str = "cpu"
-    """where to train"""
-    checkpoint_interval: int = 500
-    """updates between two checkpoints"""
-    log_interval: int = 50
-    """updates between two rows of the record"""
-    logging: Logging = field(default_factory=Logging)
-    """mirrors"""
-
-    def run(self) -> None:
-        """Fine-tune, or continue, and write the artifact."""
-        from crptpro.pretrained import finetune, load_pretrained, save_pretrained
-
-        require_device(self.device)
-        image_size, frame_stack = image_format([self.dataset])
-        pretrained = load_pretrained(
-            self.pretrained, expect={"image_size": image_size, "frame_stack": frame_stack}
-        )
-        seed_everything(self.seed)
-        with self.logging.open(self.out, self) as records:
-            loss, _ = finetune(
-                pretrained,
-                self.dataset,
-                updates=self.updates,
-                batch_size=self.batch_size,
-                learning_rate=self.learning_rate,
-                seed=self.seed,
-                precision=self.precision,
-                device=self.device,
-                run_dir=self.out,
-                logger=records,
-                checkpoint_interval=self.checkpoint_interval,
-                log_interval=self.log_interval,
-            )
-            logger.info("fine-tuned encoder: %s", save_pretrained(loss, self.out / "encoder"))
 
 
 @dataclass(frozen=True)

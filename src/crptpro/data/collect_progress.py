@@ -15,14 +15,14 @@ class CollectProgress:
     """Shows transitions, transitions/s and the time left of each domain.
 
     Args:
-        totals: Transitions wanted, by domain.
-        initial: Transitions already there.
+        totals: transitions wanted, by domain.
+        initial: transitions already there.
         is_shown: False for silence; bars also vanish where the output is no terminal.
     """
 
     def __init__(self, totals: Mapping[str, int], initial: Mapping[str, int], is_shown: bool = True):
-        self._totals, self._initial, self._is_shown = dict(totals), dict(initial), is_shown
-        self._start_s = time.monotonic()
+        self._totals, self._is_shown = dict(totals), is_shown
+        self._begun: dict[str, tuple[float, int]] = {}
         self._tenths = {name: 10 * initial[name] // total for name, total in totals.items()}
         width = max(map(len, totals), default=0)
         self._bars = {
@@ -45,15 +45,20 @@ class CollectProgress:
         if not bar.disable:
             bar.update(transitions - bar.n)
             return
+        # Domains take turns when there are fewer workers: each has its own clock, from its first report on.
+        begun_s, before = self._begun.setdefault(name, (time.monotonic(), transitions))
         tenth = 10 * transitions // self._totals[name]
         if self._is_shown and tenth > self._tenths[name]:
             self._tenths[name] = tenth
-            elapsed_s = max(time.monotonic() - self._start_s, 1e-9)
-            rate = max(transitions - self._initial[name], 0) / elapsed_s
-            left_s = (self._totals[name] - transitions) / rate if rate else float("inf")
+            elapsed_s = time.monotonic() - begun_s
+            speed = ""
+            if transitions > before and elapsed_s > 0:
+                rate = (transitions - before) / elapsed_s
+                left_s = (self._totals[name] - transitions) / rate
+                speed = f", {rate:.1f} transitions/s, {left_s:.0f} s left"
             logger.info(
-                "%s: %s of %s transitions (%d %%), %.1f transitions/s, %.0f s left",
-                name, f"{transitions:,}", f"{self._totals[name]:,}", 10 * tenth, rate, left_s,
+                "%s: %s of %s transitions (%d %%)%s",
+                name, f"{transitions:,}", f"{self._totals[name]:,}", 10 * tenth, speed,
             )  # fmt: skip
 
     def close(self) -> None:

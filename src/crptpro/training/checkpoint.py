@@ -14,9 +14,7 @@ import logging
 import numbers
 import os
 import re
-import signal
-import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -181,71 +179,6 @@ class _HashingWriter:
 
     def flush(self) -> None:
         pass
-
-
-@contextlib.contextmanager
-def exclusive(directory: str | Path) -> Iterator[None]:
-    """Hold ``directory`` for this process, so that two runs never write one record; freed even by a kill.
-
-    Raises:
-        CheckpointError: if another process holds it.
-    """
-    path = Path(directory)
-    path.mkdir(parents=True, exist_ok=True)
-    with open(path / ".lock", "a+") as file:
-        try:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise CheckpointError(
-                f"Another process is running in {path}. Wait for it, end it, or choose another directory."
-            ) from None
-        except (ImportError, OSError):  # not POSIX, or a file system without locks: run unguarded
-            pass
-        yield
-
-
-class StopRequest:
-    """While active, Ctrl-C and SIGTERM ask the loop to stop between two updates instead of tearing one.
-
-    A second Ctrl-C stops at once. Outside the main thread, where Python delivers no signals, it does nothing.
-
-    Args:
-        announcement: logged when the request arrives, for loops that take a while to heed it.
-
-    Attributes:
-        signal: the signal received, or ``None``.
-    """
-
-    def __init__(self, announcement: str = "") -> None:
-        self.signal: int | None = None
-        self._announcement = announcement
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> StopRequest:
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._before[number] = signal.signal(number, self._receive)
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
-        self._before = {}
-
-    def leave(self) -> None:
-        """End the program the way the signal would have: KeyboardInterrupt, or exit status 143."""
-        if self.signal == signal.SIGTERM:
-            raise SystemExit(128 + signal.SIGTERM)
-        raise KeyboardInterrupt
-
-    def _receive(self, number: int, frame: object) -> None:
-        if self.signal is not None:
-            raise KeyboardInterrupt
-        self.signal = number
-        if self._announcement:
-            _LOG.warning(self._announcement)
 
 
 def sync_directory(path: Path) -> None:

@@ -15,8 +15,9 @@ from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
 from crptpro.pretrained import Pretrained, load_pretrained
 from crptpro.training.agent import PixelAgent
-from crptpro.training.checkpoint import CheckpointDir, exclusive
+from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.downstream_run import DownstreamRun, EnvFactory
+from crptpro.training.run_lock import exclusive
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ import dataclasses
 import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -19,19 +18,19 @@ from crptpro.downstream_config import DownstreamConfig
 from crptpro.errors import NonFiniteError
 from crptpro.loggers import RunLogger
 from crptpro.pretrained import Pretrained
-from crptpro.seeding import derive_seed, global_rng_state, seed_everything, set_global_rng_state
+from crptpro.seeding import derive_seed, seed_everything
+from crptpro.training import downstream_checkpoint
 from crptpro.training.agent import PixelAgent, save_agent
-from crptpro.training.checkpoint import CheckpointDir, StopRequest
+from crptpro.training.checkpoint import CheckpointDir
+from crptpro.training.downstream_checkpoint import STREAMS
 from crptpro.training.downstream_parts import Parts, build_parts
 from crptpro.training.evaluate import evaluate, summarize
-from crptpro.training.pretrain.fingerprint import require_same
+from crptpro.training.stop_request import StopRequest
 from crptpro.training.video import write_video
 
 logger = logging.getLogger(__name__)
 
 EnvFactory = Callable[..., EnvBase]
-
-STREAMS = ("train", "episodes", "eval")
 
 DELAYED_METRICS = frozenset({"loss_actor", "loss_alpha", "alpha", "entropy"})
 """Metrics that only the delayed updates report."""
@@ -270,31 +269,10 @@ class DownstreamRun:
 
     # --- checkpoints --------------------------------------------------------------------------------------------
 
-    COUNTERS = ("agent_steps", "updates", "episodes", "last_eval", "next_eval", "next_checkpoint")
-
-    def fingerprint(self) -> dict[str, Any]:
-        """Return everything that must agree for a checkpoint to be continued; budgets may grow."""
-        settings = dataclasses.asdict(self.config)
-        for free in ("env_steps", "device"):
-            settings.pop(free)
-        return {"task": self.task, **settings, "pretrained": self.pretrained_identity}
-
     def save(self, checkpoints: CheckpointDir) -> None:
-        """Write everything a resumed run needs; frames are already on disk, in the replay's own files."""
+        """Write everything a resumed run needs, unless the run has diverged."""
         self.check_finite()
-        state = {
-            "fingerprint": self.fingerprint(),
-            "counters": {name: getattr(self, name) for name in self.COUNTERS},
-            "learner": self.parts.learner.state_dict(),
-            "bonus": None if self.parts.bonus is None else self.parts.bonus.state_dict(),
-            "replay": self.parts.replay.state_dict(),
-            "generators": {name: generator.get_state() for name, generator in self.generators.items()},
-            "global_rng": global_rng_state(),
-            "sums": self.sums,
-            "summed_updates": self.summed_updates,
-            "records": self.records.state_dict(STREAMS),
-        }
-        checkpoints.save(state, counter=self.agent_steps)
+        checkpoints.save(downstream_checkpoint.state_of(self), counter=self.agent_steps)
 
     def resume(self, checkpoints: CheckpointDir) -> None:
         """Continue from the newest checkpoint, if there is one.
@@ -307,21 +285,6 @@ class DownstreamRun:
             for stream in STREAMS:  # rows of an attempt that was killed before its first checkpoint
                 self.records.truncate_to(stream, "env_steps", -1)
             return
-        require_same(state["fingerprint"], self.fingerprint(), self.run_dir)
-        for name, value in state["counters"].items():
-            setattr(self, name, value)
-        self.parts.learner.load_state_dict(state["learner"])
-        if self.parts.bonus is not None:
-            self.parts.bonus.load_state_dict(state["bonus"])
-        self.parts.replay.load_state_dict(state["replay"])
-        for name, generator in self.generators.items():
-            generator.set_state(state["generators"][name])
-        set_global_rng_state(state["global_rng"])
-        self.sums, self.summed_updates = state["sums"], state["summed_updates"]
-        self.records.load_state_dict(state["records"])
-        if self.next_eval == -1 and self.env_steps < self.config.env_steps:
-            self.next_eval = self._after(
-                self.config.eval_interval_env_steps
-            )  # a finished run with a larger budget
+        downstream_checkpoint.restore(self, state)
         logger.info("%s: continuing from %s env steps", self.task, f"{self.env_steps:,}")
         self.parts.features.rebuild(progress=self.progress)

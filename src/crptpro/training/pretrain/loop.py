@@ -14,11 +14,11 @@ from crptpro.modules import resolve_precision, set_compute_dtype
 from crptpro.modules.precision import Precision
 from crptpro.objectives import method_defaults
 from crptpro.seeding import derive_seed
-from crptpro.training.checkpoint import exclusive
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.result import PretrainResult
 from crptpro.training.pretrain.run import PretrainRun
 from crptpro.training.pretrain.sources import Augment, Augmenter, open_sources
+from crptpro.training.run_lock import exclusive
 
 
 def pretrain(
@@ -83,7 +83,8 @@ def pretrain(
         CheckpointError: if ``run_dir`` holds a run with other settings (named), all its checkpoints are
             damaged, or another process is running in it.
         NonFiniteError: naming update, domain and term; the last checkpoint is kept.
-        DatasetError: if a dataset is unusable or lacks an entry that the loss reads.
+        DatasetError: if a dataset is unusable, shows other images than the encoder takes, or lacks an entry
+            that the loss reads.
         DiskSpaceError: if the disk cannot hold the checkpoints.
     """
     defaults = method_defaults(loss)
@@ -109,12 +110,15 @@ def pretrain(
         set_compute_dtype(loss, dtype)
         stack.enter_context(torch.random.fork_rng(devices=cuda))
         torch.manual_seed(derive_seed(seed, "pretrain", "loss"))
+        sources = open_sources(datasets, seed=seed, device=device)
+        for source in sources:
+            source.require_fit(getattr(loss, "encoder", None))
         if run_dir is not None:
             stack.enter_context(exclusive(run_dir))
             logger = logger or stack.enter_context(RunLogger(run_dir))
         run = PretrainRun(
             loss,
-            open_sources(datasets, seed=seed, device=device),
+            sources,
             Augmenter(augment, seed=seed),
             learner=Learner(
                 loss,

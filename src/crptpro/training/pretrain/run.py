@@ -15,13 +15,14 @@ from crptpro.cards import require_disk
 from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
 from crptpro.seeding import global_rng_state, set_global_rng_state
-from crptpro.training.checkpoint import CheckpointDir, StopRequest
+from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.collapse import CollapseMonitor
-from crptpro.training.pretrain.fingerprint import describe_loss, require_same
+from crptpro.training.fingerprint import describe_loss, require_same
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.result import PretrainResult
 from crptpro.training.pretrain.sources import Augmenter, Source, keys_read
 from crptpro.training.pretrain.window import Window, cosine_threshold, memory_row, num_prototypes
+from crptpro.training.stop_request import StopRequest
 
 _LOG = logging.getLogger(__name__)
 

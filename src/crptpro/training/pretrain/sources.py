@@ -84,6 +84,22 @@ class Source:
             "sampled on": self.generator.device.type,
         }
 
+    def require_fit(self, encoder: Any) -> None:
+        """Refuse a dataset whose card names other images than the encoder takes.
+
+        Raises:
+            DatasetError: naming both forms. Datasets without a card, and encoders that do not say, pass.
+        """
+        card = getattr(self.dataset, "card", None) or {}
+        has = (card.get("image_size"), card.get("frame_stack"))
+        channels = getattr(encoder, "in_channels", None)
+        wants = (getattr(encoder, "image_size", None), None if channels is None else channels // 3)
+        if None not in (*has, *wants) and has != wants:
+            raise DatasetError(
+                f"The dataset {self.name!r} has stacks of {has[1]} images of {has[0]} px; the encoder takes "
+                f"{wants[1]} of {wants[0]} px. Collect with those, or build the encoder for the dataset."
+            )
+
     def state_dict(self) -> dict[str, Any]:
         """Return the state of generator and sampler."""
         return {"generator": self.generator.get_state(), "sampler": self._sampler_state()}

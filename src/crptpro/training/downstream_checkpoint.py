@@ -1,0 +1,65 @@
+"""What a downstream checkpoint holds, and how a run takes it up again."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from crptpro.seeding import global_rng_state, set_global_rng_state
+from crptpro.training.fingerprint import require_same
+
+if TYPE_CHECKING:
+    from crptpro.training.downstream_run import DownstreamRun
+
+STREAMS = ("train", "episodes", "eval")
+"""Streams of the record that a resumed run cuts back to its checkpoint."""
+
+COUNTERS = ("agent_steps", "updates", "episodes", "last_eval", "next_eval", "next_checkpoint")
+
+FREE_TO_CHANGE = ("env_steps", "device")
+"""Settings that a run may be continued with other values of: budgets may grow, machines differ."""
+
+
+def fingerprint(run: DownstreamRun) -> dict[str, Any]:
+    """Return everything that must agree for a checkpoint to be continued."""
+    settings = dataclasses.asdict(run.config)
+    for name in FREE_TO_CHANGE:
+        settings.pop(name)
+    return {"task": run.task, **settings, "pretrained": run.pretrained_identity}
+
+
+def state_of(run: DownstreamRun) -> dict[str, Any]:
+    """Return everything a resumed run needs; frames are already on disk, in the replay's own files."""
+    return {
+        "fingerprint": fingerprint(run),
+        "counters": {name: getattr(run, name) for name in COUNTERS},
+        "learner": run.parts.learner.state_dict(),
+        "bonus": None if run.parts.bonus is None else run.parts.bonus.state_dict(),
+        "replay": run.parts.replay.state_dict(),
+        "generators": {name: generator.get_state() for name, generator in run.generators.items()},
+        "global_rng": global_rng_state(),
+        "sums": run.sums,
+        "summed_updates": run.summed_updates,
+        "records": run.records.state_dict(STREAMS),
+    }
+
+
+def restore(run: DownstreamRun, state: Mapping[str, Any]) -> None:
+    """Put a run where :func:`state_of` saw it; dense feature maps are rebuilt by the caller.
+
+    Raises:
+        CheckpointError: if the state belongs to a run with other settings; nothing has changed then.
+    """
+    require_same(state["fingerprint"], fingerprint(run), run.run_dir)
+    for name, value in state["counters"].items():
+        setattr(run, name, value)
+    run.parts.learner.load_state_dict(state["learner"])
+    if run.parts.bonus is not None:
+        run.parts.bonus.load_state_dict(state["bonus"])
+    run.parts.replay.load_state_dict(state["replay"])
+    for name, generator in run.generators.items():
+        generator.set_state(state["generators"][name])
+    set_global_rng_state(state["global_rng"])
+    run.sums, run.summed_updates = state["sums"], state["summed_updates"]
+    run.records.load_state_dict(state["records"])
