@@ -55,6 +55,8 @@ class Config:
     """collecting processes"""
     quality: Literal["exact", "fast"] = "fast"
     """render quality; fast uses smaller shadow maps, less than 1 % of the pixels differ [exact]"""
+    action_repeat: int = 4
+    """env steps per decision, in the datasets and in the task; fewer pictures per episode than with the paper's [2]"""
 
     # pre-training
     pretrain_updates: int = 600
@@ -69,8 +71,8 @@ class Config:
     # downstream
     task: str = "walker_stand"
     """the task to learn on the frozen encoder"""
-    env_steps: int = 9_000
-    """simulator steps, two per decision [500,000]"""
+    env_steps: int = 18_000
+    """simulator steps [500,000]"""
     random_agent_steps: int = 500
     """decisions before the first update [1,000]"""
     replay_capacity: int = 5_000
@@ -106,6 +108,7 @@ def main(config: Config) -> None:
         seed=config.seed,
         workers=config.workers,
         quality=config.quality,
+        action_repeat=config.action_repeat,
     )
     datasets = {name: FrameDataset.open(path) for name, path in paths.items()}
 
@@ -135,21 +138,23 @@ def main(config: Config) -> None:
         pretrained,
         run_dir=out / "downstream",
         env_steps=config.env_steps,
+        action_repeat=config.action_repeat,
         replay_capacity=config.replay_capacity,
         random_agent_steps=config.random_agent_steps,
         batch_size=config.batch_size,
         learning_rate=config.learning_rate,
         eval_interval_env_steps=max(1, config.env_steps // 2),
         eval_episodes=2,
-        checkpoint_interval_env_steps=2_000,
+        checkpoint_interval_env_steps=4_000,
         quality=config.quality,
         seed=config.seed,
     )
 
     # 4. the trained agent against chance, on the same episodes
     logger.info("4/5 evaluate: %d episodes of the agent and of the uniform random policy", config.episodes)
-    env = make_env(config.task, seed=config.seed, quality=config.quality)
-    blind_env = make_env(config.task, seed=config.seed, render=False)  # chance does not look: nothing to draw
+    world = {"seed": config.seed, "action_repeat": config.action_repeat}
+    env = make_env(config.task, quality=config.quality, **world)
+    blind_env = make_env(config.task, render=False, **world)  # chance does not look: nothing to draw
     players = {
         "trained agent": (result.policy, env),
         "uniform random policy": (uniform_policy(env, seed=config.seed), blind_env),
@@ -157,9 +162,9 @@ def main(config: Config) -> None:
     scores = {}
     with RunLogger(out / "evaluation") as records:
         records.truncate_to("final", "episode", -1)
-        for name, (policy, world) in players.items():
+        for name, (policy, stage) in players.items():
             episodes, _ = evaluate(
-                policy, world, episodes=config.episodes, seed=derive_seed(config.seed, "quickstart")
+                policy, stage, episodes=config.episodes, seed=derive_seed(config.seed, "quickstart")
             )
             scores[name] = summarize(episodes)
             for e in episodes:

@@ -16,6 +16,7 @@ from toy_world import FIXED, ToyEnv, fixed_length
 
 from crptpro import domains
 from crptpro.cli import main
+from crptpro.data import FrameDataset
 from crptpro.data.collect_worker import EpisodeRoller
 from crptpro.data.collection import DomainCollection
 from crptpro.domains import register_domain
@@ -307,7 +308,12 @@ def test_a_real_process_ends_with_the_same_line(
 def test_collect_pretrain_downstream_and_evaluate_on_a_real_domain(call: Call, tmp_path: Path) -> None:
     data, runs = tmp_path / "data", tmp_path / "runs"
     fast = ("--quality", "fast")
-    assert call("collect", "cartpole", "--out", data, "--transitions", 20, "--workers", 1, *fast)[0] == 0
+    repeat = ("--action-repeat", 4)
+    assert (
+        call("collect", "cartpole", "--out", data, "--transitions", 20, "--workers", 1, *fast, *repeat)[0]
+        == 0
+    )
+    assert FrameDataset.open(data / "cartpole").card["action_repeat"] == 4
     assert call("pretrain", data / "cartpole", "--out", runs / "p", "--updates", 2, "--batch-size", 4)[0] == 0
     down = (
         "downstream",
@@ -317,16 +323,18 @@ def test_collect_pretrain_downstream_and_evaluate_on_a_real_domain(call: Call, t
         "--out",
         runs / "d",
         *fast,
+        *repeat,
     )
     assert call(*down, *SMALL)[0] == 0
     evaluations = rows(runs / "d" / "eval.csv")
     assert [(row["env_steps"], row["episode_agent_steps"]) for row in evaluations] == [
-        ("0", "500"),
-        ("60", "500"),
+        ("0", "250"),
+        ("60", "250"),
     ]
     assert all(0 <= float(row["episode_return"]) <= 1000 for row in evaluations)
     status, out, _ = call("evaluate", runs / "d" / "agent", "--episodes", 1, "--csv", runs / "returns.csv")
     assert status == 0
+    assert rows(runs / "returns.csv")[0]["agent_steps"] == "250"
     assert float(rows(runs / "returns.csv")[0]["episode_return"]) == pytest.approx(
         float(out.split(":")[1].split("±")[0]), abs=0.1
     )

@@ -56,6 +56,8 @@ class Collect:
     """collecting processes, shared by all domains (default: one per core)"""
     quality: Quality = "exact"
     """render quality; fast uses smaller shadow maps on software GL"""
+    action_repeat: int | None = None
+    """simulator steps per decision (default: the domain's, 2)"""
 
     def run(self) -> None:
         """Collect, or continue collecting."""
@@ -68,6 +70,7 @@ class Collect:
             seed=self.seed,
             workers=self.workers,
             quality=self.quality,
+            action_repeat=self.action_repeat,
         )
         for name, path in paths.items():
             logger.info("%s: %s", name, path)

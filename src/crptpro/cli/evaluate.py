@@ -28,6 +28,8 @@ class Evaluate:
     """seeds the episodes"""
     quality: Quality | None = None
     """render quality (default: the one the agent was trained with; exact for the random policy)"""
+    action_repeat: int | None = None
+    """simulator steps per decision (default: what the agent was trained with; the domain's for the random policy)"""
     csv: Path | None = None
     """write one row per episode here"""
     video: Path | None = None
@@ -51,7 +53,9 @@ class Evaluate:
         if agent is not None:
             settings["image_size"] = agent.encoder.image_size
             settings["frame_stack"] = agent.encoder.in_channels // 3
-            settings["action_repeat"] = trained_with.get("action_repeat", 2)
+            settings["action_repeat"] = trained_with.get("action_repeat")
+        if self.action_repeat is not None:
+            settings["action_repeat"] = self.action_repeat
         # Chance does not look; without a video there is nothing to draw.
         settings["render"] = agent is not None or self.video is not None
         env = make_env(task, seed=self.seed, **settings)

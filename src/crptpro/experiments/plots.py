@@ -41,17 +41,18 @@ def plot_pretraining(record: str | Path, out: str | Path, *, num_prototypes: int
     """
     figure, axes = _figure(2, 2)
     uniform = math.log(num_prototypes)
-    panels = (
+    panels: tuple[tuple[str, str, float | None], ...] = (
         ("comp", "comparative loss [nats]", uniform),
         ("assignment_entropy", "assignment entropy [nats]", uniform),
         ("embedding_cosine", "mean pairwise cosine of embeddings", 1.0),
-        ("prototypes_in_use", "prototypes in use", float(num_prototypes)),
+        ("prototypes_in_use", "prototypes in use, mean over batches", None),  # at most one per row of a batch
     )
     for axis, (column, label, reference) in zip(axes.flat, panels):
         points = read_columns(record, "updates", column)
         if points:
             axis.plot(*zip(*points), color="tab:blue", linewidth=1.2)
-        axis.axhline(reference, color="0.6", linestyle="--", linewidth=0.8)
+        if reference is not None:
+            axis.axhline(reference, color="0.6", linestyle="--", linewidth=0.8)
         axis.set(xlabel="updates", ylabel=label)
     axes[0, 0].set_title(f"dashed: ln {num_prototypes} = {uniform:.3f}, nothing learned", fontsize=9)
     figure.savefig(out)
