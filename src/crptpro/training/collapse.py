@@ -174,7 +174,8 @@ class CollapseMonitor:
         plateau = self.plateaus[-1]
         plateau[1] = self._outside_since
         duration = (self._outside_since or 0) - (plateau[0] or 0)
-        _LOG.warning(
+        _LOG.log(
+            logging.WARNING if self.state == "dead" else logging.INFO,
             "Update %s: left the plateau after %d updates%s.",
             self._outside_since, duration, " (it had been called dead)" if self.state == "dead" else "",
         )  # fmt: skip
