@@ -41,7 +41,10 @@ def main(work: Path) -> None:
     plot_pretraining(runs / "group_a" / "pretrain.csv", HERE / "pretraining.png")
     datasets = {name: FrameDataset.open(work / "data" / name) for name in ("cheetah", "walker", "quadruped")}
     plot_stacks(datasets, HERE / "stacks.png")
-    for label, pretrained in (("crptpro", load_pretrained(runs / "group_a/encoder")), ("random", random_pretrained(seed=0))):
+    for label, pretrained in (
+        ("crptpro", load_pretrained(runs / "group_a/encoder")),
+        ("random", random_pretrained(seed=0)),
+    ):
         points = embed_samples(pretrained.encoder, datasets, projector=pretrained.projector)
         plot_embeddings(points, HERE / f"embeddings_{label}.png", title=LABELS[label])
     rows = []
@@ -50,7 +53,9 @@ def main(work: Path) -> None:
         records = {LABELS[name]: runs / f"{task}_{name}" / "eval.csv" for name in LABELS}
         rows.append({"task": task, "encoder": "uniform random policy", "0 env steps": cell(chance)})
         for label, record in records.items():
-            scores = {f"{steps:,} env steps": cell(values) for steps, values in sorted(returns(record).items())}
+            scores = {
+                f"{steps:,} env steps": cell(values) for steps, values in sorted(returns(record).items())
+            }
             rows.append({"task": task, "encoder": label} | scores)
         spread = (statistics.fmean(chance), statistics.stdev(chance))
         plot_learning_curves(records, HERE / f"{task}.png", baseline=spread, title=f"{task}, one seed")
