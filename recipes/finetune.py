@@ -4,7 +4,7 @@
 
 The paper's budgets from the group A encoder: pendulum 2,000 updates, manipulation 2,000, cartpole 3,000,
 cheetah 1,000, walker 500. The encoder gets better on that domain and worse on the others. Optimiser state starts
-afresh; target networks are kept. Disk: 2.1 GB for the domain's random data and 1.1 GB for the task.
+afresh; target networks are kept. Disk: 2.1 GB for the domain's random data and 1.3 GB for the task.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from crptpro.data import collect_random
 from crptpro.domains import get_domain
 from crptpro.pretrained import finetune, save_pretrained
 from crptpro.seeding import seed_everything
-from crptpro.training import DownstreamConfig, train_downstream
+from crptpro.training import SACSettings, train_downstream
 
 
 @dataclass
@@ -47,7 +47,11 @@ class Config:
     """collecting processes"""
     quality: Literal["exact", "fast"] = "exact"
     """render quality"""
-    downstream: DownstreamConfig = field(default_factory=DownstreamConfig)
+    precision: Literal["auto", "fp32", "bf16"] = "auto"
+    """arithmetic of the convolutions and big matrix products"""
+    device: str = "cpu"
+    """where to train"""
+    downstream: SACSettings = field(default_factory=SACSettings)
     """SAC on the frozen encoder"""
 
 
@@ -70,6 +74,8 @@ def main(config: Config) -> None:
         batch_size=config.batch_size,
         learning_rate=config.learning_rate,
         seed=config.seed,
+        precision=config.precision,
+        device=config.device,
         run_dir=run_dir,
     )
     encoder = save_pretrained(loss, run_dir / "encoder")
@@ -78,9 +84,11 @@ def main(config: Config) -> None:
         task,
         encoder,
         run_dir=config.out / task,
-        config=config.downstream,
+        **vars(config.downstream),
         seed=config.seed,
         quality=config.quality,
+        precision=config.precision,
+        device=config.device,
     )
 
 

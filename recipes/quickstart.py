@@ -92,9 +92,11 @@ def main(config: Config) -> None:
     started = time.monotonic()
     out = config.out
     settings = json.loads(json.dumps(asdict(config), default=str))
-    if (out / "scores.json").exists() and read_json(out / "scores.json")["config"] == settings:
+    is_reported = (out / "report.md").exists() and (out / "scores.json").exists()
+    if is_reported and read_json(out / "scores.json")["config"] == settings:
         logger.info("Already done: %s. Choose another --out to run again.", out / "report.md")
         return
+    (out / "report.md").unlink(missing_ok=True)
     seed_everything(config.seed)
 
     # 1. a uniform random policy fills one dataset per domain
@@ -176,6 +178,7 @@ def main(config: Config) -> None:
                 records.log(row, stream="final", episode=e.episode)
     env.close()
     blind_env.close()
+    write_json(out / "scores.json", {"scores": scores, "config": settings})
 
     # 5. what happened
     learned, random = scores["trained agent"], scores["uniform random policy"]
@@ -215,16 +218,18 @@ def main(config: Config) -> None:
             ),
         },
         caveats=[
-            f"The encoder had {config.pretrain_updates:,} updates on {config.transitions:,} transitions per domain, "
-            f"about 1 % of the paper's 50,000 on 100,000; {plateau} of them went by on the plateau at ln M.",
+            f"The encoder had {config.pretrain_updates:,} updates on {config.transitions:,} transitions per domain "
+            f"(the paper: 50,000 on 100,000). {plateau} of them went by on the plateau at ln M.",
             f"{config.task} is an easy task, and {config.env_steps:,} env steps are early; the paper's curves run to "
-            "500,000. Learning rate and batch size are chosen for speed, not the paper's.",
+            "500,000. Learning rate, batch size and action repeat are chosen for speed, not the paper's.",
             "One seed. It shows that the whole chain works, not that pre-training is what helped: a frozen encoder at "
-            "random initialisation is a strong control at this scale (`crptpro downstream "
-            f"{config.task} --pretrained random-encoder --out ...`).",
+            "random initialisation is a strong control at this scale. To run it: "
+            f"`crptpro downstream {config.task} --pretrained random-encoder --out {out / 'random_encoder'} "
+            f"--env-steps {config.env_steps} --action-repeat {config.action_repeat} --quality {config.quality} "
+            f"--batch-size {config.batch_size} --learning-rate {config.learning_rate} "
+            f"--replay-capacity {config.replay_capacity} --random-agent-steps {config.random_agent_steps}`.",
         ],
     )
-    write_json(out / "scores.json", {"scores": scores, "config": settings, "minutes": minutes})
     logger.info("5/5 %s", verdict)
     logger.info("Report with figures: %s", report)
 

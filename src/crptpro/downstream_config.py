@@ -7,8 +7,10 @@ from typing import Literal
 
 
 @dataclass(frozen=True)
-class DownstreamConfig:
-    """Settings of SAC on a frozen encoder (CRPTpro, hyper-parameter table; Proto-RL's released agent).
+class SACSettings:
+    """SAC on a frozen encoder: what defines the learner and its budget, wherever it runs.
+
+    Source: CRPTpro, hyper-parameter table; Proto-RL's released agent.
 
     One update per agent step once ``random_agent_steps`` transitions are stored. ``env_steps`` counts
     un-repeated simulator steps, ``agent_steps`` decisions.
@@ -18,8 +20,6 @@ class DownstreamConfig:
     """budget in simulator steps; an episode still running then is cut"""
     action_repeat: int = 2
     """simulator steps per decision"""
-    seed: int = 0
-    """seeds initialisation, environment, exploration, replay sampling, shifts, bonus and evaluation"""
     batch_size: int = 512
     """transitions per update"""
     replay_capacity: int = 40_000
@@ -62,14 +62,8 @@ class DownstreamConfig:
     """simulator steps between two checkpoints, taken at episode ends"""
     log_interval_env_steps: int = 1_000
     """simulator steps between two rows of training metrics"""
-    quality: Literal["exact", "fast"] = "exact"
-    """render quality"""
     features: Literal["auto", "dense", "reencode"] = "auto"
     """how shifted features are had: cut from dense maps stored once per observation, or encoded at every update"""
-    precision: Literal["auto", "fp32", "bf16"] = "auto"
-    """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it"""
-    device: str = "cpu"
-    """where networks and features live"""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot run.
@@ -78,10 +72,9 @@ class DownstreamConfig:
             ValueError: naming the setting, its value and what is allowed.
         """
         for name in (
-            "env_steps", "action_repeat", "batch_size", "replay_capacity", "bottleneck_dim", "hidden_dim",
-            "actor_update_interval",
-            "target_update_interval", "knn_k", "queue_size", "eval_interval_env_steps", "eval_episodes",
-            "checkpoint_interval_env_steps", "log_interval_env_steps",
+            "env_steps", "action_repeat", "batch_size", "replay_capacity", "random_agent_steps", "bottleneck_dim",
+            "hidden_dim", "actor_update_interval", "target_update_interval", "knn_k", "queue_size",
+            "eval_interval_env_steps", "eval_episodes", "checkpoint_interval_env_steps", "log_interval_env_steps",
         ):  # fmt: skip
             if getattr(self, name) < 1:
                 raise ValueError(f"`{name}` must be at least 1, got {getattr(self, name)}.")
@@ -91,7 +84,7 @@ class DownstreamConfig:
         for name in ("learning_rate", "initial_temperature"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"`{name}` must be positive, got {getattr(self, name)}.")
-        for name in ("random_agent_steps", "shift_pad", "intrinsic_reward_coef", "video_episodes"):
+        for name in ("shift_pad", "intrinsic_reward_coef", "video_episodes"):
             if getattr(self, name) < 0:
                 raise ValueError(f"`{name}` must not be negative, got {getattr(self, name)}.")
         if self.replay_capacity < self.random_agent_steps:
@@ -99,3 +92,17 @@ class DownstreamConfig:
                 f"`replay_capacity` ({self.replay_capacity}) must hold the {self.random_agent_steps} transitions "
                 "of `random_agent_steps`, or no update would ever start."
             )
+
+
+@dataclass(frozen=True)
+class DownstreamConfig(SACSettings):
+    """Every setting of the downstream stage: the learner's, and where and how it runs."""
+
+    seed: int = 0
+    """seeds initialisation, environment, exploration, replay sampling, shifts, bonus and evaluation"""
+    quality: Literal["exact", "fast"] = "exact"
+    """render quality"""
+    precision: Literal["auto", "fp32", "bf16"] = "auto"
+    """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it"""
+    device: str = "cpu"
+    """where networks and features live"""

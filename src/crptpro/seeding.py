@@ -34,15 +34,15 @@ def seed_everything(seed: int) -> None:
 
 
 def global_rng_state() -> dict[str, Any]:
-    """Return torch's global generator states (CPU, and CUDA where present) as tensors."""
+    """Return torch's global generator states (CPU, and CUDA where in use) as tensors."""
     state: dict[str, Any] = {"torch": torch.get_rng_state()}
-    if torch.cuda.is_available():
+    if torch.cuda.is_initialized():  # asking an unused GPU would take its memory
         state["cuda"] = torch.cuda.get_rng_state_all()
     return state
 
 
 def set_global_rng_state(state: dict[str, Any]) -> None:
-    """Restore what :func:`global_rng_state` returned."""
+    """Restore what :func:`global_rng_state` returned, on as many GPUs as there are."""
     torch.set_rng_state(state["torch"].cpu())
-    if "cuda" in state and torch.cuda.is_available():
-        torch.cuda.set_rng_state_all(state["cuda"])
+    for device in range(min(len(state.get("cuda", ())), torch.cuda.device_count())):
+        torch.cuda.set_rng_state(state["cuda"][device].cpu(), device)

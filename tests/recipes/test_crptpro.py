@@ -37,7 +37,7 @@ def test_one_encoder_of_the_group_serves_the_task(out: Path) -> None:
     pretrained = load_pretrained(out / "group_D_seed_0" / "encoder", expect={"prototypes": True})
     facts = pretrained.card["training"]["datasets"]
     assert [fact["domain"] for fact in facts] == ["walker", "pendulum", "hopper"]
-    run_dir = out / f"{SHORT_TASK}_crptpro_seed_0"
+    run_dir = out / f"{SHORT_TASK}_group_D_seed_0"  # the same task on another group's encoder has its own
     agent, card = load_agent(run_dir / "agent")
     assert card["pretrained"] == pretrained.identity()
     assert agent.actor.action_dim == 2

@@ -81,3 +81,11 @@ def test_what_is_missing_truncated_or_foreign_is_refused_by_name(saved: Path, tm
     (saved / WEIGHTS_FILE).unlink()
     with pytest.raises(CheckpointError, match=r"weights\.safetensors is missing"):
         load_agent(saved)
+
+
+def test_a_card_that_builds_no_agent_is_one_clear_error(saved: Path) -> None:
+    card = json.loads((saved / "card.json").read_text())
+    card["modules"]["actor"]["hidden_dim"] = 3
+    (saved / "card.json").write_text(json.dumps(card))
+    with pytest.raises(CheckpointError, match="no agent that can be rebuilt"):
+        load_agent(saved)

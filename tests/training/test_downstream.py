@@ -9,10 +9,13 @@ import torch
 from torchrl.envs import CatFrames, EnvBase, TransformedEnv
 from toy_world import ToyEnv
 
-from crptpro.errors import CheckpointError, PretrainedError
+from crptpro.errors import CheckpointError, NonFiniteError, PretrainedError
+from crptpro.loggers import RunLogger, WandbOptions
 from crptpro.modules import PixelEncoder, Projector, Prototypes
 from crptpro.pretrained import Pretrained, random_pretrained
 from crptpro.training import DownstreamConfig, load_agent, train_downstream
+from crptpro.training.frozen_features import FrozenFeatures
+from crptpro.training.rad_sac_learner import RADSACLearner
 
 EPISODE = 10
 SMALL = DownstreamConfig(
@@ -172,8 +175,84 @@ def test_without_a_directory_nothing_is_kept_but_the_result(
 
 @pytest.mark.parametrize(
     ("setting", "value"),
-    [("batch_size", 0), ("discount", 1.5), ("learning_rate", 0.0), ("random_agent_steps", 50)],
+    [
+        ("batch_size", 0),
+        ("discount", 1.5),
+        ("learning_rate", 0.0),
+        ("random_agent_steps", 50),
+        ("random_agent_steps", 0),
+    ],
 )
 def test_settings_that_cannot_run_are_named_with_their_value(setting: str, value: float) -> None:
     with pytest.raises(ValueError, match=rf"`?{setting}`?.*{value}|{value}.*`{setting}`"):
         dataclasses.replace(SMALL, **{setting: value})
+
+
+def test_every_logged_mean_is_over_the_updates_that_reported_it(tmp_path: Path) -> None:
+    # 7 updates a row, every third with an actor step: rows hold two or three of those.
+    train(
+        tmp_path,
+        log_interval_env_steps=14,
+        actor_update_interval=3,
+        initial_temperature=0.25,
+        learning_rate=1e-9,
+    )
+    with open(tmp_path / "train.csv", newline="") as file:
+        alphas = [float(row["alpha"]) for row in csv.DictReader(file)]
+    assert alphas == pytest.approx([0.25] * len(alphas))
+
+
+def test_a_smaller_budget_than_what_was_done_is_refused(tmp_path: Path) -> None:
+    train(tmp_path)
+    with pytest.raises(CheckpointError, match=r"has done 120 env steps, 40 are asked"):
+        train(tmp_path, env_steps=40)
+
+
+def test_what_auto_became_must_agree_when_a_run_is_continued(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(tmp_path, env_steps=60, features="auto", precision="fp32")
+    with pytest.raises(CheckpointError, match="precision was 'fp32', now 'bf16'"):
+        train(tmp_path, precision="bf16")
+    with pytest.raises(CheckpointError, match="features was 'dense', now 'reencode'"):
+        train(tmp_path, features="reencode")
+    assert train(tmp_path, features="dense").env_steps == 120
+
+
+def test_a_finished_run_encodes_nothing_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    train(tmp_path)
+    monkeypatch.setattr(FrozenFeatures, "rebuild", lambda *args, **options: pytest.fail("encoded again"))
+    train(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("network", "message"),
+    [
+        ("critic", r"The weight .* of toy is not finite"),
+        ("actor", r"The policy of toy gave the action \[nan"),
+    ],
+)
+def test_a_spoilt_weight_reaches_neither_a_checkpoint_nor_the_simulator(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, network: str, message: str
+) -> None:
+    train(tmp_path, env_steps=40)
+    kept = sorted((tmp_path / "checkpoints").iterdir())
+
+    def spoil(learner: RADSACLearner, *args: object, **options: object) -> dict[str, torch.Tensor]:
+        with torch.no_grad():
+            getattr(learner.loss, network).trunk.linear.weight.fill_(float("nan"))
+        return {}
+
+    monkeypatch.setattr(RADSACLearner, "update", spoil)
+    with pytest.raises(NonFiniteError, match=message):
+        train(tmp_path, env_steps=60)
+    assert sorted((tmp_path / "checkpoints").iterdir()) == kept
+
+
+def test_videos_and_mirrors_receive_the_run(tmp_path: Path) -> None:
+    with RunLogger(tmp_path, tensorboard=True, wandb=WandbOptions(mode="offline")) as logger:
+        train(tmp_path, logger=logger, env_steps=40, video_episodes=1)
+    videos = sorted(path.name for path in (tmp_path / "videos").iterdir())
+    assert videos == ["env_steps_00000000_episode_0.mp4", "env_steps_00000040_episode_0.mp4"]
+    assert {path.name for path in (tmp_path / "tensorboard").iterdir()} == {"train", "episodes", "eval"}
+    assert list((tmp_path / "wandb").glob("offline-run-*/*.wandb"))

@@ -82,11 +82,13 @@ class Evaluate:
         )
         if self.csv is not None:
             self.csv.parent.mkdir(parents=True, exist_ok=True)
-            with open(self.csv, "w", newline="") as file:
+            partial = self.csv.with_name(f".{self.csv.name}.partial")
+            with open(partial, "w", newline="") as file:
                 writer = csv.writer(file)
                 writer.writerow(["task", "agent", "episode", "episode_return", "agent_steps", "seed"])
                 writer.writerows(
                     [task, self.agent, e.episode, e.episode_return, e.agent_steps, e.seed] for e in episodes
                 )
+            partial.replace(self.csv)
         if self.video is not None:
             write_video(videos[0], self.video)

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from crptpro.cli.request import Logging, image_format, require_device
+from crptpro.loggers import RunLogger
 from crptpro.seeding import seed_everything
 
 logger = logging.getLogger(__name__)
@@ -45,6 +46,14 @@ class PretrainingOptions:
         )  # fmt: skip
         return {name: getattr(self, name) for name in names} | {"run_dir": self.out}
 
+    def keep(self, loss: Any, records: RunLogger) -> None:
+        """Write the encoder, and copy it to the mirrors."""
+        from crptpro.pretrained import save_pretrained
+
+        path = save_pretrained(loss, self.out / "encoder")
+        records.artifact(path, name=f"encoder_{self.out.name}", kind="encoder")
+        logger.info("pretrained encoder: %s", path)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Pretrain(PretrainingOptions):
@@ -65,7 +74,6 @@ class Pretrain(PretrainingOptions):
         """Pre-train, or continue, and write the artifact."""
         from crptpro.modules import PixelEncoder
         from crptpro.objectives import get_method
-        from crptpro.pretrained import save_pretrained
         from crptpro.training import pretrain
 
         # Whatever is wrong with the request is found before the run directory is made.
@@ -82,7 +90,7 @@ class Pretrain(PretrainingOptions):
             pretrain(
                 loss, list(self.datasets), updates=self.updates, logger=records, **self.training_arguments()
             )
-            logger.info("pretrained encoder: %s", save_pretrained(loss, self.out / "encoder"))
+            self.keep(loss, records)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +106,7 @@ class Finetune(PretrainingOptions):
 
     def run(self) -> None:
         """Fine-tune, or continue, and write the artifact."""
-        from crptpro.pretrained import finetune, load_pretrained, save_pretrained
+        from crptpro.pretrained import finetune, load_pretrained
 
         require_device(self.device)
         image_size, frame_stack = image_format([self.dataset])
@@ -110,4 +118,4 @@ class Finetune(PretrainingOptions):
             loss, _ = finetune(
                 pretrained, self.dataset, updates=self.updates, logger=records, **self.training_arguments()
             )
-            logger.info("fine-tuned encoder: %s", save_pretrained(loss, self.out / "encoder"))
+            self.keep(loss, records)

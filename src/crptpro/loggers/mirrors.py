@@ -6,6 +6,7 @@ import json
 import logging
 import netrc
 import os
+import re
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -103,7 +104,8 @@ class WandbMirror:
 
     def artifact(self, path: Path, *, name: str, kind: str) -> None:
         """Upload a file or directory as a W&B artifact."""
-        artifact = self._wandb.Artifact(name, type=kind)
+        # W&B takes letters, digits, dash, underscore and dot; a Gymnasium task has a colon.
+        artifact = self._wandb.Artifact(re.sub(r"[^\w.-]", "_", name), type=kind)
         (artifact.add_dir if path.is_dir() else artifact.add_file)(str(path))
         self._run.log_artifact(artifact)
 

@@ -125,23 +125,25 @@ class RunLogger:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Take back the rows written after the checkpoint, so that the resumed run writes each row once."""
+        before = self.record.counts()
         self.record.keep_first(state["rows"], only_these=state["streams"] is not None)
-        self._rewind()
+        self._rewind(before)
 
     def truncate_to(self, stream: str, counter: str, value: int) -> None:
         """Take back the rows of ``stream`` whose ``counter`` exceeds ``value`` (-1: all of them)."""
+        before = self.record.counts()
         self.record.keep_until(stream, counter, value)
-        self._rewind()
+        self._rewind(before)
 
     def close(self) -> None:
         """Finish the mirrors; the record needs no closing."""
         self._copy(lambda mirror: mirror.close())
         self._mirrors = []
 
-    def _rewind(self) -> None:
+    def _rewind(self, before: Iterable[str]) -> None:
         if not self._mirrors:
             return
-        last: dict[str, int] = {}
+        last = dict.fromkeys(before, -1)  # a stream that lost all its rows is to be forgotten from the start
         for stream in self.record.counts():
             for row in self.record.rows(stream)[-1:]:
                 last[stream] = row[main_counter({k: v for k, v in row.items() if k not in RESERVED})]

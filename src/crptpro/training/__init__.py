@@ -1,6 +1,6 @@
 """Training: offline pre-training, downstream SAC on a frozen encoder, evaluation, checkpoints."""
 
-from crptpro.downstream_config import DownstreamConfig
+from crptpro.downstream_config import DownstreamConfig, SACSettings
 from crptpro.training.agent import PixelAgent, load_agent, save_agent
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.collapse import CollapseMonitor
@@ -16,6 +16,7 @@ __all__ = [
     "Episode",
     "PixelAgent",
     "PretrainResult",
+    "SACSettings",
     "evaluate",
     "load_agent",
     "pretrain",

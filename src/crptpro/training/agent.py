@@ -65,14 +65,17 @@ def load_agent(path: str | Path) -> tuple[PixelAgent, dict[str, Any]]:
     card, tensors = read_artifact(
         path, format_name=AGENT_FORMAT, version=AGENT_VERSION, error=CheckpointError
     )
-    encoder = PixelEncoder(**card["modules"]["encoder"])
-    actor = SquashedGaussianActor(**card["modules"]["actor"])
-    for name, module in (("encoder", encoder), ("actor", actor)):
-        prefix = f"{name}."
-        module.load_state_dict(
-            {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
-        )
-        module.requires_grad_(False).eval()
+    try:
+        encoder = PixelEncoder(**card["modules"]["encoder"])
+        actor = SquashedGaussianActor(**card["modules"]["actor"])
+        for name, module in (("encoder", encoder), ("actor", actor)):
+            prefix = f"{name}."
+            module.load_state_dict(
+                {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+            )
+            module.requires_grad_(False).eval()
+    except (KeyError, TypeError, ValueError, RuntimeError) as reason:
+        raise CheckpointError(f"{path} holds no agent that can be rebuilt: {reason!r}") from reason
     return PixelAgent(encoder, actor), card
 
 

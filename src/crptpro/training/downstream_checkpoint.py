@@ -6,6 +6,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import torch
+
+from crptpro.errors import CheckpointError
 from crptpro.seeding import global_rng_state, set_global_rng_state
 from crptpro.training.fingerprint import require_same
 
@@ -17,8 +20,9 @@ STREAMS = ("train", "episodes", "eval")
 
 COUNTERS = ("agent_steps", "updates", "episodes", "last_eval", "next_eval", "next_checkpoint")
 
-FREE_TO_CHANGE = ("env_steps", "device")
-"""Settings that a run may be continued with other values of: budgets may grow, machines differ."""
+FREE_TO_CHANGE = ("env_steps", "device", "features", "precision")
+"""Settings that a run may be continued with other values of: budgets may grow, machines differ. What `auto` became
+is compared instead of what was asked."""
 
 
 def fingerprint(run: DownstreamRun) -> dict[str, Any]:
@@ -26,7 +30,11 @@ def fingerprint(run: DownstreamRun) -> dict[str, Any]:
     settings = dataclasses.asdict(run.config)
     for name in FREE_TO_CHANGE:
         settings.pop(name)
-    return {"task": run.task, **settings, "pretrained": run.pretrained_identity}
+    resolved = {
+        "precision": "bf16" if run.parts.encoder.compute_dtype == torch.bfloat16 else "fp32",
+        "features": run.parts.feature_mode,
+    }
+    return {"task": run.task, **settings, **resolved, "pretrained": run.pretrained_identity}
 
 
 def state_of(run: DownstreamRun) -> dict[str, Any]:
@@ -40,7 +48,7 @@ def state_of(run: DownstreamRun) -> dict[str, Any]:
         "generators": {name: generator.get_state() for name, generator in run.generators.items()},
         "global_rng": global_rng_state(),
         "sums": run.sums,
-        "summed_updates": run.summed_updates,
+        "counts": run.counts,
         "records": run.records.state_dict(STREAMS),
     }
 
@@ -49,9 +57,16 @@ def restore(run: DownstreamRun, state: Mapping[str, Any]) -> None:
     """Put a run where :func:`state_of` saw it; dense feature maps are rebuilt by the caller.
 
     Raises:
-        CheckpointError: if the state belongs to a run with other settings; nothing has changed then.
+        CheckpointError: if the state belongs to a run with other settings, or one that went beyond the budget;
+            nothing has changed then.
     """
     require_same(state["fingerprint"], fingerprint(run), run.run_dir)
+    done = state["counters"]["agent_steps"] * run.config.action_repeat
+    if done - run.config.action_repeat >= run.config.env_steps:
+        raise CheckpointError(
+            f"{run.run_dir} has done {done:,} env steps, {run.config.env_steps:,} are asked: ask for at least as many, "
+            "or choose another run directory."
+        )
     for name, value in state["counters"].items():
         setattr(run, name, value)
     run.parts.learner.load_state_dict(state["learner"])
@@ -61,5 +76,5 @@ def restore(run: DownstreamRun, state: Mapping[str, Any]) -> None:
     for name, generator in run.generators.items():
         generator.set_state(state["generators"][name])
     set_global_rng_state(state["global_rng"])
-    run.sums, run.summed_updates = state["sums"], state["summed_updates"]
+    run.sums, run.counts = dict(state["sums"]), dict(state["counts"])
     run.records.load_state_dict(state["records"])

@@ -32,8 +32,7 @@ logger = logging.getLogger(__name__)
 
 EnvFactory = Callable[..., EnvBase]
 
-DELAYED_METRICS = frozenset({"loss_actor", "loss_alpha", "alpha", "entropy"})
-"""Metrics that only the delayed updates report."""
+REMEDY = "The last checkpoint is kept; a smaller learning rate or precision='fp32' usually helps."
 
 
 class DownstreamRun:
@@ -83,7 +82,7 @@ class DownstreamRun:
         self.last_eval = -1
         self.next_eval, self.next_checkpoint = 0, config.checkpoint_interval_env_steps
         self.sums: dict[str, Tensor] = {}
-        self.summed_updates = 0
+        self.counts: dict[str, int] = {}
 
     @property
     def env_steps(self) -> int:
@@ -168,12 +167,21 @@ class DownstreamRun:
 
     @torch.no_grad()
     def act(self, features: Tensor) -> Tensor:
-        """Return the next action: uniform at first, then a sample of the policy."""
+        """Return the next action: uniform at first, then a sample of the policy.
+
+        Raises:
+            NonFiniteError: if the policy has diverged; no simulator should see that.
+        """
         if self.agent_steps < self.config.random_agent_steps:
             shape = self.env.action_spec.shape
             return torch.rand(shape, generator=self.generators["random_actions"]) * 2 - 1
         action, _ = self.parts.actor.sample(features, generator=self.generators["policy"])
-        return action.squeeze(0).float().cpu().clamp(-1, 1)
+        action = action.squeeze(0).float().cpu().clamp(-1, 1)
+        if not torch.isfinite(action).all():
+            raise NonFiniteError(
+                f"The policy of {self.task} gave the action {action.tolist()} after update {self.updates}. {REMEDY}"
+            )
+        return action
 
     def update(self) -> None:
         """Sample, shift, encode, add the bonus, and let the learner step."""
@@ -186,23 +194,19 @@ class DownstreamRun:
             metrics["intrinsic_reward"] = batch["next", "intrinsic_reward"].mean()
         for key, value in metrics.items():
             self.sums[key] = self.sums.get(key, 0) + value.detach()
-        self.summed_updates += 1
+            self.counts[key] = self.counts.get(key, 0) + 1
         self.updates += 1
 
     # --- records ------------------------------------------------------------------------------------------------
 
     def log_training(self) -> None:
         """Write the mean of every metric over the updates since the last row."""
-        if self.summed_updates == 0:
+        if not self.sums:
             return
         self.check_finite()
-        means = {}
-        for key, total in self.sums.items():
-            count = self.summed_updates
-            if key in DELAYED_METRICS:
-                count = max(1, count // self.config.actor_update_interval)
-            means[key] = (total / count).item()
-        self.sums, self.summed_updates = {}, 0
+        # Each by its own count: the actor's metrics come from the delayed updates only.
+        means = {key: (total / self.counts[key]).item() for key, total in self.sums.items()}
+        self.sums, self.counts = {}, {}
         self.records.log(means, stream="train", env_steps=self.env_steps, updates=self.updates)
 
     def check_finite(self) -> None:
@@ -214,8 +218,7 @@ class DownstreamRun:
         for key, total in self.sums.items():
             if not torch.isfinite(total):
                 raise NonFiniteError(
-                    f"{key} of {self.task} became {total.item()} at or before update {self.updates}. The last "
-                    "checkpoint is kept; a smaller learning rate or precision='fp32' usually helps."
+                    f"{key} of {self.task} became {total.item()} at or before update {self.updates}. {REMEDY}"
                 )
 
     def evaluate(self) -> None:
@@ -258,7 +261,7 @@ class DownstreamRun:
             "feature_mode": self.parts.feature_mode,
         }
         path = save_agent(self.run_dir / "agent", self.agent(), card=card)
-        self.records.artifact(path, name="agent", kind="agent")
+        self.records.artifact(path, name=f"agent_{self.task}", kind="agent")
         return path
 
     def close(self) -> None:
@@ -270,8 +273,18 @@ class DownstreamRun:
     # --- checkpoints --------------------------------------------------------------------------------------------
 
     def save(self, checkpoints: CheckpointDir) -> None:
-        """Write everything a resumed run needs, unless the run has diverged."""
+        """Write everything a resumed run needs, unless the run has diverged.
+
+        Raises:
+            NonFiniteError: naming a metric or a weight; earlier checkpoints are kept.
+        """
         self.check_finite()
+        # The last update may have spoilt a weight that no metric has shown yet.
+        for name, weight in self.parts.learner.loss.named_parameters():
+            if not torch.isfinite(weight).all():
+                raise NonFiniteError(
+                    f"The weight {name} of {self.task} is not finite after update {self.updates}. {REMEDY}"
+                )
         checkpoints.save(downstream_checkpoint.state_of(self), counter=self.agent_steps)
 
     def resume(self, checkpoints: CheckpointDir) -> None:
@@ -286,5 +299,8 @@ class DownstreamRun:
                 self.records.truncate_to(stream, "env_steps", -1)
             return
         downstream_checkpoint.restore(self, state)
+        if self.env_steps >= self.config.env_steps:
+            logger.info("%s: already at %s env steps", self.task, f"{self.env_steps:,}")
+            return
         logger.info("%s: continuing from %s env steps", self.task, f"{self.env_steps:,}")
         self.parts.features.rebuild(progress=self.progress)

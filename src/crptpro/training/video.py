@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import logging
 from functools import cache
@@ -26,18 +27,19 @@ def write_video(pictures: Tensor, path: str | Path, *, pictures_per_s: int = 25)
     if importlib.util.find_spec("imageio_ffmpeg") is None:
         _warn_once("no video is written: install the extra with `pip install 'crptpro[video]'`.")
         return None
-    import imageio.v2 as imageio
-
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}")
     try:
+        import imageio.v2 as imageio
+
+        path.parent.mkdir(parents=True, exist_ok=True)
         # Nearest-neighbour enlargement keeps 84 pixels visible on a screen; the codec wants even sizes.
         large = pictures.repeat_interleave(4, -1).repeat_interleave(4, -2).permute(0, 2, 3, 1).numpy()
         imageio.mimwrite(temporary, list(large), format="FFMPEG", fps=pictures_per_s, macro_block_size=4)
         temporary.replace(path)
-    except (OSError, RuntimeError, ValueError) as reason:
-        temporary.unlink(missing_ok=True)
+    except (OSError, RuntimeError, ValueError, ImportError) as reason:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
         _warn_once(f"no video is written: {reason}")
         return None
     return path

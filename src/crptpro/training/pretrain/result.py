@@ -33,5 +33,5 @@ class PretrainResult:
 
     @property
     def is_dead(self) -> bool:
-        """Whether training ended on a plateau or with collapsed embeddings."""
+        """Whether training ended on a plateau longer than its patience."""
         return self.collapse["verdict"] == "dead"

@@ -9,7 +9,6 @@ from typing import Any
 
 import torch
 from torchrl.objectives import LossModule
-from tqdm.auto import tqdm
 
 from crptpro.cards import require_disk
 from crptpro.errors import CheckpointError
@@ -19,6 +18,7 @@ from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.fingerprint import describe_loss, require_same
 from crptpro.training.pretrain.learner import Learner
+from crptpro.training.pretrain.progress import PretrainProgress
 from crptpro.training.pretrain.result import PretrainResult
 from crptpro.training.pretrain.sources import Augmenter, Source, keys_read
 from crptpro.training.pretrain.window import Window, cosine_threshold, memory_row, num_prototypes
@@ -107,18 +107,21 @@ class PretrainRun:
     def train(self, *, progress: bool) -> PretrainResult:
         """Do the updates that are left and say how it went."""
         total, interval = self.settings["updates"], self.settings["log_interval"]
-        bar = tqdm(
-            total=total, initial=self.done, desc="pretrain", unit="update", disable=None if progress else True
-        )
-        with StopRequest() as stop, bar:
+        shown = PretrainProgress(total, self.done, is_shown=progress)
+        if progress and self.done < total:
+            _LOG.info(
+                "pretrain: %s updates of batch %d, one domain after the other (%s); %s on %s",
+                f"{total:,}", self.settings["batch_size"], ", ".join(self.domains), self.precision, self.device,
+            )  # fmt: skip
+        with StopRequest() as stop, shown:
             while self.done < total:
                 self._update(interval)
-                bar.update()
+                shown.update()
                 if self.done % interval == 0:
                     self.learner.check(self.done)
                     row = self._log()
                     self.window.close()
-                    bar.set_postfix(loss=f"{row['loss']:.4f}", refresh=False)
+                    shown.row(self.done, row["loss"])
                 if self.done == total or stop.signal is not None or self._checkpoint_is_due():
                     self.save()
                 if stop.signal is not None:
