@@ -23,6 +23,7 @@ from crptpro.errors import CheckpointError, DatasetError, NonFiniteError
 from crptpro.loggers import RunLogger
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import MethodDefaults, registry
+from crptpro.pretrained import finetune, save_pretrained
 from crptpro.training import pretrain
 from crptpro.training.pretrain import learner
 
@@ -106,9 +107,12 @@ def test_seeds_make_runs_equal_or_different_and_leave_the_global_generator_alone
     assert not same_state(losses[0], losses[2])
 
 
-def test_killed_at_random_moments_it_completes_with_the_same_weights_and_record(tmp_path: Path) -> None:
+@pytest.mark.parametrize("stage", ["pretrain", "finetune"])
+def test_killed_at_random_moments_it_completes_with_the_same_weights_and_record(
+    tmp_path: Path, stage: str
+) -> None:
     script = Path(__file__).with_name("kill_target.py")
-    command = [sys.executable, str(script), str(tmp_path / "killed"), "160", "1"]
+    command = [sys.executable, str(script), stage, str(tmp_path / "killed"), "160", "1"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     output = subprocess.run(
         command, capture_output=True, text=True, timeout=300, env=environment, check=False
@@ -118,12 +122,17 @@ def test_killed_at_random_moments_it_completes_with_the_same_weights_and_record(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        whole = make_loss()
-        run(whole, 160, run_dir=tmp_path / "whole")
+        if stage == "pretrain":
+            whole = make_loss()
+            run(whole, 160, run_dir=tmp_path / "whole")
+        else:
+            start = save_pretrained(make_loss(), tmp_path / "start")
+            whole, _ = finetune(start, make_dataset(1), updates=160, run_dir=tmp_path / "whole", **SETTINGS)
     finally:
         torch.set_num_threads(threads)
-    killed = torch.load(tmp_path / "killed" / "final.pt", weights_only=True)
-    assert all(torch.equal(value, killed[key]) for key, value in whole.state_dict().items())
+    save_pretrained(whole, tmp_path / "whole" / "encoder")
+    weights = [tmp_path / run / "encoder" / "weights.safetensors" for run in ("killed", "whole")]
+    assert weights[0].read_bytes() == weights[1].read_bytes()
     assert record(tmp_path / "killed") == record(tmp_path / "whole")
 
 

@@ -63,6 +63,7 @@ def plot_learning_curves(
     records: Mapping[str, str | Path],
     out: str | Path,
     *,
+    training: Mapping[str, str | Path] | None = None,
     baseline: tuple[float, float] | None = None,
     title: str = "",
 ) -> Path:
@@ -71,6 +72,7 @@ def plot_learning_curves(
     Args:
         records: label to the ``eval.csv`` of a run (one row per episode).
         out: picture to write.
+        training: label to the ``episodes.csv`` of a run: a dot per training episode, at its end.
         baseline: mean and standard deviation of the uniform random policy's episode returns.
         title: what is learned.
     """
@@ -91,6 +93,10 @@ def plot_learning_curves(
         (line,) = axis.plot(x, mean, marker="o", markersize=3, label=f"{label} ({counts} episodes per point)")
         low, high = [m - s for m, s in zip(mean, std)], [m + s for m, s in zip(mean, std)]
         axis.fill_between(x, low, high, alpha=0.2, color=line.get_color(), linewidth=0)
+        if training is not None and label in training:
+            dots = read_columns(training[label], "env_steps", "episode_return")
+            name = f"{label}, training episodes (exploring)"
+            axis.plot(*zip(*dots), ".", color=line.get_color(), alpha=0.5, markersize=5, label=name)
     if baseline is not None:
         center, spread = baseline
         axis.axhline(center, color="0.4", linestyle="--", linewidth=1, label="uniform random policy")
