@@ -128,7 +128,7 @@ def test_a_directory_with_something_else_is_left_alone(tmp_path):
 
 def test_nobody_else_may_collect_into_the_same_place(tmp_path):
     collection = DomainCollection(tmp_path / "toy", request())
-    with pytest.raises(DatasetError, match="Another process is collecting"):
+    with pytest.raises(DatasetError, match="Another process is writing"):
         DomainCollection(tmp_path / "toy", request())
     collection.close()
     DomainCollection(tmp_path / "toy", request()).close()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import time
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,7 @@ from crptpro.data.card import read_card
 from crptpro.data.collect_worker import EpisodeJob
 from crptpro.data.episode import Episode
 from crptpro.data.episode_writer import EpisodeWriter
-from crptpro.data.incoming import (
-    drop_all_incoming,
-    drop_incoming,
-    lock_directory,
-    read_incoming,
-    write_incoming,
-)
+from crptpro.data.incoming import drop_all_incoming, drop_incoming, read_incoming, write_incoming
 from crptpro.data.layout import (
     CARD_FILE,
     COLLECTION_FILE,
@@ -29,6 +22,7 @@ from crptpro.data.layout import (
     estimate_bytes,
     write_tensordict_metadata,
 )
+from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import DatasetError
 from crptpro.seeding import derive_seed
 
@@ -67,7 +61,7 @@ class DomainCollection:
         self._running: dict[int, int] = {}
         self._waiting: dict[int, Episode] = {}
         self._writer: EpisodeWriter | None = None
-        self._lock: int | None = None
+        self._lock: DirectoryLock | None = None
         self._sessions: list[dict[str, Any]] = []
         self.is_complete = False
         if (path / CARD_FILE).exists():
@@ -78,8 +72,7 @@ class DomainCollection:
             raise DatasetError(
                 f"{path} is not empty and not a collection. Choose another directory or empty it."
             )
-        path.mkdir(parents=True, exist_ok=True)
-        self._lock = lock_directory(path)
+        self._lock = DirectoryLock(path, error=DatasetError)
         try:
             self._resume()
         except BaseException:
@@ -182,8 +175,7 @@ class DomainCollection:
         if self._writer is not None:
             self._writer.close()
         if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
+            self._lock.release()
 
     def _append_ready(self) -> None:
         writer = self._writer
