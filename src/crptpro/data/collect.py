@@ -103,7 +103,8 @@ def collect_group(
 
     Raises:
         DatasetError: if a directory holds something else than what is asked for.
-        DiskSpaceError: if the disk cannot hold it; nothing is written then.
+        DiskSpaceError: if the disk cannot hold it; no frame is written then, and the same directory may be asked for
+            less.
         UnknownNameError: for a domain nobody knows.
         CRPTproError: if a process fails, dies or hangs; finished episodes are kept.
     """
