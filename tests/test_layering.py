@@ -11,7 +11,7 @@ import crptpro
 
 PACKAGE = Path(crptpro.__file__).parent
 FOUNDATION = [
-    "errors", "seeding", "cards", "artifact", "directory_lock", "console", "loggers", "downstream_config",
+    "errors", "quality", "seeding", "cards", "artifact", "directory_lock", "console", "loggers", "downstream_config",
 ]  # fmt: skip
 ORDER = [
     "domains", "envs", "data", "modules", "objectives", "transforms", "training.evaluate", "training.checkpoint",

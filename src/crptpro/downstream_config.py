@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from crptpro.quality import Quality
+
 
 @dataclass(frozen=True)
 class DownstreamConfig:
@@ -62,7 +64,7 @@ class DownstreamConfig:
     """simulator steps between two checkpoints, taken at episode ends"""
     log_interval_env_steps: int = 1_000
     """simulator steps between two rows of training metrics"""
-    quality: Literal["exact", "fast"] = "exact"
+    quality: Quality = "exact"
     """render quality"""
     features: Literal["auto", "dense", "reencode"] = "auto"
     """how shifted features are had: cut from dense maps stored once per observation, or encoded at every update"""

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from toy_gymnasium import PAINTER
 from toy_world import FAILING, FIXED, data_bytes, run_in_order, variable_length
 from toy_world import collection_request as request
 
@@ -20,6 +21,7 @@ from crptpro.data import FrameDataset, collect_group, collect_random
 from crptpro.data.collection import DomainCollection
 from crptpro.data.layout import CARD_FILE, COLLECTION_FILE
 from crptpro.domains import Domain
+from crptpro.envs import rendering
 from crptpro.errors import CRPTproError, DatasetError, DiskSpaceError
 
 HERE = Path(__file__).parent
@@ -116,6 +118,20 @@ def test_a_card_says_what_the_frames_are(tmp_path):
         DatasetError, match=r"pixels of .* are 'float32 0..1', this release reads 'uint8 0..255'"
     ):
         FrameDataset.open(path)
+
+
+def test_a_make_that_cannot_be_sent_to_processes_is_named(tmp_path):
+    domain = Domain("own", "own", make=lambda image_size: None)
+    with pytest.raises(
+        CRPTproError, match=r"'own' cannot be sent to worker processes.*module-level function"
+    ):
+        collect_random(domain, tmp_path, transitions=5, **SMALL)
+
+
+def test_a_world_that_draws_by_itself_is_collected_without_gl(tmp_path, monkeypatch):
+    monkeypatch.setattr(rendering, "select_backend", lambda **_: pytest.fail("a GL backend was proven"))
+    path = collect_random(PAINTER, tmp_path, transitions=5, **SMALL)
+    assert FrameDataset.open(path).card["render"]["backend"] == "none"
 
 
 PROGRAM = """
