@@ -4,7 +4,6 @@ import json
 import logging
 import os
 import random
-import shutil
 import signal
 import subprocess
 import sys
@@ -274,29 +273,3 @@ def test_interrupted_killed_and_started_again_gives_the_same_bytes(tmp_path):
     assert data_bytes(path) == data_bytes(whole)
     cards = [json.loads((root / "card.json").read_text()) for root in (whole, path)]
     assert cards[0]["crc32"] == cards[1]["crc32"]
-
-
-@pytest.mark.gl
-@pytest.mark.slow
-def test_real_pixels_equal_a_live_stack_and_do_not_depend_on_the_workers(tmp_path):
-    from torchrl.modules import RandomPolicy
-
-    from crptpro.envs import make_env
-
-    settings = {"transitions": 30, "seed": 7, "quality": "fast", "progress": False}
-    one = collect_random("cartpole", tmp_path / "1", workers=1, **settings)
-    two = collect_random("cartpole", tmp_path / "2", workers=2, **settings)
-    assert data_bytes(one) == data_bytes(two)
-    dataset = FrameDataset.open(one)
-    assert dataset.physics_at(torch.arange(3))["qpos"].shape == (3, 2)
-    env = make_env("cartpole_swingup_sparse", seed=0, quality="fast")
-    env.set_seed(derive_seed(7, "collect", "cartpole", 0))
-    start = env.reset()
-    torch.manual_seed(derive_seed(7, "collect-actions", "cartpole", 0))
-    live = env.rollout(30, RandomPolicy(env.full_action_spec), auto_reset=False, tensordict=start)
-    env.close()
-    everything = dataset[:]
-    for key in ("pixels", ("next", "pixels"), "action", ("next", "reward")):
-        assert torch.equal(everything[key], live[key]), key
-    assert dataset.card["render"]
-    shutil.rmtree(tmp_path)
