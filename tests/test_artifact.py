@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -54,6 +57,63 @@ def test_a_kill_between_the_two_renames_loses_nothing(tmp_path: Path) -> None:
     write(tmp_path / "a", 1.0)
     (tmp_path / "a").rename(artifact._previous(tmp_path / "a"))
     assert read(tmp_path / "a")[1]["layer.weight"][0, 0] == 1
+
+
+def test_a_reader_between_the_two_renames_of_a_writer_does_not_disturb_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path / "a", 1.0)
+    seen = []
+    rename = os.rename
+
+    def rename_and_read(old: Path, new: Path) -> None:
+        if new == tmp_path / "a":
+            seen.append(read(tmp_path / "a")[1]["layer.weight"][0, 0].item())
+        rename(old, new)
+
+    monkeypatch.setattr(artifact.os, "rename", rename_and_read)
+    write(tmp_path / "a", 2.0)
+    assert seen == [1.0]
+    assert read(tmp_path / "a")[1]["layer.weight"][0, 0] == 2
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+@pytest.mark.parametrize("moment", ["_sha256", "read_json"])
+def test_an_artifact_that_is_replaced_while_it_is_read_is_the_new_one_as_a_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    write(tmp_path / "a", 1.0)
+    step = getattr(artifact, moment)
+
+    def step_and_replace(*args: object, **kwargs: object) -> object:
+        found = step(*args, **kwargs)
+        monkeypatch.setattr(artifact, moment, step)
+        write(tmp_path / "a", 2.0)
+        return found
+
+    monkeypatch.setattr(artifact, moment, step_and_replace)
+    card, tensors = read(tmp_path / "a")
+    assert tensors["layer.weight"][0, 0] == 2
+    assert card == read(tmp_path / "a")[0]
+
+
+def test_what_a_killed_writer_left_is_removed_by_the_next_and_a_living_ones_is_not(tmp_path: Path) -> None:
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    prefix = artifact._temporary_prefix(tmp_path / "a")
+    others = artifact._temporary_prefix(tmp_path / "a.b")
+    stale = tmp_path / f"{prefix}{dead.pid}-k2j3h4x_"
+    kept = [
+        tmp_path / f"{prefix}{os.getpid()}-k2j3h4x_",  # a writer at work
+        tmp_path / f".a.writing-another-host-{dead.pid}-k2j3h4x_",  # whose processes cannot be asked
+        tmp_path / f"{others}{dead.pid}-k2j3h4x_",  # of another artifact
+    ]
+    for path in (stale, *kept):
+        path.mkdir()
+        (path / "weights.safetensors").write_text("half")
+    write(tmp_path / "a")
+    assert not stale.exists()
+    assert all(path.exists() for path in kept)
 
 
 def truncate(path: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,35 @@ def test_provenance_names_every_package_that_can_change_a_number() -> None:
     assert "not installed" not in [content["versions"][p] for p in ("torch", "torchrl", "crptpro")]
     assert content["hardware"]["ram_bytes"] > 0
     json.dumps(content)
+
+
+def test_a_gpu_with_a_broken_driver_is_recorded_and_stops_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def name(index: int) -> str:
+        if index == 1:
+            raise RuntimeError("CUDA driver version is insufficient\nfor the runtime")
+        return "Some GPU"
+
+    monkeypatch.setattr(cards.torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(cards.torch.cuda, "get_device_name", name)
+    found = cards.hardware.__wrapped__()
+    assert found["gpus"] == ["Some GPU", "unusable: CUDA driver version is insufficient"]
+
+
+@pytest.mark.parametrize("is_tracked", [True, False])
+def test_only_a_repository_that_tracks_this_package_names_its_revision(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_tracked: bool
+) -> None:
+    package = tmp_path / ".venv" / "crptpro"
+    package.mkdir(parents=True)
+    (package / "cards.py").write_text("")
+    (tmp_path / "thesis.tex").write_text("x")
+    if not is_tracked:
+        (tmp_path / ".gitignore").write_text(".venv\n")
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=n", "-c", "user.email=e@example.org"]
+    for command in (["init", "-q"], ["add", "."], ["commit", "-qm", "begin"]):
+        subprocess.run([*git, *command], check=True)
+    monkeypatch.setattr(cards, "__file__", str(package / "cards.py"))
+    assert (cards.git_revision.__wrapped__() != "unknown") is is_tracked
 
 
 def test_json_round_trips_and_leaves_no_temporary_file(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from crptpro import doctor
 from crptpro.doctor import check_versions, run_doctor
-from crptpro.envs import gl_process
+from crptpro.envs import gl_process, render_check
 
 ALIVE = {"domain": "cartpole", "reset_ms": 200.0, "agent_step_ms": 15.0, "alive": True, "error": ""}
 PROBE = """import json, os
@@ -23,7 +23,7 @@ def _healthy_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A machine on which everything works, without rendering anything; tests break one thing each."""
     monkeypatch.setattr(gl_process, "PROBE_COMMAND", (sys.executable, "-S", "-c", PROBE))
     monkeypatch.setattr(
-        doctor, "_render_domains", lambda names, *_: tuple({**ALIVE, "domain": n} for n in names)
+        render_check, "render_domains", lambda names, *_: tuple({**ALIVE, "domain": n} for n in names)
     )
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=100e9))
     monkeypatch.setattr(doctor.psutil, "virtual_memory", lambda: SimpleNamespace(available=16e9, total=16e9))
@@ -107,24 +107,26 @@ def test_a_wrong_mujoco_gl_is_reported_and_not_raised() -> None:
 def test_dead_pixels_are_not_ok(
     monkeypatch: pytest.MonkeyPatch, entry: dict[str, object], words: str
 ) -> None:
-    monkeypatch.setattr(doctor, "_render_domains", lambda *_: ({**ALIVE, **entry},))
+    monkeypatch.setattr(render_check, "render_domains", lambda *_: ({**ALIVE, **entry},))
     report = run_doctor(["cartpole"])
     assert not report.ok
     assert words in report.text()
 
 
-def test_a_process_that_dies_between_domains_is_reported_for_those_it_did_not_reach(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.undo()
-    answer = (
-        '{"domain": "walker", "agent_step_ms": 9.0, "reset_ms": 1.0, "alive": true, "error": ""}\n',
-        "a\nboom\n",
-    )
-    monkeypatch.setattr(gl_process, "run_isolated", lambda *_, **__: [(1, *answer)])
-    walker, cheetah = doctor._render_domains(("walker", "cheetah"), "egl", 1.0)
-    assert walker["alive"]
-    assert (cheetah["domain"], cheetah["alive"], cheetah["error"]) == ("cheetah", False, "boom")
+def test_a_backend_that_mujoco_gl_names_and_nobody_tried_is_not_ok() -> None:
+    os.environ["MUJOCO_GL"] = "egl"
+    report = run_doctor(["cartpole"], backends=["osmesa"])
+    assert not report.ok
+    assert not any(check.is_chosen for check in report.backends)
+    assert "A run would use egl, which MUJOCO_GL names, but only osmesa was tried." in report.text()
+
+
+def test_a_gpu_that_torch_cannot_use_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    machine = {"cpu": "x", "cpu_cores": 2, "ram_bytes": 16e9, "gpus": ["unusable: driver too old"]}
+    monkeypatch.setattr(doctor.cards, "hardware", lambda: machine)
+    report = run_doctor(["cartpole"])
+    assert report.ok
+    assert "warning: torch cannot use a GPU: unusable: driver too old." in report.text()
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,12 @@ import pytest
 import crptpro
 
 PACKAGE = Path(crptpro.__file__).parent
-FOUNDATION = ["errors", "seeding", "cards", "artifact", "console", "loggers", "downstream_config"]
+FOUNDATION = [
+    "errors", "quality", "seeding", "cards", "artifact", "directory_lock", "console", "loggers", "downstream_config",
+]  # fmt: skip
 ORDER = [
     "domains", "envs", "data", "modules", "objectives", "transforms", "training.evaluate", "training.checkpoint",
-    "training.fingerprint", "training.run_lock", "training.stop_request", "training.collapse", "training.pretrain",
+    "training.fingerprint", "training.stop_request", "training.collapse", "training.pretrain",
     "pretrained", "training", "analysis", "experiments", "doctor", "cli",
 ]  # fmt: skip
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import socket
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import psutil
 from torch import Tensor, nn
 
 from crptpro.cards import read_json, write_json
@@ -30,7 +32,7 @@ def write_artifact(
     """Write ``weights.safetensors`` and ``card.json`` beside ``path`` and rename the directory into place.
 
     A reader sees the old artifact or the new one, never a mixture; a write that fails (a full disk, a kill)
-    leaves the old one.
+    leaves the old one. What a killed process left beside it is removed.
 
     Args:
         path: directory to write or replace.
@@ -46,6 +48,7 @@ def write_artifact(
 
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    _remove_stale(path)
     tensors = {}
     for name, module in modules.items():
         state = module.state_dict() if isinstance(module, nn.Module) else module
@@ -53,7 +56,7 @@ def write_artifact(
         tensors.update(
             {f"{name}.{key}": value.detach().cpu().contiguous().clone() for key, value in state.items()}
         )
-    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f"{_temporary_prefix(path)}{os.getpid()}-"))
     try:
         weights = temporary / WEIGHTS_FILE
         save_file(tensors, weights)
@@ -81,11 +84,26 @@ def read_artifact(
     Raises:
         CRPTproError: (or ``error``) naming what is missing, damaged, of another kind or too new.
     """
+    path = Path(path)
+    while True:
+        source = _current(path)
+        before = _identity(source)
+        try:
+            found = _read(source, format_name, version, error)
+        except (error, OSError):
+            if _identity(_current(path)) == before:
+                raise
+            continue  # a writer has replaced it meanwhile: the new one counts
+        if _identity(source) == before:
+            return found
+
+
+def _read(
+    path: Path, format_name: str, version: int, error: type[CRPTproError]
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    path = Path(path)
-    _recover(path)
     if not path.is_dir():
         raise error(
             f"{path} does not exist or is not a directory; expected one with {WEIGHTS_FILE} and {CARD_FILE}."
@@ -123,7 +141,7 @@ def _previous(path: Path) -> Path:
 
 
 def _replace_directory(new: Path, path: Path) -> None:
-    """Swap directories; a kill between the two renames is repaired by :func:`_recover`."""
+    """Swap directories; a reader that comes between the two renames, or after a kill there, uses the old one."""
     previous = _previous(path)
     if path.exists():
         shutil.rmtree(previous, ignore_errors=True)
@@ -132,7 +150,32 @@ def _replace_directory(new: Path, path: Path) -> None:
     shutil.rmtree(previous, ignore_errors=True)
 
 
-def _recover(path: Path) -> None:
+def _current(path: Path) -> Path:
+    """Return where the artifact is. It is left there: a writer may be at work."""
     previous = _previous(path)
-    if previous.is_dir() and not path.exists():
-        os.rename(previous, path)
+    return previous if previous.is_dir() and not path.exists() else path
+
+
+def _identity(path: Path) -> tuple[int, int, int] | None:
+    """Return what tells this directory from one that takes its place."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino, found.st_mtime_ns
+
+
+def _temporary_prefix(path: Path) -> str:
+    """Return how this machine's temporary directories for ``path`` begin; the writer's pid follows."""
+    return f".{path.name}.writing-{socket.gethostname()}-"
+
+
+def _remove_stale(path: Path) -> None:
+    """Remove what writers on this machine left that are dead; others may be alive and are left alone."""
+    prefix = _temporary_prefix(path)
+    for item in path.parent.iterdir():
+        if not item.name.startswith(prefix):
+            continue
+        pid = item.name[len(prefix) :].partition("-")[0]
+        if pid.isdecimal() and not psutil.pid_exists(int(pid)):
+            shutil.rmtree(item, ignore_errors=True)

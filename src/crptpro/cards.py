@@ -22,6 +22,9 @@ PACKAGES = (
     "crptpro", "torch", "torchrl", "tensordict", "dm-control", "mujoco", "gymnasium", "numpy", "wandb",
 )  # fmt: skip
 
+#: How the name of a GPU begins that torch sees and cannot use.
+UNUSABLE = "unusable"
+
 
 @cache
 def versions() -> dict[str, str]:
@@ -37,7 +40,7 @@ def versions() -> dict[str, str]:
 
 @cache
 def hardware() -> dict[str, Any]:
-    """Return CPU model and core count, RAM in bytes, and the GPU names torch sees."""
+    """Return CPU model and core count, RAM in bytes, and the GPU names torch sees (or why it cannot use one)."""
     cpu = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -47,17 +50,29 @@ def hardware() -> dict[str, Any]:
         "cpu": cpu,
         "cpu_cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "ram_bytes": psutil.virtual_memory().total,
-        "gpus": [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())],
+        "gpus": [_gpu_name(index) for index in range(torch.cuda.device_count())],
     }
+
+
+def _gpu_name(index: int) -> str:
+    try:
+        return torch.cuda.get_device_name(index)
+    except Exception as reason:  # a driver that is broken, or older than torch wants
+        return f"{UNUSABLE}: {(str(reason).splitlines() or [type(reason).__name__])[0]}"
 
 
 @cache
 def git_revision() -> str:
     """Return the revision of the source checkout, ``+dirty`` if modified, or ``"unknown"``."""
-    here = Path(__file__).resolve().parent
+    here = Path(__file__).resolve()
+    git = ["git", "-C", str(here.parent)]
+    # Installed below somebody's repository (a .venv that it ignores), this file is not part of it.
+    is_tracked = [*git, "ls-files", "--error-unmatch", here.name]
+    describe = [*git, "describe", "--always", "--dirty=+dirty", "--abbrev=12"]
     try:
-        run = ["git", "-C", str(here), "describe", "--always", "--dirty=+dirty", "--abbrev=12"]
-        return subprocess.run(run, capture_output=True, text=True, timeout=10, check=True).stdout.strip()
+        for command in (is_tracked, describe):
+            answer = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+        return answer.stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return "unknown"
 

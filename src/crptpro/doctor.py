@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import importlib.metadata
-import json
 import os
 import shutil
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -121,6 +119,15 @@ def run_doctor(
         findings += rendering
     except CRPTproError as reason:  # MUJOCO_GL is wrong: nothing can be tried before it is put right
         findings.append(Finding("error", str(reason)))
+    unusable = [gpu for gpu in hardware["gpus"] if gpu.startswith(cards.UNUSABLE)]
+    for gpu in unusable:
+        findings.append(
+            Finding(
+                "warning",
+                f"torch cannot use a GPU: {gpu}.",
+                "Repair its driver (nvidia-smi), or hide it with CUDA_VISIBLE_DEVICES; --device cpu always works.",
+            )
+        )
     if not hardware["gpus"]:
         findings.append(Finding("note", "torch sees no GPU; training runs on the CPU."))
     order = ("error", "warning", "note")
@@ -187,6 +194,7 @@ def _check_rendering(
 ) -> tuple[tuple[BackendCheck, ...], list[Finding]]:
     # Imported late: the import itself complains about a wrong MUJOCO_GL.
     from crptpro.envs.gl_process import attempt_backend, canonical_backend
+    from crptpro.envs.render_check import render_domains
     from crptpro.envs.rendering import default_timeout_s, explain, platform_candidates
 
     requested = canonical_backend(os.environ["MUJOCO_GL"]) if "MUJOCO_GL" in os.environ else None
@@ -207,7 +215,7 @@ def _check_rendering(
             continue
         chosen = backend if is_chosen else chosen
         limit_s = first_frame_s + 20 * len(names) if timeout_s is None else timeout_s
-        entries = _render_domains(names, backend, limit_s)
+        entries = render_domains(names, backend, limit_s)
         checks.append(BackendCheck(backend, is_chosen, attempt.answer, entries))
         findings += [_dead(entry, backend, is_chosen) for entry in entries if not entry["alive"]]
         if is_chosen and has_gpu and attempt.answer["gl_kind"] == "software":
@@ -223,26 +231,15 @@ def _check_rendering(
         findings.append(
             Finding("error", "No GL backend renders a frame.", "Install one, see the notes below.")
         )
+    elif chosen is None and requested not in backends:
+        findings.append(
+            Finding(
+                "error",
+                f"A run would use {requested}, which MUJOCO_GL names, but only {', '.join(backends)} was tried.",
+                f"Try {requested} as well, or set MUJOCO_GL to one that was tried.",
+            )
+        )
     return tuple(checks), findings
-
-
-def _render_domains(names: tuple[str, ...], backend: str, timeout_s: float) -> tuple[dict[str, Any], ...]:
-    """Run the check in its own process; domains it did not come to are reported as such."""
-    from crptpro.envs.gl_process import run_isolated
-
-    command = (sys.executable, "-m", "crptpro.envs.render_check", *names)
-    ((returncode, stdout, stderr),) = run_isolated([command], backend, timeout_s=timeout_s)
-    entries = [
-        json.loads(line) for line in stdout.splitlines() if line.startswith("{") and line.endswith("}")
-    ]
-    if len(entries) < len(names):
-        if returncode is None:
-            reason = f"no answer within {timeout_s:g} s"
-        else:
-            reason = (stderr.strip().splitlines() or [f"exit status {returncode}"])[-1]
-        nothing = {"reset_ms": None, "agent_step_ms": None, "alive": False}
-        entries += [{"domain": name, **nothing, "error": reason} for name in names[len(entries) :]]
-    return tuple(entries)
 
 
 def _failed(explanation: str, *, is_requested: bool) -> Finding:

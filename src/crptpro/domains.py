@@ -35,7 +35,8 @@ class Domain:
             ``physics_state`` (bool) that its signature names, and returns an unbatched TorchRL
             environment on CPU whose ``pixels`` are one uint8 RGB image ``[H, W, 3]`` or ``[3, H, W]`` with
             ``H = W = image_size``, whose ``action`` is continuous in [-1, 1], and whose reward has shape
-            ``[1]``. It repeats the action itself if it names ``action_repeat``. Frame stacking and the
+            ``[1]``. An environment whose ``done_spec`` has no ``truncated`` is taken to end episodes by
+            termination alone. It repeats the action itself if it names ``action_repeat``. Frame stacking and the
             choice of dtypes are done by ``make_env``. With ``physics_state`` it may also emit ``qpos`` and
             ``qvel``. Its ``set_seed`` must make the next ``reset`` reproducible.
             It must be a module-level function (or ``functools.partial`` of one): worker processes receive the

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from crptpro.quality import Quality
+
 
 @dataclass(frozen=True)
 class SACSettings:
@@ -100,7 +102,7 @@ class DownstreamConfig(SACSettings):
 
     seed: int = 0
     """seeds initialisation, environment, exploration, replay sampling, shifts, bonus and evaluation"""
-    quality: Literal["exact", "fast"] = "exact"
+    quality: Quality = "exact"
     """render quality"""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it"""

@@ -283,6 +283,11 @@ def test_an_unfinished_collection_says_how_far_it_is(copy):
         FrameDataset.open(copy)
 
 
+def test_an_impossible_frame_stack_is_refused(path):
+    with pytest.raises(DatasetError, match="frame_stack must be at least 1, got 0"):
+        FrameDataset.open(path, frame_stack=0)
+
+
 def test_verify_finds_a_flipped_bit(copy):
     dataset = FrameDataset.open(copy)
     dataset.verify()

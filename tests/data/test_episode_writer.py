@@ -10,7 +10,7 @@ from toy_world import data_bytes, random_episode
 
 from crptpro.data import EpisodeWriter, Layout
 from crptpro.data.episode_writer import read_journal
-from crptpro.data.layout import JOURNAL_FILE
+from crptpro.data.layout import CARD_FILE, JOURNAL_FILE
 from crptpro.errors import DatasetError, DiskSpaceError
 
 EPISODES = [random_episode(length, seed=length) for length in (3, 1, 5)]
@@ -107,3 +107,38 @@ def test_cutting_marks_the_last_transition_truncated():
 def test_a_paper_dataset_fits_the_budget():
     layout = Layout(image_size=84, action_dim=12, state={"qpos": 40, "qvel": 40})
     assert layout.bytes(transitions=100_000, frames=100_200) <= 2.2e9
+
+
+@pytest.mark.parametrize("other", [
+    Layout(image_size=6, action_dim=3, state={"qpos": 4, "qvel": 3}),
+    Layout(image_size=7, action_dim=2, state={"qpos": 4, "qvel": 3}),
+    Layout(image_size=6, action_dim=2, state={"sensors": 7}),
+    Layout(image_size=6, action_dim=2),
+])  # fmt: skip
+def test_a_dataset_opened_with_another_layout_is_refused_and_left_as_it_is(tmp_path, other):
+    write(tmp_path)
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    with pytest.raises(DatasetError, match=r"does not hold the rows of .*other shapes"):
+        EpisodeWriter(tmp_path, other)
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+
+
+def test_a_finished_dataset_is_not_opened_for_writing(tmp_path):
+    before = write(tmp_path)
+    (tmp_path / CARD_FILE).write_text("{}")
+    with pytest.raises(DatasetError, match="holds a finished dataset"):
+        EpisodeWriter(tmp_path, LAYOUT)
+    assert data_bytes(tmp_path) == before
+
+
+def test_a_rewritten_journal_is_on_the_disk_before_it_takes_the_old_ones_place(tmp_path, monkeypatch):
+    write(tmp_path)
+    with open(tmp_path / JOURNAL_FILE, "ab") as file:
+        file.write(b"torn")
+    events = []
+    real_fsync, real_replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda file: (events.append("synced"), real_fsync(file)))
+    monkeypatch.setattr(os, "replace", lambda *paths: (events.append("replaced"), real_replace(*paths)))
+    EpisodeWriter(tmp_path, LAYOUT).close()
+    assert events == ["synced", "replaced"]
+    assert len(read_journal(tmp_path / JOURNAL_FILE)) == 3

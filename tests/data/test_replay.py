@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
 import textwrap
@@ -7,7 +9,7 @@ import textwrap
 import pytest
 import torch
 
-from crptpro.data import FrameReplay
+from crptpro.data import FrameReplay, ring_storage
 from crptpro.errors import CheckpointError, DiskSpaceError
 
 
@@ -248,3 +250,16 @@ def test_frames_are_stored_once(tmp_path):
     FrameReplay(1000, action_dim=6, path=tmp_path)
     size = sum(file.stat().st_size for file in tmp_path.iterdir())
     assert size / 1000 < 1.05 * (3 * 84 * 84 + 100)
+
+
+def test_a_disk_that_fills_up_while_rows_are_reserved_keeps_none_of_them(tmp_path, monkeypatch):
+    def half(file, offset, size):
+        os.ftruncate(file, size // 2)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(ring_storage.os, "posix_fallocate", half)
+    with pytest.raises(DiskSpaceError, match="No space left"):
+        FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
+    assert not any(file.stat().st_size for file in tmp_path.glob("*.memmap"))
+    monkeypatch.undo()
+    FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import random
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,6 +16,8 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from crptpro.data import Episode
+from crptpro.data.collect_worker import EpisodeJob, EpisodeRoller
+from crptpro.data.collection import DomainCollection
 from crptpro.domains import Domain
 
 
@@ -154,3 +158,35 @@ def random_episode(
 def data_bytes(path: Path) -> dict[str, bytes]:
     """The bytes of every data file of a dataset."""
     return {str(file.relative_to(path)): file.read_bytes() for file in sorted(path.rglob("*.memmap"))}
+
+
+def collection_request(**changes: Any) -> dict[str, Any]:
+    """What a collection of a toy world is asked for."""
+    settings = {"image_size": 8, "action_repeat": 2, "camera": 0, "quality": "exact"}
+    return {"domain": "toy", "task": "toy_go", "seed": 0, "transitions": 27, **settings} | changes
+
+
+def run_in_order(
+    collection: DomainCollection,
+    order_seed: int,
+    lengths: Callable[[int], int] = fixed_length,
+    *,
+    episodes: int | None = None,
+    on_job: Callable[[EpisodeJob], None] = lambda job: None,
+) -> list[EpisodeJob]:
+    """Collect in this process with jobs that finish in random order; all, or only so many ``episodes``."""
+    rng = random.Random(order_seed)
+    roller = EpisodeRoller(lambda: ToyEnv(lengths))
+    running: list[EpisodeJob] = []
+    jobs = []
+    finished = 0
+    while not collection.is_complete and finished != episodes:
+        while len(running) < 3 and (job := collection.next_job()) is not None:
+            running.append(job)
+            jobs.append(job)
+            on_job(job)
+        job = running.pop(rng.randrange(len(running)))
+        collection.accept(job.episode, roller.roll(job))
+        finished += 1
+    roller.close()
+    return jobs

@@ -46,11 +46,24 @@ def test_actions_are_mapped_to_the_actuators_ranges() -> None:
     np.testing.assert_allclose(env.actions, [[-1.0, -0.8], [1.1, 0.8], [0.05, 0.4]], atol=1e-12)
 
 
-def test_unbounded_actuators_are_refused() -> None:
+@pytest.mark.parametrize("bound", [np.inf, 1e10])
+def test_an_actuator_without_bounds_takes_the_action_as_it_is(bound: float) -> None:
     env = FakeDmEnv()
-    spec = env.action_spec().replace(maximum=np.array([np.inf, 1.0]))
+    spec = env.action_spec().replace(minimum=np.array([-bound, 0.0]), maximum=np.array([bound, 4.0]))
     env.action_spec = lambda: spec  # type: ignore[method-assign]
-    with pytest.raises(CRPTproError, match="no bounds"):
+    simulator = simulator_of(env, action_repeat=1)
+    simulator.reset()
+    for action in ([-1, -1], [0.5, 1]):
+        simulator.step(np.array(action, np.float32))
+    np.testing.assert_allclose(env.actions, [[-1.0, 0.0], [0.5, 4.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("bound", [np.inf, 1e10])
+def test_an_actuator_that_is_bounded_on_one_side_is_refused(bound: float) -> None:
+    env = FakeDmEnv()
+    spec = env.action_spec().replace(maximum=np.array([bound, 1.0]))
+    env.action_spec = lambda: spec  # type: ignore[method-assign]
+    with pytest.raises(CRPTproError, match="one side only"):
         simulator_of(env)
 
 

@@ -142,6 +142,21 @@ def test_fast_quality_changes_few_pixels_and_is_recorded(task: str, shadow_size:
 
 
 @pytest.mark.gl
+@pytest.mark.parametrize("task", ["walker_run", "quadruped_escape"])
+def test_fast_quality_reaches_the_render_context(task: str) -> None:
+    """quadruped_escape makes its context in the reset, to send its terrain to the GPU."""
+    images = {}
+    for quality in ("exact", "fast"):
+        env = make_env(task, seed=0, frame_stack=1, quality=quality)
+        images[quality] = env.reset()["pixels"].int()
+        shadow_size = env.simulator._env.physics.contexts.mujoco.ptr.shadowSize
+        assert shadow_size == 512 if quality == "fast" else shadow_size > 512
+        env.close()
+    changed = (images["exact"] != images["fast"]).any(0).float().mean()
+    assert 0 < changed < (0.15 if task == "quadruped_escape" else 0.01)
+
+
+@pytest.mark.gl
 def test_other_sizes_stacks_repeats_and_cameras() -> None:
     env = make_env("cartpole_balance", seed=0, image_size=64, frame_stack=2, action_repeat=4, camera=1)
     td = env.rollout(2)

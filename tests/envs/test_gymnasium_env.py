@@ -9,7 +9,8 @@ import pytest
 import torch
 from torchrl.envs import check_env_specs
 
-from crptpro.envs import factory, make_env
+from crptpro.domains import Domain
+from crptpro.envs import factory, make_env, needs_gl
 from crptpro.envs.gymnasium_env import resize
 from crptpro.errors import CRPTproError, RenderingError
 
@@ -68,8 +69,30 @@ def make_painter(name: str = "Painter", **options: Any) -> Any:
 def test_specs_hold_for_an_environment_that_draws_without_gl() -> None:
     env = make_painter()
     check_env_specs(env)
-    assert env.card()["backend"] == "none"
     env.close()
+
+
+def test_an_environment_that_draws_without_gl_asks_for_no_backend_and_names_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(factory, "select_backend", lambda: pytest.fail("a GL backend was proven"))
+    env = make_painter()
+    card = env.card()
+    assert card["backend"] == "none"
+    assert not [name for name in card if name.startswith("gl_")]
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("task", "answer"),
+    [
+        ("walker_run", True), ("reach_duplo", True), ("gymnasium:HalfCheetah-v5", True),
+        ("gymnasium:Pendulum-v1", False), ("gymnasium:CrptproPainter-v0", False),
+        (Domain("own", "own", make=lambda: None), False),
+    ],
+)  # fmt: skip
+def test_who_needs_gl(task: Any, answer: bool) -> None:
+    assert needs_gl(task) is answer
 
 
 def test_a_mujoco_environment_needs_a_gl_backend() -> None:

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 from fake_simulator import FakeSimulator
-from torchrl.data import Bounded, Unbounded
+from torchrl.data import Bounded, Categorical, Unbounded
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv, check_env_specs
 from torchrl.envs.transforms import DTypeCastTransform, ExcludeTransform, PermuteTransform, UnsqueezeTransform
 
+from crptpro.data.collect_worker import EpisodeJob, EpisodeRoller
 from crptpro.domains import Domain
 from crptpro.envs import make_env
 from crptpro.envs.pixel_env import PixelEnv
@@ -85,6 +86,49 @@ def test_float64_actions_and_rewards_become_float32() -> None:
     assert rollout["action"].dtype == rollout["next", "reward"].dtype == torch.float32
 
 
+class EndingEnv(PixelEnv):
+    """Knows no truncation, as many environments do: ``done`` and ``terminated`` alone."""
+
+    def __init__(self) -> None:
+        super().__init__(FakeSimulator(is_terminal=True, length=3), image_size=8)
+        self.done_spec = Categorical(2, shape=(1,), dtype=torch.bool)
+        assert set(self.full_done_spec.keys()) == {"done", "terminated"}
+
+    def _reset(self, *args: Any, **kwargs: Any) -> Any:
+        return super()._reset(*args, **kwargs).exclude("truncated")
+
+    def _step(self, tensordict: Any) -> Any:
+        return super()._step(tensordict).exclude("truncated")
+
+
+def make_ending() -> EnvBase:
+    return EndingEnv()
+
+
+@pytest.mark.parametrize("frame_stack", [1, 3])
+def test_an_environment_without_truncation_is_never_truncated(frame_stack: int) -> None:
+    env = make_env(own(make_ending), seed=0, image_size=8, frame_stack=frame_stack)
+    check_env_specs(env)
+    rollout = env.rollout(10)
+    assert rollout["next", "terminated"].flatten().tolist() == [False, False, True]
+    assert not rollout["next", "truncated"].any()
+    assert rollout["next", "truncated"].dtype == torch.bool
+
+
+def test_an_environment_without_truncation_can_be_collected() -> None:
+    roller = EpisodeRoller(functools.partial(make_env, own(make_ending), seed=0, image_size=8, frame_stack=1))
+    natural = roller.roll(EpisodeJob("own", 0, env_seed=0, action_seed=0, limit=9))
+    cut = roller.roll(EpisodeJob("own", 1, env_seed=1, action_seed=1, limit=2))
+    roller.close()
+    assert (natural.terminated.tolist(), natural.is_cut) == ([False, False, True], False)
+    assert (cut.truncated.tolist(), cut.is_cut) == ([False, True], True)
+
+
+def elsewhere(**_: Any) -> EnvBase:
+    env = make_chw(0, 8)
+    return env.to("meta")
+
+
 def unscaled(**_: Any) -> EnvBase:
     env = make_chw(0, 8)
     env.action_spec = Bounded(-2.0, 2.0, shape=(2,), dtype=torch.float32)
@@ -115,6 +159,7 @@ def batched(**_: Any) -> EnvBase:
         (float_pixels, r"torch\.float32; they must be torch\.uint8"),
         (stacked, r"shape \(1, 3, 8, 8\)"),
         (batched, "batch size"),
+        (elsewhere, "lives on meta; it must be on the CPU"),
         (lambda **_: np.zeros(3), "ndarray; make must return a TorchRL EnvBase"),
         (None, "no make"),
     ],

@@ -27,7 +27,14 @@ Probe = Callable[[str], Path]
 def _no_backend_yet(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(rendering, "_imported_backend", lambda: None)
     with mock.patch.dict(os.environ):
-        for name in ("MUJOCO_GL", PROOF_VARIABLE, "LP_NUM_THREADS", "DISPLAY", "WAYLAND_DISPLAY"):
+        for name in (
+            "MUJOCO_GL",
+            "MUJOCO_EGL_DEVICE_ID",
+            PROOF_VARIABLE,
+            "LP_NUM_THREADS",
+            "DISPLAY",
+            "WAYLAND_DISPLAY",
+        ):
             os.environ.pop(name, None)
         yield
 
@@ -64,6 +71,31 @@ def test_the_proof_reaches_child_processes_through_the_environment(probe: Probe)
         "backend": "egl", "gl_vendor": "Mesa", "gl_renderer": "llvmpipe", "gl_version": "4.5",
         "gl_kind": "software",
     }  # fmt: skip
+
+
+def test_a_proof_does_not_hold_on_another_machine_or_gpu(
+    probe: Probe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = probe(ANSWER)
+    select_backend()
+    os.environ["MUJOCO_EGL_DEVICE_ID"] = "1"
+    select_backend()
+    select_backend()
+    assert started.read_text().split() == ["egl", "egl"]
+    # The environment reaches a machine without EGL, with the MUJOCO_GL=egl that was chosen here, not by the user.
+    monkeypatch.setattr(rendering.socket, "gethostname", lambda: "node-7")
+    started = probe(f"if b == 'egl': sys.exit('no EGL')\n{ANSWER}")
+    assert select_backend() == "osmesa"
+    assert started.read_text().split() == ["egl", "egl", "egl", "osmesa"]
+    assert json.loads(os.environ[PROOF_VARIABLE])["host"] == "node-7"
+
+
+@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"backend": "egl"}'])
+def test_a_proof_that_cannot_be_read_is_made_again(probe: Probe, content: str) -> None:
+    started = probe(ANSWER)
+    os.environ[PROOF_VARIABLE] = content
+    assert select_backend() == "egl"
+    assert started.read_text().split() == ["egl"]
 
 
 def test_a_users_mujoco_gl_is_kept_and_proven(probe: Probe, caplog: pytest.LogCaptureFixture) -> None:

@@ -11,12 +11,13 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg, subcommand
 
-from crptpro.cli.evaluate import Evaluate, Quality
+from crptpro.cli.evaluate import Evaluate
 from crptpro.cli.pretraining import Finetune, Pretrain
 from crptpro.cli.request import Logging, expand_groups, require_device
 from crptpro.console import run_main
 from crptpro.domains import get_domain
 from crptpro.downstream_config import DownstreamConfig
+from crptpro.quality import Quality
 
 logger = logging.getLogger(__name__)
 

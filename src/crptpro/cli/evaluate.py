@@ -5,13 +5,12 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from tyro.conf import Positional
 
 from crptpro.errors import CRPTproError
-
-Quality = Literal["exact", "fast"]
+from crptpro.quality import Quality
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing import Any
 from crptpro.cards import read_json
 from crptpro.data.episode_writer import read_journal
 from crptpro.data.frame_stacks import size_problem
-from crptpro.data.layout import CARD_FILE, COLLECTION_FILE, FORMAT, JOURNAL_FILE, VERSION, Layout
+from crptpro.data.layout import CARD_FILE, COLLECTION_FILE, FORMAT, JOURNAL_FILE, PIXELS, VERSION, Layout
 from crptpro.errors import DatasetError
 
 _COUNTS = ("transitions", "frames", "episodes", "frame_stack", "action_repeat", "seed")
@@ -47,6 +47,10 @@ def read_card(path: str | Path) -> dict[str, Any]:
     if missing or wrong:
         raise DatasetError(
             f"{path / CARD_FILE} is damaged: {', '.join(missing + wrong)} missing or unusable."
+        )
+    if (pixels := card.get("pixels", PIXELS)) != PIXELS:  # cards of the first releases say nothing: the same
+        raise DatasetError(
+            f"The pixels of {path} are {pixels!r}, this release reads {PIXELS!r}. Collect the dataset again."
         )
     if card["frames"] != card["transitions"] + card["episodes"] or card["transitions"] < 1:
         raise DatasetError(

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from torchrl.envs import EnvBase
 
@@ -19,6 +19,7 @@ from crptpro.data.collection import DomainCollection
 from crptpro.data.incoming import dataset_path
 from crptpro.domains import Domain, get_domain
 from crptpro.errors import DatasetError
+from crptpro.quality import Quality
 
 logger = logging.getLogger(__name__)
 
@@ -30,7 +31,7 @@ def collect_random(
     transitions: int = 100_000,
     seed: int = 0,
     workers: int = 1,
-    quality: Literal["exact", "fast"] = "exact",
+    quality: Quality = "exact",
     image_size: int = 84,
     action_repeat: int | None = None,
     camera: int | str | None = None,
@@ -68,7 +69,7 @@ def collect_group(
     transitions: int = 100_000,
     seed: int = 0,
     workers: int = 1,
-    quality: Literal["exact", "fast"] = "exact",
+    quality: Quality = "exact",
     image_size: int = 84,
     action_repeat: int | None = None,
     camera: int | str | None = None,
@@ -103,20 +104,21 @@ def collect_group(
 
     Raises:
         DatasetError: if a directory holds something else than what is asked for.
-        DiskSpaceError: if the disk cannot hold it; nothing is written then.
+        DiskSpaceError: if the disk cannot hold it; no frame is written then, and the same directory may be asked for
+            less.
         UnknownNameError: for a domain nobody knows.
         CRPTproError: if a process fails, dies or hangs; finished episodes are kept.
     """
     if transitions < 1 or workers < 1:
         raise DatasetError(f"transitions and workers must be at least 1, got {transitions} and {workers}.")
     # Imported late: nothing that reads datasets needs the simulators.
-    from crptpro.envs import episode_length, make_env
+    from crptpro.envs import episode_length, make_env, needs_gl
     from crptpro.envs.rendering import select_backend
 
     root = Path(root)
     paths: dict[str, Path] = {}
+    drawn_by_gl: set[str] = set()
     factories: dict[str, Callable[[], EnvBase]] = {}
-    needs_gl: set[str] = set()
     with ExitStack() as stack:
         collections: dict[str, DomainCollection] = {}
         for domain in map(get_domain, domains):
@@ -124,8 +126,8 @@ def collect_group(
             if path in paths.values():
                 raise DatasetError(f"Two of the domains would be collected into {path}; collect them apart.")
             paths[domain.name] = path
-            if domain.source != "own":
-                needs_gl.add(domain.name)
+            if needs_gl(domain):
+                drawn_by_gl.add(domain.name)
             settings: dict[str, Any] = {
                 "image_size": image_size,
                 "action_repeat": domain.action_repeat if action_repeat is None else action_repeat,
@@ -145,7 +147,7 @@ def collect_group(
             logger.info("%s: %s is complete", name, paths[name])
         if missing:
             _announce(missing, root)
-            if needs_gl & missing.keys():
+            if drawn_by_gl & missing.keys():
                 # Proven here once, for as many renderers as will run: some drivers hang when several start together.
                 select_backend(processes=workers)
             _run(missing, factories, workers, stall_timeout_s, progress)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import multiprocessing
+import pickle
 import signal
 import threading
 import time
@@ -48,12 +49,17 @@ class WorkerPool:
         factories: Environment factory of each domain, picklable.
         workers: Number of processes.
         stall_timeout_s: Seconds without any sign of life from a busy process after which it counts as hung.
+
+    Raises:
+        CRPTproError: if a factory cannot be pickled.
     """
 
     def __init__(
         self, factories: dict[str, Callable[[], EnvBase]], workers: int, stall_timeout_s: float = 300.0
     ):
         self._stall_timeout_s = stall_timeout_s
+        for name, factory in factories.items():
+            _require_picklable(name, factory)
         context = multiprocessing.get_context("spawn")
         self.workers: list[Worker] = []
         try:
@@ -169,6 +175,16 @@ def _interrupts_ignored() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _require_picklable(name: str, factory: Callable[[], EnvBase]) -> None:
+    try:
+        pickle.dumps(factory)
+    except Exception as reason:
+        raise CRPTproError(
+            f"Domain {name!r} cannot be sent to worker processes ({reason}); its make must be a module-level "
+            "function (or functools.partial of one)."
+        ) from None
 
 
 def _failure(worker: Worker, kind: str, message: str, trace: str) -> CRPTproError:

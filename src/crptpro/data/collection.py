@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 import logging
-import os
 import time
 from pathlib import Path
 from typing import Any
 
-from crptpro.cards import provenance, read_json, versions, write_json
+from crptpro.cards import provenance, write_json
 from crptpro.data.card import read_card
 from crptpro.data.collect_worker import EpisodeJob
+from crptpro.data.collection_state import CollectionState, require_free, require_request
 from crptpro.data.episode import Episode
 from crptpro.data.episode_writer import EpisodeWriter
-from crptpro.data.incoming import (
-    drop_all_incoming,
-    drop_incoming,
-    lock_directory,
-    read_incoming,
-    write_incoming,
-)
+from crptpro.data.incoming import drop_all_incoming, drop_incoming, read_incoming, write_incoming
 from crptpro.data.layout import (
     CARD_FILE,
-    COLLECTION_FILE,
     FORMAT,
+    PIXELS,
     VERSION,
-    Layout,
     estimate_bytes,
     write_tensordict_metadata,
 )
+from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import DatasetError
 from crptpro.seeding import derive_seed
 
@@ -59,27 +53,22 @@ class DomainCollection:
         self.path, self.request = path, request
         self.name: str = request["domain"]
         self.target: int = request["transitions"]
-        self._is_noted = False
-        self._last_append_s = time.monotonic()
+        self._last_append_s: float | None = None
         self._usual_length = episode_agent_steps
         self._longest = max(LONGEST_EPISODE, episode_agent_steps or 0)
         self._seen_lengths: set[int] = set()
         self._running: dict[int, int] = {}
         self._waiting: dict[int, Episode] = {}
         self._writer: EpisodeWriter | None = None
-        self._lock: int | None = None
-        self._sessions: list[dict[str, Any]] = []
+        self._lock: DirectoryLock | None = None
+        self._state = CollectionState(path, request)
         self.is_complete = False
         if (path / CARD_FILE).exists():
-            self._check_request(read_card(path).get("request", {}), "holds a dataset")
+            require_request(path, read_card(path).get("request", {}), request, "holds a dataset")
             self.is_complete = True
             return
-        if path.exists() and any(path.iterdir()) and not (path / COLLECTION_FILE).exists():
-            raise DatasetError(
-                f"{path} is not empty and not a collection. Choose another directory or empty it."
-            )
-        path.mkdir(parents=True, exist_ok=True)
-        self._lock = lock_directory(path)
+        require_free(path)
+        self._lock = DirectoryLock(path, error=DatasetError)
         try:
             self._resume()
         except BaseException:
@@ -121,6 +110,8 @@ class DomainCollection:
             episode += 1
         if needed <= 0 or expected <= 0:
             return None
+        if self._last_append_s is None:  # not before: domains that share a pool take turns
+            self._last_append_s = time.monotonic()
         self._running[episode] = 0
         seed = self.request["seed"]
         return EpisodeJob(
@@ -140,23 +131,9 @@ class DomainCollection:
         """Note what renders the frames.
 
         Raises:
-            DatasetError: if earlier episodes were rendered by another backend.
+            DatasetError: if earlier episodes were rendered by another backend or renderer.
         """
-        for session in self._sessions:
-            before = session["render"].get("backend")
-            if before is not None and card.get("backend", before) != before:
-                raise DatasetError(
-                    f"{self.path} was begun with the render backend {before!r}, now it is "
-                    f"{card['backend']!r}: their pixels differ. Continue with MUJOCO_GL={before}, or remove "
-                    "the directory to begin anew."
-                )
-        if self._is_noted:
-            return
-        self._is_noted = True
-        if self._sessions and self._sessions[-1]["versions"] != versions():
-            logger.warning("%s is continued with other package versions; its card lists both.", self.path)
-        self._sessions.append({"versions": versions(), "render": card})
-        self._write_state()
+        self._state.note_environment(card)
 
     def accept(self, index: int, episode: Episode) -> None:
         """Take a collected episode; it and those that waited for it are durable when this returns.
@@ -170,8 +147,8 @@ class DomainCollection:
         if not episode.is_cut:
             self._seen_lengths.add(len(episode))
         if self._writer is None:
-            self._open_writer(episode.layout)
-        assert self._writer is not None
+            self._state.note_layout(episode.layout)
+            self._writer = EpisodeWriter(self.path, episode.layout)
         self._waiting[index] = episode
         if index != self._writer.episodes:
             write_incoming(self.path, index, episode)
@@ -182,8 +159,7 @@ class DomainCollection:
         if self._writer is not None:
             self._writer.close()
         if self._lock is not None:
-            os.close(self._lock)
-            self._lock = None
+            self._lock.release()
 
     def _append_ready(self) -> None:
         writer = self._writer
@@ -199,8 +175,8 @@ class DomainCollection:
                 self._usual_length = None
             else:
                 now = time.monotonic()
-                writer.append(episode.cut(needed), wall_s=now - self._last_append_s)
-                self._last_append_s = now
+                writer.append(episode.cut(needed), wall_s=now - (self._last_append_s or now))
+                self._last_append_s = now if self._last_append_s else None
             drop_incoming(self.path, index)
             if index == writer.episodes:
                 return
@@ -219,6 +195,7 @@ class DomainCollection:
             **self.request,
             "request": self.request,
             "frame_stack": 3,
+            "pixels": PIXELS,
             "episodes": writer.episodes,
             "frames": frames,
             "layout": writer.layout.to_dict(),
@@ -228,8 +205,8 @@ class DomainCollection:
             "wall_time_s": round(sum(entry.wall_s for entry in writer.entries), 1),
             "longest_episode": self._longest,
             "policy": "uniform random in [-1, 1]",
-            "render": self._sessions[-1]["render"] if self._sessions else {},
-            "sessions": self._sessions,
+            "render": self._state.sessions[-1]["render"] if self._state.sessions else {},
+            "sessions": self._state.sessions,
             **provenance(),
         }
         # The card is the mark of a complete dataset, so it is written last.
@@ -238,55 +215,15 @@ class DomainCollection:
         self.close()
 
     def _resume(self) -> None:
-        state_path = self.path / COLLECTION_FILE
-        if not state_path.exists():
-            self._write_state()
+        self._state.resume()
+        if self._state.layout is None:
             return
-        state = read_json(state_path, error=DatasetError)
-        if (state.get("format"), state.get("version")) != (FORMAT, VERSION):
-            raise DatasetError(
-                f"{state_path} belongs to another release or program. Choose another directory."
-            )
-        self._check_request(state.get("request", {}), "was begun")
-        self._sessions = state.get("sessions", [])
-        if state.get("layout") is None:
-            return
-        self._open_writer(Layout.from_dict(state["layout"]))
-        assert self._writer is not None
+        self._writer = EpisodeWriter(self.path, self._state.layout)
         for index, episode in read_incoming(self.path):
             if episode.layout == self._writer.layout and index >= self._writer.episodes:
                 self._waiting[index] = episode
         logger.info("%s: continuing after %d of %d transitions", self.name, self.transitions, self.target)
         self._append_ready()
-
-    def _open_writer(self, layout: Layout) -> None:
-        self._writer = EpisodeWriter(self.path, layout)
-        self._write_state()
-
-    def _write_state(self) -> None:
-        layout = self._writer.layout.to_dict() if self._writer else None
-        write_json(
-            self.path / COLLECTION_FILE,
-            {
-                "format": FORMAT,
-                "version": VERSION,
-                "request": self.request,
-                "layout": layout,
-                "sessions": self._sessions,
-            },
-        )
-
-    def _check_request(self, found: dict[str, Any], what: str) -> None:
-        differing = [
-            f"{name} {found.get(name)!r} there, {value!r} asked for"
-            for name, value in self.request.items()
-            if found.get(name) != value
-        ]
-        if differing:
-            raise DatasetError(
-                f"{self.path} {what} with other settings: {'; '.join(differing)}. "
-                "Ask for the same, choose another directory, or remove this one to collect anew."
-            )
 
     def _expected_length(self, episode: int) -> int:
         if self._usual_length is not None:

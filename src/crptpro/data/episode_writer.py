@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from crptpro.data.episode import Episode
-from crptpro.data.layout import JOURNAL_FILE, Layout
+from crptpro.data.layout import CARD_FILE, JOURNAL_FILE, Layout
 from crptpro.errors import DatasetError, DiskSpaceError
 
 logger = logging.getLogger(__name__)
@@ -25,7 +25,8 @@ logger = logging.getLogger(__name__)
 class JournalEntry:
     """One durable episode: its index, its rows, and the checksum of all bytes it added.
 
-    ``wall_s`` is the time since the previous entry, or since this process began to write.
+    ``wall_s`` is the time, in seconds, since the previous entry, or since this process began the dataset's first
+    job.
     """
 
     episode: int
@@ -60,14 +61,15 @@ class EpisodeWriter:
     """Appends episodes 0, 1, 2, ... to a dataset directory.
 
     The bytes of an episode are written and synced before its journal line, so the journal never promises what
-    is not there. Opening truncates every file to the last journaled episode whose bytes are intact.
+    is not there. Opening truncates every file to the last journaled episode whose bytes are intact, unless none
+    is: then the layout is another one, or the files are not those of this journal, and nothing is touched.
 
     Args:
         root: The dataset's directory; created if missing.
         layout: Shapes of the rows.
 
     Raises:
-        DatasetError: if the files cannot be opened.
+        DatasetError: if the dataset is finished, its rows have other shapes, or the files cannot be opened.
     """
 
     def __init__(self, root: str | Path, layout: Layout):
@@ -75,17 +77,20 @@ class EpisodeWriter:
         self.layout = layout
         self._columns = layout.columns()
         self._files: dict[tuple[str, ...], int] = {}
+        if (self.root / CARD_FILE).exists():
+            raise DatasetError(
+                f"{self.root} holds a finished dataset, which nothing may be appended to. Choose another directory."
+            )
         self.entries = read_journal(self.root / JOURNAL_FILE)
+        journaled = len(self.entries)
         try:
+            self._drop_damaged()
             for column in self._columns:
                 path = self.root / column.file
                 path.parent.mkdir(parents=True, exist_ok=True)
                 self._files[column.key] = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as reason:
             raise DatasetError(f"{self.root} cannot be written: {reason}.") from reason
-        journaled = len(self.entries)
-        while self.entries and not self._last_is_intact():
-            self.entries.pop()
         if len(self.entries) < journaled:
             logger.warning(
                 "%s: %d of %d finished episodes are damaged and will be collected again.",
@@ -189,20 +194,43 @@ class EpisodeWriter:
         kept = b"".join(entry.line() for entry in self.entries)
         if not path.exists() or path.read_bytes() != kept:
             temporary = path.with_name(f".{path.name}.new")
-            temporary.write_bytes(kept)
+            with open(temporary, "wb") as file:
+                file.write(kept)
+                file.flush()
+                os.fsync(file.fileno())  # otherwise a power cut may leave an empty journal under the new name
             os.replace(temporary, path)
         self._journal_bytes = len(kept)
         return os.open(path, os.O_RDWR)
 
-    def _last_is_intact(self) -> bool:
-        entry = self.entries[-1]
-        rows = {"frames": (self.frames, entry.frames), "transitions": (self.transitions, entry.transitions)}
+    def _drop_damaged(self) -> None:
+        """Forget the last episodes up to the first intact one, and refuse a directory in which none is."""
+        kept = len(self.entries)
+        if kept and not self._is_intact(kept - 1) and not self._is_intact(0):
+            raise DatasetError(
+                f"{self.root} does not hold the rows of {self.layout.to_dict()} that its {JOURNAL_FILE} vouches for: "
+                "they have other shapes, or the files are damaged from the first episode on. Open it with the "
+                "layout it was begun with, or remove the directory to collect anew."
+            )
+        while kept and not self._is_intact(kept - 1):
+            kept -= 1
+        del self.entries[kept:]
+
+    def _is_intact(self, index: int) -> bool:
+        """Compare what an episode added to the files with its checksum; opens them for reading alone."""
+        entry, before = self.entries[index], self.entries[:index]
+        rows = {
+            "frames": (sum(other.frames for other in before), entry.frames),
+            "transitions": (sum(other.transitions for other in before), entry.transitions),
+        }
         checksum = 0
         for column in self._columns:
-            end, count = rows[column.part]
-            content = os.pread(
-                self._files[column.key], count * column.row_bytes, (end - count) * column.row_bytes
-            )
+            first, count = rows[column.part]
+            try:
+                with open(self.root / column.file, "rb") as file:
+                    file.seek(first * column.row_bytes)
+                    content = file.read(count * column.row_bytes)
+            except FileNotFoundError:
+                return False
             checksum = zlib.crc32(content, checksum)
         return checksum == entry.crc32
 

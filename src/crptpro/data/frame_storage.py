@@ -48,13 +48,16 @@ class FrameStorage(TensorStorage):
         frames: TensorDict ``[F]`` with ``pixels`` uint8 ``[F, C, H, W]`` and optional physical state.
         transitions: TensorDict ``[N]`` with ``row`` int64, ``step``, and any per-transition columns.
         frame_stack: k, frames per stack.
+
+    Raises:
+        DatasetError: for a ``frame_stack`` below 1.
     """
 
     _default_checkpointer = DatasetReference
 
     def __init__(self, frames: TensorDictBase, transitions: TensorDictBase, *, frame_stack: int = 3):
         if frame_stack < 1:
-            raise ValueError(f"frame_stack must be at least 1, got {frame_stack}.")
+            raise DatasetError(f"frame_stack must be at least 1, got {frame_stack}.")
         super().__init__(transitions, device=frames.get("pixels").device)
         self.frames = frames
         self.frame_stack = frame_stack
@@ -74,7 +77,7 @@ class FrameStorage(TensorStorage):
                 (2.1 GB per 100,000 transitions of 84 x 84), so that sampling needs no transfer.
 
         Raises:
-            DatasetError: naming the file that is missing, truncated or foreign.
+            DatasetError: naming the file that is missing, truncated or foreign; for a ``frame_stack`` below 1.
         """
         path = Path(path).resolve()
         card = read_card(path)
@@ -91,7 +94,8 @@ class FrameStorage(TensorStorage):
         transitions = parts[TRANSITIONS].clone()
         if torch.device(device).type != "cpu":
             parts[FRAMES], transitions = parts[FRAMES].to(device), transitions.to(device)
-        storage = cls(parts[FRAMES], transitions, frame_stack=frame_stack or card["frame_stack"])
+        frame_stack = card["frame_stack"] if frame_stack is None else frame_stack
+        storage = cls(parts[FRAMES], transitions, frame_stack=frame_stack)
         storage.path, storage.card = path, card
         return storage
 

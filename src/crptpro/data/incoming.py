@@ -1,8 +1,7 @@
-"""Finished episodes that wait on disk for an earlier one, and the lock of the directory they are for."""
+"""Finished episodes that wait on disk for an earlier one."""
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import shutil
@@ -12,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from crptpro.data.episode import Episode
-from crptpro.errors import DatasetError
 
 INCOMING = ".incoming"
 _ARRAYS = ("pixels", "action", "reward", "terminated", "truncated")
@@ -21,21 +19,6 @@ _ARRAYS = ("pixels", "action", "reward", "terminated", "truncated")
 def dataset_path(root: str | Path, domain_name: str) -> Path:
     """Return the directory of a domain's dataset: its name, ``-`` for what a file system may refuse."""
     return Path(root) / re.sub(r"[^\w.+-]+", "-", domain_name)
-
-
-def lock_directory(path: Path) -> int:
-    """Take the lock that a directory has one of; the file handle keeps it, the process's end releases it.
-
-    Raises:
-        DatasetError: if another process has it.
-    """
-    handle = os.open(path / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(handle)
-        raise DatasetError(f"Another process is collecting into {path}. Wait for it, or end it.") from None
-    return handle
 
 
 def write_incoming(root: Path, index: int, episode: Episode) -> None:

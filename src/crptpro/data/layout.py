@@ -19,6 +19,9 @@ JOURNAL_FILE = "journal.jsonl"
 COLLECTION_FILE = "collection.json"
 FRAMES, TRANSITIONS = "frames", "transitions"
 
+#: What a card says about its pixels: their type and range, unscaled.
+PIXELS = "uint8 0..255"
+
 TORCH_DTYPES = {
     "uint8": torch.uint8, "bool": torch.bool, "int32": torch.int32, "int64": torch.int64,
     "float32": torch.float32, "float64": torch.float64,

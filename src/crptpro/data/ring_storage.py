@@ -277,6 +277,7 @@ class RingStorage(TensorStorage):
                 # Reserved, not sparse: a disk that fills up later would end the process by a bus error.
                 os.posix_fallocate(file.fileno(), 0, size)
             except OSError as reason:
+                os.ftruncate(file.fileno(), found)  # what was reserved before the disk was full
                 raise DiskSpaceError(f"{path} needs {size / 1e9:.2f} GB: {reason}. Free space.") from reason
             mapped = mmap.mmap(file.fileno(), size)
         self._maps.append(mapped)

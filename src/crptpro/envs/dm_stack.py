@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,12 +15,13 @@ from crptpro.errors import CRPTproError, UnknownNameError
 if TYPE_CHECKING:
     import dm_env
 
-Quality = Literal["exact", "fast"]
-
 #: Side of the shadow map, texels, that ``quality="fast"`` uses instead of the model's own 2048 (suite) or
 #: 4096 (manipulation). On software GL the shadow map is half the cost of a frame; fewer than 1 % of pixels
-#: change.
+#: change (8 % on the terrain of quadruped_escape, which is all shadows).
 FAST_SHADOW_SIZE = {"suite": 512, "manipulation": 1024}
+
+#: MuJoCo's mjMAXVAL: what an action spec of dm_control says of an actuator without control limits.
+NO_BOUND = 1e10
 
 
 def load_dm_env(domain: Domain) -> dm_env.Environment:
@@ -70,6 +71,17 @@ class SceneCamera:
         self._model: Any = None
         self._camera: Any = None
 
+    def prepare(self, physics: Any) -> None:
+        """Set what a render context reads once, when it is made; call it before the first reset.
+
+        Some tasks (quadruped_escape, for its terrain) make the context while they start an episode.
+        """
+        visual = physics.model.vis
+        if self._shadow_size is not None:
+            visual.quality.shadowsize = min(self._shadow_size, visual.quality.shadowsize)
+        visual.global_.offwidth = max(self._image_size, visual.global_.offwidth)
+        visual.global_.offheight = max(self._image_size, visual.global_.offheight)
+
     def render(self, physics: Any) -> np.ndarray:
         """Return the image, uint8 ``[H, W, 3]``, in a buffer that the next call overwrites."""
         model = physics.model
@@ -84,11 +96,7 @@ class SceneCamera:
     def _build(self, physics: Any, model: Any) -> None:
         from dm_control.mujoco.engine import Camera
 
-        # All of these are read once, when the context is made, which the Camera does.
-        if self._shadow_size is not None:
-            model.vis.quality.shadowsize = min(self._shadow_size, model.vis.quality.shadowsize)
-        model.vis.global_.offwidth = max(self._image_size, model.vis.global_.offwidth)
-        model.vis.global_.offheight = max(self._image_size, model.vis.global_.offheight)
+        self.prepare(physics)  # a composer environment has compiled a new model since
         names = [model.id2name(index, "camera") or str(index) for index in range(model.ncam)]
         if self._camera_id not in (*names, *range(-1, model.ncam)):
             raise CRPTproError(
@@ -99,12 +107,26 @@ class SceneCamera:
         self._model = model
 
 
+def _bounds(spec: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return what -1 and 1 become; themselves where an actuator has no bounds."""
+    low, high = (
+        np.broadcast_to(bound, spec.shape).astype(np.float64) for bound in (spec.minimum, spec.maximum)
+    )
+    is_open = ~(np.abs(low) < NO_BOUND), ~(np.abs(high) < NO_BOUND)
+    if (is_open[0] != is_open[1]).any():
+        raise CRPTproError(
+            f"An actuator is bounded on one side only ({spec}), so [-1, 1] cannot be mapped to it."
+        )
+    return np.where(is_open[0], -1.0, low), np.where(is_open[1], 1.0, high)
+
+
 class DmControlSimulator:
     """A dm_control environment as a :class:`~crptpro.envs.simulator.Simulator`.
 
     Actions are mapped affinely from [-1, 1] to the actuators' ranges (they differ for quadruped and
-    manipulation). Rewards of the repeated env steps are summed without discount. A time limit (dm_env: last
-    step with discount 1) is a truncation, anything else that ends an episode a termination.
+    manipulation); an actuator without bounds (LQR's) takes the action as it is. Rewards of the repeated env
+    steps are summed without discount. A time limit (dm_env: last step with discount 1) is a truncation,
+    anything else that ends an episode a termination.
 
     Args:
         env: ``dm_env.Environment`` with ``physics`` and either ``task.random`` (suite) or ``random_state``
@@ -114,7 +136,7 @@ class DmControlSimulator:
         description: Goes into the card as it is.
 
     Raises:
-        CRPTproError: if an actuator has no bounds.
+        CRPTproError: if an actuator is bounded on one side only.
     """
 
     def __init__(
@@ -127,10 +149,7 @@ class DmControlSimulator:
     ):
         self._env = env
         spec = env.action_spec()
-        low, high = (np.broadcast_to(bound, spec.shape) for bound in (spec.minimum, spec.maximum))
-        if not (np.isfinite(low).all() and np.isfinite(high).all()):
-            raise CRPTproError(f"The actuators have no bounds ({spec}), so [-1, 1] cannot be mapped to them.")
-        self._to_actuators = ActionRange(low, high, spec.dtype)
+        self._to_actuators = ActionRange(*_bounds(spec), spec.dtype)
         self._camera = camera
         self._action_repeat = action_repeat
         self._description = description or {}

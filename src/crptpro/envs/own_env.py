@@ -6,6 +6,8 @@ import inspect
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
+from torchrl.data import Composite
 from torchrl.envs import DoubleToFloat, EnvBase, PermuteTransform, Transform, TransformedEnv
 from torchrl.envs.transforms import SelectTransform
 
@@ -15,10 +17,27 @@ from crptpro.errors import CRPTproError
 _OFFERED = ("seed", "image_size", "action_repeat", "camera", "quality", "physics_state")
 
 
+class NeverTruncated(Transform):
+    """Adds ``truncated``, always False, to an environment whose episodes end by termination alone."""
+
+    def transform_done_spec(self, done_spec: Composite) -> Composite:
+        """Add ``truncated``, a copy of ``done``."""
+        done_spec = done_spec.clone()
+        done_spec["truncated"] = done_spec["done"].clone()
+        return done_spec
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return tensordict_reset.set("truncated", torch.zeros_like(tensordict_reset.get("done")))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict.set("truncated", torch.zeros_like(next_tensordict.get("done")))
+
+
 def make_own_env(domain: Domain, **settings: Any) -> EnvBase:
     """Call ``domain.make`` with the settings that it names, check what it returns, and make pixels CHW.
 
-    Keys other than ``pixels`` (and ``qpos``, ``qvel`` if asked for) are dropped.
+    Keys other than ``pixels`` (and ``qpos``, ``qvel`` if asked for) are dropped; ``truncated`` is added, False, if
+    it is missing.
 
     Raises:
         CRPTproError: naming the part of the contract (see :class:`~crptpro.domains.Domain`) that is not kept.
@@ -35,6 +54,8 @@ def make_own_env(domain: Domain, **settings: Any) -> EnvBase:
         transforms.append(SelectTransform(*kept))
     if layout == "HWC":
         transforms.append(PermuteTransform((-1, -3, -2), in_keys=["pixels"]))
+    if "truncated" not in set(env.full_done_spec.keys()):
+        transforms.append(NeverTruncated())
     if torch.float64 in (env.reward_spec.dtype, env.action_spec.dtype):
         is_double = env.action_spec.dtype == torch.float64
         actions = {"in_keys_inv": ["action"]} if is_double else {"in_keys_inv": []}
@@ -66,6 +87,8 @@ def _check(domain: Domain, env: Any, *, image_size: int) -> str:
 
     if not isinstance(env, EnvBase):
         raise refuse(f"is a {type(env).__name__}; make must return a TorchRL EnvBase")
+    if env.device is not None and env.device.type != "cpu":
+        raise refuse(f"lives on {env.device}; it must be on the CPU, where frames are stored")
     if env.batch_size != torch.Size([]):
         raise refuse(f"has batch size {tuple(env.batch_size)}; it must be unbatched")
     if "pixels" not in set(env.observation_spec.keys()):

@@ -1,6 +1,7 @@
 """Render domains with one backend and measure them, in a process that answers one JSON line per domain.
 
-``python -m crptpro.envs.render_check walker cheetah``, with ``MUJOCO_GL`` naming the backend.
+``python -m crptpro.envs.render_check walker cheetah``, with ``MUJOCO_GL`` naming the backend, is what
+:func:`render_domains` runs.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import time
 from typing import Any
 
 from crptpro.envs.factory import make_env
+from crptpro.envs.gl_process import run_isolated
 from crptpro.errors import CRPTproError
 
 WARM_UP_AGENT_STEPS = 2
@@ -39,7 +41,9 @@ def check_domain(name: str) -> dict[str, Any]:
         finally:
             env.close()
     except CRPTproError as reason:
-        return {"domain": name, "reset_ms": None, "agent_step_ms": None, "alive": False, "error": str(reason)}
+        return _dead(name, str(reason))
+    except Exception as reason:  # whatever one domain does, those that follow are checked too
+        return _dead(name, f"{type(reason).__name__}: {reason}")
     has_content = first["pixels"].unique().numel() > 1
     has_changed = not first["pixels"].equal(last["pixels"])
     return {
@@ -49,6 +53,38 @@ def check_domain(name: str) -> dict[str, Any]:
         "alive": has_content and has_changed,
         "error": "",
     }
+
+
+def render_domains(names: tuple[str, ...], backend: str, timeout_s: float) -> tuple[dict[str, Any], ...]:
+    """Check domains in a process of its own, and in another one those that follow a domain that ended it.
+
+    Args:
+        names: Domains.
+        backend: GL backend.
+        timeout_s: For all of them together.
+
+    Returns:
+        What :func:`check_domain` returns, for each name.
+    """
+    entries: list[dict[str, Any]] = []
+    deadline = time.monotonic() + timeout_s
+    while len(entries) < len(names):
+        command = (sys.executable, "-m", "crptpro.envs.render_check", *names[len(entries) :])
+        left_s = max(0.0, deadline - time.monotonic())
+        ((returncode, stdout, stderr),) = run_isolated([command], backend, timeout_s=left_s)
+        lines = stdout.splitlines()
+        entries += [json.loads(line) for line in lines if line.startswith("{") and line.endswith("}")]
+        unanswered = names[len(entries) :]
+        if returncode is None:
+            return (*entries, *(_dead(name, f"no answer within {timeout_s:g} s") for name in unanswered))
+        if unanswered:
+            how = f"signal {-returncode}" if returncode < 0 else f"exit status {returncode}"
+            entries.append(_dead(unanswered[0], (stderr.strip().splitlines() or [how])[-1]))
+    return tuple(entries)
+
+
+def _dead(name: str, error: str) -> dict[str, Any]:
+    return {"domain": name, "reset_ms": None, "agent_step_ms": None, "alive": False, "error": error}
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import socket
 import sys
 import threading
 from collections.abc import Iterator
@@ -16,7 +17,8 @@ from crptpro.errors import RenderingError
 
 logger = logging.getLogger(__name__)
 
-#: Environment variable that carries the proof, as JSON, to this process's later calls and to its children.
+#: Environment variable that carries the proof, as JSON, to this process's later calls and to its children. A cluster
+#: may hand the environment on to another machine, where the proof holds no longer.
 PROOF_VARIABLE = "CRPTPRO_GL_PROOF"
 #: Environment variable with the seconds a first frame may take, for slow disks and busy machines.
 TIMEOUT_VARIABLE = "CRPTPRO_GL_TIMEOUT_S"
@@ -39,8 +41,9 @@ def select_backend(
     A ``MUJOCO_GL`` that the user has set is never overridden, only proven. Otherwise ``preference`` is
     taken, or EGL, OSMesa and (with a display) GLFW are tried in this order. The proof is a frame with
     content, rendered in a process of its own within the time limit. It holds for this process and its
-    children, so it is made once. With software GL, ``LP_NUM_THREADS=1`` is set unless the user has set it:
-    more threads cost a third more CPU time per frame and hardly gain any.
+    children, on this machine and for one ``MUJOCO_EGL_DEVICE_ID``, so it is made once. With software GL,
+    ``LP_NUM_THREADS=1`` is set unless the user has set it: more threads cost a third more CPU time per frame
+    and hardly gain any.
 
     Args:
         preference: ``"egl"``, ``"osmesa"`` or ``"glfw"``.
@@ -55,7 +58,7 @@ def select_backend(
     """
     timeout_s = default_timeout_s() if timeout_s is None else timeout_s
     proof = _proof()
-    requested = _requested_by_user(proof)
+    requested = _requested_by_user()
     if preference is not None and preference not in BACKENDS:
         raise RenderingError(f"There is no GL backend {preference!r}; choose one of {', '.join(BACKENDS)}.")
     if requested is not None and preference not in (None, requested):
@@ -132,18 +135,32 @@ def default_timeout_s() -> float:
         raise RenderingError(f"{TIMEOUT_VARIABLE} must be a number of seconds, got {text!r}.") from None
 
 
-def _proof() -> dict[str, Any] | None:
-    text = os.environ.get(PROOF_VARIABLE)
+def _carried_proof() -> dict[str, Any] | None:
+    """Return the proof in the environment, wherever it was made."""
     try:
-        return json.loads(text) if text else None
+        proof = json.loads(os.environ.get(PROOF_VARIABLE) or "null")
     except json.JSONDecodeError:
         return None
+    return proof if isinstance(proof, dict) and "backend" in proof else None
 
 
-def _requested_by_user(proof: dict[str, Any] | None) -> str | None:
-    """Return the backend of a MUJOCO_GL that is not our own doing."""
+def _proof() -> dict[str, Any] | None:
+    """Return the proof if it was made here: on this machine, for the same GPU."""
+    proof = _carried_proof()
+    is_ours = proof is not None and all(proof.get(name) == value for name, value in _place().items())
+    return proof if is_ours else None
+
+
+def _place() -> dict[str, Any]:
+    """Return what a proof is bound to."""
+    return {"host": socket.gethostname(), "egl_device": os.environ.get("MUJOCO_EGL_DEVICE_ID")}
+
+
+def _requested_by_user() -> str | None:
+    """Return the backend of a MUJOCO_GL that is not our own doing, here or where the environment comes from."""
     text = os.environ.get("MUJOCO_GL")
-    if text is None or (proof and proof["chosen_by"] == "crptpro" and text == proof["backend"]):
+    proof = _carried_proof()
+    if text is None or (proof and proof.get("chosen_by") == "crptpro" and text == proof["backend"]):
         return None
     backend = canonical_backend(text)
     if backend == "off":
@@ -172,7 +189,9 @@ def _accept(attempt: Attempt, *, processes: int, chosen_by: str) -> None:
     os.environ["MUJOCO_GL"] = attempt.backend
     if attempt.answer.get("gl_kind") == "software":
         os.environ.setdefault("LP_NUM_THREADS", "1")
-    proof = {**attempt.answer, "backend": attempt.backend, "processes": processes, "chosen_by": chosen_by}
+    proof = {
+        **attempt.answer, **_place(), "backend": attempt.backend, "processes": processes, "chosen_by": chosen_by,
+    }  # fmt: skip
     os.environ[PROOF_VARIABLE] = json.dumps(proof)
     logger.info("GL backend %s: %s", attempt.backend, attempt.answer.get("gl_renderer"))
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from crptpro.directory_lock import DirectoryLock
 from crptpro.downstream_config import DownstreamConfig
 from crptpro.envs import make_env
 from crptpro.errors import CheckpointError
@@ -17,7 +18,6 @@ from crptpro.pretrained import Pretrained, load_pretrained
 from crptpro.training.agent import PixelAgent
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.downstream_run import DownstreamRun, EnvFactory
-from crptpro.training.run_lock import exclusive
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def train_downstream(
         pretrained = load_pretrained(pretrained)
     with contextlib.ExitStack() as stack:
         directory = Path(run_dir or stack.enter_context(tempfile.TemporaryDirectory(prefix="crptpro-")))
-        stack.enter_context(exclusive(directory))
+        stack.enter_context(DirectoryLock(directory, error=CheckpointError))
         records = logger or stack.enter_context(
             RunLogger(directory, config={"task": task, **dataclasses.asdict(config)})
         )

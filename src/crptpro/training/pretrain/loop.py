@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torchrl.objectives import LossModule
 
+from crptpro.directory_lock import DirectoryLock
+from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
 from crptpro.modules import resolve_precision, set_compute_dtype
 from crptpro.modules.precision import Precision
@@ -18,7 +20,6 @@ from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.result import PretrainResult
 from crptpro.training.pretrain.run import PretrainRun
 from crptpro.training.pretrain.sources import Augment, Augmenter, open_sources
-from crptpro.training.run_lock import exclusive
 
 
 def pretrain(
@@ -114,7 +115,7 @@ def pretrain(
         for source in sources:
             source.require_fit(getattr(loss, "encoder", None))
         if run_dir is not None:
-            stack.enter_context(exclusive(run_dir))
+            stack.enter_context(DirectoryLock(run_dir, error=CheckpointError))
             logger = logger or stack.enter_context(RunLogger(run_dir))
         run = PretrainRun(
             loss,

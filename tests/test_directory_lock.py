@@ -1,0 +1,61 @@
+"""The directory lock."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from crptpro.directory_lock import DirectoryLock
+from crptpro.errors import CheckpointError, CRPTproError, DatasetError
+
+
+@pytest.mark.parametrize("error", [CheckpointError, DatasetError])
+def test_a_second_process_is_refused_and_a_dead_one_is_not_remembered(
+    tmp_path: Path, error: type[CRPTproError]
+) -> None:
+    script = (
+        "import fcntl, sys, time\n"
+        "file = open(sys.argv[1], 'a')\n"
+        "fcntl.flock(file, fcntl.LOCK_EX); print('held', flush=True); time.sleep(60)"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path / ".lock")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "held\n"
+        with pytest.raises(error, match="Another process is writing to"):
+            DirectoryLock(tmp_path, error=error)
+        holder.kill()
+    with DirectoryLock(tmp_path, error=error):
+        pass
+
+
+def test_a_released_directory_may_be_taken_again(tmp_path: Path) -> None:
+    lock = DirectoryLock(tmp_path / "new")
+    with pytest.raises(CRPTproError, match="Another process"):
+        DirectoryLock(tmp_path / "new")
+    lock.release()
+    lock.release()
+    DirectoryLock(tmp_path / "new").release()
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOTSUP])
+def test_a_file_system_without_locks_is_not_taken_for_another_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def no_locks(*_: object) -> None:
+        raise OSError(number, "no locks here")
+
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with DirectoryLock(tmp_path), DirectoryLock(tmp_path):
+        pass
+
+
+def test_a_directory_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DatasetError, match="file/data cannot be written"):
+        DirectoryLock(tmp_path / "file" / "data", error=DatasetError)
