@@ -19,6 +19,11 @@ logger = logging.getLogger(__name__)
 GYMNASIUM_PREFIX = "gymnasium:"
 
 
+LONGEST_EPISODE_AGENT_STEPS = 1000
+"""Where an episode is truncated whose world sets no limit of its own (LQR): one of 100,000 transitions would not fit in
+memory, and an evaluation would never end."""
+
+
 @dataclass(frozen=True)
 class Domain:
     """A world that looks and moves in one way, and the task from which its frames are collected.
@@ -36,12 +41,14 @@ class Domain:
             environment on CPU whose ``pixels`` are one uint8 RGB image ``[H, W, 3]`` or ``[3, H, W]`` with
             ``H = W = image_size``, whose ``action`` is continuous in [-1, 1], and whose reward has shape
             ``[1]``. An environment whose ``done_spec`` has no ``truncated`` is taken to end episodes by
-            termination alone. It repeats the action itself if it names ``action_repeat``. Frame stacking and the
+            termination alone. It repeats the action
+            itself if it names ``action_repeat``; otherwise an agent step is one env step. Frame stacking and the
             choice of dtypes are done by ``make_env``. With ``physics_state`` it may also emit ``qpos`` and
             ``qvel``. Its ``set_seed`` must make the next ``reset`` reproducible.
             It must be a module-level function (or ``functools.partial`` of one): worker processes receive the
             ``Domain`` by pickling and import ``make`` by its module's name.
-        episode_env_steps: Env steps of a full episode, ``None`` if unknown or unlimited.
+        episode_env_steps: Env steps of a full episode, ``None`` if unknown or unlimited; such an episode is
+            truncated after 1000 agent steps.
         source: What ``task`` is loaded with; ``"own"`` goes with ``make``.
     """
 

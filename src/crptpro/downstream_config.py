@@ -20,8 +20,8 @@ class SACSettings:
 
     env_steps: int = 500_000
     """budget in simulator steps; an episode still running then is cut"""
-    action_repeat: int = 2
-    """simulator steps per decision"""
+    action_repeat: int | None = None
+    """simulator steps per decision (default: the domain's, 2)"""
     batch_size: int = 512
     """transitions per update"""
     replay_capacity: int = 40_000
@@ -78,7 +78,7 @@ class SACSettings:
             "hidden_dim", "actor_update_interval", "target_update_interval", "knn_k", "queue_size",
             "eval_interval_env_steps", "eval_episodes", "checkpoint_interval_env_steps", "log_interval_env_steps",
         ):  # fmt: skip
-            if getattr(self, name) < 1:
+            if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ValueError(f"`{name}` must be at least 1, got {getattr(self, name)}.")
         for name in ("discount", "critic_tau"):
             if not 0 <= getattr(self, name) <= 1:
@@ -94,6 +94,17 @@ class SACSettings:
                 f"`replay_capacity` ({self.replay_capacity}) must hold the {self.random_agent_steps} transitions "
                 "of `random_agent_steps`, or no update would ever start."
             )
+
+    @property
+    def resolved_action_repeat(self) -> int:
+        """Simulator steps per decision; ``train_downstream`` asks the domain for it before it starts.
+
+        Raises:
+            ValueError: if nobody has asked the domain yet.
+        """
+        if self.action_repeat is None:
+            raise ValueError("`action_repeat` is the domain's, which is not known here; set it to a number.")
+        return self.action_repeat
 
 
 @dataclass(frozen=True)

@@ -105,7 +105,6 @@ def test_a_complete_dataset_is_returned_at_once(collected, caplog):
     ({"transitions": 70}, "transitions 65 there, 70 asked for"),
     ({"quality": "fast"}, "quality 'exact' there, 'fast' asked for"),
     ({"image_size": 9}, "image_size 8 there, 9 asked for"),
-    ({"action_repeat": 4}, "action_repeat 2 there, 4 asked for"),
 ])  # fmt: skip
 def test_another_request_for_the_same_place_is_refused(collected, asked, message):
     request = {"transitions": 65, "seed": 3, **SMALL} | asked
@@ -179,7 +178,7 @@ def test_no_more_is_stepped_than_needed_when_the_length_is_known(tmp_path):
 
 
 def test_an_endless_episode_is_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr("crptpro.data.collection.LONGEST_EPISODE", 12)
+    monkeypatch.setattr("crptpro.data.collection.LONGEST_EPISODE_AGENT_STEPS", 12)
     run_in_order(DomainCollection(tmp_path, request()), 0, lambda seed: 10**9)
     dataset = FrameDataset.open(tmp_path)
     assert dataset.transitions["next", "truncated"].squeeze(-1).nonzero().flatten().tolist() == [11, 23, 26]

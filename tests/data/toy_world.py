@@ -129,7 +129,7 @@ def make_failing(*, seed: int, image_size: int) -> EnvBase:
     return ToyEnv(fixed_length, seed=seed, image_size=image_size, on_step=_fail)
 
 
-FIXED = Domain("toy-fixed", "toy-fixed_go", make=make_fixed, episode_env_steps=20)
+FIXED = Domain("toy-fixed", "toy-fixed_go", make=make_fixed, episode_env_steps=10)
 VARIABLE = Domain("toy-variable", "toy-variable_go", make=make_variable)
 SLOW = Domain("toy-slow", "toy-slow_go", make=make_slow)
 DYING = Domain("toy-dying", "toy-dying_go", make=make_dying)

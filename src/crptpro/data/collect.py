@@ -112,7 +112,7 @@ def collect_group(
     if transitions < 1 or workers < 1:
         raise DatasetError(f"transitions and workers must be at least 1, got {transitions} and {workers}.")
     # Imported late: nothing that reads datasets needs the simulators.
-    from crptpro.envs import episode_length, make_env, needs_gl
+    from crptpro.envs import episode_length, make_env, needs_gl, resolve_action_repeat
     from crptpro.envs.rendering import select_backend
 
     root = Path(root)
@@ -130,7 +130,7 @@ def collect_group(
                 drawn_by_gl.add(domain.name)
             settings: dict[str, Any] = {
                 "image_size": image_size,
-                "action_repeat": domain.action_repeat if action_repeat is None else action_repeat,
+                "action_repeat": resolve_action_repeat(domain, action_repeat),
                 "camera": domain.camera if camera is None else camera,
                 "quality": quality,
             }

@@ -23,14 +23,11 @@ from crptpro.data.layout import (
     write_tensordict_metadata,
 )
 from crptpro.directory_lock import DirectoryLock
+from crptpro.domains import LONGEST_EPISODE_AGENT_STEPS
 from crptpro.errors import DatasetError
 from crptpro.seeding import derive_seed
 
 logger = logging.getLogger(__name__)
-
-#: Transitions after which an episode is truncated, unless the domain's own are known to be longer. It keeps a world
-#: that never ends an episode (LQR) from becoming one episode of 100,000 transitions, which would not fit in memory.
-LONGEST_EPISODE = 1000
 
 
 class DomainCollection:
@@ -55,7 +52,7 @@ class DomainCollection:
         self.target: int = request["transitions"]
         self._last_append_s: float | None = None
         self._usual_length = episode_agent_steps
-        self._longest = max(LONGEST_EPISODE, episode_agent_steps or 0)
+        self._longest = max(LONGEST_EPISODE_AGENT_STEPS, episode_agent_steps or 0)
         self._seen_lengths: set[int] = set()
         self._running: dict[int, int] = {}
         self._waiting: dict[int, Episode] = {}

@@ -6,10 +6,11 @@ from typing import Any
 
 from torchrl.envs import CatFrames, EnvBase
 
-from crptpro.domains import GYMNASIUM_PREFIX, Domain, get_domain
+from crptpro.domains import GYMNASIUM_PREFIX, LONGEST_EPISODE_AGENT_STEPS, Domain, get_domain
 from crptpro.envs.dm_stack import FAST_SHADOW_SIZE, DmControlSimulator, SceneCamera, load_dm_env
+from crptpro.envs.episode_limit import EpisodeLimit
 from crptpro.envs.gymnasium_env import GymnasiumSimulator
-from crptpro.envs.own_env import make_own_env, with_transform
+from crptpro.envs.own_env import make_own_env, repeats_actions, with_transform
 from crptpro.envs.pixel_env import PixelEnv
 from crptpro.envs.rendering import backend_card, first_frame_watchdog, select_backend
 from crptpro.errors import CRPTproError
@@ -32,9 +33,10 @@ def make_env(
 
     Output keys: ``pixels`` uint8 ``[3 * frame_stack, H, W]``, oldest to newest (a reset repeats its first
     frame); ``action`` float32 ``[A]`` in [-1, 1]; ``("next", "reward")`` float32 ``[1]``, summed over the
-    repeated env steps; ``done``, ``terminated``, ``truncated`` (time limits truncate). Consecutive frames
-    are ``action_repeat`` env steps apart. ``env.set_seed(s)`` re-seeds the simulator without resetting, and
-    the next ``reset`` starts the episode that belongs to ``s``. ``env.card()`` says what shaped the pixels.
+    repeated env steps; ``done``, ``terminated``, ``truncated`` (time limits truncate; where a world has none,
+    1000 agent steps do). Consecutive frames are ``action_repeat`` env steps apart. ``env.set_seed(s)``
+    re-seeds the simulator without resetting, and the next ``reset`` starts the episode that belongs to ``s``.
+    ``env.card()`` says what shaped the pixels (not in worlds of your own).
     ``env.close()`` frees the render context.
 
     Args:
@@ -56,7 +58,7 @@ def make_env(
         CRPTproError: for options or an own environment that cannot be used.
     """
     domain = get_domain(task)
-    action_repeat = domain.action_repeat if action_repeat is None else action_repeat
+    action_repeat = resolve_action_repeat(domain, action_repeat)
     _check_options(quality, image_size=image_size, action_repeat=action_repeat, frame_stack=frame_stack)
     settings: dict[str, Any] = {
         "image_size": image_size, "action_repeat": action_repeat, "quality": quality,
@@ -69,16 +71,26 @@ def make_env(
         env = _make_gymnasium_env(domain, render=render, **settings)
     else:
         env = _make_dm_env(domain, render=render, **settings)
+    if domain.episode_env_steps is None:
+        env = with_transform(env, EpisodeLimit(LONGEST_EPISODE_AGENT_STEPS))
     env.set_seed(seed)
     if frame_stack == 1:
         return env
     return with_transform(env, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
 
 
+def resolve_action_repeat(task: str | Domain, action_repeat: int | None = None) -> int:
+    """Return the env steps of one agent step: as asked, or the domain's; 1 if your own world repeats nothing."""
+    domain = get_domain(task)
+    if domain.source == "own" and not repeats_actions(domain):
+        return 1
+    return domain.action_repeat if action_repeat is None else action_repeat
+
+
 def episode_length(task: str | Domain, *, action_repeat: int | None = None) -> int | None:
     """Return the agent steps of a full episode (500; manipulation 125), ``None`` if unknown or unlimited."""
     domain = get_domain(task)
-    repeat = domain.action_repeat if action_repeat is None else action_repeat
+    repeat = resolve_action_repeat(domain, action_repeat)
     return None if domain.episode_env_steps is None else -(-domain.episode_env_steps // repeat)
 
 

@@ -11,8 +11,8 @@ from typing import Any
 
 from crptpro.directory_lock import DirectoryLock
 from crptpro.downstream_config import DownstreamConfig
-from crptpro.envs import make_env
-from crptpro.errors import CheckpointError
+from crptpro.envs import make_env, resolve_action_repeat
+from crptpro.errors import CheckpointError, UnknownNameError
 from crptpro.loggers import RunLogger
 from crptpro.pretrained import Pretrained, load_pretrained
 from crptpro.training.agent import PixelAgent
@@ -72,6 +72,7 @@ def train_downstream(
         NonFiniteError: if a loss became NaN or infinite; the last checkpoint is kept.
     """
     config = dataclasses.replace(config or DownstreamConfig(), **overrides)
+    config = dataclasses.replace(config, action_repeat=_action_repeat(task, config.action_repeat))
     if not isinstance(pretrained, Pretrained):
         pretrained = load_pretrained(pretrained)
     with contextlib.ExitStack() as stack:
@@ -93,3 +94,10 @@ def train_downstream(
         run.train(checkpoints if run_dir is not None else None)
         agent_path = run.save_agent() if run_dir is not None else None
         return DownstreamResult(run.agent(), records.rows("eval"), agent_path, run.env_steps)
+
+
+def _action_repeat(task: str, asked: int | None) -> int:
+    try:
+        return resolve_action_repeat(task, asked)
+    except UnknownNameError:  # an `env_factory` of the caller's may know names that the library does not
+        return asked or 2

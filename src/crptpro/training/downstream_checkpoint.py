@@ -61,8 +61,8 @@ def restore(run: DownstreamRun, state: Mapping[str, Any]) -> None:
             nothing has changed then.
     """
     require_same(state["fingerprint"], fingerprint(run), run.run_dir)
-    done = state["counters"]["agent_steps"] * run.config.action_repeat
-    if done - run.config.action_repeat >= run.config.env_steps:
+    done = state["counters"]["agent_steps"] * run.config.resolved_action_repeat
+    if done - run.config.resolved_action_repeat >= run.config.env_steps:
         raise CheckpointError(
             f"{run.run_dir} has done {done:,} env steps, {run.config.env_steps:,} are asked: ask for at least as many, "
             "or choose another run directory."

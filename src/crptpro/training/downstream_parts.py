@@ -107,7 +107,7 @@ def _build_replay(
     _, height, width = env.observation_spec["pixels"].shape
     # A checkpoint holds cursors, not frames: whatever it refers to must outlive the next one, and the one after
     # that while it is being written.
-    slack = 2 * (config.checkpoint_interval_env_steps // config.action_repeat) + 2_000
+    slack = 2 * (config.checkpoint_interval_env_steps // config.resolved_action_repeat) + 2_000
     replay = FrameReplay(
         config.replay_capacity,
         frame_shape=(3, height, width),
@@ -121,7 +121,7 @@ def _build_replay(
 
 
 def _agent_steps(config: DownstreamConfig) -> int:
-    return -(-config.env_steps // config.action_repeat)
+    return -(-config.env_steps // config.resolved_action_repeat)
 
 
 def _build_bonus(

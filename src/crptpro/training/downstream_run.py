@@ -64,7 +64,7 @@ class DownstreamRun:
         encoder = pretrained.encoder
         settings = {
             "quality": config.quality,
-            "action_repeat": config.action_repeat,
+            "action_repeat": config.resolved_action_repeat,
             "image_size": encoder.image_size,
             "frame_stack": encoder.in_channels // 3,
         }
@@ -87,7 +87,7 @@ class DownstreamRun:
     @property
     def env_steps(self) -> int:
         """Simulator steps taken so far."""
-        return self.agent_steps * self.config.action_repeat
+        return self.agent_steps * self.config.resolved_action_repeat
 
     # --- the loop -----------------------------------------------------------------------------------------------
 
@@ -158,8 +158,8 @@ class DownstreamRun:
             self.agent_steps += 1
             done = bool(following["done"].item())
             observation = step_mdp(transition)
-            bar.update(config.action_repeat)
-            if self.env_steps % config.log_interval_env_steps < config.action_repeat:
+            bar.update(config.resolved_action_repeat)
+            if self.env_steps % config.log_interval_env_steps < config.resolved_action_repeat:
                 self.log_training()
         self.episodes += 1
         row = {"episode_return": episode_return, "episode_agent_steps": agent_steps}
