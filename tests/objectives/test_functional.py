@@ -13,7 +13,6 @@ from torch import Tensor
 from crptpro.objectives.functional import comparative_loss, prototype_dispersion, sinkhorn_knopp
 from crptpro.objectives.metrics import prototype_ane
 
-
 SCORES = double([[0.9, 0.1, -0.3], [0.2, 0.8, 0.0], [-0.5, 0.4, 0.7], [0.6, 0.5, 0.1]])
 PROTOTYPES = double([[1, 0, 0], [0.6, 0.8, 0], [0, 0, -1], [-0.8, 0.6, 0]])
 

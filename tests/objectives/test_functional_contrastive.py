@@ -10,7 +10,6 @@ from tensor_checks import close, double, unit
 
 from crptpro.objectives.functional import becl_loss, info_nce, knn_distance, knn_distances, particle_reward
 
-
 # Nearest neighbours --------------------------------------------------------------------------------------------
 
 
