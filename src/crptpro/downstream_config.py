@@ -67,7 +67,8 @@ class DownstreamConfig:
     features: Literal["auto", "dense", "reencode"] = "auto"
     """how shifted features are had: cut from dense maps stored once per observation, or encoded at every update"""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
-    """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it"""
+    """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it. Deviation: the released code
+    computes in fp32 throughout, which `fp32` gives"""
     device: str = "cpu"
     """where networks and features live"""
 
