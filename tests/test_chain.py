@@ -40,8 +40,8 @@ def test_collect_pretrain_freeze_and_learn_in_under_twenty_seconds(tmp_path: Pat
     frozen = {key: value.clone() for key, value in artifact.encoder.state_dict().items()}
     learned = train_downstream(
         "toy", artifact, run_dir=tmp_path / "run", env_factory=functools.partial(make_task, FIXED),
-        env_steps=25, action_repeat=1, random_agent_steps=5, batch_size=8, replay_capacity=25, queue_size=16, hidden_dim=16,
-        eval_interval_env_steps=25, eval_episodes=2, precision="fp32", progress=False,
+        env_steps=25, action_repeat=1, random_agent_steps=5, batch_size=8, replay_capacity=25, queue_size=16,
+        hidden_dim=16, eval_interval_env_steps=25, eval_episodes=2, precision="fp32", progress=False,
     )  # fmt: skip
     assert learned.env_steps == 25  # 20 of them with an update
     assert [row["updates"] for row in learned.evaluations][-1] == 20

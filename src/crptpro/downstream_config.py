@@ -116,6 +116,7 @@ class DownstreamConfig(SACSettings):
     quality: Quality = "exact"
     """render quality"""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
-    """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it"""
+    """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it. Deviation: the released code
+    computes in fp32 throughout, which `fp32` gives"""
     device: str = "cpu"
     """where networks and features live"""

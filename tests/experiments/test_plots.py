@@ -95,7 +95,7 @@ def test_a_method_without_these_columns_gets_empty_panels_and_no_error(tmp_path:
     record = tmp_path / "own.csv"
     record.write_text("updates,loss_prediction\n10,0.4\n")
     plot_pretraining(record, tmp_path / "figure.png")
-    assert [len(axis.lines) for axis in axes] == [1, 1, 1, 1]  # the references alone
+    assert [len(axis.lines) for axis in axes] == [1, 1, 1, 0]  # the references alone
 
 
 def test_a_learning_curve_is_the_mean_over_episodes_with_one_deviation(
@@ -122,6 +122,16 @@ def test_stacks_are_drawn_a_domain_a_row_oldest_picture_first(tmp_path: Path, ax
     assert strip.shape == (8, 24, 3)
     assert strip[0, [0, 8, 16], 0].tolist() == [10, 60, 110]
     assert axis.get_ylabel() == "rising"
+
+
+def test_drawing_stacks_leaves_the_datasets_stream_alone(tmp_path: Path) -> None:
+    buffer, generator = dataset(10), torch.Generator().manual_seed(5)
+    buffer.set_rng(generator)
+    before = generator.get_state()
+    plot_stacks({"dark": buffer}, tmp_path / "figure.png", stacks=2)
+    assert torch.equal(generator.get_state(), before)
+    buffer.sample()
+    assert not torch.equal(generator.get_state(), before)
 
 
 def test_every_domain_has_its_own_colour_and_name_in_the_scatter(tmp_path: Path, axes: list) -> None:

@@ -171,13 +171,13 @@ def test_double_parameters_compute_in_double() -> None:
     assert small().double()(pixels()).dtype == torch.float64
 
 
-@pytest.mark.parametrize(
-    ("strides", "compatible"),
-    [((2, 1, 1), True), ((2, 2, 1), False), ((1, 1, 1), False)],
-)
-def test_dense_shift_compatibility_follows_the_strides(strides: tuple[int, ...], compatible: bool) -> None:
-    encoder = PixelEncoder(3, channels=(4, 4, 4), strides=strides, image_size=21)
-    assert encoder.is_dense_shift_compatible is compatible
+def test_atcs_own_strides_give_its_published_sizes() -> None:
+    x, sizes = torch.zeros(1, 9, 84, 84), []
+    for conv in PixelEncoder(strides=(2, 2, 2, 1)).conv_layers:
+        x = conv(x)
+        sizes.append(x.shape[-1])
+    assert sizes == [41, 20, 9, 7]
+    assert PixelEncoder(strides=(2, 2, 2, 1)).feature_map_shape == (32, 7, 7)
 
 
 def test_wrong_image_shape_is_named() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 import torch
 import torch.nn.functional as F
@@ -35,6 +37,30 @@ def test_auto_follows_the_cpu(monkeypatch: pytest.MonkeyPatch, capable: bool, dt
 def test_auto_follows_the_gpu(monkeypatch: pytest.MonkeyPatch, capability, dtype: torch.dtype) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
     assert resolve_precision("auto", "cuda:0") == dtype
+
+
+@pytest.fixture
+def tf32_everywhere() -> Iterator[tuple]:
+    backends = (torch.backends.cudnn, torch.backends.cuda.matmul)
+    before = [backend.allow_tf32 for backend in backends]
+    for backend in backends:
+        backend.allow_tf32 = True
+    yield backends
+    for backend, allowed in zip(backends, before):
+        backend.allow_tf32 = allowed
+
+
+@pytest.mark.parametrize(
+    ("precision", "device", "allowed"),
+    [("fp32", "cuda:0", False), ("auto", "cuda:0", False), ("bf16", "cuda:0", True), ("fp32", "cpu", True)],
+)
+def test_float32_on_a_gpu_means_float32_and_not_tf32(
+    monkeypatch: pytest.MonkeyPatch, tf32_everywhere, precision, device: str, allowed: bool
+) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (7, 5))
+    resolve_precision(precision, device)
+    for backend in tf32_everywhere:
+        assert backend.allow_tf32 is allowed
 
 
 def test_set_compute_dtype_reaches_the_networks_of_a_loss() -> None:

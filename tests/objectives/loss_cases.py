@@ -41,6 +41,9 @@ class LossCase:
     per_row: tuple[str, ...] = ()
     """``loss_*`` keys that have one value per row under ``reduction="none"``."""
 
+    rows_are_coupled: bool = False
+    """Whether a row's loss depends on the other rows, so that masked ones must not even take part."""
+
     def __str__(self) -> str:
         return self.name
 
@@ -104,6 +107,7 @@ CASES = [
         targets=("encoder", "projector"),
         masked=("pixels", ("next", "pixels")),
         per_row=("loss_comp",),
+        rows_are_coupled=True,
     ),
     LossCase(
         name="RADSACLoss",

@@ -7,24 +7,11 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
+from tensor_checks import close, double, unit
 from torch import Tensor
 
 from crptpro.objectives.functional import comparative_loss, prototype_dispersion, sinkhorn_knopp
 from crptpro.objectives.metrics import prototype_ane
-
-
-def double(rows: list) -> Tensor:
-    return torch.tensor(rows, dtype=torch.float64)
-
-
-def unit(*shape: int, seed: int = 0) -> Tensor:
-    values = torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    return F.normalize(values, dim=-1)
-
-
-def close(actual: Tensor, expected: Tensor, tolerance: float = 1e-6) -> None:
-    torch.testing.assert_close(actual, expected, rtol=0, atol=tolerance)
-
 
 SCORES = double([[0.9, 0.1, -0.3], [0.2, 0.8, 0.0], [-0.5, 0.4, 0.7], [0.6, 0.5, 0.1]])
 PROTOTYPES = double([[1, 0, 0], [0.6, 0.8, 0], [0, 0, -1], [-0.8, 0.6, 0]])

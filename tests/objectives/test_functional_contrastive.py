@@ -6,24 +6,9 @@ import math
 
 import pytest
 import torch
-import torch.nn.functional as F
-from torch import Tensor
+from tensor_checks import close, double, unit
 
 from crptpro.objectives.functional import becl_loss, info_nce, knn_distance, knn_distances, particle_reward
-
-
-def double(rows: list) -> Tensor:
-    return torch.tensor(rows, dtype=torch.float64)
-
-
-def unit(*shape: int, seed: int = 0) -> Tensor:
-    values = torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    return F.normalize(values, dim=-1)
-
-
-def close(actual: Tensor, expected: Tensor, tolerance: float = 1e-6) -> None:
-    torch.testing.assert_close(actual, expected, rtol=0, atol=tolerance)
-
 
 # Nearest neighbours --------------------------------------------------------------------------------------------
 
@@ -113,6 +98,21 @@ def test_invalid_rows_are_ignored_but_stay_negatives(negatives) -> None:
     assert nothing.item() == 0
     with pytest.raises(ValueError, match="'all'"):
         info_nce(anchors, positives, negatives="all")  # type: ignore[arg-type]
+
+
+def test_what_an_invalid_anchor_holds_reaches_neither_the_loss_nor_the_gradient() -> None:
+    anchors, positives = unit(4, 3), unit(4, 3, seed=1)
+    valid = torch.tensor([True, False, True, True])
+    expected = info_nce(anchors, positives, valid=valid)
+    anchors[1] = torch.nan
+    anchors.requires_grad_()
+    positives.requires_grad_()
+    loss = info_nce(anchors, positives, valid=valid)
+    loss.backward()
+    close(loss, expected)
+    assert not anchors.grad[1].any()
+    assert anchors.grad.isfinite().all()
+    assert positives.grad.isfinite().all()
 
 
 def test_info_nce_of_one_pair_is_zero() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import inspect
+import textwrap
 
 import pytest
 import torch
@@ -139,7 +141,47 @@ def test_an_unknown_reduction_is_refused_or_fails_at_once(case: LossCase) -> Non
 # L11 ----------------------------------------------------------------------------------------------------
 
 
+def not_methods(owner: type) -> list[str]:
+    """Public names ending in "loss" that a class body binds to something else than a plain method.
+
+    TorchRL's metaclass wraps whatever bears such a name into a function, so the class itself no longer tells.
+    """
+    found = []
+    for statement in ast.parse(textwrap.dedent(inspect.getsource(owner))).body[0].body:
+        if isinstance(statement, ast.FunctionDef):
+            decorators = {node.id if isinstance(node, ast.Name) else "" for node in statement.decorator_list}
+            bound = [] if decorators <= {"dispatch"} else [statement.name]
+        elif isinstance(statement, (ast.Assign, ast.AnnAssign, ast.ClassDef)):
+            nodes = getattr(statement, "targets", [getattr(statement, "target", None)])
+            bound = [node.id for node in nodes if isinstance(node, ast.Name)]
+            bound += [statement.name] if isinstance(statement, ast.ClassDef) else []
+        else:
+            bound = []
+        found += [name for name in bound if name.endswith("loss") and not name.startswith("_")]
+    return found
+
+
 def test_every_attribute_ending_in_loss_is_a_method(case: LossCase) -> None:
-    for name in dir(type(case.make())):
-        if name.endswith("loss") and not name.startswith("_"):
-            assert inspect.isfunction(inspect.getattr_static(type(case.make()), name)), name
+    own = [base for base in type(case.make()).__mro__ if base.__module__.startswith("crptpro")]
+    assert own
+    for base in own:
+        assert not_methods(base) == [], base
+
+
+def test_the_check_for_methods_sees_through_the_metaclass(case: LossCase) -> None:
+    class Trapped(type(case.make())):
+        base_loss = torch.nn.functional.mse_loss
+        cached_loss: int = 3
+
+        @property
+        def last_loss(self) -> float:
+            return 0.0
+
+        @torch.no_grad()
+        def slow_loss(self) -> float:
+            return 0.0
+
+        def plain_loss(self) -> float:
+            return 0.0
+
+    assert not_methods(Trapped) == ["base_loss", "cached_loss", "last_loss", "slow_loss"]

@@ -255,3 +255,13 @@ def test_a_missing_entry_is_named() -> None:
 def test_impossible_options_are_refused(options: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         proto(**options)
+
+
+def test_heads_of_different_latent_lengths_are_refused_naming_each() -> None:
+    with pytest.raises(ValueError, match=r"projector 6, predictor 6, prototypes 4; pass latent_dim="):
+        proto(prototypes=Prototypes(10, 4))
+    wide = Projector(small_encoder().feature_dim, 9)
+    with pytest.raises(ValueError, match="projector 9, predictor 6, prototypes 6"):
+        proto(projector=wide)
+    mute = torch.nn.Linear(small_encoder().feature_dim, 6)
+    assert proto(projector=mute)(image_batch())["loss_comp"].isfinite()

@@ -73,6 +73,7 @@ def test_all_losses_and_gradients_equal_the_released_update() -> None:
     torch.testing.assert_close(out["entropy"], -log_prob.mean())
     torch.testing.assert_close(out["target_q_mean"], y.mean())
     torch.testing.assert_close(out["q_mean"], torch.cat([q1, q2]).mean())
+    torch.testing.assert_close(out["td_error"], torch.maximum((q1 - y).abs(), (q2 - y).abs()).mean())
     (out["loss_qvalue"] + out["loss_actor"] + out["loss_alpha"]).backward()
     for parameter, expected in zip(loss.critic.parameters(), critic_gradients, strict=True):
         torch.testing.assert_close(parameter.grad, expected)
@@ -190,6 +191,29 @@ def test_priority_weights_scale_rows() -> None:
     rows = rad_sac(reduction="none", generator=generator())(td)["loss_qvalue"]
     loss = rad_sac(reduction="sum", generator=generator())(weighted)["loss_qvalue"]
     torch.testing.assert_close(loss, rows[3])
+
+
+def test_diagnostics_are_means_over_the_rows_that_count() -> None:
+    td, loss, kept = transition_batch(), rad_sac(generator=generator()), [0, 1, 4]
+    _, rows = loss.qvalue_v2_loss(td)
+    _, actions = loss.actor_loss(td)
+    mask = torch.zeros(6, 1, dtype=torch.bool)
+    mask[kept] = True
+    td["mask"] = mask
+    loss.loss_mask_key = "mask"
+    loss.generator.manual_seed(0)
+    out = loss(td)
+    expected = {"q_mean": rows["q"], "target_q_mean": rows["target_q"], "td_error": rows["td_error"]}
+    for key, value in {**expected, "entropy": -actions["log_prob"]}.items():
+        torch.testing.assert_close(out[key], value[kept].mean(), msg=key)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("alpha_init", 0.0), ("alpha_init", -0.1), ("gamma", 1.01), ("gamma", -0.5)]
+)
+def test_a_temperature_or_discount_that_cannot_be_is_refused(option: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{option} must be .*got {value}"):
+        rad_sac(**{option: value})
 
 
 def test_bfloat16_losses_and_features_are_close_to_float32() -> None:

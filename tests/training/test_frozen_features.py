@@ -7,7 +7,7 @@ import torch
 
 from crptpro.data import FrameReplay
 from crptpro.modules import PixelEncoder
-from crptpro.training.frozen_features import FrozenFeatures
+from crptpro.training.frozen_features import FrozenFeatures, dense_slots
 
 SIZE, PAD, CAPACITY, SLACK = 16, 2, 12, 9
 LENGTHS = (7, 1, 5, 3, 9, 2, 4, 8, 1, 6, 7, 5)
@@ -21,13 +21,13 @@ def make_encoder() -> PixelEncoder:
 class World:
     """A replay of short episodes and the features of what is in it; the same for both ways to have them."""
 
-    def __init__(self, mode: str, path: Path | None = None) -> None:
+    def __init__(self, mode: str, path: Path | None = None, slots: int | None = None) -> None:
         self.encoder = make_encoder()
         self.replay = FrameReplay(CAPACITY, frame_shape=(3, SIZE, SIZE), action_dim=1, path=path, slack=SLACK)
         self.replay_rng, self.shift_rng = (torch.Generator().manual_seed(seed) for seed in (1, 2))
         self.replay.set_rng(self.replay_rng)
         self.features = FrozenFeatures(
-            self.encoder, self.replay, mode=mode, pad=PAD, generator=self.shift_rng
+            self.encoder, self.replay, mode=mode, pad=PAD, slots=slots, generator=self.shift_rng
         )
         self.frames = torch.Generator().manual_seed(3)
         self.slots_seen: list[int] = []
@@ -123,3 +123,82 @@ def test_without_rebuilding_a_restored_replay_has_no_dense_features(tmp_path: Pa
     again.replay.load_state_dict(state)
     with pytest.raises(IndexError, match="never written"):
         again.sample()
+
+
+def largest_difference(ours: World, theirs: World) -> float:
+    samples = zip(ours.sample().values(), theirs.sample().values())
+    return max(float((one - other).abs().max()) for one, other in samples)
+
+
+def test_a_run_that_cannot_fill_the_replay_needs_two_slots_per_decision_and_no_less() -> None:
+    """Episodes of one decision are the worst case: each observation has a slot of its own and none is left over."""
+    decisions = CAPACITY
+    plain, enough = World("reencode"), World("dense", slots=dense_slots(World("dense").replay, decisions))
+    short = World("dense", slots=2 * decisions - 1)
+    assert short.features.slots < enough.features.slots == 2 * decisions < enough.replay.window
+    for world in (plain, enough, short):
+        for _ in range(decisions):
+            world.play(1)
+    states = [world.replay_rng.get_state() for world in (plain, enough, short)]
+    assert torch.equal(states[0], states[1])
+    assert max(largest_difference(enough, plain) for _ in range(5)) < 1e-4
+    plain.replay_rng.set_state(states[0])
+    plain.shift_rng.manual_seed(2)
+    assert max(largest_difference(short, plain) for _ in range(5)) > 1e-2
+
+
+def test_a_long_run_needs_no_more_slots_than_the_replay_has_rows() -> None:
+    replay = World("dense").replay
+    assert dense_slots(replay, 1_000_000) == replay.window < replay.frame_slots
+    assert dense_slots(replay, 1) == 2
+
+
+def test_a_run_resumed_with_a_larger_budget_has_the_same_features_in_more_slots(tmp_path: Path) -> None:
+    world = World("dense", tmp_path, slots=10)
+    for length in (2, 2, 3):
+        world.play(length)
+    state = world.replay.state_dict()
+    generators = [world.replay_rng.get_state(), world.shift_rng.get_state()]
+    expected = world.sample()
+    del world
+    again = World("dense", tmp_path, slots=24)
+    again.replay.load_state_dict(state)
+    again.replay_rng.set_state(generators[0])
+    again.shift_rng.set_state(generators[1])
+    again.features.rebuild(progress=False)
+    for key, value in again.sample().items():
+        assert torch.equal(value, expected[key]), key
+    for length in LENGTHS:
+        again.play(length)  # checks every observation that is taken in
+
+
+@pytest.mark.parametrize("mode", ["dense", "reencode"])
+def test_all_of_a_batch_is_where_the_features_are(mode: str) -> None:
+    replay = FrameReplay(CAPACITY, frame_shape=(3, SIZE, SIZE), action_dim=1)
+    encoder = make_encoder().to("meta")
+    features = FrozenFeatures(
+        encoder, replay, mode=mode, pad=PAD, generator=torch.Generator().manual_seed(0), device="meta"
+    )
+    frame = torch.zeros(3, SIZE, SIZE, dtype=torch.uint8)
+    slot = replay.begin_episode(frame)
+    for _ in range(3):
+        assert features.observe(frame.repeat(3, 1, 1), slot).shape == (1, encoder.feature_dim)
+        slot = replay.append(torch.zeros(1), 1.0, False, False, frame)
+    features.observe(frame.repeat(3, 1, 1), slot)
+    batch = features.sample(4)
+    needed = ("features", "action", ("next", "features"), ("next", "reward"), ("next", "terminated"))
+    assert {batch[key].device.type for key in needed} == {"meta"}
+    assert {value.device.type for value in batch.values(True, True)} == {"meta"}
+
+
+def test_a_slot_that_was_never_written_is_found_whatever_the_device() -> None:
+    replay = FrameReplay(CAPACITY, frame_shape=(3, SIZE, SIZE), action_dim=1)
+    generator = torch.Generator().manual_seed(0)
+    features = FrozenFeatures(
+        make_encoder().to("meta"), replay, mode="dense", pad=PAD, generator=generator, device="meta"
+    )
+    frame = torch.zeros(3, SIZE, SIZE, dtype=torch.uint8)
+    replay.begin_episode(frame)
+    replay.append(torch.zeros(1), 1.0, False, False, frame)
+    with pytest.raises(IndexError, match="never written"):
+        features.sample(4)

@@ -112,6 +112,16 @@ def test_reused_output_is_overwritten_by_the_next_call_only_when_asked_for(cache
         assert torch.equal(first, kept) is not reuse
 
 
+def test_a_clone_does_not_write_over_the_batch_of_the_original(cache, frames):
+    transform = DenseShiftFeatures(cache, generator=seeded(), reuse_output=True)
+    td = transitions(frames, 5)
+    first = transform(td.clone())["features"]
+    kept = first.clone()
+    second = transform.clone()(td.clone())["features"]
+    assert not torch.equal(second, kept)
+    assert torch.equal(first, kept)
+
+
 def test_a_changed_batch_size_gets_a_new_output(cache, frames):
     transform = DenseShiftFeatures(cache, reuse_output=True)
     assert transform(transitions(frames, 5))["features"].shape[0] == 5

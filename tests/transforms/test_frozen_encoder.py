@@ -82,6 +82,28 @@ def test_an_encoder_for_plain_batches_works_without_a_batch():
     assert td["features"].shape == (2 * (SIZE - 2) ** 2,)
 
 
+class _ElsewhereEncoder(nn.Module):
+    """Lives on "meta", where nothing can be copied back from, and answers from the CPU."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(1, device="meta"))
+        self.seen = []
+
+    def forward(self, pixels):
+        self.seen.append(pixels.device.type)
+        return torch.ones(pixels.shape[0], 3)
+
+
+def test_pixels_go_to_the_encoders_device_and_features_come_back():
+    encoder = _ElsewhereEncoder()
+    transform = FrozenEncoder(encoder)
+    assert transform(TensorDict(pixels=images(2)))["features"].device.type == "cpu"
+    assert encoder.seen == ["meta"]
+    with pytest.raises(NotImplementedError, match="copy out of meta"):  # the way back is attempted
+        FrozenEncoder(small_encoder().to("meta"))(TensorDict(pixels=images(2)))
+
+
 def test_missing_pixels_are_named():
     with pytest.raises(KeyError, match="frames"):
         FrozenEncoder(small_encoder(), in_keys="frames")(TensorDict(pixels=images(1)))

@@ -222,6 +222,8 @@ def test_a_replay_buffer_adds_beta_times_the_bonus_and_its_storage_stays(storage
         external = td["next", "reward"][sample["row"]]
         assert torch.equal(sample["next", "reward"], external + 0.2 * sample["next", "intrinsic_reward"])
         assert float(sample["next", "intrinsic_reward"].max()) > 0
+        buffer[torch.arange(B)]
+        buffer[: B - 1]
     for row in range(B):
         stored = buffer._storage.get(row)
         assert torch.equal(stored["next", "reward"], td["next", "reward"][row])
@@ -333,6 +335,16 @@ def test_a_queue_that_is_no_multiple_of_the_prototypes_is_refused_naming_both():
 def test_bad_settings_are_refused_by_name(changes, named):
     with pytest.raises(ValueError, match=named):
         on_latents(**changes)
+
+
+def test_projections_of_another_length_than_the_prototypes_are_refused():
+    with pytest.raises(ValueError, match="length 5, the prototypes 4"):
+        PrototypeReward(Projector(10, 5), Prototypes(8, 4), queue_size=32)
+    with pytest.raises(ValueError, match=f"length {D + 1}, the prototypes {D}"):
+        on_latents().intrinsic_reward(torch.randn(3, D + 1))
+    mute = PrototypeReward(torch.nn.Linear(10, 5), Prototypes(8, 4), queue_size=32)
+    with pytest.raises(ValueError, match="length 5, the prototypes 4"):
+        mute.intrinsic_reward(torch.randn(3, 10))
 
 
 def test_missing_entries_are_named():

@@ -77,9 +77,17 @@ def test_offsets_are_uniform_over_all_81_shifts():
 
 
 @pytest.mark.parametrize("bad", [[[9, 0]], [[0, -1]]])
-def test_an_offset_outside_the_padding_is_refused(bad):
+@pytest.mark.parametrize("requires_grad", [False, True])
+def test_an_offset_outside_the_padding_is_refused(bad, requires_grad):
     with pytest.raises(ValueError, match=r"0\.\.8"):
-        random_shift(torch.zeros(1, 1, 8, 8), torch.tensor(bad))
+        random_shift(torch.zeros(1, 1, 8, 8, requires_grad=requires_grad), torch.tensor(bad))
+
+
+def test_it_compiles_as_a_whole_with_and_without_a_gradient():
+    compiled = torch.compile(random_shift, fullgraph=True, backend="aot_eager")
+    offsets = draw_offsets(3, 4)
+    for pixels in (torch.rand(3, 2, 8, 8), torch.rand(3, 2, 8, 8, requires_grad=True)):
+        assert torch.equal(compiled(pixels, offsets), random_shift(pixels, offsets))
 
 
 def test_shapes_that_do_not_fit_are_refused():
@@ -146,13 +154,22 @@ def test_a_new_out_key_keeps_the_original():
 
 def test_a_replay_buffer_shifts_samples_and_leaves_its_storage_alone():
     buffer = ReplayBuffer(storage=LazyTensorStorage(32), batch_size=16)
-    buffer.extend(batch(32))
-    stored = buffer[:].clone()
+    stored = batch(32)
+    buffer.extend(stored.clone())
     buffer.append_transform(RandomShift(generator=torch.Generator().manual_seed(0)))
-    sampled = buffer.sample()
-    assert sampled["pixels"].dtype == torch.uint8
-    assert torch.equal(buffer._storage[:]["pixels"], stored["pixels"])
-    assert torch.equal(buffer._storage[:]["next", "pixels"], stored["next", "pixels"])
+    for read in (buffer.sample, lambda: buffer[torch.arange(32)], lambda: buffer[:20], lambda: buffer[3]):
+        sampled = read()
+        assert sampled["pixels"].dtype == torch.uint8
+        assert not torch.equal(sampled["pixels"], stored["pixels"][: len(sampled["pixels"])])
+        for key in ("pixels", ("next", "pixels")):
+            assert torch.equal(buffer._storage[:][key], stored[key])
+
+
+def test_reading_the_whole_of_a_full_buffer_hands_over_the_storage_as_documented():
+    buffer = ReplayBuffer(storage=LazyTensorStorage(32), batch_size=16)
+    buffer.extend(batch(32))
+    buffer.append_transform(RandomShift())
+    assert torch.equal(buffer[:]["pixels"], buffer._storage[:]["pixels"])
 
 
 def test_an_environment_shifts_resets_and_steps():

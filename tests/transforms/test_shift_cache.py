@@ -97,6 +97,16 @@ def test_reading_a_slot_that_was_never_written_is_refused(encoder):
         cache.gather(torch.tensor([0, 1, 2]), torch.zeros(3, 2, dtype=torch.int64))
 
 
+@pytest.mark.parametrize("slot", [-1, 3])
+def test_reading_outside_the_store_is_refused_and_negative_slots_do_not_wrap(encoder, slot):
+    cache = DenseShiftCache(encoder, 3)
+    cache.write(torch.arange(3), images(3))
+    with pytest.raises(
+        IndexError, match=rf"slots {min(slot, 0)}\.\.{max(slot, 0)} .* store of 3; use 0\.\.2"
+    ):
+        cache.gather(torch.tensor([slot, 0]), torch.zeros(2, 2, dtype=torch.int64))
+
+
 def test_writing_outside_the_store_is_refused(encoder):
     cache = DenseShiftCache(encoder, 3)
     for slot in (3, -1):

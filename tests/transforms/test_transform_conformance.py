@@ -1,4 +1,4 @@
-"""TorchRL's checks for its own transforms, on each of ours that an environment may carry."""
+"""TorchRL's checks for its own transforms, on each of ours."""
 
 from __future__ import annotations
 
@@ -9,13 +9,20 @@ from functools import partial
 import pytest
 import torch
 from fake_pixel_env import SIZE, FakePixelEnv, small_encoder, small_heads
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from crptpro.transforms import FrozenEncoder, PrototypeReward, RandomShift
+from crptpro.transforms import (
+    DenseShiftCache,
+    DenseShiftFeatures,
+    FrozenEncoder,
+    PrototypeReward,
+    RandomShift,
+)
 
 
 def shift_in_place():
@@ -30,51 +37,103 @@ def frozen_encoder():
     return FrozenEncoder(small_encoder())
 
 
+def reward(encoder, **options):
+    # Self-copies excluded, or a single environment would earn nothing.
+    return PrototypeReward(*small_heads(encoder), queue_size=16, knn_exclude_self=True, **options)
+
+
 def reward_in_place():
     encoder = small_encoder()
-    return Compose(FrozenEncoder(encoder), PrototypeReward(*small_heads(encoder), queue_size=16))
+    return Compose(FrozenEncoder(encoder), reward(encoder))
 
 
 def reward_to_a_new_key():
     encoder = small_encoder()
-    options = {"queue_size": 16, "in_keys": "z", "out_reward_key": "total"}
-    return Compose(FrozenEncoder(encoder, out_keys="z"), PrototypeReward(*small_heads(encoder), **options))
+    return Compose(FrozenEncoder(encoder, out_keys="z"), reward(encoder, in_keys="z", out_reward_key="total"))
 
 
 def everything():
     return Compose(RandomShift(), *reward_in_place().transforms)
 
 
+def dense_features():
+    cache = DenseShiftCache(small_encoder(), BATCH)
+    cache.write(torch.arange(BATCH), torch.randint(0, 256, (BATCH, 9, SIZE, SIZE), dtype=torch.uint8))
+    return DenseShiftFeatures(cache)
+
+
 def transformed(make):
     return TransformedEnv(FakePixelEnv(), make())
 
 
-FACTORIES = [
-    shift_in_place,
-    shift_to_a_new_key,
-    frozen_encoder,
-    reward_in_place,
-    reward_to_a_new_key,
-    everything,
-]
-each = pytest.mark.parametrize("make", FACTORIES)
+BATCH = 6
+BONUS = {("next", "intrinsic_reward"), ("next", "reward")}
+
+# What each changes in, or adds to, a replay batch.
+WRITES = {
+    shift_in_place: {"pixels", ("next", "pixels")},
+    shift_to_a_new_key: {"shifted"},
+    frozen_encoder: {"features"},
+    reward_in_place: {("next", "features")} | BONUS,
+    reward_to_a_new_key: {("next", "z"), ("next", "intrinsic_reward"), ("next", "total")},
+    everything: {"pixels", ("next", "pixels"), ("next", "features")} | BONUS,
+    dense_features: {"features", ("next", "features")},
+}
+each = pytest.mark.parametrize("make", [make for make in WRITES if make is not dense_features])
+# Starting processes takes about ten seconds: the one that contains the others stands for all in a quick run.
+each_in_processes = pytest.mark.parametrize(
+    "make",
+    [
+        make if make is everything else pytest.param(make, marks=pytest.mark.slow)
+        for make in WRITES
+        if make is not dense_features
+    ],
+)
+each_offline = pytest.mark.parametrize("make", list(WRITES))
 
 
-def sampled(count=6):
-    pixels = torch.randint(0, 256, (count, 9, SIZE, SIZE), dtype=torch.uint8)
-    return TensorDict(
-        {"pixels": pixels, "next": {"pixels": pixels.flip(0), "reward": torch.zeros(count, 1)}},
-        batch_size=[count],
-    )
+@pytest.fixture(autouse=True)
+def _seeded():
+    torch.manual_seed(0)
+
+
+def sampled():
+    pixels = torch.randint(0, 256, (BATCH, 9, SIZE, SIZE), dtype=torch.uint8)
+    rows = torch.arange(BATCH)
+    following = {"pixels": pixels.flip(0), "rows": rows.flip(0), "reward": torch.rand(BATCH, 1)}
+    return TensorDict({"pixels": pixels, "rows": rows, "next": following}, batch_size=[BATCH])
 
 
 def offline(make):
     """The transform with what it needs on a replay batch."""
-    if make in (shift_in_place, shift_to_a_new_key, frozen_encoder):
+    if make in (shift_in_place, shift_to_a_new_key, frozen_encoder, dense_features):
         return make()
     encoder = small_encoder()
-    encode = FrozenEncoder(encoder, in_keys=[("next", "pixels")], out_keys=[("next", "features")])
-    return Compose(encode, PrototypeReward(*small_heads(encoder), queue_size=16))
+    key, options = "features", {}
+    if make is reward_to_a_new_key:
+        key, options = "z", {"in_keys": "z", "out_reward_key": "total"}
+    encode = FrozenEncoder(encoder, in_keys=[("next", "pixels")], out_keys=[("next", key)])
+    return Compose(*([RandomShift()] if make is everything else []), encode, reward(encoder, **options))
+
+
+def changed(before: TensorDictBase, after: TensorDictBase) -> set:
+    """Keys that are new, or hold other values than before."""
+    known = set(before.keys(True, True))
+    return {
+        key for key in after.keys(True, True) if key not in known or not torch.equal(after[key], before[key])
+    }
+
+
+def assert_the_same(first, second):
+    """Two transforms do the same to two batches in a row: same draws, same queues."""
+    for seed in range(2):
+        td = sampled()
+        results = []
+        for transform in (first, second):
+            torch.manual_seed(seed)  # they share no generator, so both draw from the global one
+            results.append(transform(td.clone()))
+        assert changed(*results) == set()
+        assert set(results[0].keys(True, True)) == set(results[1].keys(True, True))
 
 
 @each
@@ -92,39 +151,34 @@ def test_transformed_serial_environment(make):
     check_env_specs(TransformedEnv(SerialEnv(2, FakePixelEnv), make()), seed=0)
 
 
-def test_parallel_environment_of_transformed_ones():
-    env = ParallelEnv(2, partial(transformed, everything))
+@each_in_processes
+def test_parallel_environment_of_transformed_ones(make):
+    env = ParallelEnv(2, partial(transformed, make))
     try:
         check_env_specs(env, seed=0)
     finally:
         env.close(raise_if_closed=False)
 
 
-def test_transformed_parallel_environment():
-    env = TransformedEnv(ParallelEnv(2, FakePixelEnv), everything())
+@each_in_processes
+def test_transformed_parallel_environment(make):
+    env = TransformedEnv(ParallelEnv(2, FakePixelEnv), make())
     try:
         check_env_specs(env, seed=0)
     finally:
         env.close(raise_if_closed=False)
 
 
-@each
+@each_offline
 def test_without_an_environment(make):
-    td = offline(make)(sampled())
-    for key in offline(make).out_keys:
-        assert key in td.keys(True, True)
+    td = sampled()
+    assert changed(td.clone(), offline(make)(td)) == WRITES[make]
 
 
-@each
+@each_offline
 def test_inside_a_compose_it_does_what_it_does_alone(make):
-    # Deep copies share no generator, so both draw from the global one.
     transform = offline(make)
-    alone, composed = copy.deepcopy(transform), Compose(copy.deepcopy(transform))
-    torch.manual_seed(0)
-    one = alone(sampled(4).zero_())
-    torch.manual_seed(0)
-    other = composed(sampled(4).zero_())
-    assert (one == other).all()
+    assert_the_same(Compose(copy.deepcopy(transform)), transform)
 
 
 @each
@@ -138,36 +192,52 @@ def test_reset_and_step_both_have_the_new_entries(make):
     assert after <= set(td["next"].keys(True, True))
 
 
-@each
+@each_offline
 def test_in_front_of_a_module(make):
-    model = nn.Sequential(offline(make), nn.Identity())
-    assert set(model(sampled()).keys(True, True)) >= {"pixels", ("next", "pixels")}
+    transform, td = offline(make), sampled()
+    for key in WRITES[make]:
+        torch.manual_seed(1)
+        alone = copy.deepcopy(transform)(td.clone())
+        torch.manual_seed(1)
+        model = nn.Sequential(copy.deepcopy(transform), TensorDictModule(nn.Identity(), [key], ["seen"]))
+        assert torch.equal(model(td.clone())["seen"], alone[key])
+        assert key in changed(td, alone)
 
 
-@each
+@each_offline
 def test_in_a_replay_buffer(make):
-    buffer = ReplayBuffer(storage=LazyTensorStorage(6), batch_size=4)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(BATCH), batch_size=4)
     stored = sampled()
     buffer.extend(stored.clone())
     buffer.append_transform(offline(make))
     sample = buffer.sample()
     assert sample.batch_size == (4,)
-    assert (buffer._storage[:] == stored).all()
+    assert changed(stored[sample["rows"]], sample) == WRITES[make]
+    assert changed(stored, buffer._storage[:]) == set()
 
 
-@each
+@each_offline
 def test_the_inverse_changes_nothing(make):
     td = sampled()
-    assert (offline(make).inv(td) == td).all()
+    assert changed(td, offline(make).inv(td.clone())) == set()
 
 
 @each
 def test_attaching_switches_to_evaluation_mode_and_it_still_acts(make):
     env = transformed(make)
     assert not env.transform.training
-    rollout = env.rollout(2)
-    for key in env.full_reward_spec.keys(True, True):
-        assert ("next", key) in rollout.keys(True, True) or key in rollout["next"].keys(True, True)
+    plain, rollout = FakePixelEnv().rollout(3), env.rollout(3)
+    new = set(rollout["next"].keys(True, True)) - set(plain["next"].keys(True, True))
+    assert new == {key[-1] if isinstance(key, tuple) else key for key in WRITES[make]} - {"pixels", "reward"}
+    for key in new:
+        assert rollout["next"][key].any(), key
+    is_shifted_in_place = make in (shift_in_place, everything)
+    for key in ("pixels", ("next", "pixels")):
+        assert torch.equal(rollout[key], plain[key]) is not is_shifted_in_place
+    if "intrinsic_reward" in new:
+        external = rollout["action"].mean(-1, keepdim=True)  # what the environment pays
+        total = rollout["next", "total" if "total" in new else "reward"]
+        torch.testing.assert_close(total, external + 0.2 * rollout["next", "intrinsic_reward"])
 
 
 @each
@@ -178,16 +248,21 @@ def test_a_clone_has_no_parent_and_can_be_attached_elsewhere(make):
     check_env_specs(TransformedEnv(FakePixelEnv(), clone), seed=0)
 
 
-@each
+@each_offline
+def test_a_clone_does_the_same_without_touching_the_original(make):
+    transform = offline(make)
+    transform(sampled())
+    untouched = copy.deepcopy(transform)
+    clone = transform.clone()
+    assert_the_same(clone, copy.deepcopy(transform))
+    assert_the_same(transform, untouched)
+
+
+@each_offline
 def test_it_is_picklable_before_and_after_use(make):
     transform = offline(make)
     for _ in range(2):
-        loaded = pickle.loads(pickle.dumps(transform))
-        torch.manual_seed(0)
-        one = transform(sampled(3).zero_())
-        torch.manual_seed(0)
-        other = loaded(sampled(3).zero_())
-        assert (one == other).all()
+        assert_the_same(pickle.loads(pickle.dumps(transform)), transform)
 
 
 @each

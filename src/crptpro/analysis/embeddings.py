@@ -8,6 +8,27 @@ import torch
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
+from crptpro.modules.placement import device_of
+
+
+def sample_pixels(dataset: ReplayBuffer, samples: int, *, seed: int) -> Tensor:
+    """Draw the same observations whenever asked with the same seed; the dataset's own generator is put back.
+
+    Args:
+        dataset: its samples hold ``pixels``.
+        samples: B, how many.
+        seed: which ones.
+
+    Returns:
+        ``[B, C, H, W]``, dtype and device as the dataset has them.
+    """
+    before = getattr(dataset, "_rng", None)  # TorchRL has a setter but no getter
+    dataset.set_rng(torch.Generator("cpu" if before is None else before.device).manual_seed(seed))
+    try:
+        return dataset.sample(samples)["pixels"]
+    finally:
+        dataset.set_rng(before)
+
 
 @torch.no_grad()
 def embed_samples(
@@ -18,22 +39,26 @@ def embed_samples(
     samples: int = 125,
     seed: int = 0,
 ) -> dict[str, Tensor]:
-    """Encode random observations of every dataset, without augmentation.
+    """Encode random observations of every dataset, without augmentation, where the encoder lives.
 
     Args:
         encoder: maps uint8 ``[B, C, H, W]`` to features ``[B, D]``.
-        datasets: domain name to replay buffer whose samples hold ``pixels``.
+        datasets: domain name to replay buffer whose samples hold ``pixels``; on any device. Their generators are
+            left as they were.
         projector: if given, embeddings are its outputs, else the features themselves.
         samples: observations per domain (125 in the paper's figure).
         seed: which observations.
 
     Returns:
-        Domain name to float32 embeddings ``[samples, D]``.
+        Domain name to float32 embeddings ``[samples, D]`` on the encoder's device.
+
+    Raises:
+        ValueError: images of another shape than the encoder takes.
     """
     embeddings = {}
     for name, dataset in datasets.items():
-        dataset.set_rng(torch.Generator().manual_seed(seed))
-        features = encoder(dataset.sample(samples)["pixels"])
+        pixels = sample_pixels(dataset, samples, seed=seed)
+        features = encoder(pixels.to(device_of(encoder) or pixels.device))
         embeddings[name] = (features if projector is None else projector(features)).float()
     return embeddings
 
@@ -42,18 +67,20 @@ def principal_components(points: Tensor, *, components: int = 3) -> tuple[Tensor
     """Project centred points on their leading principal directions.
 
     Args:
-        points: float ``[N, D]`` with ``N`` at least 2.
+        points: float ``[N, D]`` with ``N`` at least 2, not all equal.
         components: how many directions, at most ``min(N, D)``.
 
     Returns:
         Coordinates ``[N, components]`` and the fraction of the total variance each explains
-        ``[components]``, in decreasing order. The sign of each direction is fixed so that its
-        largest coordinate is positive.
+        ``[components]``, in [0, 1] and in decreasing order. The sign of each direction is fixed so that
+        its largest coordinate is positive.
 
     Raises:
-        ValueError: if ``components`` exceeds ``min(N, D)``.
+        ValueError: fewer than two points, or ``components`` outside ``1..min(N, D)``.
     """
-    if components > min(points.shape):
+    if points.shape[0] < 2:
+        raise ValueError(f"`points` must be at least 2, got {points.shape[0]}: one point has no variance.")
+    if not 1 <= components <= min(points.shape):
         raise ValueError(f"`components` must be at most min(N, D) = {min(points.shape)}, got {components}.")
     centred = (points - points.mean(0)).double()
     left, singular, _ = torch.linalg.svd(centred, full_matrices=False)

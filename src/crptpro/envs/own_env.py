@@ -75,7 +75,7 @@ def with_transform(env: EnvBase, transform: Transform) -> EnvBase:
 
 def repeats_actions(domain: Domain) -> bool:
     """Whether the domain's ``make`` takes ``action_repeat``; otherwise an agent step is an env step."""
-    return "action_repeat" in _accepted(domain.make, dict.fromkeys(_OFFERED))
+    return domain.make is None or "action_repeat" in _accepted(domain.make, dict.fromkeys(_OFFERED))
 
 
 def _accepted(make: Any, settings: dict[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,21 @@ from crptpro.cards import git_revision, hardware, versions
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return a Markdown table; columns are the keys of the first row, in order. No rows give an empty string."""
+    """Lay rows out as a Markdown table.
+
+    Args:
+        rows: column name to cell; columns are the keys of the first row, in order. A later row's missing cell
+            stays empty, its further keys are left out.
+
+    Returns:
+        The table without a newline at its end; an empty string for no rows.
+
+    Examples:
+        >>> print(markdown_table([{"task": "walker_run", "return": 512}]))
+        | task | return |
+        | --- | --- |
+        | walker_run | 512 |
+    """
     if not rows:
         return ""
     columns = list(rows[0])
@@ -35,13 +49,19 @@ def write_report(
     """Write a Markdown report beside its figures, whole or not at all.
 
     Args:
-        path: the ``.md`` file; figures are linked relative to it.
+        path: the ``.md`` file, in an existing directory; figures are linked relative to it.
         title: heading.
         command: what reproduces the run.
         summary: the result in a sentence or two.
         tables: heading to rows.
         figures: caption to picture.
         caveats: what the result does not show.
+
+    Returns:
+        ``path``.
+
+    Raises:
+        OSError: the file cannot be written; what was there before is kept.
     """
     path = Path(path)
     machine = hardware()

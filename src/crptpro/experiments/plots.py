@@ -12,11 +12,23 @@ from typing import Any
 from torch import Tensor
 from torchrl.data import ReplayBuffer
 
-from crptpro.analysis.embeddings import principal_components
+from crptpro.analysis.embeddings import principal_components, sample_pixels
 
 
 def read_columns(path: str | Path, *columns: str) -> list[tuple[float, ...]]:
-    """Return the rows of a CSV record in which every named column is filled, as floats."""
+    """Return the rows of a CSV record in which every named column is filled.
+
+    Args:
+        path: the record, with a header.
+        *columns: names; one that the record lacks leaves no row.
+
+    Returns:
+        A tuple of floats per row, in the order of ``columns``.
+
+    Raises:
+        FileNotFoundError: there is no such record.
+        ValueError: a cell that is no number.
+    """
     with open(path, newline="") as file:
         rows = list(csv.DictReader(file))
     return [tuple(float(row[c]) for c in columns) for row in rows if all(row.get(c) for c in columns)]
@@ -35,9 +47,15 @@ def plot_pretraining(record: str | Path, out: str | Path, *, num_prototypes: int
     """Draw the comparative loss against ``ln M``, assignment entropy, embedding cosine and prototypes in use.
 
     Args:
-        record: the ``pretrain.csv`` of a run.
+        record: the ``pretrain.csv`` of a run; a column that it lacks leaves its panel empty.
         out: picture to write (its suffix chooses the format).
         num_prototypes: ``M``.
+
+    Returns:
+        ``out``.
+
+    Raises:
+        FileNotFoundError: there is no such record, or no directory for the picture.
     """
     figure, axes = _figure(2, 2)
     uniform = math.log(num_prototypes)
@@ -70,11 +88,17 @@ def plot_learning_curves(
     """Draw mean episode return against env steps, with one standard deviation over episodes.
 
     Args:
-        records: label to the ``eval.csv`` of a run (one row per episode).
-        out: picture to write.
+        records: label to the ``eval.csv`` of a run (one row per episode, ``env_steps`` and ``episode_return``).
+        out: picture to write (its suffix chooses the format).
         training: label to the ``episodes.csv`` of a run: a dot per training episode, at its end.
         baseline: mean and standard deviation of the uniform random policy's episode returns.
         title: what is learned.
+
+    Returns:
+        ``out``.
+
+    Raises:
+        FileNotFoundError: there is no such record, or no directory for the picture.
     """
     figure, axes = _figure(width=7)
     axis = axes[0, 0]
@@ -108,13 +132,25 @@ def plot_learning_curves(
 
 
 def plot_stacks(datasets: Mapping[str, ReplayBuffer], out: str | Path, *, stacks: int = 4) -> Path:
-    """Show sampled observations, one domain a row: the pictures of each stack, oldest to newest, side by side."""
+    """Show sampled observations, one domain a row: the pictures of each stack, oldest to newest, side by side.
+
+    Args:
+        datasets: domain name to replay buffer whose samples hold ``pixels`` uint8 ``[B, 3k, H, W]``. Their
+            generators are left as they were.
+        out: picture to write (its suffix chooses the format).
+        stacks: observations per domain.
+
+    Returns:
+        ``out``.
+
+    Raises:
+        FileNotFoundError: there is no directory for the picture.
+    """
     import torch
 
     figure, axes = _figure(len(datasets), stacks, width=2.6, height=1.15)
     for row, (name, dataset) in zip(axes, datasets.items()):
-        dataset.set_rng(torch.Generator().manual_seed(0))
-        pixels = dataset.sample(stacks)["pixels"]  # (B, C, H, W)
+        pixels = sample_pixels(dataset, stacks, seed=0).cpu()  # (B, C, H, W)
         for axis, stack in zip(row, pixels):
             strip = torch.cat(list(stack.unflatten(0, (-1, 3))), -1)  # (3, H, W * frame_stack)
             axis.imshow(strip.permute(1, 2, 0).numpy())
@@ -125,10 +161,24 @@ def plot_stacks(datasets: Mapping[str, ReplayBuffer], out: str | Path, *, stacks
 
 
 def plot_embeddings(embeddings: Mapping[str, Tensor], out: str | Path, *, title: str = "") -> Path:
-    """Scatter the first two principal components of all domains' embeddings together, coloured by domain."""
+    """Scatter the first two principal components of all domains' embeddings together, coloured by domain.
+
+    Args:
+        embeddings: domain name to ``[N, D]``, as of :func:`~crptpro.analysis.embeddings.embed_samples`; D and
+            the number of all points at least 2.
+        out: picture to write (its suffix chooses the format).
+        title: what made them.
+
+    Returns:
+        ``out``.
+
+    Raises:
+        FileNotFoundError: there is no directory for the picture.
+        ValueError: fewer than two points, or dimensions.
+    """
     import torch
 
-    points = torch.cat(list(embeddings.values()))
+    points = torch.cat([part.cpu() for part in embeddings.values()])
     coordinates, explained = principal_components(points, components=2)
     figure, axes = _figure(width=5, height=4.2)
     axis = axes[0, 0]

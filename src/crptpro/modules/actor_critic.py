@@ -16,6 +16,8 @@ from crptpro.modules.precision import linear_in
 class FeatureTrunk(nn.Module):
     """Linear layer and LayerNorm that bring long features down to a bottleneck (no tanh, unlike DrQ).
 
+    Source: the trunk of denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
+
     Args:
         feature_dim: input length.
         bottleneck_dim: output length.
@@ -39,7 +41,7 @@ class FeatureTrunk(nn.Module):
 
 
 class MLP(nn.Module):
-    """Three linear layers with ReLU between them.
+    """Three linear layers with ReLU between them, as behind each trunk of denisyarats/proto ``proto.py``.
 
     Args:
         in_dim: input length.
@@ -152,7 +154,8 @@ class TwinCritic(nn.Module):
     """Two Q-functions that share ONE trunk, returned side by side.
 
     The 39,200 -> 50 trunk is shared and its output concatenated with the action, as in the released code; a
-    target network is a copy of the whole critic, trunk included.
+    target network is a copy of the whole critic, trunk included. Source: denisyarats/proto and
+    liuxin0824/CRPTpro ``proto.py``.
 
     Args:
         feature_dim: length of the features.

@@ -14,8 +14,10 @@ ATANH_MARGIN = 1e-6
 class SquashedGaussian(Distribution):
     """tanh of a diagonal Gaussian; samples are scored before the tanh.
 
-    Log-probabilities of the distribution's own samples (recognised by identity) use the stored pre-tanh noise
-    and are right at saturation. Any other action is inverted with a margin of 1e-6 from the bounds.
+    Log-probabilities of the distribution's own last sample (recognised by identity) use its pre-tanh noise and
+    are right at saturation; their gradient passes through the sample if it was reparameterised (``rsample``)
+    and takes it as given otherwise (``sample``). Any other action is inverted with a margin of 1e-6 from the
+    bounds.
 
     Args:
         loc: ``[*, A]``.
@@ -55,13 +57,21 @@ class SquashedGaussian(Distribution):
     def rsample(self, sample_shape: torch.Size | list[int] | tuple[int, ...] = ()) -> Tensor:
         """Draw reparameterised actions ``[*sample_shape, *, A]``."""
         loc = self.loc.expand(*sample_shape, *self.loc.shape)
-        action, log_prob = squashed_gaussian(loc, self.scale.expand_as(loc), standard_normal_like(loc, None))
-        self._last = (action, log_prob)
+        noise = standard_normal_like(loc, None)
+        action, _ = squashed_gaussian(loc, self.scale.expand_as(loc), noise)
+        self._last = (action, noise)
         return action
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density ``[*]`` of actions ``[*, A]`` in [-1, 1]."""
         if self._last is not None and value is self._last[0]:
-            return self._last[1]
+            noise = self._last[1]
+            if not value.requires_grad:
+                # The action is given: it stays where it is while the parameters move, so the noise must follow.
+                # Only its gradient is taken from the inversion, which rounds where loc is large beside scale.
+                pre_tanh = (self.loc + self.scale * noise).detach()
+                inverted = (pre_tanh - self.loc) / self.scale
+                noise = noise + (inverted - inverted.detach())
+            return squashed_gaussian(self.loc, self.scale, noise)[1]
         pre_tanh = torch.atanh(value.clamp(-1 + ATANH_MARGIN, 1 - ATANH_MARGIN))
         return squashed_gaussian(self.loc, self.scale, (pre_tanh - self.loc) / self.scale)[1]

@@ -109,15 +109,6 @@ class PixelEncoder(nn.Module):
         """The convolutions in order, each followed by a ReLU."""
         return cast("list[nn.Conv2d]", list(self.convs))
 
-    @property
-    def is_dense_shift_compatible(self) -> bool:
-        """Whether features of shifted images are crops of one dense map per stride phase.
-
-        True when no convolution pads, all kernels are 3x3 and only the first convolution has a stride, which
-        is 2.
-        """
-        return self.strides[0] == 2 and all(stride == 1 for stride in self.strides[1:])
-
     def forward(self, pixels: Tensor) -> Tensor:
         """Encode images.
 

@@ -17,7 +17,8 @@ class Projector(nn.Module):
     r"""One linear layer from features to the latent space: :math:`g_\theta`.
 
     Orthogonal weights (gain 1), zero bias. The product runs in ``compute_dtype``; the result has the
-    parameters' dtype, so normalisation, softmax and Sinkhorn stay float32.
+    parameters' dtype, so normalisation, softmax and Sinkhorn stay float32. Source: denisyarats/proto and
+    liuxin0824/CRPTpro ``proto.py`` (a single layer there too).
 
     Args:
         feature_dim: input length (39,200 for the default encoder).
@@ -43,6 +44,8 @@ class Projector(nn.Module):
 
 class Predictor(nn.Module):
     r"""Two-layer perceptron in the latent space, online branch only: :math:`v_\psi`.
+
+    Orthogonal weights (gain 1), zero biases. Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
 
     Args:
         latent_dim: input and output length D.
@@ -72,7 +75,8 @@ class Prototypes(nn.Module):
 
     Orthogonal initialisation (a tight frame when M > D). Training keeps the rows at unit length by calling
     :meth:`normalize_` before every update, as the released code does; every read goes through
-    :meth:`unit_weight`, so rows of any length give the same scores.
+    :meth:`unit_weight`, so rows of any length give the same scores. Source: denisyarats/proto and
+    liuxin0824/CRPTpro ``proto.py``; the idea is SwaV's (arXiv 2006.09882).
 
     Args:
         num_prototypes: M.
@@ -110,6 +114,16 @@ class Prototypes(nn.Module):
     def forward(self, latents: Tensor) -> Tensor:
         """Cosine scores ``[*, M]`` in [-1, 1] of l2-normalised latents ``[*, D]``."""
         return F.linear(latents, self.unit_weight())
+
+
+def latent_dim_of(head: nn.Module) -> int | None:
+    """Return the length D of the latents a head works in, where it says so, else None.
+
+    Args:
+        head: one of the above, or any module with a ``config`` that has ``"latent_dim"``.
+    """
+    config = getattr(head, "config", None)
+    return config.get("latent_dim") if isinstance(config, dict) else None
 
 
 def orthogonal_linear_(linear: nn.Linear, gain: float = 1.0) -> None:

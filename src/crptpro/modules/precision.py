@@ -20,6 +20,10 @@ _Module = TypeVar("_Module", bound=nn.Module)
 def resolve_precision(precision: Precision, device: torch.device | str) -> torch.dtype:
     """Turn a precision name into the compute dtype for a device.
 
+    PyTorch lets cuDNN convolutions round float32 factors to TF32's eleven significant bits by default. When
+    float32 is what comes out for a CUDA device, this switches TF32 off for convolutions and matrix products,
+    for the whole process, so that fp32 means the same on every device.
+
     Args:
         precision: ``"fp32"`` (the reference), ``"bf16"``, or ``"auto"``: bf16 where the hardware multiplies
             bf16 natively (CUDA compute capability 8 or newer; a CPU with AVX512-BF16 or AMX), otherwise fp32.
@@ -35,18 +39,17 @@ def resolve_precision(precision: Precision, device: torch.device | str) -> torch
         >>> resolve_precision("fp32", "cpu")
         torch.float32
     """
-    if precision == "fp32":
-        return torch.float32
-    if precision == "bf16":
-        return torch.bfloat16
-    if precision != "auto":
+    if precision not in ("auto", "fp32", "bf16"):
         raise ValueError(f"precision must be 'auto', 'fp32' or 'bf16', got {precision!r}.")
     device = torch.device(device)
+    if precision == "bf16" or (precision == "auto" and _multiplies_bf16(device)):
+        return torch.bfloat16
     if device.type == "cuda":
-        native = torch.cuda.get_device_capability(device)[0] >= 8
-    else:
-        native = device.type == "cpu" and _cpu_multiplies_bf16()
-    return torch.bfloat16 if native else torch.float32
+        # The older switches: every supported PyTorch has them, and reading them fails after the newer ones
+        # (fp32_precision) were set for one operation only.
+        torch.backends.cudnn.allow_tf32 = False
+        torch.backends.cuda.matmul.allow_tf32 = False
+    return torch.float32
 
 
 def set_compute_dtype(module: _Module, dtype: torch.dtype) -> _Module:
@@ -104,6 +107,12 @@ def _all_modules(module: nn.Module, seen: set[int]) -> Iterator[nn.Module]:
         for value in list(vars(child).values()):
             if isinstance(value, nn.Module):
                 yield from _all_modules(value, seen)
+
+
+def _multiplies_bf16(device: torch.device) -> bool:
+    if device.type == "cuda":
+        return torch.cuda.get_device_capability(device)[0] >= 8
+    return device.type == "cpu" and _cpu_multiplies_bf16()
 
 
 def _cpu_multiplies_bf16() -> bool:

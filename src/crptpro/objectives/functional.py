@@ -117,7 +117,7 @@ def knn_distances(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
         k: number of neighbours.
 
     Returns:
-        ``[N, k]``.
+        ``[N, k]``, non-negative, ascending along each row; at most 2 between unit vectors.
 
     Raises:
         ValueError: fewer keys than ``k``.
@@ -205,12 +205,11 @@ def info_nce(
         negatives: ``"positives"`` compares each anchor with all B positives (ATC); ``"both"`` compares each
             of the 2B views with the other 2B - 1 (SimCLR).
         valid: ``[B]`` bool; rows that are False do not count, but their positives stay as negatives. Rows of
-            both views for ``"both"``.
+            both views for ``"both"``. Anchors of invalid rows may be NaN (not for ``"both"``: negatives too).
         reduction: over the rows; the mean is over valid rows, 0 if there is none.
 
     Returns:
-        Scalar; for ``"none"`` ``[B]``, or ``[2B]`` for ``negatives="both"``, zero where invalid.
-        Non-negative, nats.
+        Non-negative, nats: scalar, or for ``"none"`` ``[B]`` (``"both"``: ``[2B]``), zero where invalid.
 
     Raises:
         ValueError: unknown ``negatives``.
@@ -218,7 +217,9 @@ def info_nce(
     count = anchors.shape[0]
     labels = torch.arange(count, device=anchors.device)
     if negatives == "positives":
-        logits = anchors @ positives.T / temperature  # (B, D) x (D, B) -> (B, B)
+        # Masking the loss alone would leave NaN in the backward, where its zero gradient multiplies the row.
+        queries = anchors if valid is None else anchors.where(valid.unsqueeze(-1), 0.0)
+        logits = queries @ positives.T / temperature  # (B, D) x (D, B) -> (B, B)
     elif negatives == "both":
         views = torch.cat([anchors, positives])
         itself = torch.eye(2 * count, dtype=torch.bool, device=anchors.device)

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictParams, dispatch
 from torch import Tensor, nn
 
 from crptpro.modules import Predictor, Projector, Prototypes
+from crptpro.modules.heads import latent_dim_of
 from crptpro.objectives import metrics
 from crptpro.objectives.base import PretrainingLoss
 from crptpro.objectives.functional import (
@@ -56,6 +57,9 @@ class ProtoLoss(PretrainingLoss):
         assignment_temperature: tau of the assignments; None follows ``temperature``.
         sinkhorn_iterations: scalings of the assignments.
         reduction: of ``loss_comp`` over the batch; ``loss_intr`` has no batch and stays a scalar.
+
+    Raises:
+        ValueError: a coefficient out of its range, or heads of different latent lengths.
 
     Returns (``forward``):
         Scalars ``loss_comp`` and ``loss_intr`` (already times alpha; their sum is minimised) and, detached,
@@ -126,6 +130,7 @@ class ProtoLoss(PretrainingLoss):
             predictor = Predictor(latent_dim, hidden_dim)
         if prototypes is None:
             prototypes = Prototypes(num_prototypes, latent_dim)
+        _check_latent_dims(projector=projector, predictor=predictor, prototypes=prototypes)
         self.convert_to_functional(encoder, "encoder", create_target_params=True)
         self.convert_to_functional(projector, "projector", create_target_params=True)
         self.convert_to_functional(predictor, "predictor")
@@ -198,6 +203,16 @@ class ProtoLoss(PretrainingLoss):
             F.normalize(targets, dim=-1) @ unit_prototypes.T,
             temperature=self.temperature if temperature is None else temperature,
             iterations=self.sinkhorn_iterations,
+        )
+
+
+def _check_latent_dims(**heads: nn.Module) -> None:
+    """Refuse heads that could not be multiplied; those that do not tell their length are left to the product."""
+    dims = {name: dim for name, head in heads.items() if (dim := latent_dim_of(head)) is not None}
+    if len(set(dims.values())) > 1:
+        told = ", ".join(f"{name} {dim}" for name, dim in dims.items())
+        raise ValueError(
+            f"The heads must share one latent length, got {told}; pass latent_dim= for those that are not given."
         )
 
 

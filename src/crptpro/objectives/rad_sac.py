@@ -47,8 +47,8 @@ class RADSACLoss(SACLoss):
     Args:
         actor: on features.
         critic: on features and actions; the target is a copy of all of it.
-        gamma: discount per agent step.
-        alpha_init: initial temperature.
+        gamma: discount per agent step, in [0, 1].
+        alpha_init: initial temperature, positive: its logarithm is what is learned.
         target_entropy: in nats; None for minus the action dimension.
         observation: key of the features; also read under ``"next"``. Change it, and the keys of action,
             reward, done and terminated, with ``set_keys``.
@@ -58,8 +58,13 @@ class RADSACLoss(SACLoss):
 
     Returns (``forward``):
         ``loss_actor``, ``loss_qvalue``, ``loss_alpha`` and, detached scalars, ``alpha``, ``entropy`` (-log
-        pi, nats), ``q_mean``, ``target_q_mean``, ``td_error`` (mean absolute). Non-finite input propagates;
+        pi, nats), ``q_mean``, ``target_q_mean``, ``td_error`` (mean over rows of the
+        larger of the two heads' absolute errors). Non-finite input propagates;
         the training loop checks. Batches of any shape, one row included.
+
+    Raises:
+        ValueError: ``gamma`` outside [0, 1], or an ``alpha_init`` that is not positive.
+        NotImplementedError: (``forward``) an unknown ``reduction``.
 
     Examples:
         >>> actor = SquashedGaussianActor(6, 2, hidden_dim=8)
@@ -110,6 +115,10 @@ class RADSACLoss(SACLoss):
         generator: torch.Generator | None = None,
         reduction: str | None = None,
     ) -> None:
+        if not 0 <= gamma <= 1:
+            raise ValueError(f"gamma must be in [0, 1], got {gamma}; 0.99 is usual.")
+        if not alpha_init > 0:
+            raise ValueError(f"alpha_init must be positive, got {alpha_init}; 0.1 is usual.")
         policy = ProbabilisticActor(
             TensorDictModule(actor, in_keys=[observation], out_keys=["loc", "scale"]),
             in_keys=["loc", "scale"],
@@ -264,6 +273,8 @@ class RADSACLoss(SACLoss):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore from a pickle or a deep copy, tying the networks to the copied parameters again."""
         super().__setstate__(state)
+        # SACLoss caches detached views of the critic's parameters; copied, they are views of nothing that trains.
+        self._erase_cache()
         self.actor_network_params.to_module(self.actor_network, preserve_module_state=False)
         self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False)
 

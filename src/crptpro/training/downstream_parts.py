@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 import torch
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from crptpro.data import FrameReplay
@@ -22,7 +24,7 @@ from crptpro.modules import (
 )
 from crptpro.objectives import RADSACLoss
 from crptpro.pretrained import Pretrained
-from crptpro.training.frozen_features import FrozenFeatures
+from crptpro.training.frozen_features import FrozenFeatures, dense_slots
 from crptpro.training.rad_sac_learner import RADSACLearner
 from crptpro.transforms import PrototypeReward, choose_feature_mode
 
@@ -49,7 +51,16 @@ def build_parts(
     generators: Mapping[str, torch.Generator],
     run_dir: Path,
 ) -> Parts:
-    """Build networks, replay, features and bonus; the encoder, projector and prototypes are frozen.
+    """Build networks, replay, features and bonus; encoder, projector and prototypes are frozen copies.
+
+    The artifact stays as it is, on its device and in its dtype: another run may hold it too.
+
+    Args:
+        pretrained: encoder, and projector and prototypes for the bonus.
+        env: what is learned in; read for its image, stack and action sizes.
+        config: every number.
+        generators: streams ``"replay"``, ``"shift"``, ``"bonus"`` and ``"policy"``.
+        run_dir: the replay's frames go below it.
 
     Raises:
         PretrainedError: if the artifact was made for other images than the environment's.
@@ -58,11 +69,13 @@ def build_parts(
     channels, image_size, _ = env.observation_spec["pixels"].shape
     pretrained.require(image_size=image_size, frame_stack=channels // 3)
     dtype = resolve_precision(config.precision, config.device)
-    frozen = [m for m in (pretrained.encoder, pretrained.projector, pretrained.prototypes) if m is not None]
-    for module in frozen:
-        set_compute_dtype(module.requires_grad_(False).eval().to(config.device), dtype)
+    networks = (pretrained.encoder, pretrained.projector, pretrained.prototypes)
+    encoder, projector, prototypes = copy.deepcopy(networks)
+    for module in (encoder, projector, prototypes):
+        if module is not None:
+            set_compute_dtype(module.requires_grad_(False).eval().to(config.device), dtype)
 
-    feature_dim, action_dim = pretrained.encoder.feature_dim, env.action_spec.shape[-1]
+    feature_dim, action_dim = encoder.feature_dim, env.action_spec.shape[-1]
     bottleneck, hidden = config.bottleneck_dim, config.hidden_dim
     actor = SquashedGaussianActor(feature_dim, action_dim, bottleneck_dim=bottleneck, hidden_dim=hidden)
     critic = TwinCritic(feature_dim, action_dim, bottleneck_dim=bottleneck, hidden_dim=hidden)
@@ -84,21 +97,22 @@ def build_parts(
     )
 
     replay = _build_replay(env, config, generators["replay"], run_dir)
-    observations = min(replay.window, _agent_steps(config))
+    slots = dense_slots(replay, _agent_steps(config))
     mode, reason = choose_feature_mode(
-        config.features, pretrained.encoder, observations, dtype, pad=config.shift_pad, device=config.device
+        config.features, encoder, slots, dtype, pad=config.shift_pad, device=config.device
     )
     logger.info("features: %s", reason)
     features = FrozenFeatures(
-        pretrained.encoder,
+        encoder,
         replay,
         mode=mode,
         pad=config.shift_pad,
+        slots=slots,
         generator=generators["shift"],
         device=config.device,
     )
-    bonus = _build_bonus(pretrained, config, generators["bonus"])
-    return Parts(pretrained.encoder, actor, learner, replay, features, bonus, mode)
+    bonus = _build_bonus(projector, prototypes, pretrained.queue, config, generators["bonus"])
+    return Parts(encoder, actor, learner, replay, features, bonus, mode)
 
 
 def _build_replay(
@@ -125,19 +139,23 @@ def _agent_steps(config: DownstreamConfig) -> int:
 
 
 def _build_bonus(
-    pretrained: Pretrained, config: DownstreamConfig, generator: torch.Generator
+    projector: nn.Module | None,
+    prototypes: nn.Module | None,
+    queue: Tensor | None,
+    config: DownstreamConfig,
+    generator: torch.Generator,
 ) -> PrototypeReward | None:
     if config.intrinsic_reward_coef == 0:
         return None
-    if pretrained.prototypes is None or pretrained.projector is None:
+    if prototypes is None or projector is None:
         logger.info("no exploration bonus: the artifact has no prototypes")
         return None
     return PrototypeReward(
-        pretrained.projector,
-        pretrained.prototypes,
+        projector,
+        prototypes,
         intrinsic_reward_coef=config.intrinsic_reward_coef,
         knn_k=config.knn_k,
         queue_size=config.queue_size,
-        queue=None if config.reset_queue else pretrained.queue,
+        queue=None if config.reset_queue else queue,
         generator=generator,
     )

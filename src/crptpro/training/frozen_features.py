@@ -19,11 +19,16 @@ class FrozenFeatures:
 
     Args:
         encoder: frozen, already in its compute dtype.
-        replay: where observations live; dense maps are kept for all that it can hold.
+        replay: where observations live.
         mode: ``"dense"`` or ``"reencode"``; see :func:`crptpro.transforms.choose_feature_mode`.
+        slots: observations to keep dense maps of; by default all that the replay can hold. A smaller number must
+            be at least the number of observations that will ever be stored; see :func:`dense_slots`.
         pad: largest random shift in pixels.
         generator: source of the shifts.
         device: where features live.
+
+    Raises:
+        ValueError: no slots, or (in mode ``"dense"``) an encoder without dense maps.
     """
 
     def __init__(
@@ -33,6 +38,7 @@ class FrozenFeatures:
         *,
         mode: Literal["dense", "reencode"],
         pad: int,
+        slots: int | None = None,
         generator: torch.Generator,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -40,10 +46,11 @@ class FrozenFeatures:
         self.replay = replay
         self.mode = mode
         self.device = torch.device(device)
+        self.slots = replay.window if slots is None else slots
         self.cache: DenseShiftCache | None = None
         if mode == "dense":
             self.cache = DenseShiftCache(
-                encoder, replay.window, pad=pad, dtype=encoder.compute_dtype, device=device
+                encoder, self.slots, pad=pad, dtype=encoder.compute_dtype, device=device
             )
         self.shifted = DenseShiftFeatures(
             self.cache,
@@ -75,15 +82,20 @@ class FrozenFeatures:
     def sample(self, batch_size: int) -> TensorDictBase:
         """Sample transitions with ``features`` and ``("next", "features")``, each observation under its own shift.
 
-        The features are valid until the next call.
+        Args:
+            batch_size: B.
+
+        Returns:
+            The replay's sample ``[B]`` with features ``[B, feature_dim]``, all on :attr:`device`. The features are
+            valid until the next call.
         """
         batch = self.replay.sample(batch_size, pixels=self.cache is None)
         if self.cache is None:
-            batch = batch.to(self.device)
-        else:
-            batch.set("cache_slot", self._cache_slots(batch["row"]))
-            batch.set(("next", "cache_slot"), self._cache_slots(batch["next", "row"]))
-        return self.shifted(batch)
+            return self.shifted(batch.to(self.device))
+        # Slots stay on the CPU until they are looked up: there the cache can check without waiting for a device.
+        batch.set("cache_slot", self._cache_slots(batch["row"]))
+        batch.set(("next", "cache_slot"), self._cache_slots(batch["next", "row"]))
+        return self.shifted(batch).to(self.device)
 
     def rebuild(self, *, progress: bool = True) -> None:
         """Encode again every stored observation, after the replay was restored from a checkpoint.
@@ -101,5 +113,19 @@ class FrozenFeatures:
 
     def _cache_slots(self, slots: Tensor) -> Tensor:
         # Live observations are among the newest `window` rows, so their numbers differ modulo `window`. The ring
-        # itself is longer by its slack, for which no maps are kept.
-        return self.replay.numbers_at(slots) % self.replay.window
+        # itself is longer by its slack, for which no maps are kept. With fewer slots no number ever reaches them.
+        return self.replay.numbers_at(slots) % self.slots
+
+
+def dense_slots(replay: FrameReplay, agent_steps: int) -> int:
+    """Return how many observations a run must keep dense maps of, so that no two live ones share a slot.
+
+    Args:
+        replay: where observations live.
+        agent_steps: decisions of the whole run, parts before a resumption included.
+
+    Returns:
+        What the replay can hold, or all that the run can store if that is less: each decision stores one
+        observation, each episode one more, and no episode is shorter than one decision.
+    """
+    return min(replay.window, 2 * agent_steps)

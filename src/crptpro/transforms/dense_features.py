@@ -122,6 +122,12 @@ class DenseShiftFeatures(Transform):
             tensordict.set(out_key, features.reshape(*lead, features.shape[-1]))
         return tensordict
 
+    def clone(self) -> DenseShiftFeatures:
+        """Return a transform without parent and with outputs of its own; cache, networks and generator are shared."""
+        copy = super().clone()
+        copy._outputs = {}
+        return copy
+
     def _dense(self, slots: Tensor, offsets: Tensor, out_key: NestedKey) -> Tensor:
         assert self.cache is not None
         if not self.reuse_output:

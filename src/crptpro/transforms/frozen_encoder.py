@@ -12,15 +12,21 @@ from torch import Tensor, nn
 from torchrl.data.tensor_specs import Composite, Unbounded
 from torchrl.envs.transforms import ModuleTransform
 
-from crptpro.transforms.keys import as_key_list, is_next
+from crptpro.modules.placement import device_of
+from crptpro.transforms.keys import as_key_list
+from crptpro.transforms.root_keys import KeyPair, OnRootKeys
 
 
-class FrozenEncoder(ModuleTransform):
+class FrozenEncoder(OnRootKeys, ModuleTransform):
     """Encode images without gradient, on environments (single and batched) and in replay buffers.
 
     The encoder is used by reference: nothing is copied and its ``requires_grad`` flags stay as they are, so
     an encoder that a loss is still training can be looked through at any time. Acting on an environment
     encodes what each reset and step returned; ``("next", ...)`` keys are for replay batches only.
+
+    An encoder may live on another device than the images: they are moved there, and the features come back to
+    where the images were. (Attaching a transform to an environment that has a device moves the transform, and
+    so the encoder, to that device: TorchRL does this to every transform.)
 
     TorchRL's ``ModuleTransform`` skips its module on reset (pytorch/rl#2595); this class does not.
 
@@ -66,19 +72,10 @@ class FrozenEncoder(ModuleTransform):
         Raises:
             KeyError: a key is missing.
         """
-        return self._encode(tensordict, self._pairs)
-
-    def _call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return self._encode(tensordict, self._root_pairs())
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._call(tensordict_reset)
-
-    def _root_pairs(self) -> list[tuple[NestedKey, NestedKey]]:
-        return [pair for pair in self._pairs if not is_next(pair[0])]
+        return self._apply_to(tensordict, self._pairs)
 
     @torch.no_grad()
-    def _encode(self, tensordict: TensorDictBase, pairs: list[tuple[NestedKey, NestedKey]]) -> TensorDictBase:
+    def _apply_to(self, tensordict: TensorDictBase, pairs: list[KeyPair]) -> TensorDictBase:
         encode = self.module[0].module
         for in_key, out_key in pairs:
             pixels = tensordict.get(in_key, None)
@@ -87,13 +84,6 @@ class FrozenEncoder(ModuleTransform):
                 raise KeyError(f"FrozenEncoder found no {in_key!r} among {present}; set in_keys.")
             tensordict.set(out_key, encode(pixels))
         return tensordict
-
-    def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Register the features; keys under ``"next"`` belong to replay batches and are not an env's."""
-        output_spec = output_spec.clone()
-        observation_spec = output_spec["full_observation_spec"]
-        output_spec["full_observation_spec"] = self.transform_observation_spec(observation_spec)
-        return output_spec
 
     @torch.no_grad()
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -114,7 +104,7 @@ class FrozenEncoder(ModuleTransform):
 
 
 class _AnyBatch(nn.Module):
-    """Give an image encoder any number of leading dimensions, none included."""
+    """Give an image encoder any number of leading dimensions, none included, and images of any device."""
 
     def __init__(self, encoder: nn.Module) -> None:
         super().__init__()
@@ -122,5 +112,6 @@ class _AnyBatch(nn.Module):
 
     def forward(self, pixels: Tensor) -> Tensor:
         lead = pixels.shape[:-3]
-        features = self.encoder(pixels.reshape(-1, *pixels.shape[-3:]))
+        device = device_of(self.encoder) or pixels.device
+        features = self.encoder(pixels.reshape(-1, *pixels.shape[-3:]).to(device)).to(pixels.device)
         return features.reshape(*lead, *features.shape[1:])

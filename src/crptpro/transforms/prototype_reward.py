@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchrl.data.tensor_specs import Composite, Unbounded
 from torchrl.envs.transforms import Transform
 
+from crptpro.modules.heads import latent_dim_of
 from crptpro.objectives.functional import knn_distance
 from crptpro.transforms.keys import as_key_list, with_next, without_next
 
@@ -37,7 +38,11 @@ class PrototypeReward(Transform):
     Works on replay batches (``forward``, keys under ``"next"``) and on environments. The candidates come
     from the batch at hand: on a single environment that is one sample, which fills the queue with itself
     and earns 0 unless ``knn_exclude_self``; use replay batches or many environments. Never put it on
-    evaluation environments. Stored rewards are never changed. Nothing depends on training mode.
+    evaluation environments. Sampling leaves stored rewards as they are; see :meth:`forward` for the one way
+    of reading a buffer that does not. Nothing depends on training mode.
+
+    Deviation: the released pre-training fills Q on the way and hands it over; here Q starts from zeros unless
+    ``queue`` is given.
 
     Args:
         projector: maps features to the latent space, frozen; None if ``in_keys`` already names projections.
@@ -65,7 +70,16 @@ class PrototypeReward(Transform):
 
     Raises:
         ValueError: a queue size that is no multiple of M, a queue of another shape, more than one key,
-            non-positive ``knn_k`` or ``candidate_temperature``, or an unknown ``reward_norm``.
+            non-positive ``knn_k`` or ``candidate_temperature``, an unknown ``reward_norm``, or a projector
+            whose outputs are not as long as the prototypes.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> bonus = PrototypeReward(None, torch.eye(4), queue_size=8)  # features that are projections already
+        >>> after = {"features": torch.randn(5, 4), "reward": torch.zeros(5, 1)}
+        >>> batch = bonus(TensorDict({"next": after}, [5]))
+        >>> torch.equal(batch["next", "reward"], 0.2 * batch["next", "intrinsic_reward"])
+        True
     """
 
     queue: Tensor
@@ -111,6 +125,9 @@ class PrototypeReward(Transform):
             raise ValueError(
                 f"expected a queue of shape {(queue_size, latent_dim)}, got {tuple(queue.shape)}."
             )
+        told = None if projector is None else latent_dim_of(projector)
+        if told is not None:
+            _check_latents(told, latent_dim)
         super().__init__(
             in_keys=[without_next(k) for k in in_keys], out_keys=[without_next(k) for k in out_keys]
         )
@@ -147,8 +164,12 @@ class PrototypeReward(Transform):
 
         Returns:
             float32 ``[B]``.
+
+        Raises:
+            ValueError: projections that are not as long as the prototypes.
         """
         latents = features if self.projector is None else self.projector(features)
+        _check_latents(latents.shape[-1], self.queue.shape[-1])
         latents = F.normalize(latents.float(), dim=-1)
         prototypes = self.prototypes
         weight = prototypes if isinstance(prototypes, Tensor) else prototypes.get_parameter("weight")
@@ -181,6 +202,10 @@ class PrototypeReward(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Add the bonus to a sampled batch, under ``"next"``.
+
+        As TorchRL's transforms do, this sets new tensors in the very tensordict it is given. A buffer's
+        ``sample()`` and ``buffer[indices]`` hand over a fresh one, so stored rewards stay as they are. Only
+        ``buffer[:]`` on a full tensor storage hands over the storage itself, whose rewards are then replaced.
 
         Raises:
             KeyError: features or reward are missing.
@@ -243,6 +268,13 @@ class PrototypeReward(Transform):
         for name in ("queue", "queue_pointer", "reward_square_sum", "reward_count"):
             copy._buffers[name] = getattr(self, name).clone()
         return copy
+
+
+def _check_latents(length: int, expected: int) -> None:
+    if length != expected:
+        raise ValueError(
+            f"projections have length {length}, the prototypes {expected}; use the projector they were trained with."
+        )
 
 
 def draw_candidates(logits: Tensor, generator: torch.Generator | None = None) -> Tensor:

@@ -12,7 +12,8 @@ from torchrl.data.tensor_specs import Composite
 from torchrl.envs.transforms import Transform
 
 from crptpro.transforms.host_memory import as_numpy_bits, empty_on_huge_pages
-from crptpro.transforms.keys import as_key_list, is_next
+from crptpro.transforms.keys import as_key_list
+from crptpro.transforms.root_keys import KeyPair, OnRootKeys
 
 DEFAULT_KEYS: list[NestedKey] = ["pixels", ("next", "pixels")]
 
@@ -56,7 +57,8 @@ def random_shift(pixels: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
         ``[B, C, H, W]``, same dtype and device.
 
     Raises:
-        ValueError: shapes that do not fit, or (on the CPU) an offset outside ``{0, ..., 2 * pad}``.
+        ValueError: shapes that do not fit, or an offset outside ``{0, ..., 2 * pad}`` (offsets on the CPU;
+            not under ``torch.compile``).
 
     Examples:
         >>> image = torch.arange(4).view(1, 1, 2, 2)
@@ -69,9 +71,11 @@ def random_shift(pixels: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
             f"random_shift expects pixels [B, C, H, W] and offsets [B, 2], "
             f"got {tuple(pixels.shape)} and {tuple(offsets.shape)}."
         )
-    if torch.compiler.is_compiling() or pixels.device.type != "cpu" or pixels.requires_grad:
+    if torch.compiler.is_compiling():
         return _shift_by_gather(pixels, offsets, pad)
     check_offsets(offsets, pad)
+    if pixels.device.type != "cpu" or pixels.requires_grad:
+        return _shift_by_gather(pixels, offsets, pad)
     return _shift_by_slices(pixels, offsets, pad)
 
 
@@ -122,7 +126,7 @@ def _shift_by_slices(pixels: Tensor, offsets: Tensor, pad: int) -> Tensor:
     return shifted
 
 
-class RandomShift(Transform):
+class RandomShift(OnRootKeys, Transform):
     """Shift images at random, for replay buffers (``forward``) and environments.
 
     Every key and every sample draws its own offset; all channels (stacked frames) of a sample share it. The
@@ -140,6 +144,15 @@ class RandomShift(Transform):
 
     Raises:
         ValueError: negative ``pad``, or ``in_keys`` and ``out_keys`` of unequal length.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> pixels = torch.arange(9, dtype=torch.uint8).view(1, 1, 3, 3)
+        >>> shift = RandomShift(pad=1, generator=torch.Generator().manual_seed(0))
+        >>> shift(TensorDict({"pixels": pixels}, [1]))["pixels"]
+        tensor([[[[3, 3, 4],
+                  [6, 6, 7],
+                  [6, 6, 7]]]], dtype=torch.uint8)
     """
 
     def __init__(
@@ -155,30 +168,25 @@ class RandomShift(Transform):
             raise ValueError(f"pad must not be negative, got {pad}.")
         if len(self.in_keys) != len(self.out_keys):
             raise ValueError(f"in_keys and out_keys differ in length: {self.in_keys} and {self.out_keys}.")
+        self._pairs = list(zip(self.in_keys, self.out_keys))
         self.pad = pad
         self.generator = generator
         self._optional = DEFAULT_KEYS[1:] if in_keys is None else []
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Shift every key of a sampled batch; new tensors are set, stored ones stay as they are.
+        """Shift every key of a sampled batch.
+
+        As TorchRL's transforms do, this sets new tensors in the very tensordict it is given. A buffer's
+        ``sample()`` and ``buffer[indices]`` hand over a fresh one, so what is stored stays as it is. Only
+        ``buffer[:]`` on a full tensor storage hands over the storage itself, which then holds the shifted
+        images.
 
         Raises:
             KeyError: a named key is missing.
         """
-        return self._shift(tensordict, list(zip(self.in_keys, self.out_keys)))
+        return self._apply_to(tensordict, self._pairs)
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._shift(next_tensordict, self._root_keys())
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._shift(tensordict_reset, self._root_keys())
-
-    def _root_keys(self) -> list[tuple[NestedKey, NestedKey]]:
-        return [pair for pair in zip(self.in_keys, self.out_keys) if not is_next(pair[0])]
-
-    def _shift(
-        self, tensordict: TensorDictBase, pairs: Sequence[tuple[NestedKey, NestedKey]]
-    ) -> TensorDictBase:
+    def _apply_to(self, tensordict: TensorDictBase, pairs: list[KeyPair]) -> TensorDictBase:
         for in_key, out_key in pairs:
             pixels = tensordict.get(in_key, None)
             if pixels is not None:
@@ -192,20 +200,13 @@ class RandomShift(Transform):
         offsets = draw_offsets(images.shape[0], self.pad, self.generator, images.device)
         return random_shift(images, offsets, pad=self.pad).reshape(obs.shape)
 
-    def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Register new root keys; keys under ``"next"`` belong to replay batches and are not an env's."""
-        output_spec = output_spec.clone()
-        observation_spec = output_spec["full_observation_spec"]
-        output_spec["full_observation_spec"] = self.transform_observation_spec(observation_spec)
-        return output_spec
-
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Give every out key the spec of its in key: a shift changes neither shape, dtype nor range.
 
         Raises:
             KeyError: the environment has no such observation.
         """
-        for in_key, out_key in self._root_keys():
+        for in_key, out_key in self._root_pairs():
             if in_key not in observation_spec.keys(True, True):
                 raise KeyError(f"RandomShift found no {in_key!r} in the observations {observation_spec}.")
             observation_spec[out_key] = observation_spec[in_key].clone()

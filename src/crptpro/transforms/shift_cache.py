@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 from typing import Literal
 
-import psutil
 import torch
 from torch import Tensor, nn
 
 from crptpro.modules import PixelEncoder
 from crptpro.transforms.dense_shift import crop_features, crop_rows, dense_shift_geometry, dense_shift_maps
+from crptpro.transforms.free_memory import free_bytes
 from crptpro.transforms.host_memory import empty_on_huge_pages
 
 FeatureMode = Literal["auto", "dense", "reencode"]
@@ -93,14 +93,7 @@ class DenseShiftCache:
         rows = torch.as_tensor(slots, dtype=torch.int64).reshape(-1)
         if rows.shape[0] != images.shape[0]:
             raise ValueError(f"got {rows.shape[0]} slots for {images.shape[0]} observations.")
-        if (
-            rows.device.type == "cpu"
-            and rows.numel()
-            and not 0 <= int(rows.min()) <= int(rows.max()) < self.slots
-        ):
-            raise IndexError(
-                f"slots {int(rows.min())}..{int(rows.max())} do not fit a store of {self.slots}."
-            )
+        self._require_inside(rows)
         chunk = max(1, self.encoder.micro_batch // self._maps.shape[1]) if self.device.type == "cpu" else 256
         for part_rows, part in zip(rows.split(chunk), images.split(chunk)):
             maps = dense_shift_maps(self.encoder, part, pad=self.pad, dtype=self.dtype)
@@ -122,7 +115,7 @@ class DenseShiftCache:
             ``[B, feature_dim]``: the encoder's features of ``random_shift(pixels, offsets)``, in its order.
 
         Raises:
-            IndexError: a slot that was never written (checked for slots on the CPU).
+            IndexError: a slot outside the store or never written (checked for slots on the CPU).
         """
         self._require_written(slots)
         return crop_rows(self._maps, slots, offsets, pad=self.pad, out=out)
@@ -153,7 +146,7 @@ class DenseShiftCache:
 
         Raises:
             RuntimeError: the cache was built without a projector.
-            IndexError: a slot that was never written (checked for slots on the CPU).
+            IndexError: a slot outside the store or never written (checked for slots on the CPU).
         """
         if self._embeddings is None:
             raise RuntimeError(
@@ -184,8 +177,18 @@ class DenseShiftCache:
             return empty_on_huge_pages(shape, dtype)
         return torch.empty(shape, dtype=dtype, device=self.device)
 
-    def _require_written(self, slots: Tensor) -> None:
+    def _require_inside(self, slots: Tensor) -> None:
         # Slots on a GPU are not read: that would wait for the device at every update.
+        if slots.device.type != "cpu" or slots.numel() == 0:
+            return
+        low, high = (int(bound) for bound in torch.aminmax(slots))
+        if low < 0 or high >= self.slots:
+            raise IndexError(
+                f"slots {low}..{high} do not fit a store of {self.slots}; use 0..{self.slots - 1}."
+            )
+
+    def _require_written(self, slots: Tensor) -> None:
+        self._require_inside(slots)
         if slots.device.type == "cpu" and not bool(self._written[slots].all()):
             missing = slots[~self._written[slots]].unique().tolist()
             raise IndexError(
@@ -212,7 +215,8 @@ def choose_feature_mode(
         encoder: the frozen encoder.
         slots: observations to hold.
         dtype: of the stored maps.
-        available_bytes: free memory, of which the cache may take four fifths; measured when None.
+        available_bytes: free memory, of which the cache may take four fifths; measured when None (on a CPU
+            within the limits of the container or batch job).
         pad: largest shift in pixels.
         latent_dim: length of the projections if they are to be kept too.
         device: whose memory is measured.
@@ -234,7 +238,7 @@ def choose_feature_mode(
             raise
         return "reencode", f"re-encoding at every update: {error}"
     needed = slots * (values * dtype.itemsize + (latent_dim or 0) * 4 * (2 * pad + 1) ** 2)
-    available = _available_bytes(torch.device(device)) if available_bytes is None else available_bytes
+    available = free_bytes(torch.device(device)) if available_bytes is None else available_bytes
     size = f"{needed / 2**30:.1f} GiB for {slots} observations, {available / 2**30:.1f} GiB free"
     if mode == "dense":
         return "dense", f"dense-shift cache, as asked ({size})"
@@ -244,12 +248,6 @@ def choose_feature_mode(
             f"re-encoding at every update: too little memory for the dense-shift cache ({size})",
         )
     return "dense", f"dense-shift cache ({size})"
-
-
-def _available_bytes(device: torch.device) -> int:
-    if device.type == "cuda":
-        return int(torch.cuda.mem_get_info(device)[0])
-    return int(psutil.virtual_memory().available)
 
 
 @torch.no_grad()

@@ -67,6 +67,7 @@ def pretrain(
         augment: ``"random_shift"`` (4 pixels, replicated border; independent per image and per sample),
             ``"none"``, or a function of a batch and a generator.
         precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (bf16 where the hardware multiplies it natively).
+            Deviation: the released code computes in fp32 throughout, which ``"fp32"`` gives.
         device: where to train. Directories are then opened on it: a GPU holds a copy of the frames.
         run_dir: record (``pretrain.csv``, ``metrics.jsonl``) and checkpoints; ``None`` writes nothing.
         logger: used instead of a local record in ``run_dir``, e.g. one that mirrors to W&B.

@@ -1,0 +1,59 @@
+"""What a downstream run is made of, and what it leaves alone."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from test_downstream import SMALL, small_pretrained, toy_env
+
+from crptpro.pretrained import Pretrained
+from crptpro.training import downstream_parts
+from crptpro.training.downstream_parts import Parts, build_parts
+
+
+def parts_of(pretrained: Pretrained, run_dir: Path, **settings: object) -> Parts:
+    config = dataclasses.replace(SMALL, **settings)
+    generators = {name: torch.Generator() for name in ("replay", "shift", "bonus", "policy")}
+    env = toy_env("toy", seed=0, image_size=16, frame_stack=3)
+    return build_parts(pretrained, env, config, generators, run_dir)
+
+
+def test_the_callers_artifact_is_neither_frozen_nor_cast_nor_moved(tmp_path: Path) -> None:
+    pretrained = small_pretrained()
+    networks = (pretrained.encoder, pretrained.projector, pretrained.prototypes)
+    before = [copy.deepcopy(network.state_dict()) for network in networks]
+    parts = parts_of(pretrained, tmp_path, precision="bf16")
+    assert parts.encoder.compute_dtype == parts.bonus.projector.compute_dtype == torch.bfloat16
+    assert not any(
+        p.requires_grad for p in [*parts.encoder.parameters(), *parts.bonus.projector.parameters()]
+    )
+    for network, state in zip(networks, before):
+        assert network.training
+        assert all(parameter.requires_grad for parameter in network.parameters())
+        assert getattr(network, "compute_dtype", torch.float32) == torch.float32
+        for key, value in network.state_dict().items():
+            assert torch.equal(value, state[key])
+    with torch.no_grad():
+        pretrained.encoder.convs[0].weight.zero_()  # somebody trains on
+    assert parts.encoder.convs[0].weight.any()
+
+
+@pytest.mark.parametrize(("env_steps", "slots"), [(10, 2 * 5), (100_000, 59)])
+def test_memory_is_measured_for_the_slots_that_are_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, env_steps: int, slots: int
+) -> None:
+    asked: list[int] = []
+    choose = downstream_parts.choose_feature_mode
+
+    def spy(mode: str, encoder: object, count: int, *rest: object, **options: object) -> tuple[str, str]:
+        asked.append(count)
+        return choose(mode, encoder, count, *rest, **options)
+
+    monkeypatch.setattr(downstream_parts, "choose_feature_mode", spy)
+    parts = parts_of(small_pretrained(), tmp_path, env_steps=env_steps, random_agent_steps=2)
+    assert parts.replay.window == 59
+    assert asked == [parts.features.cache.slots] == [slots]
