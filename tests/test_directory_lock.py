@@ -12,6 +12,7 @@ import pytest
 
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import CheckpointError, CRPTproError, DatasetError
+from crptpro.loggers import RunLogger
 
 
 @pytest.mark.parametrize("error", [CheckpointError, DatasetError])
@@ -59,3 +60,24 @@ def test_a_directory_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(DatasetError, match="file/data cannot be written"):
         DirectoryLock(tmp_path / "file" / "data", error=DatasetError)
+
+
+def test_holders_in_one_process_share_a_reentrant_lock_until_the_last_lets_go(tmp_path: Path) -> None:
+    script = f"from crptpro.directory_lock import DirectoryLock; DirectoryLock({str(tmp_path)!r}, is_reentrant=True)"
+    outer = DirectoryLock(tmp_path, is_reentrant=True)
+    with DirectoryLock(tmp_path, is_reentrant=True):
+        pass
+    refused = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert "Another process is writing to" in refused.stderr
+    outer.release()
+    subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_a_record_belongs_to_one_process(tmp_path: Path) -> None:
+    script = f"from crptpro.loggers import RunLogger; RunLogger({str(tmp_path)!r})"
+    with RunLogger(tmp_path) as logger:
+        logger.log({"loss": 1.0}, stream="pretrain", updates=1)
+        refused = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+        assert "CheckpointError" in refused.stderr
+        assert "Another process is writing to" in refused.stderr
+    subprocess.run([sys.executable, "-c", script], check=True)

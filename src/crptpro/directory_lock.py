@@ -8,6 +8,9 @@ from pathlib import Path
 
 from crptpro.errors import CRPTproError
 
+_held: dict[Path, tuple[int, int, int]] = {}
+"""Re-entrant locks of this process: handle, holders, and the process that took it (a fork inherits this table)."""
+
 
 class DirectoryLock:
     """Holds ``directory`` for this process, so that two of them never write one record; freed even by a kill.
@@ -17,16 +20,28 @@ class DirectoryLock:
     Args:
         directory: Made if it is missing; the lock is the file ``.lock`` in it, which stays.
         error: What is raised.
+        is_reentrant: Several re-entrant holders in one process share the lock: the record of a run and its training
+            loop.
 
     Raises:
         CRPTproError: (or ``error``) if another process holds the directory, or it cannot be written.
     """
 
-    def __init__(self, directory: str | Path, *, error: type[CRPTproError] = CRPTproError):
+    def __init__(
+        self, directory: str | Path, *, error: type[CRPTproError] = CRPTproError, is_reentrant: bool = False
+    ):
         path = Path(directory)
+        self._handle: int | None = None
+        self._shared_as: Path | None = None
         try:
             path.mkdir(parents=True, exist_ok=True)
-            self._handle: int | None = os.open(path / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
+            key = path.resolve()
+            if is_reentrant and key in _held and _held[key][2] == os.getpid():
+                handle, holders, process = _held[key]
+                _held[key] = (handle, holders + 1, process)
+                self._shared_as = key
+                return
+            self._handle = os.open(path / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as reason:
             raise error(f"{path} cannot be written: {reason}.") from reason
         try:
@@ -40,9 +55,19 @@ class DirectoryLock:
             ) from None
         except (ImportError, OSError):  # not POSIX, or a file system without locks: go on unguarded
             pass
+        if is_reentrant:
+            _held[key] = (self._handle, 1, os.getpid())
+            self._handle, self._shared_as = None, key
 
     def release(self) -> None:
-        """Free the directory; calling it twice is harmless."""
+        """Free the directory, once its last holder does; calling it twice is harmless."""
+        if self._shared_as is not None:
+            handle, holders, process = _held.pop(self._shared_as)
+            if holders > 1:
+                _held[self._shared_as] = (handle, holders - 1, process)
+            else:
+                self._handle = handle
+            self._shared_as = None
         if self._handle is not None:
             with contextlib.suppress(OSError):
                 os.close(self._handle)

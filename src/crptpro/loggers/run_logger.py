@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from crptpro.cards import provenance, write_json
-from crptpro.errors import CRPTproError
+from crptpro.directory_lock import DirectoryLock
+from crptpro.errors import CheckpointError, CRPTproError
 from crptpro.loggers.mirrors import Mirror, TensorboardMirror, WandbMirror, WandbOptions, main_counter
 from crptpro.loggers.record import RESERVED, MetricRecord, Scalar
 
@@ -22,7 +23,7 @@ class RunLogger:
     """Writes ``metrics.jsonl`` and one CSV per stream, and copies them to W&B and TensorBoard if asked.
 
     Rows are complete on disk when :meth:`log` returns. A mirror that fails is switched off with one warning;
-    the run goes on. Usable as a context manager.
+    the run goes on. Usable as a context manager. The directory is held for this process until :meth:`close`.
 
     Args:
         run_dir: directory of the run, created if missing; rows found there are continued.
@@ -30,6 +31,9 @@ class RunLogger:
             hardware, from the first row on.
         wandb: mirror to Weights & Biases; ``None`` for not.
         tensorboard: mirror to TensorBoard (needs the ``tensorboard`` extra).
+
+    Raises:
+        CheckpointError: if another process is running in ``run_dir``.
 
     Examples:
         >>> import tempfile
@@ -49,6 +53,8 @@ class RunLogger:
         tensorboard: bool = False,
     ) -> None:
         self.run_dir = Path(run_dir)
+        # Before the record is opened: opening repairs it, and a W&B run is one of this directory.
+        self._lock = DirectoryLock(self.run_dir, error=CheckpointError, is_reentrant=True)
         self.record = MetricRecord(self.run_dir)
         settings = _as_dict(config)
         # Written with the first row: a request that is refused must not replace the settings of the run it found.
@@ -136,9 +142,10 @@ class RunLogger:
         self._rewind(before)
 
     def close(self) -> None:
-        """Finish the mirrors; the record needs no closing."""
+        """Finish the mirrors and free the directory; every row is on disk already."""
         self._copy(lambda mirror: mirror.close())
         self._mirrors = []
+        self._lock.release()
 
     def _rewind(self, before: Iterable[str]) -> None:
         if not self._mirrors:

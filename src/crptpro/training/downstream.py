@@ -77,7 +77,7 @@ def train_downstream(
         pretrained = load_pretrained(pretrained)
     with contextlib.ExitStack() as stack:
         directory = Path(run_dir or stack.enter_context(tempfile.TemporaryDirectory(prefix="crptpro-")))
-        stack.enter_context(DirectoryLock(directory, error=CheckpointError))
+        stack.enter_context(DirectoryLock(directory, error=CheckpointError, is_reentrant=True))
         records = logger or stack.enter_context(
             RunLogger(directory, config={"task": task, **dataclasses.asdict(config)})
         )

@@ -116,7 +116,7 @@ def pretrain(
         for source in sources:
             source.require_fit(getattr(loss, "encoder", None))
         if run_dir is not None:
-            stack.enter_context(DirectoryLock(run_dir, error=CheckpointError))
+            stack.enter_context(DirectoryLock(run_dir, error=CheckpointError, is_reentrant=True))
             logger = logger or stack.enter_context(RunLogger(run_dir))
         run = PretrainRun(
             loss,
