@@ -46,7 +46,7 @@ def main(stage: str, run_dir: Path, updates: int, seed: int) -> None:
             finally:
                 os._exit(status)
         # Longer lives with every kill: on a busy machine the first ones may be too short for a single checkpoint.
-        deadline, status = time.monotonic() + rng.uniform(0.05, 0.7) * 1.1**kills, None
+        deadline, status = time.monotonic() + rng.uniform(0.05, 0.4) * 1.05**kills, None
         while status is None and time.monotonic() < deadline:
             done, code = os.waitpid(pid, os.WNOHANG)
             status = os.waitstatus_to_exitcode(code) if done else None

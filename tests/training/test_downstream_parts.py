@@ -16,7 +16,7 @@ from crptpro.training.downstream_parts import Parts, build_parts
 
 
 def parts_of(pretrained: Pretrained, run_dir: Path, **settings: object) -> Parts:
-    config = dataclasses.replace(SMALL, **settings)
+    config = dataclasses.replace(SMALL, action_repeat=2, **settings)
     generators = {name: torch.Generator() for name in ("replay", "shift", "bonus", "policy")}
     env = toy_env("toy", seed=0, image_size=16, frame_stack=3)
     return build_parts(pretrained, env, config, generators, run_dir)
