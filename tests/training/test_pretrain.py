@@ -26,6 +26,7 @@ from crptpro.objectives import MethodDefaults, registry
 from crptpro.pretrained import finetune, save_pretrained
 from crptpro.training import pretrain
 from crptpro.training.pretrain import learner
+from crptpro.training.pretrain import run as pretrain_run
 
 TIMED = {"unix_time_s", "updates_per_s", "resident_bytes"}
 
@@ -143,6 +144,19 @@ def test_a_finished_run_started_again_does_nothing_and_says_the_same(tmp_path: P
     assert again.metrics["loss_comp"] == pytest.approx(first.metrics["loss_comp"])
     assert again.collapse == first.collapse
     assert loss.training_record["updates"] == 8
+
+
+def test_the_training_record_names_the_versions_that_trained_not_those_that_looked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = make_loss()
+    run(first, 6, run_dir=tmp_path)
+    monkeypatch.setattr(pretrain_run, "provenance", lambda: {"versions": {"torch": "later"}})
+    again, further = make_loss(), make_loss()
+    run(again, 6, run_dir=tmp_path)
+    assert again.training_record["made_with"] == first.training_record["made_with"]
+    run(further, 8, run_dir=tmp_path)
+    assert further.training_record["made_with"]["versions"] == {"torch": "later"}
 
 
 def test_ctrl_c_writes_a_checkpoint_between_two_updates(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torchrl.objectives import LossModule
 
-from crptpro.cards import require_disk
+from crptpro.cards import provenance, require_disk
 from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
 from crptpro.seeding import global_rng_state, set_global_rng_state
@@ -76,6 +76,7 @@ class PretrainRun:
         self.is_repeated = False
         self.saved_at: int | None = None
         self.earlier_seconds = 0.0
+        self.made_with = provenance()
         self.started = self.row_started = self.saved_time = time.monotonic()
         self.row_updates = 0
         self.fingerprint = self._fingerprint()
@@ -147,6 +148,7 @@ class PretrainRun:
             "global_rng": global_rng_state(),
             "window": self.window.state_dict(),
             "monitor": self.monitor.state_dict(),
+            "made_with": self.made_with,
             "logger": None if self.logger is None else self.logger.state_dict([STREAM]),
         }
         self.checkpoints.save(state, counter=self.done)
@@ -174,7 +176,9 @@ class PretrainRun:
         )
         if self.logger is not None and state["logger"] is not None and not self.is_repeated:
             self.logger.load_state_dict(state["logger"])
-        if self.done < self.settings["updates"]:
+        if self.done == self.settings["updates"]:
+            self.made_with = state["made_with"]  # nothing is trained now: say what did it
+        else:
             _LOG.info("Pre-training continues from update %d.", self.done)
 
     def _update(self, log_interval: int) -> None:
@@ -237,6 +241,7 @@ class PretrainRun:
             "datasets": [source.facts() for source in self.sources],
             "metrics": metrics,
             "collapse": verdict,
+            "made_with": self.made_with,
             "started_from": getattr(self.loss, "started_from", None),
             "previous_training": getattr(self.loss, "previous_training", None),
         }
