@@ -230,8 +230,14 @@ def group_has_ended(group: int) -> bool:
 def start_collecting(tmp_path, root):
     program = tmp_path / f"{root.name}.py"
     program.write_text(textwrap.dedent(PROGRAM.format(here=str(HERE), root=str(root))))
-    # A group of its own, so that one kill ends the program and all its processes.
-    return subprocess.Popen([sys.executable, str(program)], start_new_session=True, stderr=subprocess.PIPE)
+    # A group of its own, so that one kill ends the program and all its processes; and Ctrl-C heeded, although a
+    # test suite that a script started in the background inherits that it is ignored.
+    return subprocess.Popen(
+        [sys.executable, str(program)],
+        start_new_session=True,
+        stderr=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
 
 
 def stop_while_collecting(process, journal, how, delay_s):

@@ -87,7 +87,7 @@ def variable_length(seed: int) -> int:
 
 
 def _pause_like_a_renderer(count: int) -> None:
-    time.sleep(0.03)
+    time.sleep(0.01)
 
 
 def _die(count: int) -> None:
