@@ -12,6 +12,7 @@ from crptpro.artifact import read_artifact, write_artifact
 from crptpro.cards import provenance
 from crptpro.errors import CheckpointError
 from crptpro.modules import PixelEncoder, SquashedGaussianActor
+from crptpro.modules.placement import device_of
 
 AGENT_FORMAT = "crptpro-agent"
 AGENT_VERSION = 1
@@ -32,7 +33,7 @@ class PixelAgent:
     @torch.no_grad()
     def __call__(self, pixels: Tensor) -> Tensor:
         """Return ``tanh`` of the mean, float32 ``[A]``, for uint8 ``[C, H, W]`` (no shift, no noise)."""
-        features = self.encoder(pixels.unsqueeze(0).to(_device_of(self.actor)))
+        features = self.encoder(pixels.unsqueeze(0).to(device_of(self.actor)))
         return self.actor.mode(features).squeeze(0).float().cpu()
 
 
@@ -77,7 +78,3 @@ def load_agent(path: str | Path) -> tuple[PixelAgent, dict[str, Any]]:
     except (KeyError, TypeError, ValueError, RuntimeError) as reason:
         raise CheckpointError(f"{path} holds no agent that can be rebuilt: {reason!r}") from reason
     return PixelAgent(encoder, actor), card
-
-
-def _device_of(module: nn.Module) -> torch.device:
-    return next(module.parameters()).device
