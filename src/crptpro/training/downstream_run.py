@@ -15,7 +15,6 @@ from torchrl.envs.utils import step_mdp
 from tqdm.auto import tqdm
 
 from crptpro.downstream_config import DownstreamConfig
-from crptpro.errors import NonFiniteError
 from crptpro.loggers import RunLogger
 from crptpro.pretrained import Pretrained
 from crptpro.seeding import derive_seed, seed_everything
@@ -25,14 +24,13 @@ from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.downstream_checkpoint import STREAMS
 from crptpro.training.downstream_parts import Parts, build_parts
 from crptpro.training.evaluate import evaluate, summarize
+from crptpro.training.finite import not_finite, require_finite_parameters
 from crptpro.training.stop_request import StopRequest
 from crptpro.training.video import write_video
 
 logger = logging.getLogger(__name__)
 
 EnvFactory = Callable[..., EnvBase]
-
-REMEDY = "The last checkpoint is kept; a smaller learning rate or precision='fp32' usually helps."
 
 
 class DownstreamRun:
@@ -178,9 +176,7 @@ class DownstreamRun:
         action, _ = self.parts.actor.sample(features, generator=self.generators["policy"])
         action = action.squeeze(0).float().cpu().clamp(-1, 1)
         if not torch.isfinite(action).all():
-            raise NonFiniteError(
-                f"The policy of {self.task} gave the action {action.tolist()} after update {self.updates}. {REMEDY}"
-            )
+            raise not_finite(f"After update {self.updates} the policy of {self.task} acts {action.tolist()}")
         return action
 
     def update(self) -> None:
@@ -217,9 +213,7 @@ class DownstreamRun:
         """
         for key, total in self.sums.items():
             if not torch.isfinite(total):
-                raise NonFiniteError(
-                    f"{key} of {self.task} became {total.item()} at or before update {self.updates}. {REMEDY}"
-                )
+                raise not_finite(f"Update {self.updates} or before: {key} of {self.task} is {total.item()}")
 
     def evaluate(self) -> None:
         """Run whole deterministic episodes in an environment of their own and record each."""
@@ -279,12 +273,7 @@ class DownstreamRun:
             NonFiniteError: naming a metric or a weight; earlier checkpoints are kept.
         """
         self.check_finite()
-        # The last update may have spoilt a weight that no metric has shown yet.
-        for name, weight in self.parts.learner.loss.named_parameters():
-            if not torch.isfinite(weight).all():
-                raise NonFiniteError(
-                    f"The weight {name} of {self.task} is not finite after update {self.updates}. {REMEDY}"
-                )
+        require_finite_parameters(self.parts.learner.loss, self.updates)
         checkpoints.save(downstream_checkpoint.state_of(self), counter=self.agent_steps)
 
     def resume(self, checkpoints: CheckpointDir) -> None:

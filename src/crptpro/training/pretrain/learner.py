@@ -11,8 +11,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule, SoftUpdate
 
-from crptpro.errors import NonFiniteError
 from crptpro.objectives import MethodDefaults
+from crptpro.training.finite import not_finite, require_finite_parameters
 
 
 class Learner:
@@ -100,10 +100,8 @@ class Learner:
             bad = [(int(u), name) for u, name in zip(self._first_bad.tolist(), self.names) if u >= 0]
             if bad:
                 index, name = min(bad)
-                raise NonFiniteError(_explain(f"Update {index + 1}: {name} is not finite"))
-        for name, parameter in self.loss.named_parameters():
-            if not torch.isfinite(parameter.detach().sum()) and not torch.isfinite(parameter.detach()).all():
-                raise NonFiniteError(_explain(f"After update {done} the parameter {name} is not finite"))
+                raise not_finite(f"Update {index + 1}: {name} is not finite")
+        require_finite_parameters(self.loss, done)
 
     def state_dict(self) -> dict[str, Any]:
         """Return weights, targets and optimiser state."""
@@ -138,9 +136,7 @@ class Learner:
                 self.names[: self._loss_count], values.tolist(), finite.tolist()
             ):
                 if not is_finite:
-                    raise NonFiniteError(
-                        _explain(f"Update {index + 1} on domain {domain!r}: {name} is {value}")
-                    )
+                    raise not_finite(f"Update {index + 1} on domain {domain!r}: {name} is {value}")
             return
         # No host synchronisation here: the first bad update of each term is remembered on the device.
         if self._first_bad is None:
@@ -186,10 +182,3 @@ def _keep_targets(loss: LossModule, tau: float) -> SoftUpdate:
     for name, target in kept.items():
         getattr(loss, name).data.update_(target)
     return updater
-
-
-def _explain(what: str) -> str:
-    return (
-        f"{what}. Training stopped and the last checkpoint is kept. "
-        "Lower the learning rate, use precision='fp32', or check the data."
-    )
