@@ -48,10 +48,15 @@ def hardware() -> dict[str, Any]:
         cpu = names[0].split(":", 1)[1].strip() if names else cpu
     return {
         "cpu": cpu,
-        "cpu_cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cpu_cores": cpu_cores(),
         "ram_bytes": psutil.virtual_memory().total,
         "gpus": [_gpu_name(index) for index in range(torch.cuda.device_count())],
     }
+
+
+def cpu_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _gpu_name(index: int) -> str:

@@ -86,8 +86,8 @@ class SACSettings:
         for name in ("learning_rate", "initial_temperature"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"`{name}` must be positive, got {getattr(self, name)}.")
-        for name in ("shift_pad", "intrinsic_reward_coef", "video_episodes"):
-            if getattr(self, name) < 0:
+        for name in ("shift_pad", "intrinsic_reward_coef", "video_episodes", "eval_workers"):
+            if (getattr(self, name, None) or 0) < 0:
                 raise ValueError(f"`{name}` must not be negative, got {getattr(self, name)}.")
         if self.replay_capacity < self.random_agent_steps:
             raise ValueError(
@@ -118,5 +118,11 @@ class DownstreamConfig(SACSettings):
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it. Deviation: the released code
     computes in fp32 throughout, which `fp32` gives"""
+    eval_workers: int | None = None
+    """processes that evaluate while training goes on (default: one per core, if there are several and the run has 20
+    evaluation episodes or more); 0 evaluates in between, in the training process"""
+    render_ahead: bool | None = None
+    """draw the next observation in a thread of its own while the update computes (default: on a CPU with several cores,
+    where the update does not run by itself as on a GPU)"""
     device: str = "cpu"
     """where networks and features live"""

@@ -29,6 +29,7 @@ SMALL = DownstreamConfig(
     checkpoint_interval_env_steps=20,
     log_interval_env_steps=20,
     precision="fp32",
+    eval_workers=0,
 )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +10,7 @@ from typing import Annotated
 import tyro
 from tyro.conf import Positional, arg, subcommand
 
+from crptpro.cards import cpu_cores
 from crptpro.cli.evaluate import Evaluate
 from crptpro.cli.pretraining import Finetune, Pretrain
 from crptpro.cli.request import Logging, expand_groups, require_device
@@ -53,7 +53,7 @@ class Collect:
     """transitions per domain (21 KB each)"""
     seed: int = 0
     """the same seed gives the same data whatever the number of workers"""
-    workers: int = field(default_factory=lambda: len(os.sched_getaffinity(0)))
+    workers: int = field(default_factory=cpu_cores)
     """collecting processes, shared by all domains (default: one per core)"""
     quality: Quality = "exact"
     """render quality; fast uses smaller shadow maps on software GL"""

@@ -20,7 +20,7 @@ STREAMS = ("train", "episodes", "eval")
 
 COUNTERS = ("agent_steps", "updates", "episodes", "last_eval", "next_eval", "next_checkpoint")
 
-FREE_TO_CHANGE = ("env_steps", "device", "features", "precision")
+FREE_TO_CHANGE = ("env_steps", "device", "features", "precision", "eval_workers", "render_ahead")
 """Settings that a run may be continued with other values of: budgets may grow, machines differ. What `auto` became
 is compared instead of what was asked."""
 
@@ -50,6 +50,7 @@ def state_of(run: DownstreamRun) -> dict[str, Any]:
         "sums": run.sums,
         "counts": run.counts,
         "records": run.records.state_dict(STREAMS),
+        "evaluation": run.evaluation.state_dict(),
     }
 
 
@@ -78,3 +79,4 @@ def restore(run: DownstreamRun, state: Mapping[str, Any]) -> None:
     set_global_rng_state(state["global_rng"])
     run.sums, run.counts = dict(state["sums"]), dict(state["counts"])
     run.records.load_state_dict(state["records"])
+    run.evaluation.load_state_dict(state["evaluation"], run.agent())

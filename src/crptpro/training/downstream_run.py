@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,9 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 from tqdm.auto import tqdm
 
+from crptpro.domains import get_domain
 from crptpro.downstream_config import DownstreamConfig
+from crptpro.envs import make_env
 from crptpro.loggers import RunLogger
 from crptpro.pretrained import Pretrained
 from crptpro.seeding import derive_seed, seed_everything
@@ -22,11 +25,11 @@ from crptpro.training import downstream_checkpoint
 from crptpro.training.agent import PixelAgent, save_agent
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.downstream_checkpoint import STREAMS
+from crptpro.training.downstream_evaluation import DownstreamEvaluation
 from crptpro.training.downstream_parts import Parts, build_parts
-from crptpro.training.evaluate import evaluate, summarize
+from crptpro.training.env_thread import EnvThread, runs_ahead
 from crptpro.training.finite import not_finite, require_finite_parameters
 from crptpro.training.stop_request import StopRequest
-from crptpro.training.video import write_video
 
 logger = logging.getLogger(__name__)
 
@@ -66,15 +69,19 @@ class DownstreamRun:
             "image_size": encoder.image_size,
             "frame_stack": encoder.in_channels // 3,
         }
-        self.env = env_factory(task, seed=config.seed, **settings)
-        self.make_eval_env = lambda: env_factory(task, seed=config.seed, **settings)
-        self.eval_env: EnvBase | None = None
+        # The domain itself and not its name, which may be registered in this process only.
+        name = get_domain(task) if env_factory is make_env else task
+        make_this_env = functools.partial(env_factory, name, seed=config.seed, **settings)
+        self.env = EnvThread(make_this_env, is_ahead=runs_ahead(config))
         self.generators = {
             name: torch.Generator().manual_seed(derive_seed(config.seed, "downstream", name))
             for name in ("replay", "shift", "bonus", "policy", "random_actions")
         }
-        self.parts: Parts = build_parts(pretrained, self.env, config, self.generators, run_dir)
+        self.parts: Parts = build_parts(pretrained, self.env.env, config, self.generators, run_dir)
         self.records = records
+        self.evaluation = DownstreamEvaluation(
+            task, make_this_env, config, records, run_dir, progress=progress
+        )
         self.pretrained_identity = pretrained.identity()
         self.agent_steps = self.updates = self.episodes = 0
         self.last_eval = -1
@@ -106,9 +113,11 @@ class DownstreamRun:
                 is_finished = self.env_steps >= config.env_steps
                 is_new = self.last_eval != self.env_steps
                 if is_new and (self.env_steps >= self.next_eval or is_finished):
-                    self.evaluate()
+                    self.evaluation.start(self.agent(), self.counters())
                     self.last_eval = self.env_steps
                     self.next_eval = self._after(config.eval_interval_env_steps)
+                if is_finished:
+                    self.evaluation.finish()
                 if checkpoints is not None and (
                     self.env_steps >= self.next_checkpoint or (is_finished and is_new)
                 ):
@@ -124,6 +133,11 @@ class DownstreamRun:
                     )
                     stop.leave()
                 self.run_episode(bar)
+                self.evaluation.collect()
+
+    def counters(self) -> dict[str, int]:
+        """Where the run is."""
+        return {"env_steps": self.env_steps, "agent_steps": self.agent_steps, "updates": self.updates}
 
     def _after(self, interval: int) -> int:
         return (self.env_steps // interval + 1) * interval
@@ -131,17 +145,18 @@ class DownstreamRun:
     def run_episode(self, bar: tqdm) -> None:
         """Act for one episode, or to the end of the budget, with one update per decision."""
         config, parts = self.config, self.parts
-        self.env.set_seed(derive_seed(config.seed, "downstream", "episode", self.episodes))
-        observation = self.env.reset()
+        observation = self.env.reset(derive_seed(config.seed, "downstream", "episode", self.episodes))
         slot = parts.replay.begin_episode(observation["pixels"][-3:])
         features = parts.features.observe(observation["pixels"], slot)
         episode_return, agent_steps, done = 0.0, 0, False
         while not done and self.env_steps < config.env_steps:
             action = self.act(features)
+            observation["action"] = action
+            # The action is chosen: the next picture can be drawn while the update computes.
+            self.env.begin_step(observation)
             if self.agent_steps >= config.random_agent_steps:
                 self.update()
-            observation["action"] = action
-            transition = self.env.step(observation)
+            transition = self.env.end_step()
             following = transition["next"]
             slot = parts.replay.append(
                 action,
@@ -171,7 +186,7 @@ class DownstreamRun:
             NonFiniteError: if the policy has diverged; no simulator should see that.
         """
         if self.agent_steps < self.config.random_agent_steps:
-            shape = self.env.action_spec.shape
+            shape = self.env.env.action_spec.shape
             return torch.rand(shape, generator=self.generators["random_actions"]) * 2 - 1
         action, _ = self.parts.actor.sample(features, generator=self.generators["policy"])
         action = action.squeeze(0).float().cpu().clamp(-1, 1)
@@ -215,32 +230,6 @@ class DownstreamRun:
             if not torch.isfinite(total):
                 raise not_finite(f"Update {self.updates} or before: {key} of {self.task} is {total.item()}")
 
-    def evaluate(self) -> None:
-        """Run whole deterministic episodes in an environment of their own and record each."""
-        config = self.config
-        self.eval_env = self.eval_env or self.make_eval_env()
-        episodes, videos = evaluate(
-            self.agent(),
-            self.eval_env,
-            episodes=config.eval_episodes,
-            seed=derive_seed(config.seed, "downstream", "evaluation", self.env_steps),
-            record_episodes=config.video_episodes,
-            progress=self.progress,
-        )
-        counters = {"env_steps": self.env_steps, "agent_steps": self.agent_steps, "updates": self.updates}
-        for e in episodes:
-            row = {"episode_return": e.episode_return, "episode_agent_steps": e.agent_steps, "seed": e.seed}
-            self.records.log(row, stream="eval", episode=e.episode, **counters)
-        for index, pictures in enumerate(videos):
-            path = self.run_dir / "videos" / f"env_steps_{self.env_steps:08d}_episode_{index}.mp4"
-            if write_video(pictures, path) is not None:
-                self.records.video("eval/video", path, env_steps=self.env_steps)
-        scores = summarize(episodes)
-        self.records.event(
-            f"{self.task}: {self.env_steps:,} env steps, {self.updates:,} updates, "
-            f"return {scores['mean']:.1f} ± {scores['std']:.1f} over {len(episodes)} episodes"
-        )
-
     def agent(self) -> PixelAgent:
         """Return the policy as it is now."""
         return PixelAgent(self.parts.encoder, self.parts.actor)
@@ -259,10 +248,11 @@ class DownstreamRun:
         return path
 
     def close(self) -> None:
-        """Free the render contexts."""
-        for env in (self.env, self.eval_env):
-            if env is not None:
-                env.close()
+        """Free the render contexts and end the evaluating processes."""
+        try:
+            self.evaluation.close()
+        finally:
+            self.env.close()
 
     # --- checkpoints --------------------------------------------------------------------------------------------
 

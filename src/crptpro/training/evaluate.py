@@ -47,7 +47,7 @@ def evaluate(
     """Run ``policy`` for whole episodes and return every episode's own return.
 
     The environment must carry no intrinsic reward. Episode ``e`` is seeded with
-    ``derive_seed(seed, "episode", e)``, so an evaluation is the same whatever was evaluated before.
+    ``episode_seed(seed, e)``, so an evaluation is the same whatever was evaluated before.
 
     Args:
         policy: maps one observation to one action.
@@ -70,26 +70,52 @@ def evaluate(
     bar = tqdm(
         range(episodes), desc="evaluate", unit="episode", leave=False, disable=None if progress else True
     )
-    for episode in bar:
-        episode_seed = derive_seed(seed, "episode", episode)
-        env.set_seed(episode_seed)
-        observation = env.reset()
-        pictures = [observation["pixels"][-3:].clone()] if episode < record_episodes else None
-        episode_return, agent_steps, done = 0.0, 0, False
-        while not done:
-            observation["action"] = policy(observation["pixels"])
-            transition = env.step(observation)
-            episode_return += transition["next", "reward"].item()
-            agent_steps += 1
-            done = bool(transition["next", "done"].item())
-            observation = step_mdp(transition)
-            if pictures is not None:
-                pictures.append(observation["pixels"][-3:].clone())
-        results.append(Episode(episode, episode_return, agent_steps, episode_seed))
+    for index in bar:
+        episode, pictures = run_episode(
+            policy, env, episode=index, seed=episode_seed(seed, index), is_recorded=index < record_episodes
+        )
+        results.append(episode)
         if pictures is not None:
-            videos.append(torch.stack(pictures))
+            videos.append(pictures)
         bar.set_postfix(mean_return=f"{sum(e.episode_return for e in results) / len(results):.1f}")
     return results, videos
+
+
+def run_episode(
+    policy: Policy, env: EnvBase, *, episode: int, seed: int, is_recorded: bool
+) -> tuple[Episode, Tensor | None]:
+    """Run ``policy`` for one whole episode.
+
+    Args:
+        policy: maps one observation to one action.
+        env: unbatched environment with ``pixels`` uint8 ``[C, H, W]``.
+        episode: index within the evaluation.
+        seed: what the environment is seeded with before its reset.
+        is_recorded: also return the pictures.
+
+    Returns:
+        The episode, and its RGB pictures uint8 ``[T + 1, 3, H, W]`` or ``None``.
+    """
+    env.set_seed(seed)
+    observation = env.reset()
+    pictures = [observation["pixels"][-3:].clone()] if is_recorded else None
+    episode_return, agent_steps, done = 0.0, 0, False
+    while not done:
+        observation["action"] = policy(observation["pixels"])
+        transition = env.step(observation)
+        episode_return += transition["next", "reward"].item()
+        agent_steps += 1
+        done = bool(transition["next", "done"].item())
+        observation = step_mdp(transition)
+        if pictures is not None:
+            pictures.append(observation["pixels"][-3:].clone())
+    result = Episode(episode, episode_return, agent_steps, seed)
+    return result, None if pictures is None else torch.stack(pictures)
+
+
+def episode_seed(seed: int, episode: int) -> int:
+    """Return what the environment of an evaluation's episode is seeded with."""
+    return derive_seed(seed, "episode", episode)
 
 
 def uniform_policy(env: EnvBase, *, seed: int) -> Policy:

@@ -1,0 +1,197 @@
+"""A downstream run's evaluations: on schedule, on a snapshot of the agent, every episode recorded."""
+
+from __future__ import annotations
+
+import copy
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from crptpro.cards import cpu_cores
+from crptpro.downstream_config import DownstreamConfig
+from crptpro.envs import needs_gl
+from crptpro.envs.rendering import backend_card, select_backend
+from crptpro.errors import CRPTproError, RenderingError, UnknownNameError
+from crptpro.loggers import RunLogger
+from crptpro.seeding import derive_seed
+from crptpro.training.agent import PixelAgent
+from crptpro.training.evaluate import Episode, evaluate, summarize
+from crptpro.training.evaluation_pool import EvaluationPool, can_be_sent
+from crptpro.training.video import write_video
+
+logger = logging.getLogger(__name__)
+
+WORTH_PROCESSES = 20
+"""Episodes of a run from which on processes of their own pay: starting one takes as long as running an episode."""
+
+
+class DownstreamEvaluation:
+    """Evaluates the agent in processes of its own, or in this one, and writes the ``eval`` stream.
+
+    In processes of its own an evaluation runs while training goes on; at most one at a time, so rows are in order.
+    Either way every decision is computed by one CPU thread (or the run's device in this process), and a CPU run's
+    numbers do not depend on which way it was.
+
+    Args:
+        task: for the announcements.
+        make_env: builds an environment with seeds of its own.
+        config: how many episodes, processes and videos.
+        records: where rows, events and videos go.
+        run_dir: videos go below it.
+        progress: show a bar.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        make_env: Callable[[], EnvBase],
+        config: DownstreamConfig,
+        records: RunLogger,
+        run_dir: Path,
+        *,
+        progress: bool,
+    ) -> None:
+        self.task, self.config, self.records, self.run_dir = task, config, records, run_dir
+        self.progress = progress
+        self._make_env = make_env
+        workers = eval_workers(task, make_env, config)
+        self._pool = EvaluationPool(make_env, workers=workers) if workers else None
+        self._env: EnvBase | None = None
+        self._pending: dict[str, Any] | None = None
+
+    def start(self, agent: PixelAgent, counters: Mapping[str, int]) -> None:
+        """Evaluate the agent as it is now; with processes of its own, return at once.
+
+        Args:
+            agent: what to evaluate.
+            counters: where the run is: ``env_steps`` and others, written into every row.
+        """
+        self.finish()
+        how = {
+            "episodes": self.config.eval_episodes,
+            "seed": derive_seed(self.config.seed, "downstream", "evaluation", counters["env_steps"]),
+            "record_episodes": self.config.video_episodes,
+        }
+        if self._pool is None:
+            self._env = self._env or self._make_env()
+            with _one_thread():
+                outcome = evaluate(agent, self._env, progress=self.progress, **how)
+            self._record(counters, *outcome)
+            return
+        self._pool.start(agent, **how)
+        actor = {key: value.cpu().clone() for key, value in agent.actor.state_dict().items()}
+        self._pending = {"counters": dict(counters), "actor": actor}
+
+    def collect(self) -> None:
+        """Record an evaluation that has been completed in the meantime."""
+        self._take(is_awaited=False)
+
+    def finish(self) -> None:
+        """Wait for the evaluation that is under way and record it."""
+        self._take(is_awaited=True)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the evaluation that is under way; its rows are in no checkpoint yet."""
+        return {"pending": self._pending}
+
+    def load_state_dict(self, state: Mapping[str, Any], agent: PixelAgent) -> None:
+        """Start again what was under way.
+
+        Args:
+            state: from :meth:`state_dict`.
+            agent: of the run; left as it is.
+        """
+        if state["pending"] is None:
+            return
+        actor = copy.deepcopy(agent.actor)
+        actor.load_state_dict(state["pending"]["actor"])
+        self.start(PixelAgent(agent.encoder, actor), state["pending"]["counters"])
+
+    def close(self) -> None:
+        """Free the render context and end the processes."""
+        if self._pool is not None:
+            self._pool.close()
+        if self._env is not None:
+            self._env.close()
+
+    def _take(self, *, is_awaited: bool) -> None:
+        if self._pool is None or self._pending is None:
+            return
+        outcome = self._pool.take(is_awaited=is_awaited)
+        if outcome is not None:
+            counters, self._pending = self._pending["counters"], None
+            self._record(counters, *outcome)
+
+    def _record(self, counters: Mapping[str, int], episodes: list[Episode], videos: list[Tensor]) -> None:
+        for e in episodes:
+            row = {"episode_return": e.episode_return, "episode_agent_steps": e.agent_steps, "seed": e.seed}
+            self.records.log(row, stream="eval", episode=e.episode, **counters)
+        env_steps = counters["env_steps"]
+        for index, pictures in enumerate(videos):
+            path = self.run_dir / "videos" / f"env_steps_{env_steps:08d}_episode_{index}.mp4"
+            if write_video(pictures, path) is not None:
+                self.records.video("eval/video", path, env_steps=env_steps)
+        scores = summarize(episodes)
+        self.records.event(
+            f"{self.task}: {env_steps:,} env steps, {counters['updates']:,} updates, "
+            f"return {scores['mean']:.1f} ± {scores['std']:.1f} over {len(episodes)} episodes"
+        )
+
+
+def eval_workers(task: str, make_env: Callable[[], EnvBase], config: DownstreamConfig) -> int:
+    """Return how many processes evaluate: as asked, or one per core where that works and pays; 0 is this process.
+
+    Args:
+        task: what is evaluated.
+        make_env: builds the environment.
+        config: what was asked.
+
+    Raises:
+        CRPTproError: processes were asked for, and cannot build the environment.
+        RenderingError: processes were asked for, and the GPU's driver does not render in so many at once.
+    """
+    asked = config.eval_workers
+    workers = min(cpu_cores() if asked is None else asked, config.eval_episodes)
+    evaluations = config.env_steps // config.eval_interval_env_steps + 1
+    pays = cpu_cores() > 1 and evaluations * config.eval_episodes >= WORTH_PROCESSES
+    if asked == 0 or (asked is None and not pays):
+        return 0
+    if not can_be_sent(make_env):
+        if asked is not None:
+            raise CRPTproError(
+                f"eval_workers is {asked}, but the environment of {task} cannot be built in another process: its "
+                "factory must be a function of an importable module. Move it there, or set eval_workers=0."
+            )
+        return 0
+    try:
+        _prove_rendering(task, workers)
+    except RenderingError as reason:
+        if asked is not None:
+            raise
+        logger.warning("%s Evaluating in this process instead.", reason)
+        return 0
+    return workers
+
+
+def _prove_rendering(task: str, workers: int) -> None:
+    """Some GPU drivers hang when several processes render; software does not."""
+    with suppress(UnknownNameError):  # only a caller's own factory knows the task
+        if needs_gl(task) and backend_card()["gl_kind"] == "hardware":
+            select_backend(processes=workers + 1)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Compute with one thread, as the evaluating processes do: sums of another order may round another way."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,88 @@
+"""An environment in a thread of its own: it simulates and renders while the caller's thread computes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+
+from crptpro.cards import cpu_cores
+from crptpro.downstream_config import DownstreamConfig
+
+T = TypeVar("T")
+
+
+class EnvThread:
+    """Makes, steps and closes one environment in one thread, where its render context lives.
+
+    MuJoCo lets other threads run while it simulates and draws. What the environment returns does not depend on when
+    it is asked, so running ahead changes no number.
+
+    Args:
+        make_env: builds the environment.
+        is_ahead: False does everything in the caller's thread, when it is asked for.
+    """
+
+    def __init__(self, make_env: Callable[[], EnvBase], *, is_ahead: bool) -> None:
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="environment") if is_ahead else None
+        self._pending: Future[TensorDictBase] | Callable[[], TensorDictBase] | None = None
+        try:
+            self.env: EnvBase = self._do(make_env)
+        except BaseException:
+            self._end_thread()
+            raise
+
+    def reset(self, seed: int) -> TensorDictBase:
+        """Seed the environment and start the episode that belongs to the seed."""
+
+        def reset() -> TensorDictBase:
+            self.env.set_seed(seed)
+            return self.env.reset()
+
+        return self._do(reset)
+
+    def begin_step(self, tensordict: TensorDictBase) -> None:
+        """Begin the step that ``tensordict["action"]`` asks for; nobody may change the tensordict until its end."""
+        if self._thread is None:
+            self._pending = lambda: self.env.step(tensordict)
+        else:
+            self._pending = self._thread.submit(self.env.step, tensordict)
+
+    def end_step(self) -> TensorDictBase:
+        """Wait for the step and return the tensordict with its ``"next"``; raises what the environment raised."""
+        pending, self._pending = self._pending, None
+        if pending is None:
+            raise RuntimeError("end_step() without begin_step().")
+        return pending.result() if isinstance(pending, Future) else pending()
+
+    def close(self) -> None:
+        """Let a step that has begun end, then free the render context."""
+        if isinstance(self._pending, Future):
+            self._pending.exception()
+        self._pending = None
+        try:
+            self._do(self.env.close)
+        finally:
+            self._end_thread()
+
+    def _do(self, work: Callable[[], T]) -> T:
+        return work() if self._thread is None else self._thread.submit(work).result()
+
+    def _end_thread(self) -> None:
+        if self._thread is not None:
+            self._thread.shutdown()
+
+
+def runs_ahead(config: DownstreamConfig) -> bool:
+    """Tell whether the next observation is drawn while the update computes: as asked, or where it pays.
+
+    A GPU computes by itself once it has been told to, and one core cannot do two things at a time.
+    """
+    if config.render_ahead is not None:
+        return config.render_ahead
+    # GLFW wants the main thread.
+    return config.device == "cpu" and cpu_cores() > 1 and os.environ.get("MUJOCO_GL") != "glfw"

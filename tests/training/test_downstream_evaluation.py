@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from test_downstream import SMALL, rows_without_time, toy_env, train
+from torchrl.envs import EnvBase
+
+from crptpro.errors import CRPTproError, RenderingError
+from crptpro.training import DownstreamConfig
+from crptpro.training.downstream_evaluation import eval_workers
+
+
+def sleepy_env(task: str, *, seed: int, **settings: object) -> EnvBase:
+    """The toy world; in an evaluating process it takes its time."""
+    env = toy_env(task, seed=seed, **settings)  # type: ignore[arg-type]
+    if "evaluation_worker" in " ".join(sys.orig_argv) and os.environ.get("TOY_IS_SLEEPY"):
+        env.base_env.on_step = lambda count: time.sleep(0.3)
+    return env
+
+
+def make_toy() -> EnvBase:
+    return toy_env("toy", seed=0, image_size=16, frame_stack=3)
+
+
+def test_processes_of_its_own_change_no_number(tmp_path: Path) -> None:
+    inline = train(tmp_path / "inline", eval_workers=0, render_ahead=False)
+    beside = train(tmp_path / "beside", eval_workers=2, render_ahead=True)
+    assert rows_without_time(beside.evaluations) == rows_without_time(inline.evaluations)
+    for key, value in inline.policy.actor.state_dict().items():
+        assert torch.equal(beside.policy.actor.state_dict()[key], value), key
+
+
+def test_an_evaluation_under_way_when_the_run_is_killed_is_done_again(tmp_path: Path) -> None:
+    program = """
+import sys
+from pathlib import Path
+from test_downstream import SMALL, small_pretrained
+from test_downstream_evaluation import sleepy_env
+from crptpro.training import train_downstream
+train_downstream("toy", small_pretrained(), run_dir=Path(sys.argv[1]), config=SMALL, env_factory=sleepy_env,
+                 progress=False, eval_workers=1)
+"""
+    here = Path(__file__).parent
+    path = os.pathsep.join([str(here), str(here.parent / "data"), *filter(None, sys.path)])
+    environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-c", program, str(tmp_path / "killed")]
+    run = subprocess.Popen(command, env={**environment, "TOY_IS_SLEEPY": "1"})
+    deadline = time.monotonic() + 120
+    # A checkpoint of the first episodes: the evaluation at 0 env steps takes 6 s longer than they do.
+    while not list((tmp_path / "killed").glob("checkpoints/*")):
+        assert run.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    time.sleep(0.3)  # until the checkpoint has its name
+    run.send_signal(signal.SIGKILL)
+    run.wait()
+    assert not (tmp_path / "killed" / "eval.csv").exists()
+    subprocess.run(command, env=environment, check=True, timeout=120)
+    whole = train(tmp_path / "whole")
+    killed = train(tmp_path / "killed")  # finished: only reads
+    assert rows_without_time(killed.evaluations) == rows_without_time(whole.evaluations)
+
+
+@pytest.mark.parametrize(
+    ("asked", "episodes", "cores", "expected"),
+    [
+        (None, 10, 2, 2),
+        (None, 10, 16, 10),
+        (None, 10, 1, 0),
+        (None, 1, 4, 0),  # 13 episodes in all: starting a process would take longer
+        (0, 10, 4, 0),
+        (3, 10, 1, 3),
+        (3, 2, 4, 2),
+    ],
+)
+def test_there_are_as_many_processes_as_asked_or_as_pay(
+    monkeypatch: pytest.MonkeyPatch, asked: int | None, episodes: int, cores: int, expected: int
+) -> None:
+    monkeypatch.setattr("crptpro.training.downstream_evaluation.cpu_cores", lambda: cores)
+    config = DownstreamConfig(env_steps=120_000, eval_workers=asked, eval_episodes=episodes)
+    assert eval_workers("toy", make_toy, config) == expected
+
+
+def test_a_factory_that_no_other_process_can_call_is_evaluated_here_or_refused() -> None:
+    assert eval_workers("toy", lambda: make_toy(), DownstreamConfig()) == 0
+    with pytest.raises(CRPTproError, match=r"eval_workers is 2, but .* toy .*set eval_workers=0"):
+        eval_workers("toy", lambda: make_toy(), DownstreamConfig(eval_workers=2))
+
+
+def test_a_gpu_that_does_not_render_in_many_processes_is_used_by_one(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    module = "crptpro.training.downstream_evaluation"
+    asked: list[int] = []
+
+    def refuse(*, processes: int) -> str:
+        asked.append(processes)
+        raise RenderingError("The first frame did not arrive from each of 3 processes.")
+
+    monkeypatch.setattr(f"{module}.cpu_cores", lambda: 2)
+    monkeypatch.setattr(f"{module}.backend_card", lambda: {"gl_kind": "hardware"})
+    monkeypatch.setattr(f"{module}.select_backend", refuse)
+    assert eval_workers("walker_walk", make_toy, DownstreamConfig()) == 0
+    assert "3 processes. Evaluating in this process instead." in caplog.text
+    assert asked == [3]
+    with pytest.raises(RenderingError):
+        eval_workers("walker_walk", make_toy, DownstreamConfig(eval_workers=2))
+
+
+def test_a_negative_number_of_processes_is_refused() -> None:
+    with pytest.raises(ValueError, match="`eval_workers` must not be negative, got -1"):
+        dataclasses.replace(SMALL, eval_workers=-1)
