@@ -122,6 +122,23 @@ def test_dense_and_reencoded_features_train_the_same_agent(tmp_path: Path) -> No
         assert float(dense[key]) == pytest.approx(float(reencoded[key]), rel=1e-3), key
 
 
+@pytest.mark.parametrize("features", ["dense", "reencode"])
+def test_kept_and_computed_embeddings_give_the_same_bonus(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, features: str
+) -> None:
+    settings = {"batch_size": 20, "shift_pad": 1, "features": features, "env_steps": 60}
+    kept = train(tmp_path / "kept", **settings)
+    monkeypatch.setattr("crptpro.training.downstream_parts._keeps_embeddings", lambda config: False)
+    computed = train(tmp_path / "computed", **settings)
+    rows = []
+    for run in ("kept", "computed"):
+        with open(tmp_path / run / "train.csv", newline="") as file:
+            rows.append([float(row["intrinsic_reward"]) for row in csv.DictReader(file)])
+    assert len(rows[0]) >= 2
+    assert rows[0] == pytest.approx(rows[1], rel=1e-4)
+    assert kept.env_steps == computed.env_steps
+
+
 def test_a_finished_run_returns_its_result_without_doing_anything_again(tmp_path: Path) -> None:
     first = train(tmp_path)
     record = (tmp_path / "eval.csv").read_bytes()

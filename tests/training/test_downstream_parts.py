@@ -57,3 +57,25 @@ def test_memory_is_measured_for_the_slots_that_are_taken(
     parts = parts_of(small_pretrained(), tmp_path, env_steps=env_steps, random_agent_steps=2)
     assert parts.replay.window == 59
     assert asked == [parts.features.cache.slots] == [slots]
+
+
+@pytest.mark.parametrize(
+    ("batch_size", "shift_pad", "is_kept"), [(512, 4, True), (162, 4, True), (161, 4, False), (18, 1, True)]
+)
+def test_embeddings_are_kept_where_a_batch_is_larger_than_all_shifts_of_two_observations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch_size: int, shift_pad: int, is_kept: bool
+) -> None:
+    asked: list[object] = []
+    choose = downstream_parts.choose_feature_mode
+
+    def spy(*args: object, latent_dim: int | None, **options: object) -> tuple[str, str]:
+        asked.append(latent_dim)
+        return choose(*args, latent_dim=latent_dim, **options)
+
+    monkeypatch.setattr(downstream_parts, "choose_feature_mode", spy)
+    parts = parts_of(small_pretrained(), tmp_path, batch_size=batch_size, shift_pad=shift_pad)
+    assert parts.features.cache.has_embeddings is is_kept
+    assert (parts.bonus.projector is None) is is_kept
+    assert asked == [4 if is_kept else None]
+    without_bonus = parts_of(small_pretrained(), tmp_path / "none", batch_size=512, intrinsic_reward_coef=0.0)
+    assert not without_bonus.features.cache.has_embeddings

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from crptpro.data import FrameReplay
-from crptpro.modules import PixelEncoder
+from crptpro.modules import PixelEncoder, Projector
 from crptpro.training.frozen_features import FrozenFeatures, dense_slots
 
 SIZE, PAD, CAPACITY, SLACK = 16, 2, 12, 9
@@ -21,13 +21,25 @@ def make_encoder() -> PixelEncoder:
 class World:
     """A replay of short episodes and the features of what is in it; the same for both ways to have them."""
 
-    def __init__(self, mode: str, path: Path | None = None, slots: int | None = None) -> None:
+    def __init__(
+        self,
+        mode: str,
+        path: Path | None = None,
+        slots: int | None = None,
+        projector: torch.nn.Module | None = None,
+    ) -> None:
         self.encoder = make_encoder()
         self.replay = FrameReplay(CAPACITY, frame_shape=(3, SIZE, SIZE), action_dim=1, path=path, slack=SLACK)
         self.replay_rng, self.shift_rng = (torch.Generator().manual_seed(seed) for seed in (1, 2))
         self.replay.set_rng(self.replay_rng)
         self.features = FrozenFeatures(
-            self.encoder, self.replay, mode=mode, pad=PAD, slots=slots, generator=self.shift_rng
+            self.encoder,
+            self.replay,
+            mode=mode,
+            pad=PAD,
+            slots=slots,
+            generator=self.shift_rng,
+            projector=projector,
         )
         self.frames = torch.Generator().manual_seed(3)
         self.slots_seen: list[int] = []
@@ -202,3 +214,24 @@ def test_a_slot_that_was_never_written_is_found_whatever_the_device() -> None:
     replay.append(torch.zeros(1), 1.0, False, False, frame)
     with pytest.raises(IndexError, match="never written"):
         features.sample(4)
+
+
+@pytest.mark.parametrize("mode", ["dense", "reencode"])
+def test_embeddings_are_the_projections_of_the_next_features(mode: str) -> None:
+    projector = Projector(make_encoder().feature_dim, 6).requires_grad_(False)
+    world = World(mode, projector=projector)
+    for length in LENGTHS:
+        world.play(length)
+        batch = world.features.sample(16)
+        expected = projector(batch["next", "features"])
+        torch.testing.assert_close(batch["next", "embedding"], expected, rtol=1e-4, atol=1e-5)
+        assert "embedding" not in batch.keys()  # noqa: SIM118 - iterating a TensorDict yields rows
+
+
+def test_dense_embeddings_are_kept_and_not_projected_again_when_sampled() -> None:
+    projector = Projector(make_encoder().feature_dim, 6).requires_grad_(False)
+    world = World("dense", projector=projector)
+    for length in LENGTHS:
+        world.play(length)
+    projector.register_forward_hook(lambda *call: pytest.fail("projected again"))
+    world.features.sample(16)

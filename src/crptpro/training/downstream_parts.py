@@ -98,8 +98,15 @@ def build_parts(
 
     replay = _build_replay(env, config, generators["replay"], run_dir)
     slots = dense_slots(replay, _agent_steps(config))
+    bonus = _build_bonus(projector, prototypes, pretrained.queue, config, generators["bonus"])
     mode, reason = choose_feature_mode(
-        config.features, encoder, slots, dtype, pad=config.shift_pad, device=config.device
+        config.features,
+        encoder,
+        slots,
+        dtype,
+        pad=config.shift_pad,
+        latent_dim=bonus.queue.shape[-1] if bonus is not None and _keeps_embeddings(config) else None,
+        device=config.device,
     )
     logger.info("features: %s", reason)
     features = FrozenFeatures(
@@ -110,8 +117,8 @@ def build_parts(
         slots=slots,
         generator=generators["shift"],
         device=config.device,
+        projector=projector if bonus is not None and _keeps_embeddings(config) else None,
     )
-    bonus = _build_bonus(projector, prototypes, pretrained.queue, config, generators["bonus"])
     return Parts(encoder, actor, learner, replay, features, bonus, mode)
 
 
@@ -134,6 +141,15 @@ def _build_replay(
     return replay
 
 
+def _keeps_embeddings(config: DownstreamConfig) -> bool:
+    """Whether projections are kept for every shift of an observation instead of computed in every update.
+
+    An update projects the whole batch, an agent step every shift of one observation; with a batch of twice as many
+    rows or more, keeping them costs less.
+    """
+    return config.batch_size >= 2 * (2 * config.shift_pad + 1) ** 2
+
+
 def _agent_steps(config: DownstreamConfig) -> int:
     return -(-config.env_steps // config.resolved_action_repeat)
 
@@ -150,9 +166,11 @@ def _build_bonus(
     if prototypes is None or projector is None:
         logger.info("no exploration bonus: the artifact has no prototypes")
         return None
+    keeps = _keeps_embeddings(config)
     return PrototypeReward(
-        projector,
+        None if keeps else projector,
         prototypes,
+        in_keys="embedding" if keeps else "features",
         intrinsic_reward_coef=config.intrinsic_reward_coef,
         knn_k=config.knn_k,
         queue_size=config.queue_size,

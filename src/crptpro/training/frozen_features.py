@@ -6,7 +6,7 @@ from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from crptpro.data import FrameReplay
@@ -26,6 +26,8 @@ class FrozenFeatures:
         pad: largest random shift in pixels.
         generator: source of the shifts.
         device: where features live.
+        projector: with one, ``sample`` also gives ``("next", "embedding")``, its output on the next features. In mode
+            ``"dense"`` it is kept for every shift of an observation, so that no update computes it.
 
     Raises:
         ValueError: no slots, or (in mode ``"dense"``) an encoder without dense maps.
@@ -41,6 +43,7 @@ class FrozenFeatures:
         slots: int | None = None,
         generator: torch.Generator,
         device: torch.device | str = "cpu",
+        projector: nn.Module | None = None,
     ) -> None:
         self.encoder = encoder
         self.replay = replay
@@ -50,14 +53,16 @@ class FrozenFeatures:
         self.cache: DenseShiftCache | None = None
         if mode == "dense":
             self.cache = DenseShiftCache(
-                encoder, self.slots, pad=pad, dtype=encoder.compute_dtype, device=device
+                encoder, self.slots, pad=pad, dtype=encoder.compute_dtype, device=device, projector=projector
             )
         self.shifted = DenseShiftFeatures(
             self.cache,
             mode=mode,
             encoder=encoder,
+            projector=projector,
             pad=pad,
             slot_keys=("cache_slot", ("next", "cache_slot")),
+            embedding_keys=None if projector is None else [None, ("next", "embedding")],
             generator=generator,
             reuse_output=True,
         )
@@ -86,8 +91,8 @@ class FrozenFeatures:
             batch_size: B.
 
         Returns:
-            The replay's sample ``[B]`` with features ``[B, feature_dim]``, all on :attr:`device`. The features are
-            valid until the next call.
+            The replay's sample ``[B]`` with features ``[B, feature_dim]``, and the next embeddings ``[B, D]`` with a
+            projector, all on :attr:`device`. The features are valid until the next call.
         """
         batch = self.replay.sample(batch_size, pixels=self.cache is None)
         if self.cache is None:
