@@ -10,6 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from crptpro.modules.chunks import apply_to_chunks
+
 KERNEL_SIZE = 3
 
 
@@ -40,8 +42,8 @@ class PixelEncoder(nn.Module):
         config: the constructor arguments, JSON-able.
         compute_dtype: ``torch.float32`` (the parameters' own dtype) or ``torch.bfloat16``; also the output
             dtype.
-        micro_batch: chunk length on CPU, where smaller chunks stay in cache; other devices take the whole
-            batch.
+        micro_batch: chunk length on CPU, where smaller chunks stay in cache and go to different cores; other
+            devices take the whole batch.
 
     Raises:
         ValueError: lists of unequal length, or an image too small for the convolutions.
@@ -142,13 +144,15 @@ class PixelEncoder(nn.Module):
         lead = pixels.shape[:-3]
         images = pixels.reshape(-1, *pixels.shape[-3:])
         chunk = self.micro_batch if pixels.device.type == "cpu" else 0
-        if chunk and images.shape[0] > chunk:
-            maps = torch.cat([self._convolve(part) for part in images.split(chunk)])
+        parameters = [p for conv in self.conv_layers for p in (conv.weight, cast(Tensor, conv.bias))]
+        if chunk and images.shape[0] > chunk and not images.requires_grad:
+            maps = apply_to_chunks(self._convolve, images.split(chunk), parameters)
         else:
-            maps = self._convolve(images)
+            maps = self._convolve(images, parameters)
         return maps.reshape(*lead, *maps.shape[1:])
 
-    def _convolve(self, images: Tensor) -> Tensor:
+    def _convolve(self, images: Tensor, parameters: Sequence[Tensor]) -> Tensor:
+        """Encode one chunk with weights and biases given in turn; called from several threads at a time."""
         low = self.compute_dtype != torch.float32
         if low:
             x = images.to(self.compute_dtype)
@@ -156,12 +160,11 @@ class PixelEncoder(nn.Module):
                 # In pixel units: 127.5 and its differences to 0..255 are exact in bfloat16.
                 x = x - self.pixel_offset / self.pixel_scale
         else:
-            x = images.to(self.conv_layers[0].weight.dtype) * self.pixel_scale
+            x = images.to(parameters[0].dtype) * self.pixel_scale
             if self.pixel_offset:
                 x = x - self.pixel_offset
         x = x.contiguous(memory_format=torch.channels_last)
-        for index, conv in enumerate(self.conv_layers):
-            weight, bias = conv.weight, cast(Tensor, conv.bias)
+        for index, (weight, bias) in enumerate(zip(parameters[::2], parameters[1::2])):
             if low:
                 weight = weight * self.pixel_scale if index == 0 else weight
                 weight, bias = weight.to(self.compute_dtype), bias.to(self.compute_dtype)

@@ -1,0 +1,119 @@
+"""The chunks of a batch side by side: each core does whole operations on its own chunk.
+
+PyTorch's way is that all cores share every operation and wait for each other at its end. For a convolution of a small
+chunk that wait is a good part of the time, and on a machine that is busy otherwise it is most of it: the cores that
+have finished spin until the slowest comes back. Here they meet once per batch.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+T = TypeVar("T")
+R = TypeVar("R")
+ChunkFunction = Callable[[Tensor, Sequence[Tensor]], Tensor]
+
+_pools: dict[int, ThreadPoolExecutor] = {}
+_pools_lock = threading.Lock()
+
+
+def apply_to_chunks(
+    function: ChunkFunction, chunks: Sequence[Tensor], parameters: Sequence[Tensor]
+) -> Tensor:
+    """Return ``torch.cat([function(chunk, parameters) for chunk in chunks])``, computed side by side.
+
+    The gradient of every parameter is the sum over the chunks in their order, whatever the number of threads.
+
+    Args:
+        function: maps a chunk ``[n, ...]`` and the parameters to ``[n, ...]``; must be thread-safe.
+        chunks: of the inputs, which receive no gradient.
+        parameters: all tensors that ``function`` may differentiate by.
+
+    Returns:
+        ``[sum of n, ...]``.
+    """
+    if torch.is_grad_enabled() and any(parameter.requires_grad for parameter in parameters):
+        return _Chunks.apply(function, chunks, *parameters)
+    return torch.cat(map_side_by_side(lambda chunk: function(chunk, parameters), chunks))
+
+
+def map_side_by_side(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
+    """Return ``[work(item) for item in items]``, on as many threads as PyTorch computes with here.
+
+    Each thread computes its operations alone. Gradient mode is the caller's.
+    """
+    threads = min(torch.get_num_threads(), len(items))
+    if threads <= 1:
+        return [work(item) for item in items]
+    is_recording = torch.is_grad_enabled()
+
+    def in_thread(item: T) -> R:
+        with torch.set_grad_enabled(is_recording):
+            return work(item)
+
+    return list(_pool(threads).map(in_thread, items))
+
+
+class _Chunks(torch.autograd.Function):
+    """Keeps one graph per chunk, so that the backward pass can go through them side by side too."""
+
+    @staticmethod
+    def forward(ctx: Any, function: ChunkFunction, chunks: Sequence[Tensor], *parameters: Tensor) -> Tensor:
+        needs = [parameter.requires_grad for parameter in parameters]
+
+        def record(chunk: Tensor) -> tuple[list[Tensor], Tensor]:
+            with torch.enable_grad():
+                leaves = [p.detach().requires_grad_(need) for p, need in zip(parameters, needs)]
+                output = function(chunk, leaves)
+            return [leaf for leaf in leaves if leaf.requires_grad], output
+
+        ctx.needs = needs
+        ctx.graphs = map_side_by_side(record, chunks)
+        return torch.cat([output.detach() for _, output in ctx.graphs])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
+        parts = gradient.split([output.shape[0] for _, output in ctx.graphs])
+
+        def differentiate(job: tuple[tuple[list[Tensor], Tensor], Tensor]) -> tuple[Tensor, ...]:
+            (leaves, output), part = job
+            # Kept, because the caller may ask the outer graph for a second pass; it is freed together with that one.
+            return torch.autograd.grad(output, leaves, part, retain_graph=True)
+
+        sums: list[Tensor] | None = None
+        for gradients in map_side_by_side(differentiate, list(zip(ctx.graphs, parts))):
+            sums = list(gradients) if sums is None else [a.add_(b) for a, b in zip(sums, gradients)]
+        found = iter(sums or [])
+        return (None, None, *[next(found) if need else None for need in ctx.needs])
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    with _pools_lock:
+        if threads not in _pools:
+            pool = ThreadPoolExecutor(threads, thread_name_prefix="chunks")
+            together = threading.Barrier(threads)
+
+            def compute_alone(_: int) -> None:
+                together.wait()  # so that every thread of the pool gets one of these calls
+                torch.get_num_threads()  # a thread's first question sets its number to the process's
+                torch.set_num_threads(1)
+
+            before = torch.get_num_threads()
+            list(pool.map(compute_alone, range(threads)))
+            # The number is kept per thread, but some libraries take the last one set for all.
+            torch.set_num_threads(before)
+            _pools[threads] = pool
+        return _pools[threads]
+
+
+# Threads do not survive a fork; a child makes its own.
+os.register_at_fork(after_in_child=_pools.clear)
