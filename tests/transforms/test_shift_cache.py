@@ -139,6 +139,13 @@ def test_auto_falls_back_with_a_one_line_reason(encoder, available, why):
     assert "\n" not in reason
 
 
+def test_a_cache_that_is_asked_for_and_may_not_fit_is_warned_of(caplog):
+    assert choose_feature_mode("dense", PixelEncoder(), 1000, torch.bfloat16, 2**40)[0] == "dense"
+    assert not caplog.records
+    assert choose_feature_mode("dense", PixelEncoder(), 1000, torch.bfloat16, 2**20)[0] == "dense"
+    assert "may not fit: 0.4 GiB for 1000 observations, 0.0 GiB free" in caplog.text
+
+
 def test_explicit_modes_are_obeyed_or_refused():
     assert choose_feature_mode("reencode", PixelEncoder(), 1)[0] == "reencode"
     assert choose_feature_mode("dense", PixelEncoder(), 10**9, torch.float32, 1)[0] == "dense"

@@ -241,6 +241,8 @@ def choose_feature_mode(
     available = free_bytes(torch.device(device)) if available_bytes is None else available_bytes
     size = f"{needed / 2**30:.1f} GiB for {slots} observations, {available / 2**30:.1f} GiB free"
     if mode == "dense":
+        if needed > available:
+            logger.warning("The dense-shift cache was asked for and may not fit: %s.", size)
         return "dense", f"dense-shift cache, as asked ({size})"
     if needed > MEMORY_SHARE * available:
         return (
