@@ -105,7 +105,7 @@ def build_parts(
         slots,
         dtype,
         pad=config.shift_pad,
-        latent_dim=bonus.queue.shape[-1] if bonus is not None and _keeps_embeddings(config) else None,
+        latent_dim=bonus.queue.shape[-1] if bonus is not None and keeps_embeddings(config) else None,
         device=config.device,
     )
     logger.info("features: %s", reason)
@@ -117,7 +117,7 @@ def build_parts(
         slots=slots,
         generator=generators["shift"],
         device=config.device,
-        projector=projector if bonus is not None and _keeps_embeddings(config) else None,
+        projector=projector if bonus is not None and keeps_embeddings(config) else None,
     )
     return Parts(encoder, actor, learner, replay, features, bonus, mode)
 
@@ -141,7 +141,7 @@ def _build_replay(
     return replay
 
 
-def _keeps_embeddings(config: DownstreamConfig) -> bool:
+def keeps_embeddings(config: DownstreamConfig) -> bool:
     """Whether projections are kept for every shift of an observation instead of computed in every update.
 
     An update projects the whole batch, an agent step every shift of one observation; with a batch of twice as many
@@ -166,7 +166,7 @@ def _build_bonus(
     if prototypes is None or projector is None:
         logger.info("no exploration bonus: the artifact has no prototypes")
         return None
-    keeps = _keeps_embeddings(config)
+    keeps = keeps_embeddings(config)
     return PrototypeReward(
         None if keeps else projector,
         prototypes,
