@@ -9,7 +9,7 @@ one thread (``LP_NUM_THREADS=1``), domain by domain, blocks of transitions in tu
   does in a worker and its parent: every block is an episode of its own (one more image, for its first observation),
   its physical state, checksums, and files synced to the disk.
 
-Neither stacks frames. The rest is ``collect_random`` as it is, with its processes.
+Neither stacks frames. CPU time stands beside wall time: it shows that no candidate had more than its core. The rest is ``collect_random`` as it is, with its processes.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ from crptpro.console import run_main
 from crptpro.envs import make_env
 from crptpro.envs.rendering import backend_card, select_backend
 from crptpro.quality import Quality
+
+logger = logging.getLogger("crptpro.benchmarks.collection")
 
 STOCK = "TorchRL"
 EXACT, FAST = "crptpro, exact", "crptpro, fast"
@@ -86,7 +88,9 @@ def main(settings: Settings) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="crptpro-collection-", dir=settings.scratch) as work:
         with one_core():
             for domain in settings.domains:
+                logger.info("%s, on one core", domain)
                 alone[domain], stored[domain] = _compare(domain, settings, Path(work) / domain)
+        logger.info("%s, with %s workers", settings.pool_domain, settings.workers)
         pool = worker_rates(
             settings.pool_domain,
             Path(work),
