@@ -9,7 +9,8 @@ one thread (``LP_NUM_THREADS=1``), domain by domain, blocks of transitions in tu
   does in a worker and its parent: every block is an episode of its own (one more image, for its first observation),
   its physical state, checksums, and files synced to the disk.
 
-Neither stacks frames. CPU time stands beside wall time: it shows that no candidate had more than its core. The rest is ``collect_random`` as it is, with its processes.
+Neither stacks frames. CPU time stands beside wall time: it shows that no candidate had more than its core. The rest
+is ``collect_random`` as it is, with its processes.
 """
 
 from __future__ import annotations
