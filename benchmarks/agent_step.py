@@ -7,6 +7,7 @@ a full replay; its parts are wrapped in stopwatches.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import statistics
 import time
 from collections.abc import Callable, Mapping
@@ -21,9 +22,11 @@ from crptpro.envs import make_env
 from crptpro.loggers import RunLogger
 from crptpro.pretrained import Pretrained
 from crptpro.training.downstream_run import DownstreamRun
+from crptpro.training.env_thread import EnvThread
 
-#: Stages of a decision in the order of the loop, and the parts of the update.
-STAGES = ("env step (physics, one image)", "store", "encode", "act", "update")
+#: Stages of a decision in the order of the loop, and the parts of the update. Where the image is drawn during the
+#: update, the loop only waits for the rest of it.
+STAGES = ("act", "update", "env step (physics, one image), or waiting for it", "store", "encode")
 RESET = "reset of the episode"
 PARTS = ("update, of it features", "update, of it bonus", "update, of it learner")
 
@@ -33,12 +36,14 @@ class AgentStep:
     """What a decision costs, seconds.
 
     Args:
+        is_ahead: the next image was drawn while the update computed.
         mean_s: everything from one decision to the next, reset of the episode and records included.
         median_s: half the median of two decisions in a row (the actor learns in every second).
         stages: mean by stage; ``"rest"`` is what no stopwatch saw.
         agent_steps: decisions that were timed.
     """
 
+    is_ahead: bool
     mean_s: float
     median_s: float
     stages: Mapping[str, float]
@@ -106,8 +111,10 @@ def measure_agent_step(
     *,
     agent_steps: int,
     warmup: int = 20,
-) -> AgentStep:
+) -> list[AgentStep]:
     """Fill the replay with synthetic observations, then time decisions of the real loop.
+
+    First with the image drawn when the update is done, then with the image drawn meanwhile.
 
     Args:
         task: in the real simulator.
@@ -120,26 +127,44 @@ def measure_agent_step(
     Raises:
         CRPTproError: if the dense maps do not fit the memory.
     """
-    config = dataclasses.replace(config, features="dense")
+    # Evaluations are none of a decision's business.
+    config = dataclasses.replace(config, features="dense", eval_workers=0, render_ahead=False)
     require_dense(pretrained, config)
-    watch = Stopwatch()
     with RunLogger(run_dir / "record") as records:
         run = DownstreamRun(
             task, pretrained, run_dir, config, records, progress=False, env_factory=make_env
         )  # fmt: skip
         try:
             _fill(run)
-            _attach(run, watch)
-            _run(run, warmup)
-            watch.clear()
-            start = time.perf_counter()
-            _run(run, agent_steps)
-            total = time.perf_counter() - start
+            found = [_measure(run, agent_steps, warmup, is_ahead=False)]
+            run.env.close()
+            size = run.parts.encoder.image_size
+            make_same = functools.partial(make_env, task, seed=config.seed, image_size=size)
+            run.env = EnvThread(make_same, is_ahead=True)
+            found.append(_measure(run, agent_steps, warmup, is_ahead=True))
         finally:
             run.close()
+    return found
+
+
+def _measure(run: DownstreamRun, agent_steps: int, warmup: int, *, is_ahead: bool) -> AgentStep:
+    watch = Stopwatch()
+    parts, env = run.parts, run.env
+    methods = run.act, run.update
+    _attach(run, watch)
+    try:
+        _run(run, warmup)
+        watch.clear()
+        start = time.perf_counter()
+        _run(run, agent_steps)
+        total = time.perf_counter() - start
+    finally:
+        run.parts, run.env = parts, env
+        run.act, run.update = methods  # type: ignore[method-assign]
     stages = {name: watch.seconds.get(name, 0.0) / agent_steps for name in (*STAGES, *PARTS, RESET)}
     rest = total / agent_steps - sum(stages[name] for name in (*STAGES, RESET))
     return AgentStep(
+        is_ahead=is_ahead,
         mean_s=total / agent_steps,
         median_s=_median_of_pairs(watch.starts[STAGES[0]]),
         stages={**stages, "rest (TensorDicts, records)": rest},
@@ -148,7 +173,7 @@ def measure_agent_step(
 
 
 def _fill(run: DownstreamRun) -> None:
-    action_dim = run.env.action_spec.shape[-1]
+    action_dim = run.env.env.action_spec.shape[-1]
     episodes = synthetic_episodes(
         run.config.replay_capacity, run.parts.encoder.image_size, action_dim=action_dim
     )
@@ -157,10 +182,10 @@ def _fill(run: DownstreamRun) -> None:
 
 
 def _attach(run: DownstreamRun, watch: Stopwatch) -> None:
-    render, store, encode, act, update = STAGES
+    act, update, render, store, encode = STAGES
     features, bonus, learner = PARTS
     parts = run.parts
-    run.env = watch.within(run.env, step=render, reset=RESET)
+    run.env = watch.within(run.env, end_step=render, reset=RESET)
     run.act = watch.timed(act, run.act)  # type: ignore[method-assign]
     run.update = watch.timed(update, run.update)  # type: ignore[method-assign]
     watched: dict[str, Any] = {

@@ -19,7 +19,7 @@ from crptpro.modules import PixelEncoder, Projector, Prototypes, resolve_precisi
 from crptpro.modules.precision import Precision
 from crptpro.objectives import ProtoLoss, method_defaults
 from crptpro.pretrained import Pretrained
-from crptpro.training.downstream_parts import build_parts
+from crptpro.training.downstream_parts import build_parts, keeps_embeddings
 from crptpro.training.frozen_features import dense_slots
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.sources import Augmenter, keys_read, open_sources
@@ -146,10 +146,11 @@ def synthetic_episodes(
 
 
 def dense_bytes(pretrained: Pretrained, config: DownstreamConfig) -> int:
-    """Return the memory of the dense maps of a full replay."""
+    """Return the memory of the dense maps of a full replay, and of the projections where they are kept too."""
     dtype = resolve_precision(config.precision, config.device)
     geometry = dense_shift_geometry(pretrained.encoder, config.shift_pad)
-    return geometry.values * dtype.itemsize * _slots(config)
+    projections = 4 * (_kept_latent_dim(pretrained, config) or 0) * (2 * config.shift_pad + 1) ** 2
+    return (geometry.values * dtype.itemsize + projections) * _slots(config)
 
 
 def require_dense(pretrained: Pretrained, config: DownstreamConfig) -> None:
@@ -160,10 +161,17 @@ def require_dense(pretrained: Pretrained, config: DownstreamConfig) -> None:
     """
     dtype = resolve_precision(config.precision, config.device)
     mode, reason = choose_feature_mode(
-        "auto", pretrained.encoder, _slots(config), dtype, pad=config.shift_pad
-    )
+        "auto", pretrained.encoder, _slots(config), dtype, pad=config.shift_pad,
+        latent_dim=_kept_latent_dim(pretrained, config),
+    )  # fmt: skip
     if mode != "dense":
         raise CRPTproError(f"{reason}. Ask for fewer transitions, or free memory.")
+
+
+def _kept_latent_dim(pretrained: Pretrained, config: DownstreamConfig) -> int | None:
+    if pretrained.prototypes is None or not keeps_embeddings(config):
+        return None
+    return pretrained.prototypes.get_parameter("weight").shape[1]
 
 
 def _slots(config: DownstreamConfig) -> int:

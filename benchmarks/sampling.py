@@ -9,6 +9,7 @@ in the page cache when the clock runs, as they are in training.
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import sys
 import tempfile
@@ -142,8 +143,8 @@ def _times(
         logger.info("building %s", name)
         way = WAYS[name].build(dataset, settings.batch_size, work / name)
         samples[name], stored[name] = way.sample, way.stored_bytes / settings.transitions
-    schedule = {"rounds": settings.rounds, "warmup": settings.warmup}
-    timings = side_by_side(samples, **schedule)
+    in_turns = functools.partial(side_by_side, rounds=settings.rounds, warmup=settings.warmup)
+    timings = in_turns(samples)
     shifts = {
         "ours": ("`random_shift`, uint8", _exact_shift),
         "stacked-disk": ("`grid_sample`, float32", grid_shift),
@@ -153,7 +154,7 @@ def _times(
         for name, (label, shift) in shifts.items()
         if name in samples
     }
-    return timings, side_by_side(with_shift, **schedule) if with_shift else {}, stored
+    return timings, in_turns(with_shift) if with_shift else {}, stored
 
 
 def _exact_shift(pixels: Tensor, offsets: Tensor) -> Tensor:

@@ -158,7 +158,7 @@ def _frame_rows(dataset: FrameDataset, scratch: Path) -> LazyMemmapStorage:
     storage = LazyMemmapStorage(len(dataset.frames), scratch_dir=scratch)
     buffer = ReplayBuffer(storage=storage)
     for episode in _episodes(dataset):
-        rows = torch.cat([episode.rows, episode.rows[-1:]]).set("frame", episode.frames)
+        rows = episode.rows[[*range(len(episode.rows)), -1]].set("frame", episode.frames)
         is_last = torch.zeros(len(rows), 1, dtype=torch.bool)
         is_last[-1] = True
         buffer.extend(rows.set("is_last_frame", is_last))

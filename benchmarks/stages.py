@@ -24,6 +24,7 @@ from crptpro.data import FrameDataset, Layout, collect_random
 from crptpro.downstream_config import DownstreamConfig
 from crptpro.loggers import RunLogger
 from crptpro.modules import PixelEncoder, Projector, Prototypes
+from crptpro.modules.precision import Precision
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import Pretrained
 from crptpro.training import pretrain
@@ -72,7 +73,7 @@ def collection(
 
 
 def pretraining(
-    *, datasets: list[str], run_dir: str, updates: int, batch_size: int, precision: str = "auto"
+    *, datasets: list[str], run_dir: str, updates: int, batch_size: int, precision: Precision = "auto"
 ) -> dict[str, Any]:
     """Pre-train the paper's networks for a few updates, with a record and a checkpoint."""
     loss = ProtoLoss(PixelEncoder())
@@ -100,7 +101,7 @@ def downstream(
 ) -> dict[str, Any]:
     """Fill the replay of a downstream run with drifting pictures as its loop would, update, and write a checkpoint.
 
-    The run has both of its environments, with their render contexts; only acting and rendering are left out.
+    The run has its environment, and two processes that evaluate meanwhile; only acting and rendering are left out.
 
     Returns:
         ``transitions`` in the replay, ``replay_bytes_on_disk``, ``frame_slots`` and ``window`` of its ring, and the
@@ -112,6 +113,8 @@ def downstream(
         batch_size=batch_size,
         features=features,
         action_repeat=2,
+        eval_episodes=2,
+        eval_workers=2,
     )
     directory = Path(run_dir)
     from crptpro.envs import make_env
@@ -121,13 +124,13 @@ def downstream(
             task, untrained(), directory, config, records, progress=True, env_factory=make_env
         )
         try:
-            run.env.reset()
-            run.eval_env = run.make_eval_env()
-            run.eval_env.reset()
+            run.env.reset(seed=0)
+            run.evaluation.start(run.agent(), run.counters())
             _fill(run, replay_transitions, episode_transitions)
             run.agent_steps = replay_transitions
             for _ in range(updates):
                 run.update()
+            run.evaluation.finish()
             run.save(CheckpointDir(directory / "checkpoints"))
         finally:
             run.close()
@@ -167,7 +170,7 @@ def allocated_bytes(directory: Path) -> int:
 
 def _fill(run: DownstreamRun, transitions: int, episode_transitions: int) -> None:
     replay, features = run.parts.replay, run.parts.features
-    action_dim = run.env.action_spec.shape[-1]
+    action_dim = run.env.env.action_spec.shape[-1]
     size = run.parts.encoder.image_size
     with tqdm(total=transitions, desc="fill replay", unit="transition", leave=False, disable=None) as bar:
         while len(replay) < transitions:

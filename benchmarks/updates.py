@@ -167,14 +167,19 @@ def time_agent_step(settings: Settings, scratch: Path) -> dict[str, Any]:
     found = measure_agent_step(
         settings.task, pretrained, config, scratch / "agent_step", agent_steps=settings.agent_steps
     )
-    hours = found.hours(PAPER_ENV_STEPS // config.resolved_action_repeat)
-    print(found.table())
-    print(f"\n{PAPER_ENV_STEPS:,} env steps would take {hours:.1f} h, evaluations left out.")
+    agent_steps = PAPER_ENV_STEPS // config.resolved_action_repeat
+    for one in found:
+        print(
+            f"\nThe image is drawn {'while the update computes' if one.is_ahead else 'after the update'}.\n"
+        )
+        print(one.table())
+        print(
+            f"\n{PAPER_ENV_STEPS:,} env steps would take {one.hours(agent_steps):.1f} h, evaluations left out."
+        )
     return {
-        **dataclasses.asdict(found),
+        "ways": [{**dataclasses.asdict(one), "projected_hours": one.hours(agent_steps)} for one in found],
         "precision": precisions()[-1],
         "dense_gib": gib,
-        "projected_hours": hours,
     }
 
 

@@ -109,15 +109,17 @@ def test_a_decision_on_the_simulator_is_taken_apart_into_its_stages(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     results = main(dataclasses.replace(TINY, only=("agent-step",), out=tmp_path))
-    found = results["agent-step"]
-    stages = found["stages"]
-    assert all(stages[name] > 0 for name in stages if not name.startswith("rest"))
-    whole = sum(seconds for name, seconds in stages.items() if "of it" not in name)
-    assert whole == pytest.approx(found["mean_s"])
-    parts = sum(seconds for name, seconds in stages.items() if "of it" in name)
-    assert parts < stages["update"]
-    assert found["projected_hours"] == pytest.approx(found["mean_s"] * 250_000 / 3600)
-    assert "| **whole**" in capsys.readouterr().out
+    ways = results["agent-step"]["ways"]
+    assert [way["is_ahead"] for way in ways] == [False, True]
+    for way in ways:
+        stages = way["stages"]
+        assert all(stages[name] > 0 for name in stages if not name.startswith("rest"))
+        whole = sum(seconds for name, seconds in stages.items() if "of it" not in name)
+        assert whole == pytest.approx(way["mean_s"])
+        parts = sum(seconds for name, seconds in stages.items() if "of it" in name)
+        assert parts < stages["update"]
+        assert way["projected_hours"] == pytest.approx(way["mean_s"] * 250_000 / 3600)
+    assert capsys.readouterr().out.count("| **whole**") == 2
 
 
 def test_dense_features_that_do_not_fit_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
