@@ -79,7 +79,7 @@ class PretrainUpdates:
     def __call__(self) -> None:
         """Do one update."""
         source = self.sources[self.done % len(self.sources)]
-        batch = self.augmenter(source.sample(self.batch_size, self.keys))
+        batch = self.augmenter.sample(source, self.batch_size, self.keys)
         self.learner.update(batch, index=self.done, domain=source.name)
         self.done += 1
 

@@ -132,6 +132,17 @@ def test_the_same_generator_gives_the_same_batches(path):
         assert (first == second).all()
 
 
+def test_a_sample_without_pixels_names_the_frames_that_a_sample_with_pixels_shows(path):
+    whole, bare = (FrameDataset.open(path, generator=torch.Generator().manual_seed(3)) for _ in range(2))
+    shown, named = whole.sample(40), bare.sample(40, pixels=False)
+    assert "pixels" not in named.keys() and ("next", "pixels") not in named.keys(True)  # noqa: SIM118, PT018
+    for key, rows in bare.stack_rows_of(named).items():
+        assert torch.equal(bare.frames["pixels"][rows].flatten(1, 2), shown[key])
+    for key in ("row", "action", ("next", "reward")):
+        assert torch.equal(named[key], shown[key])
+    assert "pixels" in bare.sample(2).keys()  # noqa: SIM118
+
+
 def test_plain_torchrl_buffers_read_it(path):
     storage = FrameStorage.open(path)
     rb = ReplayBuffer(storage=storage, sampler=RandomSampler(), batch_size=6)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
 
@@ -81,6 +81,34 @@ class FrameDataset(ReplayBuffer):
         """
         storage = FrameStorage.open(path, frame_stack=frame_stack, device=device)
         return cls(storage, batch_size=batch_size, **kwargs)
+
+    def sample(
+        self, batch_size: int | None = None, return_info: bool = False, *, pixels: bool = True
+    ) -> TensorDictBase:
+        """Draw transitions uniformly with replacement; see the class.
+
+        Args:
+            batch_size: B.
+            return_info: as in TorchRL's ``ReplayBuffer``.
+            pixels: ``False`` leaves the stacks out, for who reads them from :attr:`frames` (see
+                :meth:`stack_rows_of`).
+        """
+        self._storage.reads_pixels = pixels
+        try:
+            return super().sample(batch_size, return_info)
+        finally:
+            self._storage.reads_pixels = True
+
+    def stack_rows_of(self, transitions: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """Return which rows of :attr:`frames` make up the observations of sampled transitions.
+
+        Args:
+            transitions: a sample ``[B]``, with or without pixels.
+
+        Returns:
+            int64 ``[B, k]``, oldest to newest, for ``"pixels"`` and for ``("next", "pixels")``.
+        """
+        return self._storage.stack_rows_of(transitions)
 
     @property
     def card(self) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import TensorStorage
 from torchrl.data.replay_buffers.checkpointers import StorageCheckpointerBase
@@ -61,6 +61,7 @@ class FrameStorage(TensorStorage):
         super().__init__(transitions, device=frames.get("pixels").device)
         self.frames = frames
         self.frame_stack = frame_stack
+        self.reads_pixels = True
         self.path: Path | None = None
         self.card: dict[str, Any] = {}
 
@@ -108,12 +109,19 @@ class FrameStorage(TensorStorage):
         positions = self._positions(index)
         flat = positions.reshape(-1)
         columns = self._storage.apply(lambda column: column.index_select(0, flat), batch_size=flat.shape)
-        row, step = columns.get("row"), columns.get("step")
-        frames = self.frames.get("pixels")
-        columns.set("pixels", gather_stacks(frames, stack_rows(row, step, self.frame_stack)))
-        following = gather_stacks(frames, stack_rows(row + 1, step + 1, self.frame_stack))
-        columns.set(("next", "pixels"), following)
+        if self.reads_pixels:
+            frames = self.frames.get("pixels")
+            for key, rows in self.stack_rows_of(columns).items():
+                columns.set(key, gather_stacks(frames, rows))
         return columns if positions.ndim == 1 else columns.reshape(positions.shape)
+
+    def stack_rows_of(self, transitions: TensorDictBase) -> dict[NestedKey, Tensor]:
+        """Return the frame rows of both observations of transitions ``[B]``: int64 ``[B, k]`` by the stack's key."""
+        row, step = transitions.get("row"), transitions.get("step")
+        return {
+            "pixels": stack_rows(row, step, self.frame_stack),
+            ("next", "pixels"): stack_rows(row + 1, step + 1, self.frame_stack),
+        }
 
     def _positions(self, index: Any) -> Tensor:
         if isinstance(index, tuple) and len(index) == 1:

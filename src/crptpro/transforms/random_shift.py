@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -79,6 +81,45 @@ def random_shift(pixels: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
     return _shift_by_slices(pixels, offsets, pad)
 
 
+def shifted_stacks(frames: Tensor, rows: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
+    """Rebuild frame stacks from single frames and shift them, in one pass over the pixels.
+
+    Equal to ``random_shift(stacks, offsets, pad=pad)`` of the stacks that the rows describe, in less than half the
+    time on a CPU: the frames of a stack usually lie one behind the other and are cropped where they are.
+
+    Args:
+        frames: ``[F, C, H, W]``, single frames.
+        rows: int64 ``[B, k]``, the frames of each stack, oldest to newest.
+        offsets: int64 ``[B, 2]``, (row, column) in ``{0, ..., 2 * pad}``.
+        pad: width of the replicated border.
+
+    Returns:
+        ``[B, k * C, H, W]``, the dtype and device of ``frames``.
+
+    Raises:
+        ValueError: shapes that do not fit, or an offset outside ``{0, ..., 2 * pad}`` (offsets on the CPU).
+    """
+    if frames.ndim != 4 or rows.ndim != 2 or offsets.shape != (rows.shape[0], 2):
+        raise ValueError(
+            f"shifted_stacks expects frames [F, C, H, W], rows [B, k] and offsets [B, 2], got {tuple(frames.shape)}, "
+            f"{tuple(rows.shape)} and {tuple(offsets.shape)}."
+        )
+    (batch, stack), (channels, height, width) = rows.shape, frames.shape[1:]
+    shape = (batch, stack * channels, height, width)
+    if frames.device.type != "cpu":
+        return random_shift(frames[rows].reshape(shape), offsets, pad=pad)
+    check_offsets(offsets, pad)
+    source = as_numpy_bits(frames)
+    shifted = empty_on_huge_pages(shape, frames.dtype)
+    for view, numbers, offset in zip(as_numpy_bits(shifted), rows.tolist(), (offsets - pad).tolist()):
+        first, last = numbers[0], numbers[-1]
+        # Where an episode begins, its first frame is repeated, and the frames are picked one by one.
+        is_run = numbers == list(range(first, last + 1))
+        image = source[first : last + 1] if is_run else source[numbers]
+        _copy_shifted(view, image.reshape(shape[1:]), *offset)
+    return shifted
+
+
 def check_offsets(offsets: Tensor, pad: int) -> None:
     """Refuse offsets outside ``{0, ..., 2 * pad}``; offsets on other devices are not read (that would wait).
 
@@ -104,26 +145,30 @@ def _shift_by_gather(pixels: Tensor, offsets: Tensor, pad: int) -> Tensor:
 
 
 def _shift_by_slices(pixels: Tensor, offsets: Tensor, pad: int) -> Tensor:
-    # Copies the part of each image that stays in view, then repeats its outermost columns and rows: one
-    # pass over the data, where padding first would take two.
-    height, width = pixels.shape[-2:]
     shifted = empty_on_huge_pages(pixels.shape, pixels.dtype)
     source, target = as_numpy_bits(pixels.detach()), as_numpy_bits(shifted)
-    for image, view, (row, column) in zip(source, target, (offsets - pad).tolist()):
-        row, column = max(min(row, height - 1), 1 - height), max(min(column, width - 1), 1 - width)
-        top, bottom = max(-row, 0), height - max(row, 0)
-        left, right = max(-column, 0), width - max(column, 0)
-        rows = slice(top + row, bottom + row)
-        view[:, top:bottom, left:right] = image[:, rows, left + column : right + column]
-        if left:
-            view[:, top:bottom, :left] = image[:, rows, :1]
-        if right < width:
-            view[:, top:bottom, right:] = image[:, rows, -1:]
-        if top:
-            view[:, :top] = view[:, top : top + 1]
-        if bottom < height:
-            view[:, bottom:] = view[:, bottom - 1 : bottom]
+    for image, view, offset in zip(source, target, (offsets - pad).tolist()):
+        _copy_shifted(view, image, *offset)
     return shifted
+
+
+def _copy_shifted(view: np.ndarray[Any, Any], image: np.ndarray[Any, Any], row: int, column: int) -> None:
+    # Copies the part of the image that stays in view, then repeats its outermost columns and rows: one pass over
+    # the data, where padding first would take two.
+    height, width = image.shape[-2:]
+    row, column = max(min(row, height - 1), 1 - height), max(min(column, width - 1), 1 - width)
+    top, bottom = max(-row, 0), height - max(row, 0)
+    left, right = max(-column, 0), width - max(column, 0)
+    rows = slice(top + row, bottom + row)
+    view[:, top:bottom, left:right] = image[:, rows, left + column : right + column]
+    if left:
+        view[:, top:bottom, :left] = image[:, rows, :1]
+    if right < width:
+        view[:, top:bottom, right:] = image[:, rows, -1:]
+    if top:
+        view[:, :top] = view[:, top : top + 1]
+    if bottom < height:
+        view[:, bottom:] = view[:, bottom - 1 : bottom]
 
 
 class RandomShift(OnRootKeys, Transform):

@@ -183,8 +183,8 @@ class PretrainRun:
 
     def _update(self, log_interval: int) -> None:
         domain = self.done % len(self.sources)
-        batch = self.sources[domain].sample(self.settings["batch_size"], self.keys)
-        batch = self.augmenter(batch.to(self.device))
+        source, batch_size = self.sources[domain], self.settings["batch_size"]
+        batch = self.augmenter.sample(source, batch_size, self.keys, self.device)
         values = self.learner.update(batch, index=self.done, domain=self.domains[domain])
         self.window.add(values, domain)
         self.done += 1

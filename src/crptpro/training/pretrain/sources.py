@@ -16,7 +16,7 @@ from torchrl.objectives import LossModule
 from crptpro.data import FrameDataset
 from crptpro.errors import DatasetError
 from crptpro.seeding import derive_seed
-from crptpro.transforms.random_shift import draw_offsets, random_shift
+from crptpro.transforms.random_shift import draw_offsets, random_shift, shifted_stacks
 
 _LOG = logging.getLogger(__name__)
 
@@ -55,7 +55,41 @@ class Source:
         Raises:
             DatasetError: if the batch lacks one of them.
         """
-        batch = self.dataset.sample(batch_size)
+        return self._select(self.dataset.sample(batch_size), keys)
+
+    @property
+    def is_shifted_when_read(self) -> bool:
+        """Whether :meth:`sample_shifted` can be used: frames of ours on the CPU, sampled as they are."""
+        dataset = self.dataset
+        return (
+            type(dataset) is FrameDataset
+            and dataset.frames.get("pixels").device.type == "cpu"
+            and not len(dataset._transform)
+            and not dataset._prefetch
+        )
+
+    def sample_shifted(
+        self, batch_size: int, keys: Sequence[NestedKey] | None, generator: torch.Generator
+    ) -> TensorDictBase:
+        """Draw what :meth:`sample` draws, its stacks shifted while they are read from the frames.
+
+        Args:
+            batch_size: transitions.
+            keys: entries that the loss reads; all if ``None``.
+            generator: source of the offsets, one draw per stack entry in the order of their names.
+
+        Raises:
+            DatasetError: if the dataset lacks one of the keys.
+        """
+        batch = self.dataset.sample(batch_size, pixels=False)
+        frames = self.dataset.frames.get("pixels")
+        for key, rows in sorted(self.dataset.stack_rows_of(batch).items(), key=lambda item: str(item[0])):
+            if keys is None or key in keys:
+                offsets = draw_offsets(len(rows), SHIFT_PAD, generator)
+                batch.set(key, shifted_stacks(frames, rows, offsets, pad=SHIFT_PAD))
+        return self._select(batch, keys)
+
+    def _select(self, batch: TensorDictBase, keys: Sequence[NestedKey] | None) -> TensorDictBase:
         if keys is None:
             return batch
         held = set(batch.keys(True, True))
@@ -135,6 +169,22 @@ class Augmenter:
     def name(self) -> str:
         """For cards and fingerprints."""
         return self.augment if isinstance(self.augment, str) else getattr(self.augment, "__name__", "own")
+
+    def sample(
+        self,
+        source: Source,
+        batch_size: int,
+        keys: Sequence[NestedKey] | None,
+        device: torch.device | str = "cpu",
+    ) -> TensorDictBase:
+        """Draw an augmented batch, the same one whichever way is open.
+
+        Raises:
+            DatasetError: if the dataset lacks one of the keys.
+        """
+        if self.augment == "random_shift" and source.is_shifted_when_read:
+            return source.sample_shifted(batch_size, keys, self.generator).to(device)
+        return self(source.sample(batch_size, keys).to(device))
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Augment a batch, in place for the built-in shift."""
