@@ -44,15 +44,19 @@ def toy_env(task: str, *, seed: int, image_size: int, frame_stack: int, **settin
     return TransformedEnv(env, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
 
 
+def world_of_16(task: str, *, image_size: int, **settings: object) -> EnvBase:
+    """A world that draws at a size of its own."""
+    return toy_env(task, image_size=16, **settings)  # type: ignore[arg-type]
+
+
 def train(run_dir: Path | None, pretrained: Pretrained | None = None, **overrides: object):
     return train_downstream(
         "toy",
         small_pretrained() if pretrained is None else pretrained,
         run_dir=run_dir,
         config=SMALL,
-        env_factory=toy_env,
         progress=False,
-        **overrides,
+        **{"env_factory": toy_env, **overrides},
     )
 
 
@@ -178,6 +182,18 @@ def test_an_agent_is_refused_as_a_pretrained_encoder(tmp_path: Path) -> None:
     train(tmp_path, env_steps=40)
     with pytest.raises(PretrainedError, match="agent"):
         train(tmp_path / "next", tmp_path / "agent")
+
+
+def test_a_run_that_is_refused_frees_its_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[EnvBase] = []
+    monkeypatch.setattr(ToyEnv, "close", lambda env, **options: closed.append(env))
+    with pytest.raises(PretrainedError, match="image"):
+        train(
+            None,
+            random_pretrained(seed=0, channels=(4, 4), strides=(2, 1), image_size=20),
+            env_factory=world_of_16,
+        )
+    assert len(closed) == 1
 
 
 def test_without_a_directory_nothing_is_kept_but_the_result(

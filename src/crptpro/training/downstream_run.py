@@ -77,11 +77,15 @@ class DownstreamRun:
             name: torch.Generator().manual_seed(derive_seed(config.seed, "downstream", name))
             for name in ("replay", "shift", "bonus", "policy", "random_actions")
         }
-        self.parts: Parts = build_parts(pretrained, self.env.env, config, self.generators, run_dir)
         self.records = records
-        self.evaluation = DownstreamEvaluation(
-            task, make_this_env, config, records, run_dir, progress=progress
-        )
+        try:
+            self.parts: Parts = build_parts(pretrained, self.env.env, config, self.generators, run_dir)
+            self.evaluation = DownstreamEvaluation(
+                task, make_this_env, config, records, run_dir, progress=progress
+            )
+        except BaseException:
+            self.env.close()  # no run, nobody else to free the render context
+            raise
         self.pretrained_identity = pretrained.identity()
         self.agent_steps = self.updates = self.episodes = 0
         self.last_eval = -1
