@@ -119,10 +119,11 @@ class DownstreamConfig(SACSettings):
     """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it. Deviation: the released code
     computes in fp32 throughout, which `fp32` gives"""
     eval_workers: int | None = None
-    """processes that evaluate while training goes on (default: one per core, if there are several and the run has 20
-    evaluation episodes or more); 0 evaluates in between, in the training process"""
+    """processes that evaluate on the CPU while training goes on, 0.5 GB of memory each, at most one per episode; 0
+    evaluates in between, in the training process. Left to itself a run takes one per core if it has 20 evaluation
+    episodes or more and another process can build its environment"""
     render_ahead: bool | None = None
-    """draw the next observation in a thread of its own while the update computes (default: on a CPU with several cores,
-    where the update does not run by itself as on a GPU)"""
+    """draw the next observation in another thread while the update computes. Left to itself a run does so on a CPU with
+    several cores; say no where an environment wants the main thread"""
     device: str = "cpu"
     """where networks and features live"""

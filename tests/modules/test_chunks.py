@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+import weakref
 from collections.abc import Iterator, Sequence
 
 import pytest
@@ -102,6 +103,58 @@ def test_a_second_backward_pass_gives_the_same_gradients() -> None:
     torch.testing.assert_close(torch.autograd.grad(total, parameters), first, rtol=0, atol=0)
 
 
+def test_the_graphs_are_freed_by_the_backward_pass_although_somebody_keeps_the_loss() -> None:
+    images, parameters = inputs()
+    activations: list[weakref.ref[Tensor]] = []
+
+    def watched(chunk: Tensor, weights: Sequence[Tensor]) -> Tensor:
+        hidden = affine(chunk, weights)
+        activations.append(weakref.ref(hidden))
+        return hidden.square()
+
+    total = apply_to_chunks(watched, images.split(2), parameters).sum()
+    assert all(reference() is not None for reference in activations)
+    total.backward()
+    assert all(reference() is None for reference in activations)
+    with pytest.raises(RuntimeError, match="second time"):
+        total.backward()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_autocast_reaches_every_chunk(threads: int) -> None:
+    torch.set_num_threads(threads)
+    images, parameters = inputs()
+    with torch.autocast("cpu", torch.bfloat16):
+        found = apply_to_chunks(affine, images.split(2), parameters)
+        assert torch.equal(found, torch.cat([affine(chunk, parameters) for chunk in images.split(2)]))
+    assert not torch.equal(found, affine(images, parameters))
+
+
+def test_function_transforms_and_tracing_see_every_chunk() -> None:
+    torch.set_num_threads(2)
+    images, (weight, bias) = inputs()
+
+    def total(weight: Tensor, images: Tensor = images) -> Tensor:
+        return apply_to_chunks(affine, images.split(2), [weight, bias]).sum()
+
+    expected = torch.autograd.grad(total(weight), weight)[0]
+    torch.testing.assert_close(torch.func.grad(total)(weight.detach()), expected)
+    with torch.no_grad():
+        constants = [weight.detach(), bias.detach()]
+        traced = torch.jit.trace(lambda x: apply_to_chunks(affine, x.split(2), constants), images)
+        torch.testing.assert_close(traced(images + 1), affine(images + 1, constants))
+
+
+def test_an_upstream_gradient_is_not_written_to() -> None:
+    images, _ = inputs()
+    shift = torch.zeros(5).requires_grad_()
+    found = apply_to_chunks(lambda chunk, parameters: chunk + parameters[0], images.split(1), [shift])
+    upstream = torch.ones_like(found)
+    found.backward(upstream)
+    assert torch.equal(upstream, torch.ones_like(found))
+    assert torch.equal(shift.grad, torch.full((5,), 7.0))  # type: ignore[arg-type]
+
+
 def test_an_error_in_a_chunk_reaches_the_caller() -> None:
     torch.set_num_threads(2)
 
@@ -124,3 +177,27 @@ if child == 0:
 raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60, env=os.environ)
+
+
+def test_threads_that_cannot_all_start_do_not_keep_the_process_from_ending() -> None:
+    program = """
+import threading
+from crptpro.modules import lone_threads
+lone_threads.START_TIMEOUT_S = 0.5
+start, count = threading.Thread.start, 0
+def start_the_first_only(thread):
+    global count
+    count += 1
+    if count > 1:
+        raise RuntimeError("can't start new thread")
+    start(thread)
+threading.Thread.start = start_the_first_only
+try:
+    lone_threads.lone_threads(2, "lone")
+except RuntimeError as reason:
+    print(reason)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout == "can't start new thread\n"

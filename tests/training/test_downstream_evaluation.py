@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import signal
 import subprocess
@@ -14,7 +15,7 @@ from test_downstream import SMALL, rows_without_time, toy_env, train
 from torchrl.envs import EnvBase
 
 from crptpro.errors import CRPTproError, RenderingError
-from crptpro.training import DownstreamConfig
+from crptpro.training import CheckpointDir, DownstreamConfig
 from crptpro.training.downstream_evaluation import eval_workers
 
 
@@ -24,6 +25,13 @@ def sleepy_env(task: str, *, seed: int, **settings: object) -> EnvBase:
     if "evaluation_worker" in " ".join(sys.orig_argv) and os.environ.get("TOY_IS_SLEEPY"):
         env.base_env.on_step = lambda count: time.sleep(0.3)
     return env
+
+
+def only_here(task: str, *, seed: int, **settings: object) -> EnvBase:
+    """The toy world, which no other process can build."""
+    if "evaluation_worker" in " ".join(sys.orig_argv):
+        raise ValueError("not in this process")
+    return toy_env(task, seed=seed, **settings)  # type: ignore[arg-type]
 
 
 def make_toy() -> EnvBase:
@@ -54,19 +62,46 @@ train_downstream("toy", small_pretrained(), run_dir=Path(sys.argv[1]), config=SM
     command = [sys.executable, "-c", program, str(tmp_path / "killed")]
     run = subprocess.Popen(command, env={**environment, "TOY_IS_SLEEPY": "1"})
     deadline = time.monotonic() + 120
-    # A checkpoint of the first episodes: the evaluation at 0 env steps takes 6 s longer than they do.
-    while not list((tmp_path / "killed").glob("checkpoints/*")):
+    # The evaluation at 40 env steps takes 6 s longer than the episode after it; a checkpoint is due in the meantime.
+    while not (found := sorted((tmp_path / "killed").glob("checkpoints/checkpoint-*20.pt"))):
         assert run.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.01)
-    time.sleep(0.3)  # until the checkpoint has its name
     run.send_signal(signal.SIGKILL)
     run.wait()
-    assert not (tmp_path / "killed" / "eval.csv").exists()
+    state = CheckpointDir(found[0].parent).load_latest()
+    assert state["evaluation"]["pending"]["counters"]["env_steps"] == 40
     subprocess.run(command, env=environment, check=True, timeout=120)
     whole = train(tmp_path / "whole")
     killed = train(tmp_path / "killed")  # finished: only reads
     assert rows_without_time(killed.evaluations) == rows_without_time(whole.evaluations)
+
+
+def test_processes_that_fail_are_replaced_by_this_one_where_nobody_asked_for_them(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("crptpro.training.downstream_evaluation.WORTH_PROCESSES", 1)
+    monkeypatch.setattr("crptpro.training.downstream_evaluation.cpu_cores", lambda: 2)
+    run = train(tmp_path / "auto", eval_workers=None, env_factory=only_here)
+    assert caplog.text.count("not in this process. The run is kept") == 1
+    assert caplog.text.count("Evaluating in the training process from here on.") == 1
+    monkeypatch.undo()
+    assert rows_without_time(run.evaluations) == rows_without_time(train(tmp_path / "inline").evaluations)
+    with pytest.raises(CRPTproError, match="not in this process"):
+        train(tmp_path / "asked", eval_workers=2, env_factory=only_here)
+
+
+def test_the_record_does_not_depend_on_how_long_an_evaluation_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def order(run_dir: Path) -> list[tuple[str, int]]:
+        lines = (run_dir / "metrics.jsonl").read_text().splitlines()
+        return [(row["stream"], row["env_steps"]) for row in map(json.loads, lines)]
+
+    train(tmp_path / "quick", eval_workers=2)
+    monkeypatch.setenv("TOY_IS_SLEEPY", "1")
+    train(tmp_path / "slow", eval_workers=2, env_factory=sleepy_env)
+    assert order(tmp_path / "slow") == order(tmp_path / "quick")
 
 
 @pytest.mark.parametrize(
@@ -75,7 +110,7 @@ train_downstream("toy", small_pretrained(), run_dir=Path(sys.argv[1]), config=SM
         (None, 10, 2, 2),
         (None, 10, 16, 10),
         (None, 10, 1, 0),
-        (None, 1, 4, 0),  # 13 episodes in all: starting a process would take longer
+        (None, 1, 4, 0),  # 14 episodes in all: starting a process would take longer
         (0, 10, 4, 0),
         (3, 10, 1, 3),
         (3, 2, 4, 2),
@@ -85,7 +120,7 @@ def test_there_are_as_many_processes_as_asked_or_as_pay(
     monkeypatch: pytest.MonkeyPatch, asked: int | None, episodes: int, cores: int, expected: int
 ) -> None:
     monkeypatch.setattr("crptpro.training.downstream_evaluation.cpu_cores", lambda: cores)
-    config = DownstreamConfig(env_steps=120_000, eval_workers=asked, eval_episodes=episodes)
+    config = DownstreamConfig(env_steps=125_000, eval_workers=asked, eval_episodes=episodes)
     assert eval_workers("toy", make_toy, config) == expected
 
 
@@ -99,18 +134,18 @@ def test_a_gpu_that_does_not_render_in_many_processes_is_used_by_one(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     module = "crptpro.training.downstream_evaluation"
-    asked: list[int] = []
+    asked: list[tuple[str, int]] = []
 
-    def refuse(*, processes: int) -> str:
-        asked.append(processes)
+    def refuse(backend: str, *, processes: int) -> str:
+        asked.append((backend, processes))
         raise RenderingError("The first frame did not arrive from each of 3 processes.")
 
     monkeypatch.setattr(f"{module}.cpu_cores", lambda: 2)
-    monkeypatch.setattr(f"{module}.backend_card", lambda: {"gl_kind": "hardware"})
+    monkeypatch.setattr(f"{module}.backend_card", lambda: {"backend": "egl", "gl_kind": "hardware"})
     monkeypatch.setattr(f"{module}.select_backend", refuse)
     assert eval_workers("walker_walk", make_toy, DownstreamConfig()) == 0
-    assert "3 processes. Evaluating in this process instead." in caplog.text
-    assert asked == [3]
+    assert "3 processes. Evaluating in the training process instead." in caplog.text
+    assert asked == [("egl", 3)]
     with pytest.raises(RenderingError):
         eval_workers("walker_walk", make_toy, DownstreamConfig(eval_workers=2))
 

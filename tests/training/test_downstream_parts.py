@@ -13,6 +13,7 @@ from test_downstream import SMALL, small_pretrained, toy_env
 from crptpro.pretrained import Pretrained
 from crptpro.training import downstream_parts
 from crptpro.training.downstream_parts import Parts, build_parts
+from crptpro.transforms import dense_shift_geometry
 
 
 def parts_of(pretrained: Pretrained, run_dir: Path, **settings: object) -> Parts:
@@ -68,7 +69,7 @@ def test_embeddings_are_kept_where_a_batch_is_larger_than_all_shifts_of_two_obse
     asked: list[object] = []
     choose = downstream_parts.choose_feature_mode
 
-    def spy(*args: object, latent_dim: int | None, **options: object) -> tuple[str, str]:
+    def spy(*args: object, latent_dim: int | None = None, **options: object) -> tuple[str, str]:
         asked.append(latent_dim)
         return choose(*args, latent_dim=latent_dim, **options)
 
@@ -79,3 +80,23 @@ def test_embeddings_are_kept_where_a_batch_is_larger_than_all_shifts_of_two_obse
     assert asked == [4 if is_kept else None]
     without_bonus = parts_of(small_pretrained(), tmp_path / "none", batch_size=512, intrinsic_reward_coef=0.0)
     assert not without_bonus.features.cache.has_embeddings
+
+
+def test_projections_give_way_before_dense_maps_do_and_others_needs_are_set_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    maps = 59 * dense_shift_geometry(small_pretrained().encoder, 4).values * 4
+    projections = 59 * 81 * 4 * 4
+    free, room_for_maps = int((maps + projections) / 0.8) + 2, int(maps / 0.8) + 2
+    monkeypatch.setattr(downstream_parts, "free_bytes", lambda device: free)
+    settings = {"batch_size": 512, "precision": "fp32", "env_steps": 10_000, "features": "auto"}
+    config = dataclasses.replace(SMALL, action_repeat=2, **settings)
+    generators = {name: torch.Generator() for name in ("replay", "shift", "bonus", "policy")}
+    env = toy_env("toy", seed=0, image_size=16, frame_stack=3)
+    found = {}
+    for reserved in (0, free - room_for_maps, free - room_for_maps + 4):
+        directory = tmp_path / str(reserved)
+        parts = build_parts(small_pretrained(), env, config, generators, directory, reserved_bytes=reserved)
+        found[reserved] = (parts.feature_mode, parts.features.keeps_projections)
+        assert (parts.bonus.projector is None) is parts.features.keeps_projections
+    assert list(found.values()) == [("dense", True), ("dense", False), ("reencode", False)]

@@ -94,15 +94,48 @@ def test_a_step_that_never_began_has_no_end() -> None:
         env.end_step()
 
 
+def test_steps_do_not_overtake_each_other_and_closing_again_is_harmless() -> None:
+    env = EnvThread(make_toy, is_ahead=True)
+    env.begin_step(env.reset(0).set("action", action(0.0)))
+    with pytest.raises(RuntimeError, match=r"begin_step\(\) twice"):
+        env.begin_step(env.reset(0).set("action", action(0.0)))
+    env.close()
+    env.close()
+
+
+def test_the_thread_computes_with_one_core_and_the_caller_with_its_own_number() -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        numbers: list[int] = []
+        env = EnvThread(
+            lambda: ToyEnv(lambda seed: 10, on_step=lambda count: numbers.append(torch.get_num_threads())),
+            is_ahead=True,
+        )
+        env.begin_step(env.reset(0).set("action", action(0.0)))
+        env.end_step()
+        env.close()
+        assert numbers == [1]
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
 @pytest.mark.parametrize(
-    ("device", "cores", "backend", "expected"),
-    [("cpu", 2, "egl", True), ("cpu", 1, "egl", False), ("cuda", 2, "egl", False), ("cpu", 2, "glfw", False)],
+    ("task", "device", "cores", "backend", "expected"),
+    [
+        ("walker_walk", "cpu", 2, "egl", True),
+        ("walker_walk", "cpu", 1, "egl", False),
+        ("walker_walk", "cuda", 2, "egl", False),
+        ("walker_walk", "cpu", 2, "glfw", False),
+        ("a caller's own", "cpu", 2, "glfw", True),
+    ],
 )
 def test_running_ahead_is_chosen_where_it_pays_and_can_be_asked_for(
-    monkeypatch: pytest.MonkeyPatch, device: str, cores: int, backend: str, expected: bool
+    monkeypatch: pytest.MonkeyPatch, task: str, device: str, cores: int, backend: str, expected: bool
 ) -> None:
     monkeypatch.setattr("crptpro.training.env_thread.cpu_cores", lambda: cores)
-    monkeypatch.setenv("MUJOCO_GL", backend)
+    monkeypatch.setattr("crptpro.training.env_thread.select_backend", lambda: backend)
     config = DownstreamConfig(device=device)
-    assert runs_ahead(config) is expected
-    assert runs_ahead(dataclasses.replace(config, render_ahead=not expected)) is not expected
+    assert runs_ahead(task, config) is expected
+    assert runs_ahead(task, dataclasses.replace(config, render_ahead=not expected)) is not expected

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -30,8 +31,45 @@ def small_agent(seed: int = 0) -> PixelAgent:
     return PixelAgent(encoder, SquashedGaussianActor(encoder.feature_dim, 2, hidden_dim=8))
 
 
+def full_size_agent() -> PixelAgent:
+    """Its snapshot is larger than what a connection holds without a reader."""
+    encoder = small_pretrained().encoder
+    return PixelAgent(encoder, SquashedGaussianActor(encoder.feature_dim, 2))
+
+
+def start_program(program: str, **options: Any) -> subprocess.Popen[str]:
+    here = Path(__file__).parent
+    path = os.pathsep.join([str(here), str(here.parent / "data"), *filter(None, sys.path)])
+    environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, env=environment, **options
+    )
+
+
 def make_refusing() -> EnvBase:
     raise RenderingError("no backend renders here")
+
+
+def make_unreadable() -> EnvBase:
+    raise EOFError("the save game ends early")
+
+
+def make_unhurried(*, seed: int, image_size: int) -> EnvBase:
+    return ToyEnv(lambda seed: 10, seed=seed, image_size=image_size, on_step=lambda count: time.sleep(0.15))
+
+
+class Unpicklable:
+    """Arrives, and cannot be rebuilt."""
+
+    def __call__(self) -> EnvBase:
+        raise AssertionError
+
+    def __reduce__(self) -> object:
+        return (_refuse, ())
+
+
+def _refuse() -> None:
+    raise ImportError("No module named 'her_laptop'")
 
 
 def make_exploding() -> EnvBase:
@@ -58,7 +96,7 @@ def test_its_episodes_and_pictures_are_those_of_evaluate(pool: EvaluationPool) -
     for seed in (1, 2):
         agent = small_agent(seed)
         pool.start(agent, episodes=5, seed=seed, record_episodes=2)
-        episodes, videos = pool.take(is_awaited=True)
+        episodes, videos = pool.result()
         expected, pictures = evaluate(
             agent, make_toy(), episodes=5, seed=seed, record_episodes=2, progress=False
         )
@@ -75,21 +113,70 @@ def test_it_evaluates_the_agent_of_the_moment_it_was_asked(pool: EvaluationPool)
     with torch.no_grad():
         for parameter in agent.actor.parameters():
             parameter.add_(1.0)
-    episodes, _ = pool.take(is_awaited=True)
+    episodes, _ = pool.result()
     assert episodes == expected
 
 
-def test_nothing_is_taken_before_it_is_complete_and_nothing_twice(pool: EvaluationPool) -> None:
-    assert pool.take(is_awaited=True) is None
+def test_there_is_one_evaluation_at_a_time_and_its_result_is_taken_once(pool: EvaluationPool) -> None:
     pool.start(small_agent(), episodes=3, seed=0)
     with pytest.raises(RuntimeError, match="One evaluation at a time"):
         pool.start(small_agent(), episodes=3, seed=0)
-    deadline = time.monotonic() + 60
-    while (outcome := pool.take(is_awaited=False)) is None:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    assert len(outcome[0]) == 3
-    assert pool.take(is_awaited=False) is None
+    assert len(pool.result()[0]) == 3
+    with pytest.raises(RuntimeError, match="No evaluation is under way"):
+        pool.result()
+
+
+def test_episodes_follow_each_other_while_nobody_asks() -> None:
+    pool = EvaluationPool(functools.partial(stacked, make_unhurried), workers=1)
+    pool.start(small_agent(), episodes=3, seed=0)  # 1.5 s each, with a sign of life in between
+    assert pool._evaluation is not None
+    pool._evaluation.result(timeout=60)
+    began = time.monotonic()
+    assert [episode.episode for episode in pool.result()[0]] == [0, 1, 2]
+    assert time.monotonic() - began < 0.1
+    pool.close()
+
+
+def test_a_process_that_died_between_two_evaluations_is_replaced(pool: EvaluationPool) -> None:
+    pool.start(small_agent(), episodes=2, seed=0)
+    first = pool.result()
+    victim = pool._workers[0].process
+    victim.kill()
+    victim.wait()
+    pool.start(small_agent(), episodes=2, seed=0)
+    assert pool.result() == first
+
+
+def test_ctrl_c_reaches_the_caller_and_not_the_processes() -> None:
+    program = """
+import functools, signal, time
+from test_evaluation_pool import EvaluationPool, make_toy, small_agent
+asked = []
+signal.signal(signal.SIGINT, lambda *_: asked.append(1))
+pool = EvaluationPool(make_toy, workers=1)
+pool.start(small_agent(), episodes=1, seed=0)
+print("started", flush=True)
+print(len(pool.result()[0]), len(asked), flush=True)
+pool.close()
+"""
+    run = start_program(program, start_new_session=True)
+    assert run.stdout.readline() == "started\n"  # type: ignore[union-attr]
+    for _ in range(3):  # while the process imports, and when it does not
+        time.sleep(0.7)
+        os.killpg(run.pid, signal.SIGINT)
+    assert run.communicate(timeout=60)[0] == "1 3\n"
+    assert run.returncode == 0
+
+
+def test_the_callers_directory_does_not_hide_the_standard_library(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "statistics.py").write_text("raise RuntimeError('not this one')")
+    monkeypatch.chdir(tmp_path)
+    pool = EvaluationPool(make_toy, workers=1)
+    pool.start(small_agent(), episodes=1, seed=0)
+    assert len(pool.result()[0]) == 1
+    pool.close()
 
 
 @pytest.mark.parametrize(
@@ -97,6 +184,8 @@ def test_nothing_is_taken_before_it_is_complete_and_nothing_twice(pool: Evaluati
     [
         (make_refusing, RenderingError, "^no backend renders here$"),
         (make_exploding, CRPTproError, "failed: the simulator exploded.*start it again"),
+        (make_unreadable, CRPTproError, "failed: the save game ends early"),
+        (Unpicklable(), CRPTproError, "failed: No module named 'her_laptop'"),
         (functools.partial(stacked, make_dying), CRPTproError, "episode 0.* exited with status 7"),
         (
             functools.partial(stacked, make_hanging),
@@ -110,26 +199,39 @@ def test_a_process_that_fails_dies_or_hangs_is_named(
 ) -> None:
     pool = EvaluationPool(make_env, workers=1, stall_timeout_s=20)  # type: ignore[arg-type]
     try:
-        pool.start(small_agent(), episodes=1, seed=0)
+        pool.start(full_size_agent(), episodes=1, seed=0)
         with pytest.raises(error, match=message):
-            pool.take(is_awaited=True)
+            pool.result()
     finally:
         pool.close()
 
 
 def test_a_killed_process_is_named_with_the_signal() -> None:
     pool = EvaluationPool(functools.partial(stacked, make_hanging), workers=1)
-    pool.start(small_agent(), episodes=1, seed=0)
-    os.kill(pool._workers[0].process.pid, signal.SIGKILL)
+    busy_process(pool).kill()
     with pytest.raises(CRPTproError, match=r"killed by signal 9\. Out of memory"):
-        pool.take(is_awaited=True)
+        pool.result()
     pool.close()
+
+
+def busy_process(pool: EvaluationPool) -> subprocess.Popen[bytes]:
+    """Start an evaluation and wait until its process is in the episode."""
+    pool.start(small_agent(), episodes=1, seed=0)
+    deadline = time.monotonic() + 60
+    while not pool._workers or pool._workers[0].episode is None:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process = pool._workers[0].process
+    while psutil.Process(process.pid).cpu_times().user < 2:  # its imports
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    return process
 
 
 def test_closing_ends_busy_processes() -> None:
     pool = EvaluationPool(functools.partial(stacked, make_hanging), workers=1)
-    pool.start(small_agent(), episodes=1, seed=0)
-    process = pool._workers[0].process
+    process = busy_process(pool)
+    pool.close()
     pool.close()
     assert process.poll() is not None
 
@@ -140,17 +242,12 @@ import functools, sys, time
 from test_evaluation_pool import EvaluationPool, functools, make_hanging, small_agent, stacked
 pool = EvaluationPool(functools.partial(stacked, make_hanging), workers=1)
 pool.start(small_agent(), episodes=1, seed=0)
+while not pool._workers:
+    time.sleep(0.01)
 print(pool._workers[0].process.pid, flush=True)
 time.sleep(100)
 """
-    here = Path(__file__).parent
-    path = os.pathsep.join([str(here), str(here.parent / "data"), *filter(None, sys.path)])
-    parent = subprocess.Popen(
-        [sys.executable, "-c", program],
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": path},
-    )
+    parent = start_program(program)
     child = psutil.Process(int(parent.stdout.readline()))  # type: ignore[union-attr]
     parent.kill()
     parent.wait()

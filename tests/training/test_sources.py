@@ -50,6 +50,9 @@ def test_a_dataset_with_transforms_or_prefetching_of_its_own_is_read_its_own_way
     transform = ToTensorImage(in_keys=["pixels"])
     assert not Source("toy", make_dataset(transform=transform), seed=0).is_shifted_when_read
     assert not Source("toy", make_dataset(prefetch=1, batch_size=2), seed=0).is_shifted_when_read
+    assert not Source("toy", make_dataset(collate_fn=lambda batch: batch), seed=0).is_shifted_when_read
+    with pytest.raises(ValueError, match="cannot leave the pixels out"):
+        make_dataset(prefetch=1, batch_size=4).sample(pixels=False)
 
 
 def test_an_entry_that_the_dataset_lacks_is_named_either_way() -> None:

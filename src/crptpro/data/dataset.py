@@ -48,6 +48,7 @@ class FrameDataset(ReplayBuffer):
         **kwargs: Any,
     ):
         kwargs.setdefault("sampler", RandomSampler())
+        self._is_plain = not kwargs.get("prefetch") and kwargs.get("collate_fn") is None
         super().__init__(
             storage=storage,
             writer=ImmutableDatasetWriter(),
@@ -91,13 +92,25 @@ class FrameDataset(ReplayBuffer):
             batch_size: B.
             return_info: as in TorchRL's ``ReplayBuffer``.
             pixels: ``False`` leaves the stacks out, for who reads them from :attr:`frames` (see
-                :meth:`stack_rows_of`).
+                :meth:`stack_rows_of`); only where :attr:`is_read_directly`.
+
+        Raises:
+            ValueError: if something else takes part in reading that may want the stacks.
         """
+        if not pixels and not self.is_read_directly:
+            raise ValueError(
+                "A dataset that prefetches, transforms or collates in its own way cannot leave the pixels out."
+            )
         self._storage.reads_pixels = pixels
         try:
             return super().sample(batch_size, return_info)
         finally:
             self._storage.reads_pixels = True
+
+    @property
+    def is_read_directly(self) -> bool:
+        """Whether a sample is what the storage returns: no transform, no prefetching, no collation of its own."""
+        return self._is_plain and not len(self._transform)
 
     def stack_rows_of(self, transitions: TensorDictBase) -> dict[NestedKey, Tensor]:
         """Return which rows of :attr:`frames` make up the observations of sampled transitions.

@@ -16,6 +16,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from torch.utils._python_dispatch import is_in_torch_dispatch_mode
+
+from crptpro.modules.lone_threads import lone_threads
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -30,7 +33,9 @@ def apply_to_chunks(
 ) -> Tensor:
     """Return ``torch.cat([function(chunk, parameters) for chunk in chunks])``, computed side by side.
 
-    The gradient of every parameter is the sum over the chunks in their order, whatever the number of threads.
+    The gradient of every parameter is the sum over the chunks in their order, whatever the number of threads. There is
+    no second derivative. Where somebody watches or changes the operations themselves (autocast, compiling, tracing,
+    ``torch.func``), which other threads would not see, the chunks are computed here one after the other.
 
     Args:
         function: maps a chunk ``[n, ...]`` and the parameters to ``[n, ...]``; must be thread-safe.
@@ -40,6 +45,8 @@ def apply_to_chunks(
     Returns:
         ``[sum of n, ...]``.
     """
+    if _is_watched():
+        return torch.cat([function(chunk, parameters) for chunk in chunks])
     if torch.is_grad_enabled() and any(parameter.requires_grad for parameter in parameters):
         return _Chunks.apply(function, chunks, *parameters)
     return torch.cat(map_side_by_side(lambda chunk: function(chunk, parameters), chunks))
@@ -62,6 +69,16 @@ def map_side_by_side(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
     return list(_pool(threads).map(in_thread, items))
 
 
+def _is_watched() -> bool:
+    return (
+        torch.compiler.is_compiling()
+        or torch.jit.is_tracing()
+        or torch.is_autocast_enabled("cpu")
+        or is_in_torch_dispatch_mode()
+        or torch._C._are_functorch_transforms_active()
+    )
+
+
 class _Chunks(torch.autograd.Function):
     """Keeps one graph per chunk, so that the backward pass can go through them side by side too."""
 
@@ -75,14 +92,20 @@ class _Chunks(torch.autograd.Function):
                 output = function(chunk, leaves)
             return [leaf for leaf in leaves if leaf.requires_grad], output
 
+        graphs = map_side_by_side(record, chunks)
         ctx.needs = needs
-        ctx.graphs = map_side_by_side(record, chunks)
-        return torch.cat([output.detach() for _, output in ctx.graphs])
+        # On a saved tensor and not on the context: autograd frees those after the backward pass, while the context
+        # lives as long as anybody holds the loss.
+        carrier: Any = torch.empty(0)
+        carrier.graphs = graphs
+        ctx.save_for_backward(carrier)
+        return torch.cat([output.detach() for _, output in graphs])
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
-        parts = gradient.split([output.shape[0] for _, output in ctx.graphs])
+        graphs = ctx.saved_tensors[0].graphs
+        parts = gradient.split([output.shape[0] for _, output in graphs])
 
         def differentiate(job: tuple[tuple[list[Tensor], Tensor], Tensor]) -> tuple[Tensor, ...]:
             (leaves, output), part = job
@@ -90,8 +113,8 @@ class _Chunks(torch.autograd.Function):
             return torch.autograd.grad(output, leaves, part, retain_graph=True)
 
         sums: list[Tensor] | None = None
-        for gradients in map_side_by_side(differentiate, list(zip(ctx.graphs, parts))):
-            sums = list(gradients) if sums is None else [a.add_(b) for a, b in zip(sums, gradients)]
+        for gradients in map_side_by_side(differentiate, list(zip(graphs, parts))):
+            sums = list(gradients) if sums is None else [a + b for a, b in zip(sums, gradients)]
         found = iter(sums or [])
         return (None, None, *[next(found) if need else None for need in ctx.needs])
 
@@ -99,21 +122,15 @@ class _Chunks(torch.autograd.Function):
 def _pool(threads: int) -> ThreadPoolExecutor:
     with _pools_lock:
         if threads not in _pools:
-            pool = ThreadPoolExecutor(threads, thread_name_prefix="chunks")
-            together = threading.Barrier(threads)
-
-            def compute_alone(_: int) -> None:
-                together.wait()  # so that every thread of the pool gets one of these calls
-                torch.get_num_threads()  # a thread's first question sets its number to the process's
-                torch.set_num_threads(1)
-
-            before = torch.get_num_threads()
-            list(pool.map(compute_alone, range(threads)))
-            # The number is kept per thread, but some libraries take the last one set for all.
-            torch.set_num_threads(before)
-            _pools[threads] = pool
+            _pools[threads] = lone_threads(threads, "chunks")
         return _pools[threads]
 
 
-# Threads do not survive a fork; a child makes its own.
-os.register_at_fork(after_in_child=_pools.clear)
+def _forget_pools() -> None:
+    """Threads do not survive a fork; a child makes its own."""
+    global _pools_lock
+    _pools_lock = threading.Lock()
+    _pools.clear()
+
+
+os.register_at_fork(after_in_child=_forget_pools)

@@ -60,7 +60,8 @@ def train_downstream(
         resume: continue from the newest checkpoint in ``run_dir``. Checkpoints are taken between episodes, so a
             kill costs the episodes since the last one and, on a CPU, changes no number.
         progress: show bars (never in log files).
-        env_factory: makes the environments; called as :func:`~crptpro.envs.make_env` is.
+        env_factory: makes the environments; called as :func:`~crptpro.envs.make_env` is, in a thread of its own and in
+            the processes that evaluate (see ``render_ahead`` and ``eval_workers``).
         **overrides: single settings of :class:`DownstreamConfig`, e.g. ``env_steps=100_000``.
 
     Returns:

@@ -33,6 +33,7 @@ def fingerprint(run: DownstreamRun) -> dict[str, Any]:
     resolved = {
         "precision": "bf16" if run.parts.encoder.compute_dtype == torch.bfloat16 else "fp32",
         "features": run.parts.feature_mode,
+        "projections": "kept" if run.parts.features.keeps_projections else "computed",
     }
     return {"task": run.task, **settings, **resolved, "pretrained": run.pretrained_identity}
 
@@ -79,4 +80,4 @@ def restore(run: DownstreamRun, state: Mapping[str, Any]) -> None:
     set_global_rng_state(state["global_rng"])
     run.sums, run.counts = dict(state["sums"]), dict(state["counts"])
     run.records.load_state_dict(state["records"])
-    run.evaluation.load_state_dict(state["evaluation"], run.agent())
+    run.evaluation.load_state_dict(state.get("evaluation", {"pending": None}), run.agent())

@@ -22,7 +22,7 @@ from crptpro.loggers import RunLogger
 from crptpro.seeding import derive_seed
 from crptpro.training.agent import PixelAgent
 from crptpro.training.evaluate import Episode, evaluate, summarize
-from crptpro.training.evaluation_pool import EvaluationPool, can_be_sent
+from crptpro.training.evaluation_pool import EvaluationPool, Outcome, can_be_sent
 from crptpro.training.video import write_video
 
 logger = logging.getLogger(__name__)
@@ -34,9 +34,10 @@ WORTH_PROCESSES = 20
 class DownstreamEvaluation:
     """Evaluates the agent in processes of its own, or in this one, and writes the ``eval`` stream.
 
-    In processes of its own an evaluation runs while training goes on; at most one at a time, so rows are in order.
-    Either way every decision is computed by one CPU thread (or the run's device in this process), and a CPU run's
-    numbers do not depend on which way it was.
+    In processes of its own an evaluation runs on a snapshot while training goes on. Its rows are written when the loop
+    asks for them and not when they happen to be there: the record of a run is the same however fast its machine is.
+    Where nobody asked for processes and they fail, this one takes over. Either way every decision is computed by one
+    CPU thread (in this process, on the run's device), and a CPU run's numbers do not depend on which way it was.
 
     Args:
         task: for the announcements.
@@ -45,6 +46,9 @@ class DownstreamEvaluation:
         records: where rows, events and videos go.
         run_dir: videos go below it.
         progress: show a bar.
+
+    Attributes:
+        workers: processes; 0 for none.
     """
 
     def __init__(
@@ -60,10 +64,17 @@ class DownstreamEvaluation:
         self.task, self.config, self.records, self.run_dir = task, config, records, run_dir
         self.progress = progress
         self._make_env = make_env
-        workers = eval_workers(task, make_env, config)
-        self._pool = EvaluationPool(make_env, workers=workers) if workers else None
+        self.workers = eval_workers(task, make_env, config)
+        if self.workers:
+            logger.info("evaluation: %d processes of its own, while training goes on", self.workers)
+        self._pool = EvaluationPool(make_env, workers=self.workers) if self.workers else None
         self._env: EnvBase | None = None
-        self._pending: dict[str, Any] | None = None
+        self._pending: tuple[PixelAgent, dict[str, int]] | None = None
+
+    @property
+    def is_beside(self) -> bool:
+        """Whether training goes on meanwhile."""
+        return self._pool is not None
 
     def start(self, agent: PixelAgent, counters: Mapping[str, int]) -> None:
         """Evaluate the agent as it is now; with processes of its own, return at once.
@@ -73,32 +84,37 @@ class DownstreamEvaluation:
             counters: where the run is: ``env_steps`` and others, written into every row.
         """
         self.finish()
-        how = {
-            "episodes": self.config.eval_episodes,
-            "seed": derive_seed(self.config.seed, "downstream", "evaluation", counters["env_steps"]),
-            "record_episodes": self.config.video_episodes,
-        }
+        snapshot = PixelAgent(agent.encoder, copy.deepcopy(agent.actor))
+        self._pending = (snapshot, dict(counters))
         if self._pool is None:
+            self.finish()
+        else:
+            self._pool.start(snapshot, **self._how(counters))
+
+    def finish(self) -> bool:
+        """Wait for the evaluation that is under way and record it; returns whether there was one.
+
+        Raises:
+            CRPTproError: if a process that was asked for fails.
+        """
+        if self._pending is None:
+            return False
+        agent, counters = self._pending
+        outcome = self._from_pool()
+        if outcome is None:
             self._env = self._env or self._make_env()
             with _one_thread():
-                outcome = evaluate(agent, self._env, progress=self.progress, **how)
-            self._record(counters, *outcome)
-            return
-        self._pool.start(agent, **how)
-        actor = {key: value.cpu().clone() for key, value in agent.actor.state_dict().items()}
-        self._pending = {"counters": dict(counters), "actor": actor}
-
-    def collect(self) -> None:
-        """Record an evaluation that has been completed in the meantime."""
-        self._take(is_awaited=False)
-
-    def finish(self) -> None:
-        """Wait for the evaluation that is under way and record it."""
-        self._take(is_awaited=True)
+                outcome = evaluate(agent, self._env, progress=self.progress, **self._how(counters))
+        self._pending = None
+        self._record(counters, *outcome)
+        return True
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the evaluation that is under way; its rows are in no checkpoint yet."""
-        return {"pending": self._pending}
+        """Return the evaluation that is under way; its rows are not in the record yet."""
+        if self._pending is None:
+            return {"pending": None}
+        agent, counters = self._pending
+        return {"pending": {"counters": counters, "actor": agent.actor.state_dict()}}
 
     def load_state_dict(self, state: Mapping[str, Any], agent: PixelAgent) -> None:
         """Start again what was under way.
@@ -114,19 +130,34 @@ class DownstreamEvaluation:
         self.start(PixelAgent(agent.encoder, actor), state["pending"]["counters"])
 
     def close(self) -> None:
-        """Free the render context and end the processes."""
-        if self._pool is not None:
-            self._pool.close()
-        if self._env is not None:
-            self._env.close()
+        """Free the render context and end the processes. Harmless when called again."""
+        try:
+            if self._pool is not None:
+                self._pool.close()
+        finally:
+            if self._env is not None:
+                self._env.close()
+                self._env = None
 
-    def _take(self, *, is_awaited: bool) -> None:
-        if self._pool is None or self._pending is None:
-            return
-        outcome = self._pool.take(is_awaited=is_awaited)
-        if outcome is not None:
-            counters, self._pending = self._pending["counters"], None
-            self._record(counters, *outcome)
+    def _how(self, counters: Mapping[str, int]) -> dict[str, int]:
+        return {
+            "episodes": self.config.eval_episodes,
+            "seed": derive_seed(self.config.seed, "downstream", "evaluation", counters["env_steps"]),
+            "record_episodes": self.config.video_episodes,
+        }
+
+    def _from_pool(self) -> Outcome | None:
+        if self._pool is None:
+            return None
+        try:
+            return self._pool.result()
+        except CRPTproError as reason:
+            if self.config.eval_workers is not None:
+                raise
+            logger.warning("%s Evaluating in the training process from here on.", reason)
+            self._pool.close()
+            self._pool = None
+            return None
 
     def _record(self, counters: Mapping[str, int], episodes: list[Episode], videos: list[Tensor]) -> None:
         for e in episodes:
@@ -158,7 +189,7 @@ def eval_workers(task: str, make_env: Callable[[], EnvBase], config: DownstreamC
     """
     asked = config.eval_workers
     workers = min(cpu_cores() if asked is None else asked, config.eval_episodes)
-    evaluations = config.env_steps // config.eval_interval_env_steps + 1
+    evaluations = -(-config.env_steps // config.eval_interval_env_steps) + 1
     pays = cpu_cores() > 1 and evaluations * config.eval_episodes >= WORTH_PROCESSES
     if asked == 0 or (asked is None and not pays):
         return 0
@@ -174,7 +205,7 @@ def eval_workers(task: str, make_env: Callable[[], EnvBase], config: DownstreamC
     except RenderingError as reason:
         if asked is not None:
             raise
-        logger.warning("%s Evaluating in this process instead.", reason)
+        logger.warning("%s Evaluating in the training process instead.", reason)
         return 0
     return workers
 
@@ -182,8 +213,9 @@ def eval_workers(task: str, make_env: Callable[[], EnvBase], config: DownstreamC
 def _prove_rendering(task: str, workers: int) -> None:
     """Some GPU drivers hang when several processes render; software does not."""
     with suppress(UnknownNameError):  # only a caller's own factory knows the task
-        if needs_gl(task) and backend_card()["gl_kind"] == "hardware":
-            select_backend(processes=workers + 1)
+        if needs_gl(task) and (card := backend_card())["gl_kind"] == "hardware":
+            # With this very backend: the training environment has it.
+            select_backend(card["backend"], processes=workers + 1)
 
 
 @contextmanager

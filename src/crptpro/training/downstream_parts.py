@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from crptpro.pretrained import Pretrained
 from crptpro.training.frozen_features import FrozenFeatures, dense_slots
 from crptpro.training.rad_sac_learner import RADSACLearner
 from crptpro.transforms import PrototypeReward, choose_feature_mode
+from crptpro.transforms.free_memory import free_bytes
 
 logger = logging.getLogger(__name__)
 
@@ -50,6 +52,8 @@ def build_parts(
     config: DownstreamConfig,
     generators: Mapping[str, torch.Generator],
     run_dir: Path,
+    *,
+    reserved_bytes: int = 0,
 ) -> Parts:
     """Build networks, replay, features and bonus; encoder, projector and prototypes are frozen copies.
 
@@ -61,6 +65,7 @@ def build_parts(
         config: every number.
         generators: streams ``"replay"``, ``"shift"``, ``"bonus"`` and ``"policy"``.
         run_dir: the replay's frames go below it.
+        reserved_bytes: of the CPU's memory, that others will need.
 
     Raises:
         PretrainedError: if the artifact was made for other images than the environment's.
@@ -98,17 +103,17 @@ def build_parts(
 
     replay = _build_replay(env, config, generators["replay"], run_dir)
     slots = dense_slots(replay, _agent_steps(config))
-    bonus = _build_bonus(projector, prototypes, pretrained.queue, config, generators["bonus"])
-    mode, reason = choose_feature_mode(
-        config.features,
-        encoder,
-        slots,
-        dtype,
-        pad=config.shift_pad,
-        latent_dim=bonus.queue.shape[-1] if bonus is not None and keeps_embeddings(config) else None,
-        device=config.device,
+    latent_dim = None
+    if (
+        prototypes is not None
+        and projector is not None
+        and config.intrinsic_reward_coef
+        and keeps_embeddings(config)
+    ):
+        latent_dim = prototypes.get_parameter("weight").shape[1]
+    mode, keeps_projections = _choose_features(
+        config, encoder, slots, dtype, latent_dim=latent_dim, reserved_bytes=reserved_bytes
     )
-    logger.info("features: %s", reason)
     features = FrozenFeatures(
         encoder,
         replay,
@@ -117,7 +122,15 @@ def build_parts(
         slots=slots,
         generator=generators["shift"],
         device=config.device,
-        projector=projector if bonus is not None and keeps_embeddings(config) else None,
+        projector=projector if keeps_projections else None,
+    )
+    bonus = _build_bonus(
+        projector,
+        prototypes,
+        pretrained.queue,
+        config,
+        generators["bonus"],
+        reads_projections=keeps_projections,
     )
     return Parts(encoder, actor, learner, replay, features, bonus, mode)
 
@@ -141,6 +154,38 @@ def _build_replay(
     return replay
 
 
+def _choose_features(
+    config: DownstreamConfig,
+    encoder: PixelEncoder,
+    slots: int,
+    dtype: torch.dtype,
+    *,
+    latent_dim: int | None,
+    reserved_bytes: int,
+) -> tuple[Literal["dense", "reencode"], bool]:
+    """Return how features are had, and whether projections are kept beside dense maps; says so.
+
+    Args:
+        config: what was asked for.
+        encoder: frozen.
+        slots: observations.
+        dtype: of the features.
+        latent_dim: length of the projections, if they are to be kept where there is room.
+        reserved_bytes: of the CPU's memory, that others will need.
+    """
+    device = torch.device(config.device)
+    available = max(0, free_bytes(device) - (reserved_bytes if device.type == "cpu" else 0))
+    choose = functools.partial(
+        choose_feature_mode, config.features, encoder, slots, dtype, available, pad=config.shift_pad
+    )
+    mode, reason = choose(latent_dim=latent_dim)
+    keeps_projections = latent_dim is not None and mode == "dense"
+    if latent_dim is not None and mode == "reencode":
+        mode, reason = choose()  # a tenth less
+    logger.info("features: %s", reason)
+    return mode, keeps_projections
+
+
 def keeps_embeddings(config: DownstreamConfig) -> bool:
     """Whether projections are kept for every shift of an observation instead of computed in every update.
 
@@ -160,17 +205,18 @@ def _build_bonus(
     queue: Tensor | None,
     config: DownstreamConfig,
     generator: torch.Generator,
+    *,
+    reads_projections: bool,
 ) -> PrototypeReward | None:
     if config.intrinsic_reward_coef == 0:
         return None
     if prototypes is None or projector is None:
         logger.info("no exploration bonus: the artifact has no prototypes")
         return None
-    keeps = keeps_embeddings(config)
     return PrototypeReward(
-        None if keeps else projector,
+        None if reads_projections else projector,
         prototypes,
-        in_keys="embedding" if keeps else "features",
+        in_keys="embedding" if reads_projections else "features",
         intrinsic_reward_coef=config.intrinsic_reward_coef,
         knn_k=config.knn_k,
         queue_size=config.queue_size,

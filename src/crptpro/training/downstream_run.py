@@ -28,6 +28,7 @@ from crptpro.training.downstream_checkpoint import STREAMS
 from crptpro.training.downstream_evaluation import DownstreamEvaluation
 from crptpro.training.downstream_parts import Parts, build_parts
 from crptpro.training.env_thread import EnvThread, runs_ahead
+from crptpro.training.evaluation_pool import WORKER_BYTES
 from crptpro.training.finite import not_finite, require_finite_parameters
 from crptpro.training.stop_request import StopRequest
 
@@ -72,16 +73,23 @@ class DownstreamRun:
         # The domain itself and not its name, which may be registered in this process only.
         name = get_domain(task) if env_factory is make_env else task
         make_this_env = functools.partial(env_factory, name, seed=config.seed, **settings)
-        self.env = EnvThread(make_this_env, is_ahead=runs_ahead(config))
+        self.env = EnvThread(make_this_env, is_ahead=runs_ahead(task, config))
         self.generators = {
             name: torch.Generator().manual_seed(derive_seed(config.seed, "downstream", name))
             for name in ("replay", "shift", "bonus", "policy", "random_actions")
         }
         self.records = records
         try:
-            self.parts: Parts = build_parts(pretrained, self.env.env, config, self.generators, run_dir)
             self.evaluation = DownstreamEvaluation(
                 task, make_this_env, config, records, run_dir, progress=progress
+            )
+            self.parts: Parts = build_parts(
+                pretrained,
+                self.env.env,
+                config,
+                self.generators,
+                run_dir,
+                reserved_bytes=self.evaluation.workers * WORKER_BYTES,
             )
         except BaseException:
             self.env.close()  # no run, nobody else to free the render context
@@ -116,28 +124,28 @@ class DownstreamRun:
             while True:
                 is_finished = self.env_steps >= config.env_steps
                 is_new = self.last_eval != self.env_steps
-                if is_new and (self.env_steps >= self.next_eval or is_finished):
-                    self.evaluation.start(self.agent(), self.counters())
-                    self.last_eval = self.env_steps
-                    self.next_eval = self._after(config.eval_interval_env_steps)
-                if is_finished:
-                    self.evaluation.finish()
-                if checkpoints is not None and (
-                    self.env_steps >= self.next_checkpoint or (is_finished and is_new)
-                ):
-                    self.next_checkpoint = self._after(config.checkpoint_interval_env_steps)
-                    self.save(checkpoints)
-                if is_finished:
-                    return
-                if stop.signal is not None:
+                if stop.signal is not None and not is_finished:
                     if checkpoints is not None:
                         self.save(checkpoints)
                     logger.warning(
                         "Stopped at %s of %s env steps.", f"{self.env_steps:,}", f"{config.env_steps:,}"
                     )
                     stop.leave()
+                is_evaluated = is_new and (self.env_steps >= self.next_eval or is_finished)
+                if is_evaluated:
+                    self.evaluation.start(self.agent(), self.counters())
+                    self.last_eval = self.env_steps
+                    self.next_eval = self._after(config.eval_interval_env_steps)
+                is_due = self.env_steps >= self.next_checkpoint
+                if is_finished or (is_due and not is_evaluated):
+                    # The rows of an evaluation appear at places that do not depend on how long it took.
+                    is_due = self.evaluation.finish() or is_new or is_due
+                if checkpoints is not None and is_due:
+                    self.next_checkpoint = self._after(config.checkpoint_interval_env_steps)
+                    self.save(checkpoints)
+                if is_finished:
+                    return
                 self.run_episode(bar)
-                self.evaluation.collect()
 
     def counters(self) -> dict[str, int]:
         """Where the run is."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
+from contextlib import suppress
 from typing import TypeVar
 
 from tensordict import TensorDictBase
@@ -12,6 +12,10 @@ from torchrl.envs import EnvBase
 
 from crptpro.cards import cpu_cores
 from crptpro.downstream_config import DownstreamConfig
+from crptpro.envs import needs_gl
+from crptpro.envs.rendering import select_backend
+from crptpro.errors import UnknownNameError
+from crptpro.modules.lone_threads import lone_threads
 
 T = TypeVar("T")
 
@@ -28,8 +32,9 @@ class EnvThread:
     """
 
     def __init__(self, make_env: Callable[[], EnvBase], *, is_ahead: bool) -> None:
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="environment") if is_ahead else None
+        self._thread = lone_threads(1, "environment") if is_ahead else None
         self._pending: Future[TensorDictBase] | Callable[[], TensorDictBase] | None = None
+        self._is_closed = False
         try:
             self.env: EnvBase = self._do(make_env)
         except BaseException:
@@ -47,6 +52,8 @@ class EnvThread:
 
     def begin_step(self, tensordict: TensorDictBase) -> None:
         """Begin the step that ``tensordict["action"]`` asks for; nobody may change the tensordict until its end."""
+        if self._pending is not None:
+            raise RuntimeError("begin_step() twice; end_step() comes between.")
         if self._thread is None:
             self._pending = lambda: self.env.step(tensordict)
         else:
@@ -60,14 +67,19 @@ class EnvThread:
         return pending.result() if isinstance(pending, Future) else pending()
 
     def close(self) -> None:
-        """Let a step that has begun end, then free the render context."""
-        if isinstance(self._pending, Future):
-            self._pending.exception()
-        self._pending = None
+        """Let a step that has begun end, then free the render context. Harmless when called again."""
+        if self._is_closed:
+            return
+        self._is_closed = True
         try:
-            self._do(self.env.close)
+            if isinstance(self._pending, Future):
+                self._pending.exception()
         finally:
-            self._end_thread()
+            self._pending = None
+            try:
+                self._do(self.env.close)
+            finally:
+                self._end_thread()
 
     def _do(self, work: Callable[[], T]) -> T:
         return work() if self._thread is None else self._thread.submit(work).result()
@@ -77,12 +89,16 @@ class EnvThread:
             self._thread.shutdown()
 
 
-def runs_ahead(config: DownstreamConfig) -> bool:
-    """Tell whether the next observation is drawn while the update computes: as asked, or where it pays.
+def runs_ahead(task: str, config: DownstreamConfig) -> bool:
+    """Tell whether the next observation is drawn while the update computes: as asked, or where it pays and can.
 
-    A GPU computes by itself once it has been told to, and one core cannot do two things at a time.
+    A GPU computes by itself once it has been told to, and one core cannot do two things at a time. GLFW wants the main
+    thread.
     """
     if config.render_ahead is not None:
         return config.render_ahead
-    # GLFW wants the main thread.
-    return config.device == "cpu" and cpu_cores() > 1 and os.environ.get("MUJOCO_GL") != "glfw"
+    if config.device != "cpu" or cpu_cores() == 1:
+        return False
+    with suppress(UnknownNameError):  # only a caller's own factory knows the task
+        return not (needs_gl(task) and select_backend() == "glfw")
+    return True

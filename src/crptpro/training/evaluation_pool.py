@@ -8,9 +8,12 @@ import os
 import pickle
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 
@@ -24,11 +27,13 @@ from crptpro.modules import resolve_precision, set_compute_dtype
 from crptpro.modules.placement import device_of
 from crptpro.training.agent import PixelAgent
 from crptpro.training.evaluate import Episode, episode_seed
-from crptpro.training.evaluation_worker import EvaluationJob, receive, send
+from crptpro.training.evaluation_worker import EvaluationJob, OtherEndGone, receive, send
 
 logger = logging.getLogger(__name__)
 
-START = "from crptpro.training.evaluation_worker import main; main()"
+Outcome = tuple[list[Episode], list[Tensor]]
+WORKER_BYTES = 500_000_000
+START = "import sys; sys.path[:] = sys.argv[3:]; from crptpro.training.evaluation_worker import main; main()"
 REMEDY = "The run is kept up to its last checkpoint: start it again once the cause is removed"
 
 
@@ -42,28 +47,16 @@ class _Worker:
     heard_s: float = 0.0
 
 
-@dataclass
-class _Evaluation:
-    """What is asked and what has come back."""
-
-    episodes: int
-    waiting: list[EvaluationJob]
-    results: dict[int, tuple[Episode, Tensor | None]] = field(default_factory=dict)
-
-    @property
-    def is_complete(self) -> bool:
-        return len(self.results) == self.episodes
-
-
 class EvaluationPool:
     """Runs the episodes of one evaluation in several processes.
 
     Each episode is what :func:`crptpro.training.evaluate` makes of it, whatever the number of processes. They start
-    with the first evaluation and end with this process, however it ends.
+    with the first evaluation and end with this process, however it ends. A thread hands out the episodes, so that the
+    caller has nothing to do until it wants the result.
 
     Args:
         make_env: builds the environment, in the processes; see :func:`can_be_sent`.
-        workers: processes, at least 1; each renders and computes on one core and takes about 0.5 GB of memory.
+        workers: processes, at least 1; each renders and computes on one core and takes :data:`WORKER_BYTES` of memory.
         stall_timeout_s: seconds without a sign of life from a busy process after which it counts as hung.
     """
 
@@ -74,7 +67,10 @@ class EvaluationPool:
         self._count = workers
         self._stall_timeout_s = stall_timeout_s
         self._workers: list[_Worker] = []
-        self._evaluation: _Evaluation | None = None
+        self._driver = ThreadPoolExecutor(1, thread_name_prefix="evaluation")
+        self._evaluation: Future[Outcome] | None = None
+        self._lock = threading.Lock()  # no process may be started while they are being ended
+        self._is_closed = False
 
     def start(self, agent: PixelAgent, *, episodes: int, seed: int, record_episodes: int = 0) -> None:
         """Begin an evaluation of the agent as it is now; returns at once.
@@ -95,96 +91,110 @@ class EvaluationPool:
             EvaluationJob(snapshot, episode, episode_seed(seed, episode), episode < record_episodes)
             for episode in range(episodes)
         ]
-        self._evaluation = _Evaluation(episodes, jobs)
-        while len(self._workers) < min(self._count, episodes):
-            self._workers.append(self._start_worker())
-        self._hand_out(self._evaluation)
+        self._evaluation = self._driver.submit(self._run, jobs)
 
-    def take(self, *, is_awaited: bool) -> tuple[list[Episode], list[Tensor]] | None:
-        """Return the evaluation that was started, once: as :func:`crptpro.training.evaluate` does.
-
-        Args:
-            is_awaited: return only when it is complete.
-
-        Returns:
-            ``None`` if there is none, or it is not complete and not awaited.
+    def result(self) -> Outcome:
+        """Wait for the evaluation that was started and return it, once, as :func:`crptpro.training.evaluate` does.
 
         Raises:
-            CRPTproError: if a process failed, died or hangs; the message says what to do.
+            RuntimeError: none was started.
+            CRPTproError: if a process failed, died or hung; the message says what to do.
         """
-        evaluation = self._evaluation
+        evaluation, self._evaluation = self._evaluation, None
         if evaluation is None:
-            return None
-        self._receive(evaluation, timeout_s=0.0)
-        while is_awaited and not evaluation.is_complete:
-            self._receive(evaluation, timeout_s=1.0)
-        if not evaluation.is_complete:
-            return None
-        self._evaluation = None
-        outcomes = [evaluation.results[index] for index in range(evaluation.episodes)]
-        return [episode for episode, _ in outcomes], [p for _, p in outcomes if p is not None]
+            raise RuntimeError("No evaluation is under way.")
+        return evaluation.result()
 
     def close(self) -> None:
-        """End the processes, busy or not."""
-        for worker in self._workers:
-            worker.connection.close()
-            worker.process.terminate()
+        """End the processes, busy or not. Harmless when called again."""
+        with self._lock:
+            self._is_closed = True
+            for worker in self._workers:
+                if worker.episode is not None:
+                    worker.process.terminate()
+                else:
+                    worker.connection.close()  # it frees its render context and ends
         for worker in self._workers:
             try:
                 worker.process.wait(5.0)
             except subprocess.TimeoutExpired:
                 worker.process.kill()
                 worker.process.wait()
+        self._driver.shutdown()
+        for worker in self._workers:
+            worker.connection.close()
         self._workers, self._evaluation = [], None
 
-    def _start_worker(self) -> _Worker:
+    # --- in the driving thread ----------------------------------------------------------------------------------
+
+    def _run(self, jobs: list[EvaluationJob]) -> Outcome:
+        waiting, results = list(jobs), dict[int, tuple[Episode, Tensor | None]]()
+        self._workers = [worker for worker in self._workers if worker.process.poll() is None]
+        while len(self._workers) < min(self._count, len(jobs)):
+            self._start_worker()
+        while len(results) < len(jobs):
+            for worker in self._workers:
+                if worker.episode is None and waiting:
+                    job = waiting.pop(0)
+                    worker.episode, worker.heard_s = job.episode, time.monotonic()
+                    self._send(worker, job)
+            results.update(self._receive())
+        outcomes = [results[index] for index in range(len(jobs))]
+        return [episode for episode, _ in outcomes], [p for _, p in outcomes if p is not None]
+
+    def _start_worker(self) -> None:
         ours, theirs = Pipe()
         descriptor = theirs.fileno()
-        process = subprocess.Popen(
-            [sys.executable, "-c", START, str(descriptor), str(os.getpid())],
-            pass_fds=[descriptor],
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        )
-        theirs.close()
-        worker = _Worker(process, ours)
+        path = [os.path.abspath(entry) for entry in sys.path]
+        with self._lock:
+            if self._is_closed:
+                raise CRPTproError("The evaluation was given up.")
+            # A session of its own: Ctrl-C is for the parent, which decides what it ends.
+            process = subprocess.Popen(
+                [sys.executable, "-c", START, str(descriptor), str(os.getpid()), *path],
+                pass_fds=[descriptor],
+                start_new_session=True,
+            )
+            theirs.close()
+            worker = _Worker(process, ours)
+            self._workers.append(worker)
         self._send(worker, self._make_env)
-        return worker
 
-    def _hand_out(self, evaluation: _Evaluation) -> None:
-        for worker in self._workers:
-            if worker.episode is None and evaluation.waiting:
-                job = evaluation.waiting.pop(0)
-                worker.episode, worker.heard_s = job.episode, time.monotonic()
-                self._send(worker, job)
-
-    def _receive(self, evaluation: _Evaluation, *, timeout_s: float) -> None:
-        """Take in what has arrived, then give free processes the next episodes."""
-        ready = wait([worker.connection for worker in self._workers], timeout_s)
-        for worker in self._workers:
+    def _receive(self) -> dict[int, tuple[Episode, Tensor | None]]:
+        """Wait up to a second for what the busy processes have to say; returns finished episodes."""
+        busy = [worker for worker in self._workers if worker.episode is not None]
+        ready = wait([worker.connection for worker in busy], 1.0)
+        finished: dict[int, tuple[Episode, Tensor | None]] = {}
+        for worker in busy:
             if worker.connection in ready:
                 try:
                     kind, payload = receive(worker.connection)
-                except (EOFError, ConnectionResetError):
+                except OtherEndGone:
                     raise _death(worker) from None
                 worker.heard_s = time.monotonic()
                 if kind == "error":
                     raise _failure(*payload)
                 if kind == "episode":
                     worker.episode = None
-                    evaluation.results[payload[0].episode] = payload
-        self._hand_out(evaluation)
-        for worker in self._workers:
-            if worker.episode is not None and time.monotonic() - worker.heard_s > self._stall_timeout_s:
+                    finished[payload[0].episode] = payload
+            elif time.monotonic() - worker.heard_s > self._stall_timeout_s:
                 raise RenderingError(
                     f"{_name(worker)} has given no sign of life for {self._stall_timeout_s:.0f} s; a render driver "
                     f"that hangs is the usual cause. {REMEDY}, with eval_workers=0, or with MUJOCO_GL=osmesa or egl."
                 )
+        return finished
 
     @staticmethod
     def _send(worker: _Worker, message: object) -> None:
         try:
             send(worker.connection, message)
-        except OSError:
+        except OtherEndGone:
+            # It may have said why before it went.
+            with suppress(OtherEndGone):
+                while worker.connection.poll():
+                    kind, payload = receive(worker.connection)
+                    if kind == "error":
+                        raise _failure(*payload) from None
             raise _death(worker) from None
 
 
@@ -192,7 +202,7 @@ def can_be_sent(make_env: Callable[[], EnvBase]) -> bool:
     """Tell whether another process can rebuild a factory: it pickles, and needs nothing of the main program."""
     try:
         return b"__main__" not in pickle.dumps(make_env)
-    except (pickle.PicklingError, AttributeError, TypeError):
+    except Exception:  # objects may refuse in ways of their own
         return False
 
 

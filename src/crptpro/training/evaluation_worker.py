@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import os
 import pickle
-import signal
 import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
@@ -45,14 +45,33 @@ class EvaluationJob:
     is_recorded: bool
 
 
+class OtherEndGone(Exception):
+    """Nobody is left to talk to."""
+
+
 def send(connection: Connection, message: object) -> None:
-    """Send an object whole; ``Connection.send`` would share tensors through servers that the other end cannot reach."""
-    connection.send_bytes(pickle.dumps(message))
+    """Send an object whole; ``Connection.send`` would share tensors through servers that the other end cannot reach.
+
+    Raises:
+        OtherEndGone: if the other process has closed the connection or ended.
+    """
+    try:
+        connection.send_bytes(pickle.dumps(message))
+    except OSError as reason:
+        raise OtherEndGone from reason
 
 
 def receive(connection: Connection) -> Any:
-    """Receive what :func:`send` sent."""
-    return pickle.loads(connection.recv_bytes())
+    """Receive what :func:`send` sent.
+
+    Raises:
+        OtherEndGone: if the other process has closed the connection or ended.
+    """
+    try:
+        content = connection.recv_bytes()
+    except (EOFError, OSError) as reason:
+        raise OtherEndGone from reason
+    return pickle.loads(content)
 
 
 def serve(connection: Connection) -> None:
@@ -72,11 +91,12 @@ def serve(connection: Connection) -> None:
                 policy, env, episode=job.episode, seed=job.seed, is_recorded=job.is_recorded
             )
             send(connection, ("episode", outcome))
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        pass  # the parent needs no more answers
+    except OtherEndGone:
+        pass
     except Exception as reason:
         kind = type(reason).__name__ if isinstance(reason, CRPTproError) else ""
-        send(connection, ("error", (kind, str(reason), traceback.format_exc())))
+        with suppress(OtherEndGone):
+            send(connection, ("error", (kind, str(reason), traceback.format_exc())))
     finally:
         if env is not None:
             env.close()
@@ -104,7 +124,6 @@ def _exit_with(parent: int) -> None:
 
 def main() -> None:
     """Serve on the inherited file descriptor, as long as the parent lives."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
     threading.Thread(target=_exit_with, args=(int(sys.argv[2]),), daemon=True).start()
     # One thread to draw and one to compute: episodes run side by side, and the arithmetic is that of `evaluate`.
     os.environ.setdefault("LP_NUM_THREADS", "1")

@@ -67,6 +67,11 @@ class FrozenFeatures:
             reuse_output=True,
         )
 
+    @property
+    def keeps_projections(self) -> bool:
+        """Whether projections are read from the cache."""
+        return self.cache is not None and self.cache.has_embeddings
+
     @torch.no_grad()
     def observe(self, pixels: Tensor, slot: int) -> Tensor:
         """Take in the observation that was just stored and return its un-shifted features.

@@ -63,9 +63,8 @@ class Source:
         dataset = self.dataset
         return (
             type(dataset) is FrameDataset
+            and dataset.is_read_directly
             and dataset.frames.get("pixels").device.type == "cpu"
-            and not len(dataset._transform)
-            and not dataset._prefetch
         )
 
     def sample_shifted(
