@@ -63,7 +63,7 @@ train_downstream("toy", small_pretrained(), run_dir=Path(sys.argv[1]), config=SM
     run = subprocess.Popen(command, env={**environment, "TOY_IS_SLEEPY": "1"})
     deadline = time.monotonic() + 120
     # The evaluation at 40 env steps takes 6 s longer than the episode after it; a checkpoint is due in the meantime.
-    while not (found := sorted((tmp_path / "killed").glob("checkpoints/checkpoint-*20.pt"))):
+    while not (found := sorted((tmp_path / "killed").glob("checkpoints/checkpoint-*0020-*.pt"))):
         assert run.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.01)
