@@ -1,6 +1,6 @@
 """The whole of CRPTpro in small: collect at random, pre-train, freeze, learn a task, compare with chance.
 
-    python recipes/quickstart.py                    # about nine minutes on two CPU cores, no GPU, no display
+    python recipes/quickstart.py                    # about ten minutes on two CPU cores, no GPU, no display
     python recipes/quickstart.py --out runs/other --seed 1
 
 Ends with runs/quickstart/report.md and its figures: the trained agent's mean return beside the uniform random
