@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from crptpro.modules import PixelEncoder
-from crptpro.modules.chunks import apply_to_chunks, map_side_by_side
+from crptpro.modules.chunks import apply_to_chunks, map_side_by_side, split_among_threads
 
 
 @pytest.fixture(autouse=True)
@@ -78,6 +78,18 @@ def test_every_thread_computes_alone_and_the_callers_number_stays() -> None:
     assert len({ident for ident, _ in seen}) == 2
     assert [number for _, number in seen] == [1, 1]
     assert torch.get_num_threads() == 2
+
+
+@pytest.mark.parametrize(("threads", "count", "parts"), [(2, 130, 2), (3, 200, 3), (2, 100, 1), (4, 0, 1)])
+def test_items_are_split_evenly_among_the_threads_and_each_is_done_once(
+    threads: int, count: int, parts: int
+) -> None:
+    torch.set_num_threads(threads)
+    done: list[range] = []
+    split_among_threads(lambda part: done.append(range(count)[part]), count)
+    assert sorted(item for part in done for item in part) == list(range(count))
+    assert len(done) == parts
+    assert max(map(len, done)) - min(map(len, done)) <= 1
 
 
 def test_gradient_mode_is_the_callers() -> None:

@@ -7,6 +7,7 @@ have finished spin until the slowest comes back. Here they meet once per batch.
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 from collections.abc import Callable, Sequence
@@ -77,6 +78,19 @@ def _is_watched() -> bool:
         or is_in_torch_dispatch_mode()
         or torch._C._are_functorch_transforms_active()
     )
+
+
+def split_among_threads(work: Callable[[slice], None], count: int, *, smallest: int = 64) -> None:
+    """Call ``work`` with the parts of ``range(count)``, one per thread, side by side.
+
+    Args:
+        work: does the items of a slice; must be thread-safe, and let other threads run for most of its time.
+        count: items.
+        smallest: items below which a part is not worth a thread.
+    """
+    parts = max(1, min(torch.get_num_threads(), count // smallest))
+    bounds = [count * index // parts for index in range(parts + 1)]
+    map_side_by_side(work, [slice(first, last) for first, last in itertools.pairwise(bounds)])
 
 
 class _Chunks(torch.autograd.Function):

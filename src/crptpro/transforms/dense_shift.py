@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from crptpro.modules import PixelEncoder
+from crptpro.modules.chunks import split_among_threads
 from crptpro.transforms.host_memory import as_numpy_bits, empty_on_huge_pages
 from crptpro.transforms.random_shift import check_offsets
 
@@ -178,10 +179,15 @@ def crop_rows(
     crops = empty_on_huge_pages(shape, maps.dtype) if out is None else out
     source = as_numpy_bits(maps)
     target = as_numpy_bits(crops).reshape(batch, channels, height, width)
-    for crop, row, (dy, dx) in zip(target, rows.tolist(), offsets.tolist()):
-        top, left = dy // phases, dx // phases
-        phase = dy % phases * phases + dx % phases
-        crop[:] = source[row, phase, :, top : top + height, left : left + width]
+    where = list(zip(rows.tolist(), offsets.tolist()))
+
+    def crop_part(part: slice) -> None:
+        for crop, (row, (dy, dx)) in zip(target[part], where[part]):
+            top, left = dy // phases, dx // phases
+            phase = dy % phases * phases + dx % phases
+            crop[:] = source[row, phase, :, top : top + height, left : left + width]
+
+    split_among_threads(crop_part, batch)
     return crops
 
 
