@@ -106,11 +106,13 @@ def save(name: str, settings: Any, results: Mapping[str, Any], *, out: Path | No
     Returns:
         The file.
     """
+    arguments = [_without_place(argument) for argument in sys.argv[1:]]
     content = {
         "benchmark": name,
-        "command": " ".join(["python", "-m", f"benchmarks.{name}", *sys.argv[1:]]),
+        "command": " ".join(["python", "-m", f"benchmarks.{name}", *arguments]),
         "settings": {
-            key: str(value) if isinstance(value, Path) else value for key, value in asdict(settings).items()
+            key: _without_place(str(value)) if isinstance(value, Path) else value
+            for key, value in asdict(settings).items()
         },
         "results": _plain(results),
         "threads": torch.get_num_threads(),
@@ -120,6 +122,11 @@ def save(name: str, settings: Any, results: Mapping[str, Any], *, out: Path | No
     path = (out or RESULTS) / f"{name}.json"
     write_json(path, content)
     return path
+
+
+def _without_place(argument: str) -> str:
+    """Results are published: where a directory lies on one machine is nobody's business, its name may be."""
+    return Path(argument).name if Path(argument).is_absolute() else argument
 
 
 def _plain(value: Any) -> Any:
