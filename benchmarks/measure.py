@@ -110,10 +110,7 @@ def save(name: str, settings: Any, results: Mapping[str, Any], *, out: Path | No
     content = {
         "benchmark": name,
         "command": " ".join(["python", "-m", f"benchmarks.{name}", *arguments]),
-        "settings": {
-            key: _without_place(str(value)) if isinstance(value, Path) else value
-            for key, value in asdict(settings).items()
-        },
+        "settings": _plain(asdict(settings)),
         "results": _plain(results),
         "threads": torch.get_num_threads(),
         "load_average_at_end": os.getloadavg()[0],
@@ -134,6 +131,8 @@ def _plain(value: Any) -> Any:
         return asdict(value)
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, Path):
+        return _without_place(str(value))
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
     return value
