@@ -40,7 +40,7 @@ from benchmarks.library_updates import (
 )
 from benchmarks.measure import ratios, save, side_by_side
 from benchmarks.synthetic import write_dataset
-from crptpro.cards import hardware
+from crptpro.cards import cpu_cores
 from crptpro.console import run_main
 from crptpro.data import FrameDataset
 from crptpro.downstream_config import DownstreamConfig
@@ -72,7 +72,7 @@ class Settings:
     """timed calls of each candidate, taken in turns"""
     warmup: int = 2
     """calls of each candidate before the first timed one"""
-    threads: int = dataclasses.field(default_factory=lambda: hardware()["cpu_cores"])
+    threads: int = dataclasses.field(default_factory=cpu_cores)
     """of torch; all cores this process may use by default"""
     batch_size: int = 512
     """transitions per update where it is not what grows"""

@@ -19,7 +19,7 @@ from crptpro.modules import PixelEncoder, Projector, Prototypes, resolve_precisi
 from crptpro.modules.precision import Precision
 from crptpro.objectives import ProtoLoss, method_defaults
 from crptpro.pretrained import Pretrained
-from crptpro.training.downstream_parts import build_parts, keeps_embeddings
+from crptpro.training.downstream_parts import build_parts, worth_keeping_projections
 from crptpro.training.frozen_features import dense_slots
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.sources import Augmenter, keys_read, open_sources
@@ -169,7 +169,7 @@ def require_dense(pretrained: Pretrained, config: DownstreamConfig) -> None:
 
 
 def _kept_latent_dim(pretrained: Pretrained, config: DownstreamConfig) -> int | None:
-    if pretrained.prototypes is None or not keeps_embeddings(config):
+    if pretrained.prototypes is None or not worth_keeping_projections(config):
         return None
     return pretrained.prototypes.get_parameter("weight").shape[1]
 

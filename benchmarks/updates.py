@@ -33,7 +33,7 @@ from benchmarks.library_updates import dense_bytes, fresh_loss, fresh_pretrained
 from benchmarks.measure import Timing, ratios, save, side_by_side, table
 from benchmarks.peer import Peer
 from benchmarks.synthetic import write_dataset
-from crptpro.cards import hardware
+from crptpro.cards import cpu_cores
 from crptpro.console import run_main
 from crptpro.data import FrameDataset
 from crptpro.domains import get_domain
@@ -58,7 +58,7 @@ class Settings:
     """timed calls of each candidate, taken in turns; a call is one pre-training update or two downstream updates"""
     warmup: int = 2
     """calls of each candidate before the first timed one"""
-    threads: int = dataclasses.field(default_factory=lambda: hardware()["cpu_cores"])
+    threads: int = dataclasses.field(default_factory=cpu_cores)
     """of torch; all cores this process may use by default"""
     batch_size: int = 512
     """transitions per update"""

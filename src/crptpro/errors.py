@@ -33,3 +33,19 @@ class PretrainedError(CRPTproError):
 
 class NonFiniteError(CRPTproError):
     """A loss or a gradient became NaN or infinite."""
+
+
+def error_name(reason: BaseException) -> str:
+    """Return the name under which another process can raise this error again; empty if it is not one of ours."""
+    return type(reason).__name__ if isinstance(reason, CRPTproError) else ""
+
+
+def error_named(name: str, message: str) -> CRPTproError | None:
+    """Rebuild an error that another process named by :func:`error_name`; ``None`` if it was not one of ours.
+
+    Examples:
+        >>> error_named(error_name(DatasetError("gone")), "gone")
+        DatasetError('gone')
+    """
+    known = globals().get(name)
+    return known(message) if isinstance(known, type) and issubclass(known, CRPTproError) else None

@@ -132,7 +132,7 @@ def test_kept_and_computed_embeddings_give_the_same_bonus(
 ) -> None:
     settings = {"batch_size": 20, "shift_pad": 1, "features": features, "env_steps": 60}
     kept = train(tmp_path / "kept", **settings)
-    monkeypatch.setattr("crptpro.training.downstream_parts.keeps_embeddings", lambda config: False)
+    monkeypatch.setattr("crptpro.training.downstream_parts.worth_keeping_projections", lambda config: False)
     computed = train(tmp_path / "computed", **settings)
     rows = []
     for run in ("kept", "computed"):

@@ -206,6 +206,18 @@ def test_a_process_that_fails_dies_or_hangs_is_named(
         pool.close()
 
 
+def test_a_process_that_cannot_be_started_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*args: object, **options: object) -> None:
+        raise OSError(12, "Cannot allocate memory")
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    pool = EvaluationPool(make_toy, workers=1)
+    pool.start(small_agent(), episodes=1, seed=0)
+    with pytest.raises(CRPTproError, match=r"could not be started: .*Cannot allocate memory"):
+        pool.result()
+    pool.close()
+
+
 def test_a_killed_process_is_named_with_the_signal() -> None:
     pool = EvaluationPool(functools.partial(stacked, make_hanging), workers=1)
     busy_process(pool).kill()

@@ -16,9 +16,8 @@ from typing import Any
 
 from torchrl.envs import EnvBase
 
-from crptpro import errors
 from crptpro.data.collect_worker import EpisodeJob, worker_main
-from crptpro.errors import CRPTproError, RenderingError
+from crptpro.errors import CRPTproError, RenderingError, error_named
 
 logger = logging.getLogger(__name__)
 
@@ -188,9 +187,9 @@ def _require_picklable(name: str, factory: Callable[[], EnvBase]) -> None:
 
 
 def _failure(worker: Worker, kind: str, message: str, trace: str) -> CRPTproError:
-    known = getattr(errors, kind, None) if kind else None
+    known = error_named(kind, message)
     if known is not None:
-        return known(message)
+        return known
     logger.error("%s", trace)
     return CRPTproError(
         f"{worker.describe()} failed: {message.strip() or 'see the traceback above'}. "

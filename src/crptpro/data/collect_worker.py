@@ -21,7 +21,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.modules import RandomPolicy
 
 from crptpro.data.episode import Episode
-from crptpro.errors import CRPTproError
+from crptpro.errors import error_name
 
 HEARTBEAT_S = 1.0
 POLLING = 25
@@ -186,9 +186,7 @@ def worker_main(connection: Connection, factories: dict[str, Callable[[], EnvBas
     except (BrokenPipeError, ConnectionResetError, EOFError):
         pass  # the parent is gone and needs no answer
     except Exception as reason:
-        error = reason if isinstance(reason, CRPTproError) else None
-        kind = type(error).__name__ if error else ""
-        connection.send(("error", domain, (kind, str(reason), traceback.format_exc())))
+        connection.send(("error", domain, (error_name(reason), str(reason), traceback.format_exc())))
 
 
 class _Heartbeat:

@@ -71,11 +71,6 @@ class DownstreamEvaluation:
         self._env: EnvBase | None = None
         self._pending: tuple[PixelAgent, dict[str, int]] | None = None
 
-    @property
-    def is_beside(self) -> bool:
-        """Whether training goes on meanwhile."""
-        return self._pool is not None
-
     def start(self, agent: PixelAgent, counters: Mapping[str, int]) -> None:
         """Evaluate the agent as it is now; with processes of its own, return at once.
 

@@ -108,7 +108,7 @@ def build_parts(
         prototypes is not None
         and projector is not None
         and config.intrinsic_reward_coef
-        and keeps_embeddings(config)
+        and worth_keeping_projections(config)
     ):
         latent_dim = prototypes.get_parameter("weight").shape[1]
     mode, keeps_projections = _choose_features(
@@ -186,7 +186,7 @@ def _choose_features(
     return mode, keeps_projections
 
 
-def keeps_embeddings(config: DownstreamConfig) -> bool:
+def worth_keeping_projections(config: DownstreamConfig) -> bool:
     """Whether projections are kept for every shift of an observation instead of computed in every update.
 
     An update projects the whole batch, an agent step every shift of one observation; with a batch of twice as many

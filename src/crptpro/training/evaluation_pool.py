@@ -21,8 +21,7 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from crptpro import errors
-from crptpro.errors import CRPTproError, RenderingError
+from crptpro.errors import CRPTproError, RenderingError, error_named
 from crptpro.modules import resolve_precision, set_compute_dtype
 from crptpro.modules.placement import device_of
 from crptpro.training.agent import PixelAgent
@@ -150,12 +149,19 @@ class EvaluationPool:
             if self._is_closed:
                 raise CRPTproError("The evaluation was given up.")
             # A session of its own: Ctrl-C is for the parent, which decides what it ends.
-            process = subprocess.Popen(
-                [sys.executable, "-c", START, str(descriptor), str(os.getpid()), *path],
-                pass_fds=[descriptor],
-                start_new_session=True,
-            )
-            theirs.close()
+            try:
+                process = subprocess.Popen(
+                    [sys.executable, "-c", START, str(descriptor), str(os.getpid()), *path],
+                    pass_fds=[descriptor],
+                    start_new_session=True,
+                )
+            except OSError as reason:
+                ours.close()
+                raise CRPTproError(
+                    f"An evaluating process could not be started: {reason}. {REMEDY}."
+                ) from reason
+            finally:
+                theirs.close()
             worker = _Worker(process, ours)
             self._workers.append(worker)
         self._send(worker, self._make_env)
@@ -231,9 +237,9 @@ def _death(worker: _Worker) -> CRPTproError:
 
 
 def _failure(kind: str, message: str, trace: str) -> CRPTproError:
-    known = getattr(errors, kind, None) if kind else None
+    known = error_named(kind, message)
     if known is not None:
-        return known(message)
+        return known
     logger.error("%s", trace)
     return CRPTproError(
         f"An evaluating process failed: {message.strip() or 'see the traceback above'}. {REMEDY}."

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from crptpro.errors import CRPTproError
+from crptpro.errors import error_name
 from crptpro.training.evaluate import Policy, run_episode
 
 HEARTBEAT_S = 1.0
@@ -94,9 +94,8 @@ def serve(connection: Connection) -> None:
     except OtherEndGone:
         pass
     except Exception as reason:
-        kind = type(reason).__name__ if isinstance(reason, CRPTproError) else ""
         with suppress(OtherEndGone):
-            send(connection, ("error", (kind, str(reason), traceback.format_exc())))
+            send(connection, ("error", (error_name(reason), str(reason), traceback.format_exc())))
     finally:
         if env is not None:
             env.close()
