@@ -86,8 +86,8 @@ class SACSettings:
         for name in ("learning_rate", "initial_temperature"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"`{name}` must be positive, got {getattr(self, name)}.")
-        for name in ("shift_pad", "intrinsic_reward_coef", "video_episodes", "eval_workers"):
-            if (getattr(self, name, None) or 0) < 0:
+        for name in ("shift_pad", "intrinsic_reward_coef", "video_episodes"):
+            if getattr(self, name) < 0:
                 raise ValueError(f"`{name}` must not be negative, got {getattr(self, name)}.")
         if self.replay_capacity < self.random_agent_steps:
             raise ValueError(
@@ -127,3 +127,13 @@ class DownstreamConfig(SACSettings):
     several cores; say no where an environment wants the main thread"""
     device: str = "cpu"
     """where networks and features live"""
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot run.
+
+        Raises:
+            ValueError: naming the setting, its value and what is allowed.
+        """
+        super().__post_init__()
+        if self.eval_workers is not None and self.eval_workers < 0:
+            raise ValueError(f"`eval_workers` must not be negative, got {self.eval_workers}.")

@@ -80,4 +80,4 @@ def restore(run: DownstreamRun, state: Mapping[str, Any]) -> None:
     set_global_rng_state(state["global_rng"])
     run.sums, run.counts = dict(state["sums"]), dict(state["counts"])
     run.records.load_state_dict(state["records"])
-    run.evaluation.load_state_dict(state.get("evaluation", {"pending": None}), run.agent())
+    run.evaluation.load_state_dict(state["evaluation"], run.agent())
