@@ -10,6 +10,7 @@ from crptpro.objectives.rad_sac import RADSACLoss
 from crptpro.objectives.registry import (
     Method,
     MethodDefaults,
+    exploration_defaults,
     get_method,
     method_defaults,
     methods,
@@ -27,6 +28,7 @@ __all__ = [
     "ProtoLoss",
     "RADSACLoss",
     "SimCLRLoss",
+    "exploration_defaults",
     "get_method",
     "method_defaults",
     "methods",

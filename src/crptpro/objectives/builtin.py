@@ -66,6 +66,7 @@ register_method(
         reward="skill-contrast",
         agent="skill-ddpg",
         encoder_updates_each=3,
+        encodes_before_update=True,
         agent_update_interval=2,
         n_step=3,
         skill_dim=16,

@@ -36,6 +36,9 @@ class ExplorationDefaults:
     agent_update_interval: int = 1
     """Agent steps between two updates of the agent."""
 
+    encodes_before_update: bool = False
+    """Whether reward and agent see the features from before the encoder update of the same turn, not after it."""
+
     transfers_actor: bool = False
     """Whether the downstream agent starts from the exploring actor."""
 

@@ -183,3 +183,11 @@ def method_defaults(loss: LossModule | type[LossModule]) -> MethodDefaults:
         return MethodDefaults()
     has_targets = any(name.startswith("target_") for name, _ in loss.named_children())
     return MethodDefaults() if has_targets else MethodDefaults(encoder_tau=None)
+
+
+def exploration_defaults(loss: LossModule) -> ExplorationDefaults:
+    """How active pre-training of a loss explores: as the method that built it does, else with the generic defaults."""
+    named = _METHODS.get(getattr(loss, "method_name", None) or "")
+    if named is not None and isinstance(loss, named.loss_class) and named.exploration is not None:
+        return named.exploration
+    return ExplorationDefaults()

@@ -1,14 +1,18 @@
 """Training: offline pre-training, downstream SAC on a frozen encoder, evaluation, checkpoints."""
 
+from crptpro.active_config import ActiveConfig
 from crptpro.downstream_config import DownstreamConfig, SACSettings
 from crptpro.training.agent import PixelAgent, load_agent, save_agent
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.downstream import DownstreamResult, train_downstream
 from crptpro.training.evaluate import Episode, evaluate, summarize, uniform_policy
+from crptpro.training.explore import ActiveResult, pretrain_active, register_intrinsic_reward
 from crptpro.training.pretrain import PretrainResult, pretrain
 
 __all__ = [
+    "ActiveConfig",
+    "ActiveResult",
     "CheckpointDir",
     "CollapseMonitor",
     "DownstreamConfig",
@@ -20,6 +24,8 @@ __all__ = [
     "evaluate",
     "load_agent",
     "pretrain",
+    "pretrain_active",
+    "register_intrinsic_reward",
     "save_agent",
     "summarize",
     "train_downstream",

@@ -10,7 +10,9 @@ from typing import TypeVar
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
+from crptpro.active_config import ActiveConfig
 from crptpro.cards import cpu_cores
+from crptpro.domains import Domain
 from crptpro.downstream_config import DownstreamConfig
 from crptpro.envs import needs_gl
 from crptpro.envs.rendering import select_backend
@@ -89,7 +91,7 @@ class EnvThread:
             self._thread.shutdown()
 
 
-def runs_ahead(task: str, config: DownstreamConfig) -> bool:
+def runs_ahead(task: str | Domain, config: DownstreamConfig | ActiveConfig) -> bool:
     """Tell whether the next observation is drawn while the update computes: as asked, or where it pays and can.
 
     A GPU computes by itself once it has been told to, and one core cannot do two things at a time. GLFW wants the main

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from torchrl.objectives import LossModule
+
 
 @dataclass(frozen=True)
 class PretrainResult:
@@ -35,3 +37,25 @@ class PretrainResult:
     def is_dead(self) -> bool:
         """Whether training ended on a plateau longer than its patience."""
         return self.collapse["verdict"] == "dead"
+
+
+def training_record(
+    loss: LossModule, *, updates: int, seconds: float, collapse: dict[str, Any], **facts: Any
+) -> dict[str, Any]:
+    """Return what the card of an artifact says about how it was trained.
+
+    Args:
+        loss: what was trained; a fine-tuned one knows what it started from.
+        updates: encoder updates.
+        seconds: training time.
+        collapse: verdict of the monitor.
+        **facts: settings, data, last metrics, versions.
+    """
+    return {
+        "updates": updates,
+        "seconds": round(seconds, 1),
+        **facts,
+        "collapse": collapse,
+        "started_from": getattr(loss, "started_from", None),
+        "previous_training": getattr(loss, "previous_training", None),
+    }

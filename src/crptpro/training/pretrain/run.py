@@ -19,7 +19,7 @@ from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.fingerprint import describe_loss, require_same
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.progress import PretrainProgress
-from crptpro.training.pretrain.result import PretrainResult
+from crptpro.training.pretrain.result import PretrainResult, training_record
 from crptpro.training.pretrain.sources import Augmenter, Source, keys_read
 from crptpro.training.pretrain.window import Window, cosine_threshold, memory_row, num_prototypes
 from crptpro.training.stop_request import StopRequest
@@ -230,21 +230,20 @@ class PretrainRun:
         metrics = {name: value for name, value in row.items() if name != "updates"}
         verdict = self.monitor.finish(self.done)
         seconds = self.seconds
-        self.loss.training_record = {
-            "updates": self.done,
-            "seconds": round(seconds, 1),
-            "precision": self.precision,
-            "device": str(self.device),
-            "settings": {
+        self.loss.training_record = training_record(
+            self.loss,
+            updates=self.done,
+            seconds=seconds,
+            precision=self.precision,
+            device=str(self.device),
+            settings={
                 key: value for key, value in self.fingerprint.items() if key not in ("loss", "datasets")
             },
-            "datasets": [source.facts() for source in self.sources],
-            "metrics": metrics,
-            "collapse": verdict,
-            "made_with": self.made_with,
-            "started_from": getattr(self.loss, "started_from", None),
-            "previous_training": getattr(self.loss, "previous_training", None),
-        }
+            datasets=[source.facts() for source in self.sources],
+            metrics=metrics,
+            collapse=verdict,
+            made_with=self.made_with,
+        )
         return PretrainResult(
             updates=self.done,
             resumed_from=self.resumed_from,

@@ -1,0 +1,111 @@
+"""Every number of active pre-training; what a method decides is left to it unless set."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from crptpro.quality import Quality
+
+
+@dataclass(frozen=True)
+class ActiveConfig:
+    """Pre-training while exploring: each domain has an environment, a replay buffer and an agent of its own.
+
+    Source: Proto-RL's released agent (denisyarats/proto) and CRPTpro's comparison of it across domains.
+
+    ``None`` means the method's own value (``crptpro.objectives.get_method(name).exploration`` and ``.defaults``).
+    ``env_steps`` count un-repeated simulator steps, ``agent_steps`` decisions; every interval below is in a domain's
+    own decisions, so that no domain is left out whatever their number.
+    """
+
+    env_steps: int | None = None
+    """budget in simulator steps (default: the method's)"""
+    steps_budget: Literal["total", "per_domain"] = "total"
+    """whether the budget is shared by all domains or each has it"""
+    reward: str | None = None
+    """what exploration is paid with: prototype, particle, skill-contrast, or one of your own (default: the method's)"""
+    agent: str | None = None
+    """what explores: rad-sac, averaged-sac or skill-ddpg (default: the method's)"""
+    action_repeat: int | None = None
+    """simulator steps per decision (default: each domain's, 2)"""
+    batch_size: int | None = None
+    """transitions per update, of encoder and agent alike (default: the method's)"""
+    learning_rate: float | None = None
+    """of the encoder's Adam (default: the method's)"""
+    encoder_update_interval: int | None = None
+    """decisions in a domain between two encoder updates on it (default: the method's, 2)"""
+    encoder_updates_each: int | None = None
+    """encoder updates every time, each on a batch of its own (default: the method's; becl 3, others 1)"""
+    agent_update_interval: int | None = None
+    """decisions in a domain between two updates of its agent (default: the method's)"""
+    random_agent_steps: int | None = None
+    """decisions per domain taken uniformly at random before its first update (default: the method's)"""
+    replay_capacity: int | None = None
+    """transitions kept per domain (default: the method's, 100,000)"""
+    n_step: int | None = None
+    """decisions that the agent's return looks ahead (default: the method's)"""
+    skill_dim: int | None = None
+    """number of skills; none without (default: the method's; becl 16)"""
+    skill_agent_steps: int | None = None
+    """decisions that a skill is kept for (default: the method's)"""
+    bottleneck_dim: int = 50
+    """width that actor and critic first reduce the features to"""
+    hidden_dim: int = 1024
+    """width of the two hidden layers of actor and critic"""
+    discount: float = 0.99
+    """per decision"""
+    agent_learning_rate: float = 1e-4
+    """of the agents' Adam optimisers"""
+    initial_temperature: float = 0.1
+    """SAC's alpha at the start"""
+    critic_tau: float = 0.01
+    """share of the critic that enters its target at each target update"""
+    shift_pad: int = 4
+    """random shift of at most so many pixels in each direction"""
+    knn_k: int | None = None
+    """the reward's number of neighbours (default: prototype 3, particle 12)"""
+    queue_size: int = 2_048
+    """candidates that the prototype reward keeps, a multiple of the number of prototypes"""
+    per_domain_queue: bool = False
+    """a reward with a memory of its own (candidates, running scale) for every domain instead of one for all"""
+    log_interval: int = 50
+    """encoder updates between two rows of the record"""
+    checkpoint_interval_env_steps: int = 5_000
+    """simulator steps, over all domains, between two checkpoints"""
+    patience_updates: int = 5_000
+    """length of a plateau after which the run is called dead"""
+    seed: int = 0
+    """seeds agents, environments, exploration, sampling and shifts"""
+    quality: Quality = "exact"
+    """render quality"""
+    precision: Literal["auto", "fp32", "bf16"] = "auto"
+    """arithmetic of the convolutions and big matrix products"""
+    device: str = "cpu"
+    """where networks live"""
+    render_ahead: bool | None = None
+    """draw a domain's next observation in another thread while other work goes on; by default where it pays"""
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot run.
+
+        Raises:
+            ValueError: naming the setting, its value and what is allowed.
+        """
+        for name in (
+            "env_steps", "action_repeat", "batch_size", "encoder_update_interval", "encoder_updates_each",
+            "agent_update_interval", "replay_capacity", "n_step", "skill_dim", "skill_agent_steps",
+            "bottleneck_dim", "hidden_dim", "knn_k", "queue_size", "log_interval", "checkpoint_interval_env_steps",
+            "patience_updates",
+        ):  # fmt: skip
+            if getattr(self, name) is not None and getattr(self, name) < 1:
+                raise ValueError(f"`{name}` must be at least 1, got {getattr(self, name)}.")
+        for name in ("discount", "critic_tau"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"`{name}` must be in [0, 1], got {getattr(self, name)}.")
+        for name in ("learning_rate", "agent_learning_rate", "initial_temperature"):
+            if getattr(self, name) is not None and not getattr(self, name) > 0:
+                raise ValueError(f"`{name}` must be positive, got {getattr(self, name)}.")
+        for name in ("random_agent_steps", "shift_pad"):
+            if getattr(self, name) is not None and getattr(self, name) < 0:
+                raise ValueError(f"`{name}` must not be negative, got {getattr(self, name)}.")

@@ -1,0 +1,159 @@
+"""Active pre-training: an agent explores each domain while one encoder learns from all of them."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+from torchrl.envs import EnvBase
+from torchrl.objectives import LossModule
+
+from crptpro.active_config import ActiveConfig
+from crptpro.directory_lock import DirectoryLock
+from crptpro.domains import Domain
+from crptpro.envs import make_env
+from crptpro.errors import CheckpointError
+from crptpro.loggers import RunLogger
+from crptpro.modules import resolve_precision, set_compute_dtype
+from crptpro.objectives import exploration_defaults, method_defaults
+from crptpro.seeding import derive_seed
+from crptpro.training.checkpoint import CheckpointDir
+from crptpro.training.explore.assemble import assemble, domain_names
+from crptpro.training.explore.plan import resolve
+from crptpro.training.pretrain.result import PretrainResult, training_record
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ActiveResult(PretrainResult):
+    """How an active pre-training ended.
+
+    Attributes:
+        env_steps: simulator steps over all domains.
+        actors: the agent's actor of each domain, by name.
+    """
+
+    env_steps: int = 0
+    actors: dict[str, nn.Module] = field(default_factory=dict, repr=False)
+
+
+def pretrain_active(
+    loss: LossModule,
+    domains: str | Domain | Sequence[str | Domain],
+    *,
+    run_dir: str | Path | None = None,
+    config: ActiveConfig | None = None,
+    logger: RunLogger | None = None,
+    resume: bool = True,
+    progress: bool = True,
+    env_factory: Callable[..., EnvBase] = make_env,
+    **overrides: Any,
+) -> ActiveResult:
+    """Train a self-supervised loss on what exploring agents see (Proto-RL, APT, BeCL; here also across domains).
+
+    The domains take turns, one decision each. A domain has its own environment, replay, actor, critic and temperature;
+    encoder, heads, prototypes and their optimiser are shared. Its agent is paid with the intrinsic reward alone and
+    learns from detached features; the encoder learns from the self-supervised loss alone, on batches of one domain at a
+    time. Which reward and agent, and when each is updated, is the method's (see
+    :class:`~crptpro.objectives.ExplorationDefaults`) unless ``config`` says otherwise.
+
+    Deviation: neither the paper nor the released code says how its cross-domain active baselines are built. Turns,
+    shared candidates and schedules in a domain's own decisions are this project's choice.
+
+    With ``run_dir`` the run can be killed at any moment: the same call with a newly built loss continues from the last
+    checkpoint and, on the CPU, gives the same numbers as an uninterrupted one. An episode that was under way is played
+    again from its seed and actions.
+
+    Args:
+        loss: the objective with its networks; trained in place. Its ``training_record`` afterwards says how.
+        domains: one or several, by domain or task name.
+        run_dir: records (``pretrain.csv``, ``explore.csv``, ``episodes.csv``), replays and checkpoints; ``None`` keeps
+            nothing but the result.
+        config: every number.
+        logger: used instead of a local record in ``run_dir``.
+        resume: continue what ``run_dir`` holds; ``False`` refuses a directory that holds a run.
+        progress: show a bar (lines in log files).
+        env_factory: makes the environments; called as :func:`~crptpro.envs.make_env` is, in threads of their own.
+        **overrides: single settings of :class:`~crptpro.training.ActiveConfig`, e.g. ``env_steps=50_000``.
+
+    Returns:
+        Metrics, verdict on collapse, budgets spent, and the actors.
+
+    Raises:
+        CRPTproError: a single-domain method was given several domains, or the budget is too small for any update.
+        CheckpointError: if ``run_dir`` holds a run with other settings (named).
+        NonFiniteError: if a loss or a policy became NaN or infinite; the last checkpoint is kept.
+        DiskSpaceError: if the disk cannot hold the replays.
+    """
+    config = dataclasses.replace(config or ActiveConfig(), **overrides)
+    defaults, exploration = method_defaults(loss), exploration_defaults(loss)
+    config = resolve(config, exploration, defaults)
+    named = domain_names(loss, domains, exploration)
+    dtype = resolve_precision(config.precision, config.device)
+    device = torch.device(config.device)
+    cuda = [device.index or 0] if device.type == "cuda" else []
+    loss.to(device).train()
+    with contextlib.ExitStack() as stack:
+        stack.callback(set_compute_dtype, loss, torch.float32)
+        set_compute_dtype(loss, dtype)
+        stack.enter_context(torch.random.fork_rng(devices=cuda))
+        torch.manual_seed(derive_seed(config.seed, "active", "loss"))
+        directory = Path(run_dir or stack.enter_context(tempfile.TemporaryDirectory(prefix="crptpro-")))
+        stack.enter_context(DirectoryLock(directory, error=CheckpointError, is_reentrant=True))
+        checkpoints = None if run_dir is None else CheckpointDir(directory / "checkpoints")
+        if not resume and checkpoints is not None and checkpoints.latest_counter() is not None:
+            raise CheckpointError(f"{run_dir} already holds a run. Choose another directory, or resume it.")
+        if run_dir is not None and logger is None:
+            logger = stack.enter_context(RunLogger(directory, config=config))
+        run = assemble(
+            loss,
+            named,
+            config,
+            defaults,
+            exploration,
+            run_dir=directory,
+            dtype=dtype,
+            records=logger,
+            checkpoints=checkpoints,
+            env_factory=env_factory,
+        )
+        stack.callback(run.close)
+        run.resume()
+        run.train(progress=progress)
+        metrics, verdict = run.finish()
+        loss.training_record = training_record(
+            loss,
+            updates=run.updates,
+            seconds=run.seconds,
+            precision=run.precision,
+            device=str(device),
+            env_steps=run.env_steps,
+            settings={key: value for key, value in run.fingerprint.items() if key != "loss"},
+            datasets=[
+                {"domain": m.name, "agent_steps": m.agent_steps, "episodes": m.episodes} for m in run.members
+            ],
+            metrics=metrics,
+            collapse=verdict,
+            made_with=run.made_with,
+        )
+        return ActiveResult(
+            updates=run.updates,
+            resumed_from=run.resumed_from,
+            seconds=run.seconds,
+            precision=run.precision,
+            metrics=metrics,
+            collapse=verdict,
+            history=run.history,
+            run_dir=None if run_dir is None else Path(run_dir),
+            env_steps=run.env_steps,
+            actors={member.name: member.agent.actor for member in run.members},
+        )

@@ -1,0 +1,69 @@
+"""Toy domains and a tiny loss for tests of active pre-training."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import torch
+from toy_world import ToyEnv
+from torchrl.envs import CatFrames, EnvBase, TransformedEnv
+
+from crptpro.modules import PixelEncoder
+from crptpro.objectives import get_method
+from crptpro.training import ActiveConfig, ActiveResult, pretrain_active
+
+LENGTHS = {"even": lambda seed: 10, "odd": lambda seed: 7, "varied": lambda seed: 3 + seed % 9}
+SIZE = 16
+
+SMALL = ActiveConfig(
+    env_steps=240,
+    batch_size=8,
+    random_agent_steps=10,
+    replay_capacity=1_000,
+    bottleneck_dim=4,
+    hidden_dim=16,
+    queue_size=16,
+    log_interval=5,
+    checkpoint_interval_env_steps=40,
+    precision="fp32",
+    render_ahead=False,
+)
+
+
+def toy_env(domain: str, *, seed: int, image_size: int, frame_stack: int, **settings: Any) -> EnvBase:
+    env = ToyEnv(LENGTHS[domain], seed=seed, image_size=image_size)
+    return TransformedEnv(env, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
+
+
+def make_loss(method: str = "proto-rl-c", seed: int = 0, **options: Any) -> Any:
+    torch.manual_seed(seed)
+    chosen = get_method(method)
+    small = {"channels": (4, 4), "strides": (2, 1), "image_size": SIZE}
+    encoder = PixelEncoder(9, **{**small, **chosen.encoder_options})
+    if method.startswith("proto"):
+        options = {"num_prototypes": 8, "latent_dim": 4, "hidden_dim": 8, **options}
+    elif method.startswith("apt"):
+        options = {"latent_dim": 4, **options}
+    else:
+        options = {"hidden_dim": 8, **options}
+    return chosen.build(encoder, **options)
+
+
+def explore(
+    run_dir: Path | None, domains: tuple[str, ...] = ("even", "odd"), loss: Any = None, **overrides: Any
+) -> tuple[Any, ActiveResult]:
+    loss = make_loss() if loss is None else loss
+    factory = overrides.pop("env_factory", toy_env)
+    resume = overrides.pop("resume", True)
+    result = pretrain_active(
+        loss,
+        list(domains),
+        run_dir=run_dir,
+        config=dataclasses.replace(SMALL, **overrides),
+        progress=False,
+        resume=resume,
+        env_factory=factory,
+    )
+    return loss, result

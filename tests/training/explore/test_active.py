@@ -1,0 +1,266 @@
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+from active_world import explore, make_loss, toy_env
+
+from crptpro.errors import CheckpointError, CRPTproError, NonFiniteError
+from crptpro.pretrained import load_pretrained, save_pretrained
+from crptpro.training.explore.member import Member
+from crptpro.training.explore.run import ActiveRun
+
+
+def same_state(one: torch.nn.Module, two: torch.nn.Module) -> bool:
+    a, b = one.state_dict(), two.state_dict()
+    return a.keys() == b.keys() and all(torch.equal(a[key], b[key]) for key in a)
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return [
+            {
+                key: value
+                for key, value in row.items()
+                if "time" not in key and "per_s" not in key and "bytes" not in key
+            }
+            for row in csv.DictReader(file)
+        ]
+
+
+def test_it_spends_its_budget_and_says_so_in_env_steps_and_encoder_updates(tmp_path: Path) -> None:
+    loss, result = explore(tmp_path)
+    assert result.env_steps == 240
+    # 60 decisions in each of two domains, the first 10 without updates, then one encoder update every second.
+    assert result.updates == 2 * 25
+    assert loss.training_record["env_steps"] == 240
+    assert loss.training_record["updates"] == 50
+    assert [facts["agent_steps"] for facts in loss.training_record["datasets"]] == [60, 60]
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_no_domain_is_starved_whatever_their_number(
+    count: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Counted over all domains, "every second decision" would always fall on the same ones of an even number."""
+    updated: list[str] = []
+    original = ActiveRun._update
+
+    def spy(run: ActiveRun, index: int) -> None:
+        before = run.updates
+        original(run, index)
+        updated.extend([run.domains[index]] * (run.updates - before))
+
+    monkeypatch.setattr(ActiveRun, "_update", spy)
+    domains = ("a", "b", "c", "d")[:count]
+    explore(
+        None,
+        domains,
+        env_steps=2 * count * 30,
+        env_factory=lambda domain, **settings: toy_env("even", **settings),
+    )
+    assert {name: updated.count(name) for name in domains} == dict.fromkeys(domains, 10)
+    assert updated[:count] == list(domains), "domains take turns"
+
+
+def test_only_the_self_supervised_loss_trains_the_encoder_and_only_the_intrinsic_reward_the_agent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    moved, seen = [], []
+    original = ActiveRun._update
+
+    def spy(run: ActiveRun, index: int) -> None:
+        before = {key: value.clone() for key, value in run.loss.encoder.state_dict().items()}
+        updates = run.updates
+        agent = run.members[index].agent
+        update = agent.update
+
+        def agent_update(batch, *, agent_step):
+            assert torch.equal(batch["next", "reward"], batch["next", "intrinsic_reward"])
+            encoder = {key: value.clone() for key, value in run.loss.encoder.state_dict().items()}
+            metrics = update(batch, agent_step=agent_step)
+            after = run.loss.encoder.state_dict()
+            assert all(torch.equal(after[key], encoder[key]) for key in after)
+            assert all(parameter.grad is None or run.updates for parameter in run.loss.encoder.parameters())
+            seen.append(agent_step)
+            return metrics
+
+        agent.update = agent_update
+        original(run, index)
+        agent.update = update
+        after = run.loss.encoder.state_dict()
+        moved.append((run.updates - updates, any(not torch.equal(after[key], before[key]) for key in after)))
+
+    monkeypatch.setattr(ActiveRun, "_update", spy)
+    explore(None)
+    assert seen
+    assert all(changed == bool(updates) for updates, changed in moved)
+
+
+def test_the_same_seed_gives_the_same_weights_and_another_seed_others() -> None:
+    (one, first), (two, second), (other, third) = explore(None), explore(None), explore(None, seed=1)
+    assert same_state(one, two)
+    assert all(same_state(first.actors[name], second.actors[name]) for name in first.actors)
+    assert not same_state(first.actors["even"], third.actors["even"])
+    assert not same_state(one, other)
+
+
+def test_drawing_ahead_in_other_threads_changes_no_number(tmp_path: Path) -> None:
+    one, first = explore(tmp_path / "in turn", render_ahead=False)
+    two, second = explore(tmp_path / "ahead", render_ahead=True)
+    assert same_state(one, two)
+    assert all(same_state(first.actors[name], second.actors[name]) for name in first.actors)
+    for name in ("pretrain.csv", "explore.csv", "episodes.csv"):
+        assert rows(tmp_path / "in turn" / name) == rows(tmp_path / "ahead" / name)
+
+
+class Killed(BaseException):
+    pass
+
+
+@pytest.mark.parametrize("domains", [("even", "odd"), ("varied", "even", "odd")])
+@pytest.mark.parametrize("turn", [35, 90])
+def test_killed_in_the_middle_of_an_episode_it_ends_with_the_same_weights_and_records(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, domains: tuple[str, ...], turn: int
+) -> None:
+    whole, expected = explore(tmp_path / "whole", domains)
+    original = ActiveRun._turn
+
+    def dies(run: ActiveRun, index: int) -> None:
+        if run.decisions == turn:
+            raise Killed
+        original(run, index)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ActiveRun, "_turn", dies)
+        with pytest.raises(Killed):
+            explore(tmp_path / "killed", domains)
+    resumed, result = explore(tmp_path / "killed", domains)
+    assert result.resumed_from > 0 or turn == 35
+    assert same_state(whole, resumed)
+    assert all(same_state(expected.actors[name], result.actors[name]) for name in expected.actors)
+    for name in ("pretrain.csv", "explore.csv", "episodes.csv"):
+        assert rows(tmp_path / "killed" / name) == rows(tmp_path / "whole" / name), name
+
+
+def test_a_finished_run_is_found_again_and_changes_nothing(tmp_path: Path) -> None:
+    loss, first = explore(tmp_path)
+    before = {name: rows(tmp_path / name) for name in ("pretrain.csv", "episodes.csv")}
+    again, second = explore(tmp_path)
+    assert same_state(loss, again)
+    assert second.updates == first.updates
+    assert second.metrics == first.metrics
+    assert {name: rows(tmp_path / name) for name in before} == before
+    assert again.training_record["collapse"] == loss.training_record["collapse"]
+
+
+def test_a_ring_shorter_than_the_run_survives_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, _ = explore(tmp_path / "whole", replay_capacity=20)
+    original = Member.decide
+
+    def dies(member: Member, *args) -> None:
+        if member.agent_steps == 44:
+            raise Killed
+        original(member, *args)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Member, "decide", dies)
+        with pytest.raises(Killed):
+            explore(tmp_path / "killed", replay_capacity=20)
+    resumed, _ = explore(tmp_path / "killed", replay_capacity=20)
+    assert same_state(whole, resumed)
+
+
+def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:
+    explore(tmp_path)
+    with pytest.raises(CheckpointError, match="encoder_update_interval was 2, now 3"):
+        explore(tmp_path, encoder_update_interval=3)
+    with pytest.raises(CheckpointError, match="already holds a run"):
+        explore(tmp_path, resume=False)
+
+
+def test_a_world_that_does_not_repeat_itself_is_announced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Dies(ActiveRun):
+        pass
+
+    original = ActiveRun._turn
+
+    def dies(run: ActiveRun, index: int) -> None:
+        if run.decisions == 50:
+            raise Killed
+        original(run, index)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ActiveRun, "_turn", dies)
+        with pytest.raises(Killed):
+            explore(tmp_path)
+
+    def another_world(domain: str, *, seed: int, **settings) -> object:
+        env = toy_env(domain, seed=seed, **settings)
+        set_seed = env.set_seed
+        env.set_seed = lambda seed, **_: set_seed(seed + 1)  # type: ignore[method-assign]
+        return env
+
+    explore(tmp_path, env_factory=another_world)
+    assert "does not repeat an episode" in caplog.text
+
+
+def test_a_single_domain_method_refuses_several_domains_and_a_domain_twice() -> None:
+    with pytest.raises(CRPTproError, match="proto-rl-s pre-trains on one domain, got 2"):
+        explore(None, loss=make_loss("proto-rl-s"))
+    with pytest.raises(CRPTproError, match="named twice"):
+        explore(None, ("even", "even"))
+
+
+def test_a_budget_without_any_update_is_refused() -> None:
+    with pytest.raises(CRPTproError, match="no update would ever happen"):
+        explore(None, env_steps=40, random_agent_steps=10)
+
+
+def test_a_budget_per_domain_gives_each_domain_all_of_it() -> None:
+    _, result = explore(None, steps_budget="per_domain", env_steps=60)
+    assert result.env_steps == 120
+
+
+def test_a_diverged_explorer_stops_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    original = ActiveRun._update
+
+    def spoil(run: ActiveRun, index: int) -> None:
+        original(run, index)
+        with torch.no_grad():
+            next(run.members[index].agent.actor.parameters()).fill_(float("nan"))
+
+    monkeypatch.setattr(ActiveRun, "_update", spoil)
+    with pytest.raises(NonFiniteError, match="explorer of even acts"):
+        explore(None)
+
+
+def test_the_artifact_carries_the_candidates_to_the_downstream_stage(tmp_path: Path) -> None:
+    loss, _ = explore(None)
+    save_pretrained(loss, tmp_path / "encoder")
+    pretrained = load_pretrained(tmp_path / "encoder")
+    assert pretrained.method == "proto-rl-c"
+    assert pretrained.queue is not None
+    assert pretrained.queue.shape == (16, 4)
+    assert pretrained.queue.norm(dim=-1).min() > 0.99, "the queue has been filled"
+    assert pretrained.card["training"]["env_steps"] == 240
+
+
+def test_a_queue_per_domain_keeps_candidates_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs: list[ActiveRun] = []
+    original = ActiveRun.finish
+
+    def spy(run: ActiveRun):
+        runs.append(run)
+        return original(run)
+
+    monkeypatch.setattr(ActiveRun, "finish", spy)
+    explore(None)
+    explore(None, per_domain_queue=True)
+    shared, apart = runs
+    assert shared.rewards[0] is shared.rewards[1]
+    assert apart.rewards[0] is not apart.rewards[1]
