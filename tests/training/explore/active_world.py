@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from toy_world import ToyEnv
 from torchrl.envs import CatFrames, EnvBase, TransformedEnv
+from toy_world import ToyEnv
 
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import get_method
