@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import inspect
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -88,7 +89,17 @@ class Method:
 
         The result remembers this method's name, so that :func:`method_defaults` returns this method's
         defaults.
+
+        Raises:
+            ValueError: an option that the loss does not have.
         """
+        parameters = inspect.signature(self.loss_class.__init__).parameters.values()
+        known = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY or p.name in options]
+        unknown = sorted(set(options) - set(known))
+        if unknown and not any(p.kind is p.VAR_KEYWORD for p in parameters):
+            raise ValueError(
+                f"The method {self.name!r} has no option {', '.join(unknown)}; it has {', '.join(known)}."
+            )
         loss = self.loss_class(encoder, **{**self.loss_options, **options})
         loss.method_name = self.name
         return loss
