@@ -13,6 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from crptpro.objectives.particles import particle_entropy
+
 Reduction = Literal["none", "mean", "sum"]
 DispersionReduction = Literal["mean_all", "sum", "mean_offdiag"]
 
@@ -161,10 +163,7 @@ def particle_reward(
     scale: float | Tensor = 1.0,
     clip: float = 0.0,
 ) -> Tensor:
-    r"""Particle entropy: :math:`\log(1 + \overline{\mathrm{relu}(d/scale - clip)})` (APT, arXiv 2103.04551).
-
-    Form of rll-research/url_benchmark ``utils.py``: division and clipping act on each distance, the average
-    over the k neighbours comes after, the logarithm last.
+    r"""Particle entropy among the k nearest neighbours (:func:`~crptpro.objectives.particles.particle_entropy`).
 
     Args:
         features: ``[N, D]``.
@@ -181,9 +180,7 @@ def particle_reward(
         ValueError: fewer keys than ``k``.
     """
     distances = knn_distances(features, features if keys is None else keys, k=k)
-    if not average:
-        distances = distances[:, -1:]
-    return torch.log1p(F.relu(distances / scale - clip).mean(dim=-1))
+    return particle_entropy(distances if average else distances[:, -1:], scale=scale, clip=clip)
 
 
 def info_nce(

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data.tensor_specs import Composite, Unbounded
-from torchrl.envs.transforms import Transform
 
 from crptpro.modules.heads import latent_dim_of
 from crptpro.objectives.functional import knn_distance
-from crptpro.transforms.keys import as_key_list, with_next, without_next
+from crptpro.transforms.intrinsic_reward import IntrinsicReward
 
 
-class PrototypeReward(Transform):
+class PrototypeReward(IntrinsicReward):
     r"""Add the prototype-kNN exploration bonus to the reward (CRPTpro, Eq. 10-11).
 
     .. math:: r = r_\mathrm{ext} + \beta \hat r
@@ -82,6 +80,7 @@ class PrototypeReward(Transform):
         True
     """
 
+    own_state: ClassVar[tuple[str, ...]] = ("queue", "queue_pointer", "reward_square_sum", "reward_count")
     queue: Tensor
     queue_pointer: Tensor
     reward_square_sum: Tensor
@@ -106,9 +105,6 @@ class PrototypeReward(Transform):
         queue_pointer: int = 0,
         generator: torch.Generator | None = None,
     ) -> None:
-        in_keys, out_keys = as_key_list(in_keys), as_key_list(out_keys)
-        if len(in_keys) != 1 or len(out_keys) != 1:
-            raise ValueError(f"PrototypeReward reads and writes one key each, got {in_keys} and {out_keys}.")
         if reward_norm not in (None, "rms"):
             raise ValueError(f"reward_norm must be None or 'rms', got {reward_norm!r}.")
         if candidate_temperature <= 0:
@@ -129,20 +125,21 @@ class PrototypeReward(Transform):
         if told is not None:
             _check_latents(told, latent_dim)
         super().__init__(
-            in_keys=[without_next(k) for k in in_keys], out_keys=[without_next(k) for k in out_keys]
+            intrinsic_reward_coef=intrinsic_reward_coef,
+            in_keys=in_keys,
+            out_keys=out_keys,
+            reward_key=reward_key,
+            out_reward_key=out_reward_key,
         )
         self.projector = projector
         if isinstance(prototypes, Tensor):
             self.register_buffer("prototypes", prototypes.detach().clone())
         else:
             self.prototypes = prototypes
-        self.intrinsic_reward_coef = intrinsic_reward_coef
         self.knn_k = knn_k
         self.candidate_temperature = candidate_temperature
         self.knn_exclude_self = knn_exclude_self
         self.reward_norm = reward_norm
-        self.reward_key = None if reward_key is None else without_next(reward_key)
-        self.out_reward_key = self.reward_key if out_reward_key is None else without_next(out_reward_key)
         self.generator = generator
         start = torch.zeros(queue_size, latent_dim, device=weight.device) if queue is None else queue
         self.register_buffer("queue", start.detach().to(weight.device, torch.float32, copy=True))
@@ -200,74 +197,8 @@ class PrototypeReward(Transform):
         # Too few other entries (tiny batches in a tiny queue): no estimate, no bonus.
         return torch.where(nearest.values[:, -1].isinf(), torch.zeros_like(kth), kth)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Add the bonus to a sampled batch, under ``"next"``.
-
-        As TorchRL's transforms do, this sets new tensors in the very tensordict it is given. A buffer's
-        ``sample()`` and ``buffer[indices]`` hand over a fresh one, so stored rewards stay as they are. Only
-        ``buffer[:]`` on a full tensor storage hands over the storage itself, whose rewards are then replaced.
-
-        Raises:
-            KeyError: features or reward are missing.
-        """
-        in_key, out_key = with_next(self.in_keys[0]), with_next(self.out_keys[0])
-        reward_key = None if self.reward_key is None else with_next(self.reward_key)
-        out_reward_key = None if self.out_reward_key is None else with_next(self.out_reward_key)
-        return self._add_bonus(tensordict, in_key, out_key, reward_key, out_reward_key)
-
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._add_bonus(
-            next_tensordict, self.in_keys[0], self.out_keys[0], self.reward_key, self.out_reward_key
-        )
-
-    def _add_bonus(
-        self,
-        tensordict: TensorDictBase,
-        in_key: NestedKey,
-        out_key: NestedKey,
-        reward_key: NestedKey | None,
-        out_reward_key: NestedKey | None,
-    ) -> TensorDictBase:
-        features = tensordict.get(in_key, None)
-        reward = None if reward_key is None else tensordict.get(reward_key, None)
-        for key, value in ((in_key, features), (reward_key, reward)):
-            if key is not None and value is None:
-                present = list(tensordict.keys(True, True))
-                raise KeyError(
-                    f"PrototypeReward found no {key!r} among {present}; set in_keys or reward_key."
-                )
-        bonus = self.intrinsic_reward(features.reshape(-1, features.shape[-1]))
-        bonus = bonus.reshape(*features.shape[:-1], 1) if reward is None else bonus.to(reward).view_as(reward)
-        tensordict.set(out_key, bonus)
-        if reward is not None:
-            # A new tensor: the sampled reward may share memory with the storage.
-            tensordict.set(out_reward_key, reward + self.intrinsic_reward_coef * bonus)
-        return tensordict
-
-    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """Register the bonus and the total, both unbounded.
-
-        Raises:
-            KeyError: the environment has no such reward.
-        """
-        if self.reward_key is not None and self.reward_key not in reward_spec.keys(True, True):
-            raise KeyError(f"PrototypeReward found no {self.reward_key!r} in the rewards {reward_spec}.")
-        if self.reward_key is None:
-            shape, dtype, device = (*reward_spec.shape, 1), torch.float32, reward_spec.device
-        else:
-            external = reward_spec[self.reward_key]
-            shape, dtype, device = external.shape, external.dtype, external.device
-        reward_spec[self.out_keys[0]] = Unbounded(shape=shape, dtype=dtype, device=device)
-        if self.out_reward_key is not None:
-            reward_spec[self.out_reward_key] = Unbounded(shape=shape, dtype=dtype, device=device)
-        return reward_spec
-
-    def clone(self) -> PrototypeReward:
-        """Return a transform without parent, with its own queue; networks and generator are shared."""
-        copy = super().clone()
-        for name in ("queue", "queue_pointer", "reward_square_sum", "reward_count"):
-            copy._buffers[name] = getattr(self, name).clone()
-        return copy
+    def _bonus(self, features: Tensor, root: TensorDictBase) -> Tensor:
+        return self.intrinsic_reward(features)
 
 
 def _check_latents(length: int, expected: int) -> None:
