@@ -1,11 +1,16 @@
 """Networks: the pixel encoder, its pre-training heads, and the downstream actor and critic."""
 
 from crptpro.modules.actor_critic import SquashedGaussianActor, TwinCritic
+from crptpro.modules.deterministic_actor import DeterministicActor, FixedSkillActor
 from crptpro.modules.encoder import PixelEncoder
 from crptpro.modules.heads import Predictor, Projector, Prototypes
+from crptpro.modules.pixel_critic import PixelCritic
 from crptpro.modules.precision import resolve_precision, set_compute_dtype
 
 __all__ = [
+    "DeterministicActor",
+    "FixedSkillActor",
+    "PixelCritic",
     "PixelEncoder",
     "Predictor",
     "Projector",
