@@ -9,11 +9,12 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.objectives import LossModule
 
-from crptpro.modules import PixelEncoder, SquashedGaussianActor, TwinCritic
-from crptpro.objectives import ProtoLoss, RADSACLoss
+from crptpro.modules import DeterministicActor, PixelEncoder, SquashedGaussianActor, TwinCritic
+from crptpro.objectives import AveragedSACLoss, DrQLoss, ProtoLoss, RADSACLoss, SkillDDPGLoss
 
 IMAGE = (3, 15, 15)
-FEATURES, ACTIONS = 12, 2
+FEATURES, ACTIONS, SKILLS = 12, 2, 3
+HEADS = {"bottleneck_dim": 5, "hidden_dim": 16}
 
 
 @dataclass(frozen=True)
@@ -88,10 +89,66 @@ def transition_batch(count: int = 6, seed: int = 0) -> TensorDict:
 
 def rad_sac(seed: int = 0, **options) -> RADSACLoss:
     torch.manual_seed(seed)
-    shape = {"bottleneck_dim": 5, "hidden_dim": 16}
-    actor = SquashedGaussianActor(FEATURES, ACTIONS, **shape)
-    return RADSACLoss(actor, TwinCritic(FEATURES, ACTIONS, **shape), **options)
+    actor = SquashedGaussianActor(FEATURES, ACTIONS, **HEADS)
+    return RADSACLoss(actor, TwinCritic(FEATURES, ACTIONS, **HEADS), **options)
 
+
+def with_views(td: TensorDict, key: str, seed: int) -> TensorDict:
+    """The batch with other values, of the same kind, as second views of a key."""
+    other = transition_batch(len(td), seed) if key == "features" else image_batch(len(td), seed)
+    td.set(f"{key}_view", other[key])
+    td.set(("next", f"{key}_view"), other["next", key])
+    return td
+
+
+def two_view_batch(count: int = 6, seed: int = 0) -> TensorDict:
+    return with_views(transition_batch(count, seed), "features", seed + 100)
+
+
+def averaged_sac(seed: int = 0, **options) -> AveragedSACLoss:
+    torch.manual_seed(seed)
+    actor = SquashedGaussianActor(FEATURES, ACTIONS, **HEADS)
+    return AveragedSACLoss(actor, TwinCritic(FEATURES, ACTIONS, **HEADS), **options)
+
+
+def pixel_batch(count: int = 6, seed: int = 0) -> TensorDict:
+    td, images = transition_batch(count, seed), image_batch(count, seed)
+    del td["features"], td["next", "features"]
+    td["pixels"], td["next", "pixels"] = images["pixels"], images["next", "pixels"]
+    return with_views(td, "pixels", seed + 100)
+
+
+def drq(seed: int = 0, **options) -> DrQLoss:
+    torch.manual_seed(seed)
+    encoder = small_encoder()
+    sizes = (encoder.feature_dim, ACTIONS)
+    actor = SquashedGaussianActor(*sizes, **HEADS, has_tanh=True)
+    return DrQLoss(encoder, actor, TwinCritic(*sizes, **HEADS, has_tanh=True), **options)
+
+
+def skill_batch(count: int = 6, seed: int = 0) -> TensorDict:
+    td = transition_batch(count, seed)
+    generator = torch.Generator().manual_seed(seed + 1)
+    skills = torch.randint(SKILLS, (count,), generator=generator)
+    td["skill"] = torch.nn.functional.one_hot(skills, SKILLS).float()
+    td["next", "discount"] = 0.9 * (~td["next", "terminated"]).float()
+    return td
+
+
+def skill_ddpg(seed: int = 0, **options) -> SkillDDPGLoss:
+    torch.manual_seed(seed)
+    actor = DeterministicActor(FEATURES, ACTIONS, skill_dim=SKILLS, **HEADS)
+    critic = TwinCritic(FEATURES + SKILLS, ACTIONS, **HEADS, has_tanh=True)
+    return SkillDDPGLoss(actor, critic, **options)
+
+
+SAC_ROUTING = {
+    "loss_qvalue": {"qvalue_network_params"},
+    "loss_actor": {"actor_network_params"},
+    "loss_alpha": {"log_alpha"},
+}
+SAC_KEYS = {"action": "action", "reward": "reward", "done": "done", "terminated": "terminated"}
+SAC_LOSSES = ("loss_qvalue", "loss_actor", "loss_alpha")
 
 CASES = [
     LossCase(
@@ -113,22 +170,51 @@ CASES = [
         name="RADSACLoss",
         make=rad_sac,
         batch=transition_batch,
-        routing={
-            "loss_qvalue": {"qvalue_network_params"},
-            "loss_actor": {"actor_network_params"},
-            "loss_alpha": {"log_alpha"},
-        },
-        keys={
-            "observation": "features",
-            "action": "action",
-            "reward": "reward",
-            "done": "done",
-            "terminated": "terminated",
-        },
+        routing=SAC_ROUTING,
+        keys={"observation": "features", **SAC_KEYS},
         keys_hold_under_next=True,
         targets=("qvalue_network",),
         masked=("features", "action", ("next", "features"), ("next", "reward")),
-        per_row=("loss_qvalue", "loss_actor", "loss_alpha"),
+        per_row=SAC_LOSSES,
+    ),
+    LossCase(
+        name="AveragedSACLoss",
+        make=averaged_sac,
+        batch=two_view_batch,
+        routing=SAC_ROUTING,
+        keys={"observation": "features", "observation_view": "features_view", **SAC_KEYS},
+        keys_hold_under_next=True,
+        targets=("qvalue_network",),
+        masked=("features_view", "action", ("next", "features_view"), ("next", "reward")),
+        per_row=SAC_LOSSES,
+    ),
+    LossCase(
+        name="DrQLoss",
+        make=drq,
+        batch=pixel_batch,
+        routing=SAC_ROUTING,
+        keys={"observation": "pixels", "observation_view": "pixels_view", **SAC_KEYS},
+        keys_hold_under_next=True,
+        targets=("qvalue_network",),
+        masked=("pixels", "pixels_view", "action", ("next", "pixels"), ("next", "pixels_view")),
+        per_row=SAC_LOSSES,
+    ),
+    LossCase(
+        name="SkillDDPGLoss",
+        make=skill_ddpg,
+        batch=skill_batch,
+        routing={"loss_qvalue": {"qvalue_network_params"}, "loss_actor": {"actor_network_params"}},
+        keys={
+            "observation": "features",
+            "skill": "skill",
+            "action": "action",
+            "reward": "reward",
+            "discount": "discount",
+        },
+        keys_hold_under_next=True,
+        targets=("qvalue_network",),
+        masked=("features", "skill", "action", ("next", "features"), ("next", "reward")),
+        per_row=("loss_qvalue", "loss_actor"),
     ),
 ]
 

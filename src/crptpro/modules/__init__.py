@@ -2,12 +2,17 @@
 
 from crptpro.modules.actor_critic import SquashedGaussianActor, TwinCritic
 from crptpro.modules.contrast_heads import AnchorHead, SkillHead
+from crptpro.modules.deterministic_actor import DeterministicActor, FixedSkillActor
 from crptpro.modules.encoder import PixelEncoder
 from crptpro.modules.heads import Predictor, Projector, Prototypes
+from crptpro.modules.pixel_critic import PixelCritic
 from crptpro.modules.precision import resolve_precision, set_compute_dtype
 
 __all__ = [
     "AnchorHead",
+    "DeterministicActor",
+    "FixedSkillActor",
+    "PixelCritic",
     "PixelEncoder",
     "Predictor",
     "Projector",

@@ -14,17 +14,20 @@ from crptpro.modules.precision import linear_in
 
 
 class FeatureTrunk(nn.Module):
-    """Linear layer and LayerNorm that bring long features down to a bottleneck (no tanh, unlike DrQ).
+    """Linear layer and LayerNorm that bring long features down to a bottleneck.
 
-    Source: the trunk of denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
+    Source: the trunk of denisyarats/proto and liuxin0824/CRPTpro ``proto.py``; with tanh, that of
+    denisyarats/drq ``drq.py`` and rll-research/url_benchmark ``agent/ddpg.py``.
 
     Args:
         feature_dim: input length.
         bottleneck_dim: output length.
+        has_tanh: end with a tanh, as DrQ and URLB's DDPG do.
     """
 
-    def __init__(self, feature_dim: int, bottleneck_dim: int = 50) -> None:
+    def __init__(self, feature_dim: int, bottleneck_dim: int = 50, *, has_tanh: bool = False) -> None:
         super().__init__()
+        self.has_tanh = has_tanh
         self.linear = nn.Linear(feature_dim, bottleneck_dim)
         self.norm = nn.LayerNorm(bottleneck_dim)
         self.compute_dtype: torch.dtype = torch.float32
@@ -37,7 +40,8 @@ class FeatureTrunk(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``[*, feature_dim]``, any floating dtype, to ``[*, bottleneck_dim]`` in the weights' dtype."""
-        return self.norm(linear_in(features, self.linear.weight, self.linear.bias, self.compute_dtype))
+        bottleneck = self.norm(linear_in(features, self.linear.weight, self.linear.bias, self.compute_dtype))
+        return torch.tanh(bottleneck) if self.has_tanh else bottleneck
 
 
 class MLP(nn.Module):
@@ -82,6 +86,7 @@ class SquashedGaussianActor(nn.Module):
         bottleneck_dim: width after the trunk.
         hidden_dim: width of the two hidden layers.
         log_std_bounds: range of the log standard deviation.
+        has_tanh: end the trunk with a tanh, as DrQ does.
     """
 
     def __init__(
@@ -92,6 +97,7 @@ class SquashedGaussianActor(nn.Module):
         bottleneck_dim: int = 50,
         hidden_dim: int = 1024,
         log_std_bounds: tuple[float, float] = (-10.0, 2.0),
+        has_tanh: bool = False,
     ) -> None:
         super().__init__()
         low, high = log_std_bounds
@@ -99,7 +105,7 @@ class SquashedGaussianActor(nn.Module):
             raise ValueError(f"log_std_bounds must be (low, high) with low < high, got {log_std_bounds}.")
         self.action_dim = action_dim
         self.log_std_bounds = (float(low), float(high))
-        self.trunk = FeatureTrunk(feature_dim, bottleneck_dim)
+        self.trunk = FeatureTrunk(feature_dim, bottleneck_dim, has_tanh=has_tanh)
         self.mlp = MLP(bottleneck_dim, hidden_dim, 2 * action_dim)
         self.config: dict[str, Any] = {
             "feature_dim": feature_dim,
@@ -107,6 +113,7 @@ class SquashedGaussianActor(nn.Module):
             "bottleneck_dim": bottleneck_dim,
             "hidden_dim": hidden_dim,
             "log_std_bounds": list(self.log_std_bounds),
+            "has_tanh": has_tanh,
         }
         self.reset_parameters()
 
@@ -162,14 +169,21 @@ class TwinCritic(nn.Module):
         action_dim: A.
         bottleneck_dim: width after the trunk.
         hidden_dim: width of the two hidden layers of each head.
+        has_tanh: end the trunk with a tanh, as DrQ and URLB's DDPG do.
     """
 
     def __init__(
-        self, feature_dim: int, action_dim: int, *, bottleneck_dim: int = 50, hidden_dim: int = 1024
+        self,
+        feature_dim: int,
+        action_dim: int,
+        *,
+        bottleneck_dim: int = 50,
+        hidden_dim: int = 1024,
+        has_tanh: bool = False,
     ) -> None:
         super().__init__()
         self.action_dim = action_dim
-        self.trunk = FeatureTrunk(feature_dim, bottleneck_dim)
+        self.trunk = FeatureTrunk(feature_dim, bottleneck_dim, has_tanh=has_tanh)
         self.q1 = MLP(bottleneck_dim + action_dim, hidden_dim, 1)
         self.q2 = MLP(bottleneck_dim + action_dim, hidden_dim, 1)
         self.config: dict[str, Any] = {
@@ -177,6 +191,7 @@ class TwinCritic(nn.Module):
             "action_dim": action_dim,
             "bottleneck_dim": bottleneck_dim,
             "hidden_dim": hidden_dim,
+            "has_tanh": has_tanh,
         }
         self.reset_parameters()
 

@@ -2,8 +2,10 @@
 
 from crptpro.objectives import builtin as _builtin  # noqa: F401 - registers what the library brings
 from crptpro.objectives.atc import ATCLoss
+from crptpro.objectives.averaged_sac import AveragedSACLoss
 from crptpro.objectives.base import PretrainingLoss
 from crptpro.objectives.becl import BeCLLoss
+from crptpro.objectives.drq import DrQLoss
 from crptpro.objectives.exploration import ExplorationDefaults
 from crptpro.objectives.proto import ProtoLoss
 from crptpro.objectives.rad_sac import RADSACLoss
@@ -17,10 +19,13 @@ from crptpro.objectives.registry import (
     register_method,
 )
 from crptpro.objectives.simclr import SimCLRLoss
+from crptpro.objectives.skill_ddpg import SkillDDPGLoss
 
 __all__ = [
     "ATCLoss",
+    "AveragedSACLoss",
     "BeCLLoss",
+    "DrQLoss",
     "ExplorationDefaults",
     "Method",
     "MethodDefaults",
@@ -28,6 +33,7 @@ __all__ = [
     "ProtoLoss",
     "RADSACLoss",
     "SimCLRLoss",
+    "SkillDDPGLoss",
     "exploration_defaults",
     "get_method",
     "method_defaults",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -13,10 +13,10 @@ from torch import Tensor
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SACLoss, ValueEstimators
 
-from crptpro.modules import SquashedGaussianActor, TwinCritic
+from crptpro.modules import PixelCritic, SquashedGaussianActor, TwinCritic
 from crptpro.modules.distributions import SquashedGaussian
 from crptpro.objectives.base import valid_rows
-from crptpro.objectives.functional import reduce_batch
+from crptpro.objectives.masked_rows import mean_of_rows, without_masked_values
 
 
 class RADSACLoss(SACLoss):
@@ -90,6 +90,9 @@ class RADSACLoss(SACLoss):
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
+    view_names: ClassVar[tuple[str, ...]] = ("observation",)
+    """Configurable keys of the views of an observation."""
+
     _out_keys: list[NestedKey] | None
 
     default_out_keys = (
@@ -106,7 +109,7 @@ class RADSACLoss(SACLoss):
     def __init__(
         self,
         actor: SquashedGaussianActor,
-        critic: TwinCritic,
+        critic: TwinCritic | PixelCritic,
         *,
         gamma: float = 0.99,
         alpha_init: float = 0.1,
@@ -169,9 +172,9 @@ class RADSACLoss(SACLoss):
         valid = valid_rows(self, tensordict)
         out = {
             "loss_qvalue": loss,
-            "q_mean": _mean_of_rows(metadata["q"].mean(-1), valid),
-            "target_q_mean": _mean_of_rows(metadata["target_q"], valid),
-            "td_error": _mean_of_rows(metadata["td_error"], valid),
+            "q_mean": mean_of_rows(metadata["q"].mean(-1), valid),
+            "target_q_mean": mean_of_rows(metadata["target_q"], valid),
+            "td_error": mean_of_rows(metadata["td_error"], valid),
         }
         return TensorDict(out, batch_size=[])
 
@@ -185,37 +188,37 @@ class RADSACLoss(SACLoss):
             "loss_actor": loss_actor,
             "loss_alpha": loss_alpha,
             "alpha": self._alpha,
-            "entropy": -_mean_of_rows(log_prob, valid_rows(self, tensordict)),
+            "entropy": -mean_of_rows(log_prob, valid_rows(self, tensordict)),
         }
         return TensorDict(out, batch_size=[])
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Critic loss and detached per-row metadata (``td_error``, ``q``, ``target_q``)."""
-        tensordict = self._without_masked_values(tensordict)
+        tensordict = without_masked_values(self, tensordict)
         target = self._compute_target_v2(tensordict)  # (B,)
+        action = tensordict.get(self.tensor_keys.action)
         with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
-            values = self.critic(
-                self._features(tensordict), tensordict.get(self.tensor_keys.action)
-            )  # (B, 2)
-        errors = values - target.unsqueeze(-1)
-        # Sum over the two heads of the mean over the batch.
+            values = torch.stack([self._q_values(view, action) for view in self._views(tensordict)], -2)
+        errors = values - target[..., None, None]  # (B, views, 2)
+        # Sum over the views and the two heads of the mean over the batch.
         loss = self._reduce_loss(
-            errors.square().sum(-1),
+            errors.square().sum((-2, -1)),
             tensordict=tensordict,
             weights=self._maybe_get_priority_weight(tensordict),
         )
-        metadata = {"td_error": errors.detach().abs().amax(-1), "q": values.detach(), "target_q": target}
+        largest = errors.detach().abs().amax(-1).mean(-1)
+        metadata = {"td_error": largest, "q": values.detach().mean(-2), "target_q": target}
         return loss, metadata
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Actor loss and the detached log-probability of its actions."""
-        tensordict = self._without_masked_values(tensordict)
-        features = self._features(tensordict)
+        tensordict = without_masked_values(self, tensordict)
+        features = self._policy_features(self._views(tensordict)[0])
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             action, log_prob = self.actor.sample(features, generator=self.generator)
         # Detached weights: the gradient passes through Q to the action and to nothing else.
         with self._cached_detached_qvalue_params.to_module(self.qvalue_network, preserve_module_state=False):
-            value = self.critic(features, action).amin(-1)
+            value = self._q_values_on_features(features, action).amin(-1)
         loss = self._reduce_loss(
             self._alpha * log_prob - value,
             tensordict=tensordict,
@@ -229,42 +232,46 @@ class RADSACLoss(SACLoss):
 
     @torch.no_grad()
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
-        next_features = self._features(tensordict.get("next"))
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            action, log_prob = self.actor.sample(next_features, generator=self.generator)
-        with self.target_qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
-            value = self.critic(next_features, action).amin(-1)
-        soft_value = (value - self._alpha * log_prob).unsqueeze(-1)
+        soft_values = []
+        for view in self._views(tensordict.get("next")):
+            features = self._policy_features(view)
+            with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+                action, log_prob = self.actor.sample(features, generator=self.generator)
+            with self.target_qvalue_network_params.to_module(
+                self.qvalue_network, preserve_module_state=False
+            ):
+                soft_values.append(self._q_values(view, action).amin(-1) - self._alpha * log_prob)
+        soft_value = torch.stack(soft_values).mean(0).unsqueeze(-1)
         names = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
         estimate = tensordict.select(*[unravel_key(("next", name)) for name in names], strict=False)
         estimate.set(("next", self.value_estimator.tensor_keys.value), soft_value)
         return self.value_estimator.value_estimate(estimate).squeeze(-1)
 
-    def _features(self, tensordict: TensorDictBase) -> Tensor:
-        return tensordict.get(self.tensor_keys.observation).detach()
+    # What subclasses change: how many views there are of an observation, and what lies before the features.
+
+    def _views(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """The views of the observation; the first is the one that the actor learns from."""
+        return [tensordict.get(getattr(self.tensor_keys, name)).detach() for name in self.view_names]
+
+    def _policy_features(self, view: Tensor) -> Tensor:
+        """What the actor sees of a view, without gradient."""
+        return view
+
+    def _q_values(self, view: Tensor, action: Tensor) -> Tensor:
+        return self.critic(view, action)
+
+    def _q_values_on_features(self, features: Tensor, action: Tensor) -> Tensor:
+        return self.critic(features, action)
 
     def _make_vmap(self) -> None:
         # SACLoss vectorises over a stack of critics; here there is one, and the vmap closure cannot be pickled.
         pass
 
-    def _without_masked_values(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The batch with zeros in masked rows: a NaN there would survive a zero weight in the backward."""
-        valid = valid_rows(self, tensordict)
-        if valid is None:
-            return tensordict
-        clean = tensordict.copy()
-        for key in self.in_keys:
-            value = tensordict.get(key, None)
-            if value is not None:
-                flat = value.reshape(valid.shape[0], -1)
-                flat = torch.where(valid.unsqueeze(-1), flat, torch.zeros_like(flat))
-                clean.set(key, flat.reshape(value.shape))
-        return clean
-
     def _set_in_keys(self) -> None:
         keys = self.tensor_keys
-        following = (keys.observation, keys.reward, keys.done, keys.terminated)
-        self._in_keys = [keys.observation, keys.action, *(unravel_key(("next", key)) for key in following)]
+        views = [getattr(keys, name) for name in self.view_names]
+        following = (*views, keys.reward, keys.done, keys.terminated)
+        self._in_keys = [*views, keys.action, *(unravel_key(("next", key)) for key in following)]
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         super()._forward_value_estimator_keys(**kwargs)
@@ -287,8 +294,3 @@ class RADSACLoss(SACLoss):
             self.critic.reset_parameters()
         self.target_qvalue_network_params.data.update_(self.qvalue_network_params.data)
         self.log_alpha.copy_(self.alpha_init.log())
-
-
-def _mean_of_rows(values: Tensor, valid: Tensor | None) -> Tensor:
-    """Mean over the rows that count, of any batch shape."""
-    return reduce_batch(values.reshape(-1), "mean", valid)

@@ -1,4 +1,4 @@
-"""The SAC learner of the downstream stage: which loss steps which optimiser, and when."""
+"""The SAC learner: which loss steps which optimiser, and when."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ class RADSACLearner:
 
     Every update steps the critic; every ``actor_update_interval``-th also the actor and then the
     temperature; every ``target_update_interval``-th then moves the target critic. Each of the three has
-    its own Adam (default betas), as in Proto-RL's and CRPTpro's released agents.
+    its own Adam (default betas), as in Proto-RL's and CRPTpro's released agents. DrQ learns on the same schedule;
+    its critic includes the convolutions.
 
     Args:
-        loss: the SAC losses; its parameters are trained in place.
+        loss: the SAC losses, one view or two, on features or pixels; its parameters are trained in place.
         learning_rate: of all three optimisers.
         critic_tau: share of the critic that enters the target at each target update.
         actor_update_interval: updates between two actor and temperature steps.
@@ -54,7 +55,8 @@ class RADSACLearner:
 
         Args:
             td: batch with ``features`` ``[B, D]``, ``action`` ``[B, A]``, ``("next", "features")``,
-                ``("next", "reward")`` ``[B, 1]`` (bonus included) and ``("next", "terminated")``.
+                ``("next", "reward")`` ``[B, 1]`` (bonus included) and ``("next", "terminated")``; with other or
+                further views where the loss names them.
             agent_step: the decision about to be taken; the delayed updates run on its multiples.
 
         Returns:

@@ -1,0 +1,219 @@
+"""Skill-conditioned DDPG on frozen features: the agent of BeCL and of URLB's skill methods."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import unravel_key
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from crptpro.modules import DeterministicActor, TwinCritic
+from crptpro.modules.deterministic_actor import with_skill
+from crptpro.objectives.base import valid_rows
+from crptpro.objectives.masked_rows import mean_of_rows, without_masked_values
+
+
+class SkillDDPGLoss(LossModule):
+    r"""DDPG of the unsupervised RL benchmark (rll-research/url_benchmark ``agent/ddpg.py``; BeCL's own agent).
+
+    With :math:`s = [h, z]` the features of an observation and its skill, :math:`s^+ = [h^+, z]` n steps later:
+
+    * :math:`y = R_n + d_n \min(Q_1', Q_2')(s^+, a^+)`, where :math:`R_n` is ``("next", "reward")`` and
+      :math:`d_n = \gamma^n \prod (\text{discounts of the environment})` is ``("next", "discount")``;
+    * ``loss_qvalue`` = MSE(Q1, y) + MSE(Q2, y), gradient to the critic only;
+    * ``loss_actor`` = -mean(min(Q1, Q2)(s, a)), gradient to the actor only.
+
+    Both actions are the actor's with Gaussian noise clipped to ``noise_clip``. Only the critic has a target.
+    Features never receive a gradient.
+
+    Args:
+        actor: on features and skill; it knows the size of its noise.
+        critic: built for ``feature_dim + skill_dim`` and with ``has_tanh=True``, as in the released code.
+        noise_clip: largest absolute noise of the actions that are learned from.
+        generator: source of all noise, asked for the target's first; torch's global generator if None. Not part
+            of the state dictionary.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (per-row losses).
+
+    Returns (``forward``):
+        ``loss_actor``, ``loss_qvalue`` and, detached scalars, ``q_mean``, ``target_q_mean``, ``td_error`` (mean
+        over rows of the larger of the two heads' absolute errors). Non-finite input propagates. Batches of any
+        shape, one row included.
+
+    Raises:
+        ValueError: ``noise_clip`` negative, or a critic for other features than the actor's.
+        NotImplementedError: (``forward``) an unknown ``reduction``.
+
+    Examples:
+        >>> actor = DeterministicActor(6, 2, skill_dim=3, hidden_dim=8)
+        >>> loss = SkillDDPGLoss(actor, TwinCritic(6 + 3, 2, hidden_dim=8, has_tanh=True))
+        >>> from torchrl.objectives import SoftUpdate
+        >>> updater = SoftUpdate(loss, tau=0.01)
+        >>> h, one = torch.randn(4, 6), torch.ones(4, 1)
+        >>> after = {"features": h, "reward": one, "discount": 0.97 * one}
+        >>> root = {"features": h, "skill": torch.eye(4, 3), "action": torch.zeros(4, 2)}
+        >>> loss(TensorDict({**root, "next": after}, [4]))["loss_qvalue"].shape
+        torch.Size([])
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can change.
+
+        Attributes:
+            observation: the features, at the root and under ``"next"``.
+            skill: one-hot skill, at the root.
+            action: what was done.
+            reward: n-step return, under ``"next"``.
+            discount: of the value n steps later, under ``"next"``.
+            priority_weight: importance of a row, if the batch has it.
+        """
+
+        observation: NestedKey = "features"
+        skill: NestedKey = "skill"
+        action: NestedKey = "action"
+        reward: NestedKey = "reward"
+        discount: NestedKey = "discount"
+        priority_weight: NestedKey = "_weight"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    default_out_keys = ("loss_actor", "loss_qvalue", "q_mean", "target_q_mean", "td_error")
+
+    def __init__(
+        self,
+        actor: DeterministicActor,
+        critic: TwinCritic,
+        *,
+        noise_clip: float = 0.3,
+        generator: torch.Generator | None = None,
+        reduction: str | None = None,
+    ) -> None:
+        if noise_clip < 0:
+            raise ValueError(f"noise_clip must not be negative, got {noise_clip}; 0.3 is usual.")
+        inputs = actor.config["feature_dim"] + actor.skill_dim
+        if critic.config["feature_dim"] != inputs:
+            raise ValueError(
+                f"The critic was built for {critic.config['feature_dim']} inputs, the actor sees {inputs} (features "
+                f"and skill); build the critic with feature_dim={inputs}."
+            )
+        self._in_keys: list[NestedKey] | None = None
+        self._out_keys: list[NestedKey] | None = None
+        super().__init__()
+        self.noise_clip = noise_clip
+        self.generator = generator
+        self.reduction = "mean" if reduction is None else reduction
+        self.convert_to_functional(actor, "actor_network")
+        self.convert_to_functional(critic, "qvalue_network", create_target_params=True)
+        # Hidden from nn.Module, as LossModule hides its networks: the parameters are registered once.
+        self.__dict__["actor"] = actor
+        self.__dict__["critic"] = critic
+        self._tie()
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Entries that ``forward`` reads."""
+        if self._in_keys is None:
+            keys = self.tensor_keys
+            following = (keys.observation, keys.reward, keys.discount)
+            root = [keys.observation, keys.skill, keys.action]
+            self._in_keys = [*root, *(unravel_key(("next", key)) for key in following)]
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, values: list[NestedKey]) -> None:
+        self._in_keys = values
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Entries that ``forward`` returns."""
+        if self._out_keys is None:
+            self._out_keys = list(self.default_out_keys)
+        return self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, values: list[NestedKey]) -> None:
+        self._out_keys = values
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute both losses against the same critic; see the class."""
+        out = self.critic_loss(tensordict)
+        out.set("loss_actor", self.actor_loss(tensordict))
+        return out.select(*self.default_out_keys)
+
+    def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not changed."""
+        valid = valid_rows(self, tensordict)
+        tensordict = without_masked_values(self, tensordict)
+        target = self._target(tensordict)  # (B,)
+        inputs = self._inputs(tensordict, tensordict)
+        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
+            values = self.critic(inputs, tensordict.get(self.tensor_keys.action))  # (B, 2)
+        errors = values - target.unsqueeze(-1)
+        out = {
+            "loss_qvalue": self._reduced(errors.square().sum(-1), tensordict),
+            "q_mean": mean_of_rows(values.detach().mean(-1), valid),
+            "target_q_mean": mean_of_rows(target, valid),
+            "td_error": mean_of_rows(errors.detach().abs().amax(-1), valid),
+        }
+        return TensorDict(out, batch_size=[])
+
+    def actor_loss(self, tensordict: TensorDictBase) -> Tensor:
+        """The actor's loss, against the critic as it is now."""
+        tensordict = without_masked_values(self, tensordict)
+        inputs = self._inputs(tensordict, tensordict)
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            action = self.actor.sample(inputs, noise_clip=self.noise_clip, generator=self.generator)
+        # Detached weights: the gradient passes through Q to the action and to nothing else.
+        with self.qvalue_network_params.data.to_module(self.qvalue_network, preserve_module_state=False):
+            value = self.critic(inputs, action).amin(-1)
+        return self._reduced(-value, tensordict)
+
+    @torch.no_grad()
+    def _target(self, tensordict: TensorDictBase) -> Tensor:
+        following = tensordict.get("next")
+        inputs = self._inputs(following, tensordict)
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            action = self.actor.sample(inputs, noise_clip=self.noise_clip, generator=self.generator)
+        with self.target_qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
+            value = self.critic(inputs, action).amin(-1)
+        reward, discount = (
+            following.get(key).squeeze(-1) for key in (self.tensor_keys.reward, self.tensor_keys.discount)
+        )
+        return reward + discount * value
+
+    def _inputs(self, observed: TensorDictBase, root: TensorDictBase) -> Tensor:
+        return with_skill(
+            observed.get(self.tensor_keys.observation).detach(), root.get(self.tensor_keys.skill)
+        )
+
+    def _reduced(self, rows: Tensor, tensordict: TensorDictBase) -> Tensor:
+        weights = self._maybe_get_priority_weight(tensordict)
+        return self._reduce_loss(rows, tensordict=tensordict, weights=weights)
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        # No value estimator here; changed keys only have to show in in_keys.
+        self._in_keys = None
+
+    def _tie(self) -> None:
+        for name in ("actor_network", "qvalue_network"):
+            getattr(self, f"{name}_params").to_module(getattr(self, name), preserve_module_state=False)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore from a pickle or a deep copy, tying the networks to the copied parameters again."""
+        super().__setstate__(state)
+        self._tie()
+
+    @torch.no_grad()
+    def reset_parameters_recursive(self) -> None:
+        """Re-initialise actor and critic, and copy the critic into its target."""
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            self.actor.reset_parameters()
+        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
+            self.critic.reset_parameters()
+        self.target_qvalue_network_params.data.update_(self.qvalue_network_params.data)
