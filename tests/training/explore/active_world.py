@@ -25,6 +25,7 @@ SMALL = ActiveConfig(
     bottleneck_dim=4,
     hidden_dim=16,
     queue_size=16,
+    skill_agent_steps=4,
     log_interval=5,
     checkpoint_interval_env_steps=40,
     precision="fp32",

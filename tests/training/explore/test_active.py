@@ -120,12 +120,21 @@ class Killed(BaseException):
     pass
 
 
-@pytest.mark.parametrize("domains", [("even", "odd"), ("varied", "even", "odd")])
-@pytest.mark.parametrize("turn", [35, 90])
+@pytest.mark.parametrize(
+    ("method", "domains", "turn"),
+    [
+        ("proto-rl-c", ("even", "odd"), 15),  # before the first checkpoint
+        ("proto-rl-c", ("varied", "even", "odd"), 90),
+        ("proto-rl-s", ("varied",), 90),
+        ("apt-c", ("even", "odd"), 90),
+        ("apt-s", ("even",), 90),
+        ("becl", ("even", "varied"), 90),
+    ],
+)
 def test_killed_in_the_middle_of_an_episode_it_ends_with_the_same_weights_and_records(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, domains: tuple[str, ...], turn: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str, domains: tuple[str, ...], turn: int
 ) -> None:
-    whole, expected = explore(tmp_path / "whole", domains)
+    whole, expected = explore(tmp_path / "whole", domains, make_loss(method))
     original = ActiveRun._turn
 
     def dies(run: ActiveRun, index: int) -> None:
@@ -136,9 +145,9 @@ def test_killed_in_the_middle_of_an_episode_it_ends_with_the_same_weights_and_re
     with monkeypatch.context() as patched:
         patched.setattr(ActiveRun, "_turn", dies)
         with pytest.raises(Killed):
-            explore(tmp_path / "killed", domains)
-    resumed, result = explore(tmp_path / "killed", domains)
-    assert result.resumed_from > 0 or turn == 35
+            explore(tmp_path / "killed", domains, make_loss(method))
+    resumed, result = explore(tmp_path / "killed", domains, make_loss(method))
+    assert (result.resumed_from > 0) == (turn > 20)
     assert same_state(whole, resumed)
     assert all(same_state(expected.actors[name], result.actors[name]) for name in expected.actors)
     for name in ("pretrain.csv", "explore.csv", "episodes.csv"):

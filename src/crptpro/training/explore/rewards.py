@@ -13,7 +13,7 @@ from torchrl.objectives import LossModule
 
 from crptpro.active_config import ActiveConfig
 from crptpro.errors import CRPTproError, UnknownNameError
-from crptpro.transforms import PrototypeReward
+from crptpro.transforms import ParticleReward, PrototypeReward, SkillContrastReward
 
 IntrinsicRewardBuilder = Callable[[LossModule, ActiveConfig, torch.Generator], Transform]
 
@@ -98,6 +98,17 @@ def _prototype(loss: LossModule, config: ActiveConfig, generator: torch.Generato
     )
 
 
+def _particle(loss: LossModule, config: ActiveConfig, generator: torch.Generator) -> Transform:
+    (projector,) = _networks(loss, "particle", "projector")
+    return ParticleReward(projector, k=config.knn_k or 12, reward_key=None)
+
+
+def _skill_contrast(loss: LossModule, config: ActiveConfig, generator: torch.Generator) -> Transform:
+    (head,) = _networks(loss, "skill-contrast", "projector")
+    temperature = getattr(loss, "temperature", 0.5)
+    return SkillContrastReward(head, temperature=float(temperature), reward_key=None)
+
+
 def _networks(loss: LossModule, reward: str, *names: str) -> list:
     missing = [name for name in names if getattr(loss, name, None) is None]
     if missing:
@@ -109,3 +120,5 @@ def _networks(loss: LossModule, reward: str, *names: str) -> list:
 
 
 register_intrinsic_reward("prototype", _prototype)
+register_intrinsic_reward("particle", _particle)
+register_intrinsic_reward("skill-contrast", _skill_contrast)

@@ -1,0 +1,134 @@
+"""What the methods differ in: rewards, agents, views, skills, looking ahead."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from active_world import explore, make_loss
+
+from crptpro.errors import CRPTproError, UnknownNameError
+from crptpro.objectives import AveragedSACLoss, RADSACLoss, SkillDDPGLoss
+from crptpro.training import register_intrinsic_reward
+from crptpro.training.explore.run import ActiveRun
+from crptpro.transforms import ParticleReward, PrototypeReward, SkillContrastReward
+
+
+@pytest.fixture
+def batches(monkeypatch: pytest.MonkeyPatch) -> list:
+    """Batches that the first domain's agent was trained on, with the run."""
+    seen: list = []
+    original = ActiveRun._update
+
+    def spy(run: ActiveRun, index: int) -> None:
+        agent = run.members[index].agent
+        update = agent.update
+
+        def record(batch, *, agent_step):
+            seen.append((run, batch))
+            return update(batch, agent_step=agent_step)
+
+        agent.update = record
+        original(run, index)
+        agent.update = update
+
+    monkeypatch.setattr(ActiveRun, "_update", spy)
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("method", "agent_loss", "reward"),
+    [
+        ("proto-rl-c", RADSACLoss, PrototypeReward),
+        ("apt-c", AveragedSACLoss, ParticleReward),
+        ("becl", SkillDDPGLoss, SkillContrastReward),
+    ],
+)
+def test_each_method_has_its_agent_and_its_reward(
+    method: str, agent_loss: type, reward: type, batches: list
+) -> None:
+    explore(None, loss=make_loss(method))
+    run, _ = batches[0]
+    assert type(run.members[0].agent.loss) is agent_loss
+    assert type(run.rewards[0].transform) is reward
+
+
+def test_apt_sees_two_different_views_of_both_observations(batches: list) -> None:
+    explore(None, loss=make_loss("apt-c"))
+    _, batch = batches[0]
+    for key in ("pixels", ("next", "pixels")):
+        view = "pixels_view" if key == "pixels" else ("next", "pixels_view")
+        assert not torch.equal(batch[key], batch[view])
+    assert not torch.equal(batch["features"], batch["features_view"])
+
+
+def test_becl_updates_three_times_on_batches_of_their_own_and_looks_three_decisions_ahead(
+    batches: list,
+) -> None:
+    _, result = explore(None, loss=make_loss("becl"))
+    assert result.updates == 3 * 2 * 25
+    run, batch = batches[-1]
+    assert batch["skill"].shape == (8, 16)
+    # No termination within the window: gamma^3.
+    alive = batch["next", "discount"] > 0
+    torch.testing.assert_close(
+        batch["next", "discount"][alive], torch.full((int(alive.sum()),), 0.99**3), rtol=0, atol=1e-6
+    )
+    assert [member.agent_steps for member in run.members] == [60, 60]
+
+
+def test_becl_trains_its_agent_on_features_from_before_the_last_encoder_update_and_rewards_with_the_head_after_it(
+    batches: list,
+) -> None:
+    explore(None, loss=make_loss("becl"))
+    run, batch = batches[-1]  # nothing was updated after the last batch but the agent
+    with torch.no_grad():
+        now = run.loss.encoder(batch["next", "pixels"])
+    assert not torch.equal(now, batch["next", "features"])
+    again = run.rewards[0].transform.intrinsic_reward(batch["next", "features"], batch["skill"])
+    torch.testing.assert_close(again, batch["next", "reward"].squeeze(-1))
+
+
+def test_proto_rl_rewards_with_the_encoder_just_updated(batches: list) -> None:
+    explore(None, env_steps=240 - 4)  # the last turn updates the encoder
+    run, batch = batches[-1]
+    with torch.no_grad():
+        torch.testing.assert_close(run.loss.encoder(batch["next", "pixels"]), batch["next", "features"])
+
+
+def test_skills_change_with_episodes_and_intervals_and_are_stored_with_the_transitions(batches: list) -> None:
+    explore(None, ("even",), make_loss("becl"), skill_agent_steps=4)
+    run, _ = batches[0]
+    stored = run.members[0].replay[:]["skill"].argmax(-1)
+    episodes = stored[: 10 * (len(stored) // 10)].view(-1, 10)
+    for skills in episodes:
+        for part in (skills[:4], skills[4:8], skills[8:]):
+            assert part.unique().numel() == 1
+    assert stored.unique().numel() > 3
+
+
+def test_a_reward_of_ones_own_is_chosen_by_its_name(batches: list) -> None:
+    class Constant(ParticleReward):
+        def intrinsic_reward(self, features: torch.Tensor) -> torch.Tensor:
+            return torch.full((len(features),), 0.25)
+
+    def build(loss, config, generator):
+        return Constant(None, reward_key=None)
+
+    register_intrinsic_reward("constant", build)
+    with pytest.raises(ValueError, match="already registered"):
+        register_intrinsic_reward("constant", lambda *arguments: None)
+    explore(None, reward="constant")
+    assert all((batch["next", "reward"] == 0.25).all() for _, batch in batches)
+
+
+def test_what_a_method_cannot_explore_with_is_refused_by_name() -> None:
+    with pytest.raises(UnknownNameError, match=r"no intrinsic reward 'curiosity'; known: .*particle"):
+        explore(None, reward="curiosity")
+    with pytest.raises(UnknownNameError, match="no exploring agent 'ppo'; known: averaged-sac"):
+        explore(None, agent="ppo")
+    with pytest.raises(
+        CRPTproError, match="needs a loss with projector and prototypes; SimCLRLoss has no prototypes"
+    ):
+        explore(None, loss=make_loss("apt-c"), reward="prototype")
+    with pytest.raises(CRPTproError, match="skill-ddpg needs skills"):
+        explore(None, agent="skill-ddpg")
