@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import dispatch
+from tensordict.nn import TensorDictParams, dispatch
 from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -83,6 +83,13 @@ class SkillDDPGLoss(LossModule):
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     default_out_keys = ("loss_actor", "loss_qvalue", "q_mean", "target_q_mean", "td_error")
+
+    actor_network: DeterministicActor
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+    qvalue_network: TwinCritic
+    qvalue_network_params: TensorDictParams
+    target_qvalue_network_params: TensorDictParams
 
     def __init__(
         self,
