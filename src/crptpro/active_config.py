@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from crptpro.quality import Quality
 
 
 @dataclass(frozen=True)
-class ActiveConfig:
-    """Pre-training while exploring: each domain has an environment, a replay buffer and an agent of its own.
+class ExplorationSettings:
+    """How agents explore while an encoder is pre-trained: what defines the run, wherever it runs.
 
     Source: Proto-RL's released agent (denisyarats/proto) and CRPTpro's comparison of it across domains.
 
-    ``None`` means the method's own value (``crptpro.objectives.get_method(name).exploration`` and ``.defaults``).
-    ``env_steps`` count un-repeated simulator steps, ``agent_steps`` decisions; every interval below is in a domain's
-    own decisions, so that no domain is left out whatever their number.
+    ``None`` means the method's own value (``crptpro.objectives.get_method(name).exploration``). ``env_steps`` count
+    un-repeated simulator steps, ``agent_steps`` decisions; every interval is in a domain's own decisions, so that no
+    domain is left out whatever their number.
     """
 
     env_steps: int | None = None
@@ -29,10 +30,6 @@ class ActiveConfig:
     """what explores: rad-sac, averaged-sac or skill-ddpg (default: the method's)"""
     action_repeat: int | None = None
     """simulator steps per decision (default: each domain's, 2)"""
-    batch_size: int | None = None
-    """transitions per update, of encoder and agent alike (default: the method's)"""
-    learning_rate: float | None = None
-    """of the encoder's Adam (default: the method's)"""
     encoder_update_interval: int | None = None
     """decisions in a domain between two encoder updates on it (default: the method's, 2)"""
     encoder_updates_each: int | None = None
@@ -69,16 +66,45 @@ class ActiveConfig:
     """candidates that the prototype reward keeps, a multiple of the number of prototypes"""
     per_domain_queue: bool = False
     """a reward with a memory of its own (candidates, running scale) for every domain instead of one for all"""
-    log_interval: int = 50
-    """encoder updates between two rows of the record"""
     checkpoint_interval_env_steps: int = 5_000
     """simulator steps, over all domains, between two checkpoints"""
+    quality: Quality = "exact"
+    """render quality"""
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot run.
+
+        Raises:
+            ValueError: naming the setting, its value and what is allowed.
+        """
+        for name in (
+            "env_steps", "action_repeat", "encoder_update_interval", "encoder_updates_each", "agent_update_interval",
+            "replay_capacity", "n_step", "skill_dim", "skill_agent_steps", "bottleneck_dim", "hidden_dim", "knn_k",
+            "queue_size", "checkpoint_interval_env_steps",
+        ):  # fmt: skip
+            _require(self, name, "at least 1", lambda value: value >= 1)
+        for name in ("discount", "critic_tau"):
+            _require(self, name, "in [0, 1]", lambda value: 0 <= value <= 1)
+        for name in ("agent_learning_rate", "initial_temperature"):
+            _require(self, name, "positive", lambda value: value > 0)
+        for name in ("random_agent_steps", "shift_pad"):
+            _require(self, name, "0 or more", lambda value: value >= 0)
+
+
+@dataclass(frozen=True)
+class ActiveConfig(ExplorationSettings):
+    """Every setting of active pre-training: how it explores, how the encoder learns, and where and how it runs."""
+
+    batch_size: int | None = None
+    """transitions per update, of encoder and agent alike (default: the method's)"""
+    learning_rate: float | None = None
+    """of the encoder's Adam (default: the method's)"""
+    log_interval: int = 50
+    """encoder updates between two rows of the record"""
     patience_updates: int = 5_000
     """length of a plateau after which the run is called dead"""
     seed: int = 0
     """seeds agents, environments, exploration, sampling and shifts"""
-    quality: Quality = "exact"
-    """render quality"""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """arithmetic of the convolutions and big matrix products"""
     device: str = "cpu"
@@ -92,20 +118,15 @@ class ActiveConfig:
         Raises:
             ValueError: naming the setting, its value and what is allowed.
         """
-        for name in (
-            "env_steps", "action_repeat", "batch_size", "encoder_update_interval", "encoder_updates_each",
-            "agent_update_interval", "replay_capacity", "n_step", "skill_dim", "skill_agent_steps",
-            "bottleneck_dim", "hidden_dim", "knn_k", "queue_size", "log_interval", "checkpoint_interval_env_steps",
-            "patience_updates",
-        ):  # fmt: skip
-            if getattr(self, name) is not None and getattr(self, name) < 1:
-                raise ValueError(f"`{name}` must be at least 1, got {getattr(self, name)}.")
-        for name in ("discount", "critic_tau"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"`{name}` must be in [0, 1], got {getattr(self, name)}.")
-        for name in ("learning_rate", "agent_learning_rate", "initial_temperature"):
-            if getattr(self, name) is not None and not getattr(self, name) > 0:
-                raise ValueError(f"`{name}` must be positive, got {getattr(self, name)}.")
-        for name in ("random_agent_steps", "shift_pad"):
-            if getattr(self, name) is not None and getattr(self, name) < 0:
-                raise ValueError(f"`{name}` must not be negative, got {getattr(self, name)}.")
+        super().__post_init__()
+        for name in ("batch_size", "log_interval", "patience_updates"):
+            _require(self, name, "at least 1", lambda value: value >= 1)
+        _require(self, "learning_rate", "positive", lambda value: value > 0)
+
+
+def _require(
+    settings: ExplorationSettings, name: str, allowed: str, is_allowed: Callable[[Any], bool]
+) -> None:
+    value = getattr(settings, name)
+    if value is not None and not is_allowed(value):
+        raise ValueError(f"`{name}` must be {allowed}, got {value}.")

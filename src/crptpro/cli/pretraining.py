@@ -5,13 +5,21 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from crptpro.cli.request import Logging, image_format, require_device
+from crptpro.active_config import ExplorationSettings
+from crptpro.cli.request import Logging, explored_domains, image_format, require_device
+from crptpro.errors import CRPTproError
 from crptpro.loggers import RunLogger
 from crptpro.seeding import seed_everything
+
+if TYPE_CHECKING:
+    from torch import nn
+    from torchrl.objectives import LossModule
+
+    from crptpro.objectives import ExplorationDefaults, Method
 
 logger = logging.getLogger(__name__)
 
@@ -46,51 +54,89 @@ class PretrainingOptions:
         )  # fmt: skip
         return {name: getattr(self, name) for name in names} | {"run_dir": self.out}
 
-    def keep(self, loss: Any, records: RunLogger) -> None:
+    def keep(self, loss: LossModule, records: RunLogger, *, actor: nn.Module | None = None) -> None:
         """Write the encoder, and copy it to the mirrors."""
         from crptpro.pretrained import save_pretrained
 
-        path = save_pretrained(loss, self.out / "encoder")
+        path = save_pretrained(loss, self.out / "encoder", actor=actor)
         records.artifact(path, name=f"encoder_{self.out.name}", kind="encoder")
         logger.info("pretrained encoder: %s", path)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Pretrain(PretrainingOptions):
-    """Pre-train one encoder on the datasets of several domains, one update per domain in turn."""
+    """Pre-train one encoder for several domains, one update per domain in turn: on datasets, or while exploring."""
 
-    datasets: Positional[tuple[Path, ...]]
-    """dataset directories, e.g. data/walker data/cartpole"""
+    sources: Positional[tuple[str, ...]]
+    """dataset directories, e.g. data/walker data/cartpole; for exploring methods domains, tasks or group letters"""
     method: str = "crptpro"
-    """a registered method, e.g. crptpro or released-code"""
+    """a registered method: crptpro, atc (on datasets), proto-rl-c, proto-rl-s, apt-c, apt-s, becl (exploring), ..."""
     updates: int | None = None
-    """encoder updates over all domains (default: the method's; crptpro 50,000)"""
+    """encoder updates over all domains (default: the method's; crptpro 50,000); exploring methods have
+    --explore.env-steps instead"""
     assignment_temperature: float | None = None
     """temperature of the Sinkhorn-Knopp targets (default: the student's, 0.1)"""
     intr_loss_coef: float | None = None
-    """weight of the prototype dispersion loss (default: the method's, 5e-3)"""
+    """weight of the prototype dispersion loss (default: the method's; crptpro 5e-3, proto-rl 0)"""
+    explore: ExplorationSettings = field(default_factory=ExplorationSettings)
+    """how a method explores that does"""
 
     def run(self) -> None:
         """Pre-train, or continue, and write the artifact."""
         from crptpro.objectives import get_method
-        from crptpro.training import pretrain
 
         # Whatever is wrong with the request is found before the run directory is made.
         require_device(self.device)
-        image_size, frame_stack = image_format(self.datasets)
+        method = get_method(self.method)
+        if method.exploration is None:
+            self._on_datasets(method)
+        else:
+            self._exploring(method, method.exploration)
+
+    def _on_datasets(self, method: Method) -> None:
+        from crptpro.training import pretrain
+
+        if self.explore != ExplorationSettings():
+            raise CRPTproError(
+                f"{self.method} learns from datasets and does not explore; leave --explore.* out."
+            )
+        datasets = [Path(source) for source in self.sources]
+        loss = self._build(method, *image_format(datasets))
+        with self.logging.open(self.out, self) as records:
+            pretrain(loss, datasets, updates=self.updates, logger=records, **self.training_arguments())
+            self.keep(loss, records)
+
+    def _exploring(self, method: Method, exploration: ExplorationDefaults) -> None:
+        from crptpro.training import ActiveConfig, pretrain_active
+
+        domains = explored_domains(self.sources, method.name)
+        if self.updates is not None:
+            raise CRPTproError(
+                f"{self.method} updates its encoder as it explores: its budget is --explore.env-steps, not --updates."
+            )
+        loss = self._build(method)
+        config = ActiveConfig(
+            **vars(self.explore),
+            batch_size=self.batch_size,
+            learning_rate=self.learning_rate,
+            log_interval=self.log_interval,
+            seed=self.seed,
+            precision=self.precision,
+            device=self.device,
+        )
+        with self.logging.open(self.out, self) as records:
+            result = pretrain_active(loss, domains, run_dir=self.out, config=config, logger=records)
+            actor = next(iter(result.actors.values())) if exploration.transfers_actor else None
+            self.keep(loss, records, actor=actor)
+
+    def _build(self, method: Method, image_size: int = 84, frame_stack: int = 3) -> LossModule:
         options = {
             name: value
             for name in ("assignment_temperature", "intr_loss_coef")
             if (value := getattr(self, name)) is not None
         }
-        method = get_method(self.method)
         seed_everything(self.seed)
-        loss = method.build(method.build_encoder(3 * frame_stack, image_size), **options)
-        with self.logging.open(self.out, self) as records:
-            pretrain(
-                loss, list(self.datasets), updates=self.updates, logger=records, **self.training_arguments()
-            )
-            self.keep(loss, records)
+        return method.build(method.build_encoder(3 * frame_stack, image_size), **options)
 
 
 @dataclass(frozen=True, kw_only=True)

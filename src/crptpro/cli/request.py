@@ -51,6 +51,22 @@ def expand_groups(names: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(expanded))
 
 
+def explored_domains(names: Sequence[str], method: str) -> list[str]:
+    """Expand the domains that a method is to explore.
+
+    Raises:
+        CRPTproError: if one is a directory: such a method collects its own data.
+        UnknownNameError: if no name is given, or one that nobody knows.
+    """
+    for name in names:
+        if Path(name).is_dir() and name not in GROUPS:
+            raise CRPTproError(
+                f"{method} explores and collects its own data; {name} is a directory. Name domains, tasks or groups "
+                f"({', '.join(GROUPS)}), or choose a method that learns from datasets."
+            )
+    return expand_groups(names)
+
+
 def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
     """Open every dataset and check that all show images of one form.
 

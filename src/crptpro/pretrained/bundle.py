@@ -18,6 +18,7 @@ VERSION = 1
 ROLES = ("encoder", "projector", "predictor", "prototypes")
 TARGET_ROLES = ("target_encoder", "target_projector")
 QUEUE = "queue"
+ACTOR = "actor"
 REST = "loss"
 
 
@@ -33,6 +34,7 @@ class Pretrained:
         target_encoder: slow copy of the encoder.
         target_projector: slow copy of the projector.
         queue: candidate latents ``[Q, D]`` if the method keeps some.
+        actor: policy that explored while it was pre-trained, for methods that hand it over.
         card: what made it.
         rest: remaining state of the loss (further heads, coefficients), for fine-tuning.
     """
@@ -44,6 +46,7 @@ class Pretrained:
     target_encoder: nn.Module | None = None
     target_projector: nn.Module | None = None
     queue: Tensor | None = None
+    actor: nn.Module | None = None
     card: dict[str, Any] = field(default_factory=dict)
     rest: dict[str, Tensor] = field(default_factory=dict, repr=False)
 
@@ -57,7 +60,7 @@ class Pretrained:
         if "weights_sha256" in self.card:
             return f"{self.method}:{self.card['weights_sha256']}"
         digest = hashlib.sha256()
-        for name in (*ROLES, *TARGET_ROLES):
+        for name in (*ROLES, *TARGET_ROLES, ACTOR):
             module = getattr(self, name)
             for key, value in ({} if module is None else module.state_dict()).items():
                 digest.update(f"{name}.{key}".encode())

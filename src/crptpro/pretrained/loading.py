@@ -11,11 +11,19 @@ from torch import Tensor, nn
 from crptpro.artifact import CARD_FILE, read_artifact
 from crptpro.cards import read_json
 from crptpro.errors import PretrainedError
-from crptpro.modules import PixelEncoder, Predictor, Projector, Prototypes, SkillHead
-from crptpro.pretrained.bundle import FORMAT, QUEUE, REST, ROLES, TARGET_ROLES, VERSION, Pretrained
+from crptpro.modules import (
+    PixelEncoder,
+    Predictor,
+    Projector,
+    Prototypes,
+    SkillHead,
+    SquashedGaussianActor,
+)
+from crptpro.pretrained.bundle import ACTOR, FORMAT, QUEUE, REST, ROLES, TARGET_ROLES, VERSION, Pretrained
 
 _KNOWN_CLASSES: dict[str, type[nn.Module]] = {
-    cls.__name__: cls for cls in (PixelEncoder, Projector, Predictor, Prototypes, SkillHead)
+    cls.__name__: cls
+    for cls in (PixelEncoder, Projector, Predictor, Prototypes, SkillHead, SquashedGaussianActor)
 }
 
 
@@ -69,7 +77,7 @@ def _take(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
 def _rebuild(
     path: Path, role: str, description: Any, state: dict[str, Tensor], known: Mapping[str, type[nn.Module]]
 ) -> nn.Module:
-    if role not in (*ROLES, *TARGET_ROLES) or not isinstance(description, dict):
+    if role not in (*ROLES, *TARGET_ROLES, ACTOR) or not isinstance(description, dict):
         raise PretrainedError(
             f"The card of {path} describes an unknown part {role!r}; it is damaged or too new."
         )

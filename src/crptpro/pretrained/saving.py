@@ -10,21 +10,25 @@ from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from crptpro.artifact import CARD_FILE, write_artifact
 from crptpro.cards import provenance, read_json
 from crptpro.errors import DiskSpaceError, PretrainedError
 from crptpro.objectives import get_method, methods
-from crptpro.pretrained.bundle import FORMAT, QUEUE, REST, ROLES, TARGET_ROLES, VERSION, Pretrained
+from crptpro.pretrained.bundle import ACTOR, FORMAT, QUEUE, REST, ROLES, TARGET_ROLES, VERSION, Pretrained
 from crptpro.pretrained.networks import target_state, unwrap
 
 _LOG = logging.getLogger(__name__)
 
 
 def save_pretrained(
-    loss: LossModule | Pretrained, path: str | Path, *, extra_card: Mapping[str, Any] | None = None
+    loss: LossModule | Pretrained,
+    path: str | Path,
+    *,
+    actor: nn.Module | None = None,
+    extra_card: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write what a loss has trained as a directory: ``weights.safetensors`` and ``card.json``.
 
@@ -32,6 +36,8 @@ def save_pretrained(
         loss: any loss with the pre-training contract (``.encoder``, and ``.projector``, ``.predictor``,
             ``.prototypes`` where it has them), or a loaded artifact.
         path: directory to write; an artifact there is replaced, as a whole.
+        actor: policy that explored meanwhile, for a downstream run in the same domain to start from; a loaded
+            artifact's own by default.
         extra_card: further JSON-able facts for the card.
 
     Returns:
@@ -67,6 +73,11 @@ def save_pretrained(
         state = target_state(loss, role)
         if state and role in described:
             states[target], described[target] = state, described[role]
+    if actor is None and isinstance(loss, Pretrained):
+        actor = loss.actor
+    if actor is not None:
+        states[ACTOR] = actor.state_dict()
+        described[ACTOR] = {"class": type(actor).__name__, "config": actor.config}
     if isinstance(queue := getattr(loss, QUEUE, None), Tensor):
         states[QUEUE] = {"latents": queue}
     if rest := _rest_state(loss):

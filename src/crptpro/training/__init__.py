@@ -1,6 +1,6 @@
 """Training: offline pre-training, downstream SAC on a frozen encoder, evaluation, checkpoints."""
 
-from crptpro.active_config import ActiveConfig
+from crptpro.active_config import ActiveConfig, ExplorationSettings
 from crptpro.downstream_config import DownstreamConfig, SACSettings
 from crptpro.training.agent import PixelAgent, load_agent, save_agent
 from crptpro.training.checkpoint import CheckpointDir
@@ -18,6 +18,7 @@ __all__ = [
     "DownstreamConfig",
     "DownstreamResult",
     "Episode",
+    "ExplorationSettings",
     "PixelAgent",
     "PretrainResult",
     "SACSettings",
