@@ -62,7 +62,7 @@ class Pretrain(PretrainingOptions):
     datasets: Positional[tuple[Path, ...]]
     """dataset directories, e.g. data/walker data/cartpole"""
     method: str = "crptpro"
-    """a registered method, e.g. crptpro or released-code"""
+    """a registered method or preset, e.g. crptpro, atc, apt-c, proto-rl-c, released-code, atc-native"""
     updates: int | None = None
     """encoder updates over all domains (default: the method's; crptpro 50,000)"""
     assignment_temperature: float | None = None
