@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.data import Bounded, Composite, OneHot, Unbounded
 from torchrl.envs import EnvBase
 
 from crptpro.modules import PixelEncoder, Projector, Prototypes
 
 SIZE = 20
 EPISODE = 4
+SKILLS = 3
 
 
 class FakePixelEnv(EnvBase):
-    """uint8 [9, 20, 20] noise; reward = mean action; truncated after 4 agent steps."""
+    """uint8 [9, 20, 20] noise and a skill that changes every second agent step; reward = mean action.
+
+    Truncated after 4 agent steps.
+    """
 
     def __init__(self) -> None:
         super().__init__(device="cpu")
-        self.observation_spec = Composite(pixels=Bounded(0, 255, (9, SIZE, SIZE), dtype=torch.uint8))
+        self.observation_spec = Composite(
+            pixels=Bounded(0, 255, (9, SIZE, SIZE), dtype=torch.uint8),
+            skill=OneHot(SKILLS, dtype=torch.float32),
+        )
         self.action_spec = Bounded(-1.0, 1.0, (2,))
         self.reward_spec = Unbounded((1,))
         flag = Bounded(0, 1, (1,), dtype=torch.bool)
@@ -29,9 +36,12 @@ class FakePixelEnv(EnvBase):
     def _pixels(self) -> torch.Tensor:
         return torch.randint(0, 256, (9, SIZE, SIZE), dtype=torch.uint8, generator=self._rng)
 
+    def _skill(self) -> torch.Tensor:
+        return torch.eye(SKILLS)[self._count // 2]
+
     def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
         self._count = 0
-        return TensorDict({"pixels": self._pixels()})
+        return TensorDict({"pixels": self._pixels(), "skill": self._skill()})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self._count += 1
@@ -39,6 +49,7 @@ class FakePixelEnv(EnvBase):
         return TensorDict(
             {
                 "pixels": self._pixels(),
+                "skill": self._skill(),
                 "reward": tensordict["action"].mean(-1, keepdim=True),
                 "done": over,
                 "truncated": over,

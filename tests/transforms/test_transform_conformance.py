@@ -8,7 +8,7 @@ from functools import partial
 
 import pytest
 import torch
-from fake_pixel_env import SIZE, FakePixelEnv, small_encoder, small_heads
+from fake_pixel_env import SIZE, SKILLS, FakePixelEnv, small_encoder, small_heads
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -20,8 +20,10 @@ from crptpro.transforms import (
     DenseShiftCache,
     DenseShiftFeatures,
     FrozenEncoder,
+    ParticleReward,
     PrototypeReward,
     RandomShift,
+    SkillContrastReward,
 )
 
 
@@ -52,6 +54,24 @@ def reward_to_a_new_key():
     return Compose(FrozenEncoder(encoder, out_keys="z"), reward(encoder, in_keys="z", out_reward_key="total"))
 
 
+def particles(encoder):
+    return ParticleReward(small_heads(encoder)[0], k=3)
+
+
+def particle_reward():
+    encoder = small_encoder()
+    return Compose(FrozenEncoder(encoder), particles(encoder))
+
+
+def skills(encoder):
+    return SkillContrastReward(small_heads(encoder)[0])
+
+
+def skill_contrast_reward():
+    encoder = small_encoder()
+    return Compose(FrozenEncoder(encoder), skills(encoder))
+
+
 def everything():
     return Compose(RandomShift(), *reward_in_place().transforms)
 
@@ -76,6 +96,8 @@ WRITES = {
     frozen_encoder: {"features"},
     reward_in_place: {("next", "features")} | BONUS,
     reward_to_a_new_key: {("next", "z"), ("next", "intrinsic_reward"), ("next", "total")},
+    particle_reward: {("next", "features")} | BONUS,
+    skill_contrast_reward: {("next", "features")} | BONUS,
     everything: {"pixels", ("next", "pixels"), ("next", "features")} | BONUS,
     dense_features: {"features", ("next", "features")},
 }
@@ -101,7 +123,8 @@ def sampled():
     pixels = torch.randint(0, 256, (BATCH, 9, SIZE, SIZE), dtype=torch.uint8)
     rows = torch.arange(BATCH)
     following = {"pixels": pixels.flip(0), "rows": rows.flip(0), "reward": torch.rand(BATCH, 1)}
-    return TensorDict({"pixels": pixels, "rows": rows, "next": following}, batch_size=[BATCH])
+    skill = torch.eye(SKILLS)[rows % SKILLS]
+    return TensorDict({"pixels": pixels, "rows": rows, "skill": skill, "next": following}, batch_size=[BATCH])
 
 
 def offline(make):
@@ -113,6 +136,8 @@ def offline(make):
     if make is reward_to_a_new_key:
         key, options = "z", {"in_keys": "z", "out_reward_key": "total"}
     encode = FrozenEncoder(encoder, in_keys=[("next", "pixels")], out_keys=[("next", key)])
+    if make in (particle_reward, skill_contrast_reward):
+        return Compose(encode, particles(encoder) if make is particle_reward else skills(encoder))
     return Compose(*([RandomShift()] if make is everything else []), encode, reward(encoder, **options))
 
 
@@ -224,9 +249,12 @@ def test_the_inverse_changes_nothing(make):
 
 @each
 def test_attaching_switches_to_evaluation_mode_and_it_still_acts(make):
-    env = transformed(make)
+    # Two of them: rewards that compare the elements of a batch give nothing to a single one.
+    plain, env = SerialEnv(2, FakePixelEnv), TransformedEnv(SerialEnv(2, FakePixelEnv), make())
     assert not env.transform.training
-    plain, rollout = FakePixelEnv().rollout(3), env.rollout(3)
+    for each_env in (plain, env):
+        each_env.set_seed(0)
+    plain, rollout = plain.rollout(3), env.rollout(3)
     new = set(rollout["next"].keys(True, True)) - set(plain["next"].keys(True, True))
     assert new == {key[-1] if isinstance(key, tuple) else key for key in WRITES[make]} - {"pixels", "reward"}
     for key in new:

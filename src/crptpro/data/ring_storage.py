@@ -191,11 +191,9 @@ class RingStorage(TensorStorage):
         return batch if positions.ndim == 1 else batch.reshape(positions.shape)
 
     def has_window(self, index: Tensor, n_step: int) -> Tensor:
-        """Whether the ``n_step`` transitions from ``index`` on, ``[B]``, are there and of one episode; bool."""
-        inside = index + n_step <= len(self)
-        last = (index + n_step - 1).clamp_max(len(self) - 1)
+        """Whether ``n_step`` transitions from ``index`` on, ``[B]``, at most ``len - n_step``, are of one episode."""
         # An episode has one frame more than transitions, so between two of them the rows jump.
-        return inside & (self._counters_at(last) - self._counters_at(index) == n_step - 1)
+        return self._counters_at(index + n_step - 1) - self._counters_at(index) == n_step - 1
 
     def _counters_at(self, index: Tensor) -> Tensor:
         """Return how many frames were written before those that the transitions start at."""
