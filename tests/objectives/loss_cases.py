@@ -81,7 +81,7 @@ def view_batch(count: int = 6, seed: int = 0) -> TensorDict:
     return TensorDict({"pixels": pair["pixels"], "pixels_view": pair["next", "pixels"]}, [count])
 
 
-def skill_batch(count: int = 6, seed: int = 0) -> TensorDict:
+def skill_image_batch(count: int = 6, seed: int = 0) -> TensorDict:
     skills = torch.nn.functional.one_hot(torch.arange(count) % SKILLS, SKILLS).float()
     return image_batch(count, seed).set("skill", skills)
 
@@ -226,7 +226,7 @@ CASES = [
     LossCase(
         name="BeCLLoss",
         make=becl,
-        batch=skill_batch,
+        batch=skill_image_batch,
         routing={"loss_contrast": {"encoder_params", "projector_params"}},
         keys={"next_observation": ("next", "pixels"), "skill": "skill"},
         keys_hold_under_next=False,

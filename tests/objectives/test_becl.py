@@ -7,7 +7,7 @@ import copy
 import pytest
 import torch
 import torch.nn.functional as F
-from loss_cases import SKILLS, as_images, becl, passing_through, skill_batch
+from loss_cases import SKILLS, as_images, becl, passing_through, skill_image_batch
 from tensor_checks import close, double
 from tensordict import TensorDict
 
@@ -36,7 +36,7 @@ def released_update(loss: BeCLLoss, td: TensorDict):
 
 
 def test_loss_and_gradients_equal_the_released_update() -> None:
-    loss, td = becl(), skill_batch(11)
+    loss, td = becl(), skill_image_batch(11)
     expected, gradients = released_update(loss, td)
     value = loss(td)["loss_contrast"]
     torch.testing.assert_close(value.detach(), expected)
@@ -56,7 +56,7 @@ def test_golden_losses_pass_through_the_module() -> None:
 
 
 def test_it_reads_the_next_images_and_the_skill_and_nothing_else() -> None:
-    loss, td = becl(), skill_batch()
+    loss, td = becl(), skill_image_batch()
     assert loss.in_keys == [("next", "pixels"), "skill"]
     expected = loss(td)["loss_contrast"]
     assert torch.equal(loss(td.exclude("pixels"))["loss_contrast"], expected)
@@ -70,7 +70,7 @@ def test_it_reads_the_next_images_and_the_skill_and_nothing_else() -> None:
 
 def test_the_head_is_the_projector_and_ends_in_as_many_numbers_as_skills() -> None:
     loss = becl()
-    latents = loss.projector(loss.encoder(skill_batch(4)["next", "pixels"]))
+    latents = loss.projector(loss.encoder(skill_image_batch(4)["next", "pixels"]))
     assert latents.shape == (4, SKILLS)
     assert loss.target_state() == {}
     assert loss.skill_dim == SKILLS
