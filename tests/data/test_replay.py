@@ -145,16 +145,29 @@ def test_pixels_can_be_left_unread():
     assert "pixels" in replay.sample(2)
 
 
-def test_extra_features_travel_with_their_observation(tmp_path):
+def test_extra_columns_belong_to_the_transition_and_are_sampled_at_the_root(tmp_path):
     spec = {"code": ((2,), torch.bfloat16)}
-    replay = FrameReplay(10, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path, extra_features=spec)
-    replay.begin_episode(frame(0), code=torch.tensor([0.0, 1.0]))
-    replay.append(torch.zeros(1), 0.0, False, False, frame(1), code=torch.tensor([2.0, 3.0]))
-    batch = replay[0]
-    assert batch["code"].tolist() == [0.0, 1.0]
-    assert batch["next", "code"].tolist() == [2.0, 3.0]
-    with pytest.raises(ValueError, match=r"needs the features \['code'\]"):
-        replay.begin_episode(frame(0))
+    replay = FrameReplay(10, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path, extra_columns=spec)
+    replay.begin_episode(frame(0))
+    for i in range(3):
+        replay.append(torch.zeros(1), i, False, False, frame(i), code=torch.tensor([i, i + 0.5]))
+    everything = replay[:]
+    assert everything["code"].tolist() == [[0.0, 0.5], [1.0, 1.5], [2.0, 2.5]]
+    assert everything["code"].dtype == torch.bfloat16
+    assert "code" not in everything["next"]
+    # Of a window it is the first transition's: what was in force at the observation.
+    assert replay.sample(4, n_step=3)["code"].tolist() == [[0.0, 0.5]] * 4
+    with pytest.raises(ValueError, match=r"needs \['code'\], got \[\]"):
+        replay.append(torch.zeros(1), 0.0, False, False, frame(1))
+    with pytest.raises(ValueError, match=r"got \['code', 'cod'\]|got \['cod', 'code'\]"):
+        replay.append(torch.zeros(1), 0.0, False, False, frame(1), code=torch.zeros(2), cod=1)
+    assert len(replay) == 3
+
+
+@pytest.mark.parametrize("name", ["reward", "next", "row_of", "discount"])
+def test_an_extra_column_may_not_hide_what_a_sample_has_anyway(name):
+    with pytest.raises(ValueError, match=name):
+        FrameReplay(10, action_dim=1, extra_columns={name: ((1,), torch.float32)})
 
 
 @pytest.mark.parametrize("before", [4, 33, 100])

@@ -9,10 +9,17 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
+from torchrl.data import ImmutableDatasetWriter, ReplayBuffer
 
 from crptpro.cards import require_disk
+from crptpro.data.n_step import Reading, WindowSampler
 from crptpro.data.ring_storage import RingStorage
+
+# Names in the ring or in a sample; the arguments of append() are among them, next_frame apart.
+_TAKEN = {
+    *("pixels", "action", "reward", "done", "terminated", "truncated", "discount"),
+    *("index", "row", "row_of", "step", "number", "next", "next_frame"),
+}
 
 
 class _EpisodeOnlyWriter(ImmutableDatasetWriter):
@@ -44,14 +51,15 @@ class FrameReplay(ReplayBuffer):
         path: Directory of the ring's files; RAM if ``None``. It must not be shared by two running buffers.
         slack: Frames that may be written after a checkpoint before it is worthless; 0 if there are none.
         frame_stack: k, frames per stack.
-        extra_features: Further quantities per observation, name to ``(shape, dtype)``; given as keyword
-            arguments to :meth:`begin_episode` and :meth:`append`, sampled as ``name`` and ``("next", name)``.
+        extra_columns: Further quantities per transition, such as the skill that chose the action: name to
+            ``(shape, dtype)``. Given to :meth:`append` as keyword arguments, sampled under their names.
         batch_size: Default of :meth:`sample`.
         generator: Source of randomness; torch's global generator if ``None``.
 
     Raises:
         DiskSpaceError: if the disk cannot hold the ring.
         CheckpointError: if ``path`` holds a ring of another size.
+        ValueError: if an extra column has the name of something that a sample has anyway.
 
     Examples:
         >>> replay = FrameReplay(capacity=100, frame_shape=(3, 4, 4), action_dim=1)
@@ -71,7 +79,7 @@ class FrameReplay(ReplayBuffer):
         path: str | Path | None = None,
         slack: int = 0,
         frame_stack: int = 3,
-        extra_features: Mapping[str, tuple[tuple[int, ...], torch.dtype]] | None = None,
+        extra_columns: Mapping[str, tuple[tuple[int, ...], torch.dtype]] | None = None,
         batch_size: int | None = None,
         generator: torch.Generator | None = None,
     ):
@@ -79,7 +87,12 @@ class FrameReplay(ReplayBuffer):
             raise ValueError(f"capacity must be at least 1 and slack at least 0, got {capacity} and {slack}.")
         # One frame more per episode than transitions, and the frames of the oldest stack.
         window = capacity + max(16, capacity // 50) + frame_stack
-        extra = dict(extra_features or {})
+        extra = dict(extra_columns or {})
+        taken = sorted(_TAKEN & set(extra))
+        if taken:
+            raise ValueError(
+                f"extra_columns may not be named {taken}: a sample has those; choose other names."
+            )
         columns: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
             "pixels": (tuple(frame_shape), torch.uint8),
             "action": ((action_dim,), torch.float32),
@@ -100,12 +113,12 @@ class FrameReplay(ReplayBuffer):
             slack=slack,
             columns=columns,
             frame_stack=frame_stack,
-            next_columns=self._extra,
+            root_columns=("action", *extra),
             path=None if path is None else Path(path),
         )
         super().__init__(
             storage=storage,
-            sampler=RandomSampler(),
+            sampler=WindowSampler(),
             writer=_EpisodeOnlyWriter(),
             batch_size=batch_size,
             generator=generator,
@@ -133,17 +146,16 @@ class FrameReplay(ReplayBuffer):
         """
         return self._storage.numbers_at(slots)
 
-    def begin_episode(self, frame: Tensor, **features: Any) -> int:
+    def begin_episode(self, frame: Tensor) -> int:
         """Store the first frame of an episode, whether or not the previous one had ended.
 
         Args:
             frame: uint8 ``[C, H, W]``, the single newest frame.
-            **features: The ``extra_features`` of this observation.
 
         Returns:
             The frame's slot, which identifies this observation while it is in the ring.
         """
-        return self._storage.write_first(self._row(frame, features))
+        return self._storage.write_first(self._row(frame))
 
     def append(
         self,
@@ -152,7 +164,7 @@ class FrameReplay(ReplayBuffer):
         terminated: bool | Tensor,
         truncated: bool | Tensor,
         next_frame: Tensor,
-        **features: Any,
+        **columns: Any,
     ) -> int:
         """Store a transition from the newest observation, and the frame it leads to.
 
@@ -162,16 +174,19 @@ class FrameReplay(ReplayBuffer):
             terminated: The episode ended by its own rules; it is not bootstrapped.
             truncated: The episode was stopped, by a time limit for example; it is bootstrapped.
             next_frame: uint8 ``[C, H, W]``, the single newest frame.
-            **features: The ``extra_features`` of the next observation.
+            **columns: The ``extra_columns`` of this transition.
 
         Returns:
             The next frame's slot.
 
         Raises:
             RuntimeError: if no episode is running.
+            ValueError: if an extra column is missing or unknown.
         """
         if not self._storage.cursors.is_open:
             raise RuntimeError("No episode is running: call begin_episode(frame) with its first frame.")
+        if set(columns) != set(self._extra):
+            raise ValueError(f"Every transition needs {sorted(self._extra)}, got {sorted(columns)}.")
         terminated, truncated = bool(terminated), bool(truncated)
         transition = {
             "action": action,
@@ -179,31 +194,59 @@ class FrameReplay(ReplayBuffer):
             "terminated": terminated,
             "truncated": truncated,
             "done": terminated or truncated,
+            **columns,
         }
         is_last = terminated or truncated
-        return self._storage.write_next(transition, self._row(next_frame, features), is_last=is_last)
+        return self._storage.write_next(transition, self._row(next_frame), is_last=is_last)
 
     def sample(
-        self, batch_size: int | None = None, return_info: bool = False, *, pixels: bool = True
+        self,
+        batch_size: int | None = None,
+        return_info: bool = False,
+        *,
+        pixels: bool = True,
+        n_step: int = 1,
+        discount: float | None = None,
     ) -> TensorDict:
         """Draw uniformly, with replacement, from the valid transitions.
+
+        For ``n_step`` above 1, only those are drawn from whose n transitions lie in one episode and in the ring;
+        as in url_benchmark (``replay_buffer.py``), a window is not cut short at an episode's end, so an episode's
+        last n - 1 transitions are only ever the later part of one. ``("next", ...)`` is then n agent steps ahead:
+        its flags are the last transition's, its reward is the n-step return, and ``("next", "discount")`` weighs
+        the value of the next observation (:func:`~crptpro.data.n_step.n_step_return`).
+
+        Deviation: url_benchmark draws an episode uniformly and then an anchor in it, and only from finished
+        episodes; here every admissible anchor is equally likely, the running episode's included. For finished
+        episodes of equal length the two are the same.
 
         Args:
             batch_size: B; the constructor's if ``None``.
             return_info: As in TorchRL: return ``(batch, info)``.
             pixels: False leaves the frames unread, for a user that has features by slot.
+            n_step: n, agent steps from an observation to the next one.
+            discount: gamma of the n-step return. None is 0.99; for ``n_step`` 1 it leaves
+                ``("next", "discount")`` out.
 
         Returns:
             TensorDict ``[B]``: ``pixels`` and ``("next", "pixels")`` uint8 ``[B, k * C, H, W]``, ``action``,
-            ``("next", "reward" | "done" | "terminated" | "truncated")`` ``[B, 1]``, ``index`` (0 is the
-            oldest valid transition), ``row`` and ``("next", "row")``: the slots of the two observations'
-            newest frames.
+            the ``extra_columns``, ``("next", "reward" | "done" | "terminated" | "truncated")`` ``[B, 1]``,
+            ``("next", "discount")`` float32 ``[B, 1]``, ``index`` (0 is the oldest valid transition), ``row``
+            and ``("next", "row")``: the slots of the two observations' newest frames.
+
+        Raises:
+            RuntimeError: if there is nothing to draw from.
+            ValueError: if ``n_step`` is below 1.
         """
-        self._storage.reads_pixels = pixels
+        if n_step < 1:
+            raise ValueError(f"n_step must be at least 1, got {n_step}.")
+        if discount is None and n_step > 1:
+            discount = 0.99
+        self._storage.reading = Reading(pixels, n_step, discount)
         try:
             return super().sample(batch_size, return_info)
         finally:
-            self._storage.reads_pixels = True
+            self._storage.reading = Reading()
 
     def observations_at(self, slots: Tensor) -> Tensor:
         """Return the observations whose newest frames lie in ``slots``, uint8 ``[B, k * C, H, W]``."""
@@ -231,15 +274,11 @@ class FrameReplay(ReplayBuffer):
         """
         self._storage.load_state_dict(state_dict["ring"])
 
-    def _row(self, frame: Tensor, features: Mapping[str, Any]) -> dict[str, Any]:
+    def _row(self, frame: Tensor) -> dict[str, Any]:
         frame = torch.as_tensor(frame)
         if frame.dtype != torch.uint8 or frame.shape != self._frame_shape:
             raise ValueError(
                 f"A frame must be uint8 {tuple(self._frame_shape)}, the newest single frame, "
                 f"got {frame.dtype} {tuple(frame.shape)}."
             )
-        if set(features) != set(self._extra):
-            raise ValueError(
-                f"Every observation needs the features {sorted(self._extra)}, got {sorted(features)}."
-            )
-        return {"pixels": frame, **features}
+        return {"pixels": frame}

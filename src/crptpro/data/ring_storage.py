@@ -16,6 +16,7 @@ from torchrl.data import TensorStorage
 from torchrl.data.replay_buffers.checkpointers import StorageCheckpointerBase
 
 from crptpro.data.frame_stacks import gather_stacks, stack_rows
+from crptpro.data.n_step import Reading, n_step_return
 from crptpro.errors import CheckpointError, DiskSpaceError
 
 _OWN = ("pixels", "step", "number", "row_of")
@@ -66,7 +67,7 @@ class RingStorage(TensorStorage):
         slack: Further rows, which only restoring needs.
         columns: Name to (shape, dtype) of every per-row quantity, ``pixels`` among them.
         frame_stack: k, frames per stack.
-        next_columns: Names that are also returned for the next row, under ``("next", name)``.
+        root_columns: Names that belong to a transition's observation; the others are returned under ``"next"``.
         path: Directory of the memory-mapped files; RAM if ``None``.
     """
 
@@ -80,14 +81,13 @@ class RingStorage(TensorStorage):
         slack: int,
         columns: Mapping[str, tuple[tuple[int, ...], torch.dtype]],
         frame_stack: int,
-        next_columns: tuple[str, ...] = (),
+        root_columns: tuple[str, ...] = ("action",),
         path: Path | None = None,
     ):
         self.window, self.slack, self.frame_stack = window, slack, frame_stack
-        self.rows = window + slack
-        self.path = path
-        self.next_columns = next_columns
-        self.reads_pixels = True
+        self.rows, self.path = window + slack, path
+        self.root_columns = root_columns
+        self.reading = Reading()
         self.cursors = RingCursors()
         # ``number`` is one more than the row's counter, 0 if it was never written; ``row_of`` belongs to
         # transitions, which have a counter of their own.
@@ -153,7 +153,7 @@ class RingStorage(TensorStorage):
         pass  # follows the cursors
 
     def get(self, index: Any) -> TensorDict:
-        """Return the transitions at ``index``, 0 being the oldest valid one."""
+        """Return the transitions at ``index``, 0 being the oldest valid one, as :attr:`reading` says."""
         if isinstance(index, tuple) and len(index) == 1:
             index = index[0]
         if isinstance(index, slice):
@@ -169,23 +169,37 @@ class RingStorage(TensorStorage):
                 raise IndexError(f"index {index} is out of range for {len(self)} transitions.")
             positions = torch.where(positions < 0, positions + len(self), positions)
         flat = positions.reshape(-1)
-        number = (self.cursors.oldest + flat) % self.rows
-        row = self._storage.get("row_of")[number] % self.rows
-        following = (row + 1) % self.rows
+        n_step, discount = self.reading.n_step, self.reading.discount
+        row = self._counters_at(flat) % self.rows
+        # The transitions of a window follow one another in rows, and its last one leads to the next observation.
+        last, following = (row + n_step - 1) % self.rows, (row + n_step) % self.rows
         batch = TensorDict({"index": flat, "row": row, ("next", "row"): following}, batch_size=flat.shape)
         for name in self._storage.keys():  # noqa: SIM118 - iterating a TensorDict yields rows
             if name in _OWN:
                 continue
-            column = self._storage.get(name)
-            if name in self.next_columns:
-                batch.set(("next", name), column[following])
-                batch.set(name, column[row])
-            else:
-                batch.set(name if name == "action" else ("next", name), column[row])
-        if self.reads_pixels:
+            is_root, column = name in self.root_columns, self._storage.get(name)
+            batch.set(name if is_root else ("next", name), column[row if is_root else last])
+        if discount is not None:
+            window = (row.unsqueeze(-1) + torch.arange(n_step)) % self.rows
+            rewards, ended = self._storage.get("reward")[window], self._storage.get("terminated")[window]
+            returns, discounts = n_step_return(rewards, ended, discount)
+            batch.set(("next", "reward"), returns)
+            batch.set(("next", "discount"), discounts)
+        if self.reading.pixels:
             batch.set("pixels", self.stacks_at(row))
             batch.set(("next", "pixels"), self.stacks_at(following))
         return batch if positions.ndim == 1 else batch.reshape(positions.shape)
+
+    def has_window(self, index: Tensor, n_step: int) -> Tensor:
+        """Whether the ``n_step`` transitions from ``index`` on, ``[B]``, are there and of one episode; bool."""
+        inside = index + n_step <= len(self)
+        last = (index + n_step - 1).clamp_max(len(self) - 1)
+        # An episode has one frame more than transitions, so between two of them the rows jump.
+        return inside & (self._counters_at(last) - self._counters_at(index) == n_step - 1)
+
+    def _counters_at(self, index: Tensor) -> Tensor:
+        """Return how many frames were written before those that the transitions start at."""
+        return self._storage.get("row_of")[(self.cursors.oldest + index) % self.rows]
 
     def stacks_at(self, slots: Tensor) -> Tensor:
         """Return the observations whose newest frames lie in ``slots``, uint8 ``[B, k * C, H, W]``."""
