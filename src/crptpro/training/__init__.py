@@ -1,6 +1,12 @@
-"""Training: offline pre-training, downstream SAC on a frozen encoder, evaluation, checkpoints."""
+"""Training: offline pre-training, downstream reinforcement learning, evaluation, checkpoints."""
 
-from crptpro.downstream_config import DownstreamConfig, SACSettings
+from crptpro.downstream_config import (
+    DownstreamConfig,
+    SACSettings,
+    SkillDDPGSettings,
+    drq_settings,
+    skill_ddpg_settings,
+)
 from crptpro.training.agent import PixelAgent, load_agent, save_agent
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.collapse import CollapseMonitor
@@ -17,10 +23,13 @@ __all__ = [
     "PixelAgent",
     "PretrainResult",
     "SACSettings",
+    "SkillDDPGSettings",
+    "drq_settings",
     "evaluate",
     "load_agent",
     "pretrain",
     "save_agent",
+    "skill_ddpg_settings",
     "summarize",
     "train_downstream",
     "uniform_policy",
