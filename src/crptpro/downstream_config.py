@@ -145,7 +145,7 @@ class SACSettings:
         if self.algorithm != "rad-sac" and self.intrinsic_reward_coef:
             raise ValueError(
                 f"`intrinsic_reward_coef` is {self.intrinsic_reward_coef}, but {self.algorithm} has no bonus: set it "
-                f"to 0, or start from {self.algorithm.replace('-', '_')}_settings(), which holds that algorithm's values."
+                f"to 0, or start from {self.algorithm.replace('-', '_')}_settings(), which holds all its values."
             )
 
     @property

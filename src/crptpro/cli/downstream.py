@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import sys
 from collections.abc import Sequence
@@ -30,7 +31,7 @@ def settings_asked_for(arguments: Sequence[str]) -> DownstreamConfig:
         arguments: of the command; what cannot be read is left to the parser.
     """
     words = " ".join(arguments).replace("=", " ").split()
-    named = [after for word, after in zip(words, words[1:]) if word == "--algorithm"]
+    named = [after for word, after in itertools.pairwise(words) if word == "--algorithm"]
     return skill_ddpg_settings() if named[-1:] == ["skill-ddpg"] else DownstreamConfig()
 
 
