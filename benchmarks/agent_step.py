@@ -192,7 +192,9 @@ def _attach(run: DownstreamRun, watch: Stopwatch) -> None:
         "replay": watch.within(parts.replay, append=store),
         "features": watch.within(parts.features, observe=encode, sample=features),
         "bonus": None if parts.bonus is None else watch.timed(bonus, parts.bonus),
-        "learner": watch.within(parts.learner, update=learner),
+        "algorithm": dataclasses.replace(
+            parts.algorithm, learner=watch.within(parts.learner, update=learner)
+        ),
     }
     run.parts = dataclasses.replace(parts, **watched)
 

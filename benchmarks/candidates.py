@@ -90,7 +90,7 @@ def downstream_candidates(
             )
     parts = next(iter(ours.values())).parts
     store = StackedStore.of(parts.replay, len(parts.replay))
-    plain = PlainDownstream.like(pretrained, parts.actor, parts.learner.loss.critic)
+    plain = PlainDownstream.like(pretrained, parts.learner.loss.actor, parts.learner.loss.critic)
     agent_step = itertools.count()
     candidates: dict[str, Callable[[], Any]] = {
         PLAIN: lambda: plain.sample_and_update(store, config.batch_size, next(agent_step))

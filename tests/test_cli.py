@@ -102,14 +102,16 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.parametrize(("command", "named"), [
-    ((), ["doctor", "collect", "pretrain", "finetune", "downstream", "evaluate"]),
+    ((), ["doctor", "collect", "pretrain", "finetune", "downstream", "drq", "evaluate"]),
     (("doctor",), ["--domains"]),
     (("collect",), ["--out", "--transitions", "--seed", "--workers", "--quality {exact,fast}", "group letters"]),
     (("pretrain",), ["--out", "--method", "--updates", "--batch-size", "--learning-rate", "--precision",
                      "--device", "--logging.wandb", "50,000"]),
     (("finetune",), ["--out", "--updates", "--batch-size", "--learning-rate", "--logging.wandb", "PATH PATH"]),
     (("downstream",), ["--pretrained", "random-encoder", "--out", "--env-steps", "--replay-capacity",
-                       "--eval-episodes", "--features", "--logging.tensorboard"]),
+                       "--eval-episodes", "--features", "--logging.tensorboard", "(default: 500000)"]),
+    (("downstream", "--algorithm", "skill-ddpg"), ["(default: skill-ddpg)", "--skill-ddpg.n-step", "(default: 2000)"]),
+    (("drq",), ["--out", "(default: drq)", "(default: 1000000)", "(default: 100000)", "(default: 0.001)"]),
     (("evaluate",), ["random-policy", "--task", "--episodes", "--csv", "--video"]),
 ])  # fmt: skip
 def test_help_names_every_argument(call: Call, command: tuple[str, ...], named: list[str]) -> None:
@@ -156,6 +158,10 @@ def test_what_the_parser_cannot_read_is_named_with_status_2(
     (("downstream", TASK, "--pretrained", "absent"), r"absent does not exist"),
     (("downstream", TASK, "--pretrained", "random-encoder", "--device", "abacus"), r"'abacus' cannot be used"),
     (("downstream", TASK, "--pretrained", "random-encoder", "--discount", "2"), r"discount.*got 2"),
+    (("downstream", TASK, "--pretrained", "random-encoder", "--algorithm", "drq", "--intrinsic-reward-coef", "0"),
+     r"crptpro drq fixed_go"),
+    (("drq", "walker_rum"), r"'walker_rum'\. Nearest: walker_run"),
+    (("drq", TASK, "--algorithm", "skill-ddpg"), r"learns on a frozen encoder.*--algorithm skill-ddpg"),
 ])  # fmt: skip
 def test_a_request_that_cannot_be_met_leaves_nothing_behind(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], message: str
@@ -324,6 +330,24 @@ def test_every_command_does_its_part_on_a_world_without_a_simulator(
     )
     assert "no pretrained encoder" in line
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("command", "pretrained", "updates"), [
+    (("drq",), None, "18"),
+    (("downstream", "--algorithm=skill-ddpg", "--pretrained", "random-encoder", "--skill-ddpg.skill", 3), "random-encoder",
+     "9"),
+])  # fmt: skip
+def test_the_other_algorithms_leave_agents_that_evaluate(
+    call: Call, tmp_path: Path, command: tuple[object, ...], pretrained: str | None, updates: str
+) -> None:
+    status, _, err = call(command[0], TASK, *command[1:], "--out", tmp_path / "run", *SMALL)
+    assert status == 0, err
+    assert rows(tmp_path / "run" / "eval.csv")[-1]["updates"] == updates
+    _, card = load_agent(tmp_path / "run" / "agent")
+    assert (card["pretrained"] or "None").split(":")[0] == str(pretrained)
+    status, out, _ = call("evaluate", tmp_path / "run" / "agent", "--episodes", 1)
+    assert status == 0
+    assert out.startswith(f"{TASK}: ")
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

@@ -2,10 +2,51 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 from crptpro.quality import Quality
+
+Algorithm = Literal["rad-sac", "drq", "skill-ddpg"]
+
+
+@dataclass(frozen=True)
+class SkillDDPGSettings:
+    """What `skill-ddpg` alone reads: BeCL's own agent, DDPG with a skill that is fixed downstream.
+
+    Source: rll-research/url_benchmark ``agent/ddpg.py``; Rooshy-yang/BeCL.
+    """
+
+    skill_dim: int = 16
+    """number of skills"""
+    skill: int | None = None
+    """which one is learned with, from 0 (default: drawn from the seed)"""
+    n_step: int = 3
+    """agent steps whose rewards are summed before the critic's value takes over"""
+    update_interval: int = 2
+    """agent steps between two updates"""
+    noise_std: float = 0.2
+    """standard deviation of the noise on every action that is not evaluated"""
+    noise_clip: float = 0.3
+    """largest noise on actions that are learned from"""
+
+    def __post_init__(self) -> None:
+        """Refuse values that cannot run.
+
+        Raises:
+            ValueError: naming the setting, its value and what is allowed.
+        """
+        for name in ("skill_dim", "n_step", "update_interval"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"`skill_ddpg.{name}` must be at least 1, got {getattr(self, name)}.")
+        for name in ("noise_std", "noise_clip"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"`skill_ddpg.{name}` must not be negative, got {getattr(self, name)}.")
+        if self.skill is not None and not 0 <= self.skill < self.skill_dim:
+            raise ValueError(
+                f"`skill_ddpg.skill` must be in 0..{self.skill_dim - 1} (`skill_dim` is {self.skill_dim}), "
+                f"got {self.skill}."
+            )
 
 
 @dataclass(frozen=True)
@@ -15,9 +56,13 @@ class SACSettings:
     Source: CRPTpro, hyper-parameter table; Proto-RL's released agent.
 
     One update per agent step once ``random_agent_steps`` transitions are stored. ``env_steps`` counts
-    un-repeated simulator steps, ``agent_steps`` decisions.
+    un-repeated simulator steps, ``agent_steps`` decisions. The defaults are those of `rad-sac`;
+    :func:`drq_settings` and :func:`skill_ddpg_settings` hold the other algorithms'.
     """
 
+    algorithm: Algorithm = "rad-sac"
+    """`rad-sac`: SAC on a frozen encoder; `drq`: SAC that trains its encoder itself, from scratch; `skill-ddpg`: BeCL's
+    own agent on a frozen encoder"""
     env_steps: int = 500_000
     """budget in simulator steps; an episode still running then is cut"""
     action_repeat: int | None = None
@@ -35,19 +80,19 @@ class SACSettings:
     discount: float = 0.99
     """per agent step; only true terminations stop bootstrapping, time limits never do"""
     learning_rate: float = 1e-4
-    """of the three Adam optimisers (actor, critic, temperature)"""
+    """of the Adam optimisers (actor, critic, temperature)"""
     initial_temperature: float = 0.1
-    """SAC's alpha at the start"""
+    """SAC's alpha at the start (not of skill-ddpg)"""
     actor_update_interval: int = 2
-    """updates between two actor and temperature steps"""
+    """updates between two actor and temperature steps (of skill-ddpg: every update)"""
     critic_tau: float = 0.01
     """share of the critic that enters its target at each target update"""
     target_update_interval: int = 2
-    """updates between two target updates"""
+    """updates between two target updates (of skill-ddpg: every update)"""
     shift_pad: int = 4
     """random shift of at most so many pixels in each direction"""
     intrinsic_reward_coef: float = 0.2
-    """weight of the prototype-kNN bonus (the paper's beta); 0 switches it off"""
+    """weight of the prototype-kNN bonus (the paper's beta), which rad-sac alone has; 0 switches it off"""
     knn_k: int = 3
     """the bonus is the distance to the k-th nearest candidate"""
     queue_size: int = 2_048
@@ -65,7 +110,10 @@ class SACSettings:
     log_interval_env_steps: int = 1_000
     """simulator steps between two rows of training metrics"""
     features: Literal["auto", "dense", "reencode"] = "auto"
-    """how shifted features are had: cut from dense maps stored once per observation, or encoded at every update"""
+    """how shifted features are had: cut from dense maps stored once per observation, or encoded at every update (drq
+    encodes, whatever is said here)"""
+    skill_ddpg: SkillDDPGSettings = field(default_factory=SkillDDPGSettings)
+    """what skill-ddpg alone reads"""
 
     def __post_init__(self) -> None:
         """Refuse values that cannot run.
@@ -93,6 +141,11 @@ class SACSettings:
             raise ValueError(
                 f"`replay_capacity` ({self.replay_capacity}) must hold the {self.random_agent_steps} transitions "
                 "of `random_agent_steps`, or no update would ever start."
+            )
+        if self.algorithm != "rad-sac" and self.intrinsic_reward_coef:
+            raise ValueError(
+                f"`intrinsic_reward_coef` is {self.intrinsic_reward_coef}, but {self.algorithm} has no bonus: set it "
+                f"to 0, or start from {self.algorithm.replace('-', '_')}_settings(), which holds all its values."
             )
 
     @property
@@ -137,3 +190,47 @@ class DownstreamConfig(SACSettings):
         super().__post_init__()
         if self.eval_workers is not None and self.eval_workers < 0:
             raise ValueError(f"`eval_workers` must not be negative, got {self.eval_workers}.")
+
+
+def drq_settings(**overrides: Any) -> DownstreamConfig:
+    """Return DrQ's settings: end to end from pixels, without pre-training and without bonus.
+
+    Source: denisyarats/drq (config, and batch 512 of its README); twice the budget of the pre-trained methods, as in
+    CRPTpro's comparison.
+
+    Args:
+        **overrides: single settings of :class:`DownstreamConfig`.
+
+    Examples:
+        >>> drq_settings(seed=1).env_steps
+        1000000
+    """
+    settings: dict[str, Any] = {
+        "algorithm": "drq",
+        "env_steps": 1_000_000,
+        "replay_capacity": 100_000,
+        "learning_rate": 1e-3,
+        "intrinsic_reward_coef": 0.0,
+    }
+    return DownstreamConfig(**{**settings, **overrides})
+
+
+def skill_ddpg_settings(**overrides: Any) -> DownstreamConfig:
+    """Return the settings of BeCL's own downstream agent: skill-conditioned DDPG on a frozen encoder.
+
+    Source: rll-research/url_benchmark and Rooshy-yang/BeCL. Deviation: batch and replay are those of the other
+    pre-trained methods (512 and 40,000; natively 256 to 1,024 and 1,000,000), so that what is compared is the agent.
+
+    Args:
+        **overrides: single settings of :class:`DownstreamConfig`.
+
+    Examples:
+        >>> skill_ddpg_settings(skill_ddpg=SkillDDPGSettings(skill=3)).skill_ddpg.n_step
+        3
+    """
+    settings: dict[str, Any] = {
+        "algorithm": "skill-ddpg",
+        "random_agent_steps": 2_000,
+        "intrinsic_reward_coef": 0.0,
+    }
+    return DownstreamConfig(**{**settings, **overrides})

@@ -8,20 +8,17 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from tyro.conf import Positional, arg, subcommand
+from tyro.conf import Positional, subcommand
 
 from crptpro.cards import cpu_cores
+from crptpro.cli.downstream import Downstream, DrQ
 from crptpro.cli.evaluate import Evaluate
 from crptpro.cli.pretraining import Finetune, Pretrain
-from crptpro.cli.request import Logging, expand_groups, require_device
+from crptpro.cli.request import expand_groups
 from crptpro.console import run_main
-from crptpro.domains import get_domain
-from crptpro.downstream_config import DownstreamConfig
 from crptpro.quality import Quality
 
 logger = logging.getLogger(__name__)
-
-RANDOM_ENCODER = "random-encoder"
 
 
 @dataclass(frozen=True)
@@ -77,39 +74,6 @@ class Collect:
             logger.info("%s: %s", name, path)
 
 
-@dataclass(frozen=True)
-class Downstream:
-    """Train SAC on a frozen encoder with the prototype-kNN exploration bonus."""
-
-    task: Positional[str]
-    """task to learn, e.g. walker_run, reach_duplo, gymnasium:HalfCheetah-v5"""
-    pretrained: str
-    """directory of the pretrained encoder, or `random-encoder` for the untrained control"""
-    out: Path
-    """run directory: eval.csv, train.csv, checkpoints, and the agent in OUT/agent"""
-    config: Annotated[DownstreamConfig, arg(name="")] = field(default_factory=DownstreamConfig)
-    """every number of the stage"""
-    logging: Logging = field(default_factory=Logging)
-    """mirrors"""
-
-    def run(self) -> None:
-        """Train, or continue."""
-        from crptpro.pretrained import load_pretrained, random_pretrained
-        from crptpro.training import train_downstream
-
-        require_device(self.config.device)
-        get_domain(self.task)  # an unknown name is refused before the run directory is made
-        if self.pretrained == RANDOM_ENCODER:
-            artifact = random_pretrained(seed=self.config.seed)
-        else:
-            artifact = load_pretrained(self.pretrained)
-        with self.logging.open(self.out, self) as records:
-            result = train_downstream(
-                self.task, artifact, run_dir=self.out, config=self.config, logger=records
-            )
-        logger.info("agent: %s", result.agent_path)
-
-
 def main() -> None:
     """Entry point of the ``crptpro`` command."""
     commands = tyro.conf.OmitSubcommandPrefixes[
@@ -118,6 +82,7 @@ def main() -> None:
         | Annotated[Pretrain, subcommand("pretrain")]
         | Annotated[Finetune, subcommand("finetune")]
         | Annotated[Downstream, subcommand("downstream")]
+        | Annotated[DrQ, subcommand("drq")]
         | Annotated[Evaluate, subcommand("evaluate")]
     ]
     run_main(lambda: tyro.cli(commands, prog="crptpro", description=DESCRIPTION).run())

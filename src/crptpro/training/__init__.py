@@ -1,7 +1,13 @@
-"""Training: offline pre-training, downstream SAC on a frozen encoder, evaluation, checkpoints."""
+"""Training: offline pre-training, downstream reinforcement learning, evaluation, checkpoints."""
 
 from crptpro.active_config import ActiveConfig, ExplorationSettings
-from crptpro.downstream_config import DownstreamConfig, SACSettings
+from crptpro.downstream_config import (
+    DownstreamConfig,
+    SACSettings,
+    SkillDDPGSettings,
+    drq_settings,
+    skill_ddpg_settings,
+)
 from crptpro.training.agent import PixelAgent, load_agent, save_agent
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.collapse import CollapseMonitor
@@ -22,12 +28,15 @@ __all__ = [
     "PixelAgent",
     "PretrainResult",
     "SACSettings",
+    "SkillDDPGSettings",
+    "drq_settings",
     "evaluate",
     "load_agent",
     "pretrain",
     "pretrain_active",
     "register_intrinsic_reward",
     "save_agent",
+    "skill_ddpg_settings",
     "summarize",
     "train_downstream",
     "uniform_policy",

@@ -1,4 +1,4 @@
-"""Downstream reinforcement learning: SAC on a frozen encoder with the prototype-kNN bonus (CRPTpro, Sec. III-C)."""
+"""Downstream reinforcement learning: on a frozen encoder (CRPTpro, Sec. III-C), or end to end for comparison."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import Any
 from crptpro.directory_lock import DirectoryLock
 from crptpro.downstream_config import DownstreamConfig
 from crptpro.envs import make_env, resolve_action_repeat
-from crptpro.errors import CheckpointError, UnknownNameError
+from crptpro.errors import CheckpointError, PretrainedError, UnknownNameError
 from crptpro.loggers import RunLogger
-from crptpro.pretrained import Pretrained, load_pretrained
+from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
 from crptpro.training.agent import PixelAgent
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.downstream_run import DownstreamRun, EnvFactory
@@ -39,7 +39,7 @@ class DownstreamResult:
 
 def train_downstream(
     task: str,
-    pretrained: Pretrained | str | Path,
+    pretrained: Pretrained | str | Path | None,
     *,
     run_dir: str | Path | None = None,
     config: DownstreamConfig | None = None,
@@ -49,11 +49,12 @@ def train_downstream(
     env_factory: EnvFactory = make_env,
     **overrides: Any,
 ) -> DownstreamResult:
-    """Train SAC on a task with the encoder frozen.
+    """Train an agent on a task: SAC with the encoder frozen, or what ``config.algorithm`` says.
 
     Args:
         task: any name that :func:`crptpro.envs.make_env` knows.
-        pretrained: an artifact or its directory. Without prototypes there is no bonus, which is said once.
+        pretrained: an artifact or its directory. Without prototypes there is no bonus, which is said once. None for
+            DrQ, whose encoder starts from the seed: ``train_downstream(task, None, config=drq_settings())``.
         run_dir: records, checkpoints and the agent go here; ``None`` keeps nothing but the result.
         config: every number; the paper's by default.
         logger: records and mirrors; by default a local record in ``run_dir``.
@@ -68,14 +69,14 @@ def train_downstream(
         The agent and every evaluated episode.
 
     Raises:
-        PretrainedError: if the artifact does not fit, e.g. another image size, or actor weights only.
+        PretrainedError: if the artifact does not fit, e.g. another image size, or actor weights only; if there is none
+            for a frozen encoder, or one for DrQ.
         CheckpointError: if ``run_dir`` holds a run with other settings.
         NonFiniteError: if a loss became NaN or infinite; the last checkpoint is kept.
     """
     config = dataclasses.replace(config or DownstreamConfig(), **overrides)
     config = dataclasses.replace(config, action_repeat=_action_repeat(task, config.action_repeat))
-    if not isinstance(pretrained, Pretrained):
-        pretrained = load_pretrained(pretrained)
+    artifact = _artifact(pretrained, config)
     with contextlib.ExitStack() as stack:
         directory = Path(run_dir or stack.enter_context(tempfile.TemporaryDirectory(prefix="crptpro-")))
         stack.enter_context(DirectoryLock(directory, error=CheckpointError, is_reentrant=True))
@@ -88,13 +89,29 @@ def train_downstream(
                 f"{directory} already holds a run. Choose another directory, or continue it (resume=True)."
             )
         run = DownstreamRun(
-            task, pretrained, directory, config, records, progress=progress, env_factory=env_factory
+            task, artifact, directory, config, records, progress=progress, env_factory=env_factory
         )
         stack.callback(run.close)
         run.resume(checkpoints)
         run.train(checkpoints if run_dir is not None else None)
         agent_path = run.save_agent() if run_dir is not None else None
         return DownstreamResult(run.agent(), records.rows("eval"), agent_path, run.env_steps)
+
+
+def _artifact(pretrained: Pretrained | str | Path | None, config: DownstreamConfig) -> Pretrained:
+    if config.algorithm == "drq":
+        if pretrained is not None:
+            raise PretrainedError(
+                "DrQ trains its encoder from scratch and takes no pretrained one; leave it out (None), or choose "
+                "algorithm='rad-sac' to learn on this encoder."
+            )
+        return random_pretrained(seed=config.seed)
+    if pretrained is None:
+        raise PretrainedError(
+            f"{config.algorithm} learns on a frozen encoder: give it a pretrained artifact, or random_pretrained() as "
+            "the control. Only drq needs none."
+        )
+    return pretrained if isinstance(pretrained, Pretrained) else load_pretrained(pretrained)
 
 
 def _action_repeat(task: str, asked: int | None) -> int:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
+from crptpro.downstream_config import SkillDDPGSettings
 from crptpro.errors import CheckpointError
 from crptpro.seeding import global_rng_state, set_global_rng_state
 from crptpro.training.fingerprint import require_same
@@ -23,6 +24,9 @@ COUNTERS = ("agent_steps", "updates", "episodes", "last_eval", "next_eval", "nex
 FREE_TO_CHANGE = ("env_steps", "device", "features", "precision", "eval_workers", "render_ahead")
 """Settings that a run may be continued with other values of: budgets may grow, machines differ. What `auto` became
 is compared instead of what was asked."""
+
+CAME_LATER: dict[str, Any] = {"algorithm": "rad-sac", "skill_ddpg": dataclasses.asdict(SkillDDPGSettings())}
+"""Settings that checkpoints of earlier versions do not name, with what was the case then."""
 
 
 def fingerprint(run: DownstreamRun) -> dict[str, Any]:
@@ -43,9 +47,7 @@ def state_of(run: DownstreamRun) -> dict[str, Any]:
     return {
         "fingerprint": fingerprint(run),
         "counters": {name: getattr(run, name) for name in COUNTERS},
-        "learner": run.parts.learner.state_dict(),
-        "bonus": None if run.parts.bonus is None else run.parts.bonus.state_dict(),
-        "replay": run.parts.replay.state_dict(),
+        **run.parts.state_dict(),
         "generators": {name: generator.get_state() for name, generator in run.generators.items()},
         "global_rng": global_rng_state(),
         "sums": run.sums,
@@ -62,7 +64,7 @@ def restore(run: DownstreamRun, state: Mapping[str, Any]) -> None:
         CheckpointError: if the state belongs to a run with other settings, or one that went beyond the budget;
             nothing has changed then.
     """
-    require_same(state["fingerprint"], fingerprint(run), run.run_dir)
+    require_same({**CAME_LATER, **state["fingerprint"]}, fingerprint(run), run.run_dir)
     done = state["counters"]["agent_steps"] * run.config.resolved_action_repeat
     if done - run.config.resolved_action_repeat >= run.config.env_steps:
         raise CheckpointError(
@@ -71,10 +73,7 @@ def restore(run: DownstreamRun, state: Mapping[str, Any]) -> None:
         )
     for name, value in state["counters"].items():
         setattr(run, name, value)
-    run.parts.learner.load_state_dict(state["learner"])
-    if run.parts.bonus is not None:
-        run.parts.bonus.load_state_dict(state["bonus"])
-    run.parts.replay.load_state_dict(state["replay"])
+    run.parts.load_state_dict(state)
     for name, generator in run.generators.items():
         generator.set_state(state["generators"][name])
     set_global_rng_state(state["global_rng"])

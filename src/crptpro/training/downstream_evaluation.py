@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -79,7 +78,7 @@ class DownstreamEvaluation:
             counters: where the run is: ``env_steps`` and others, written into every row.
         """
         self.finish()
-        snapshot = PixelAgent(agent.encoder, copy.deepcopy(agent.actor))
+        snapshot = agent.snapshot()
         self._pending = (snapshot, dict(counters))
         if self._pool is None:
             self.finish()
@@ -109,7 +108,7 @@ class DownstreamEvaluation:
         if self._pending is None:
             return {"pending": None}
         agent, counters = self._pending
-        return {"pending": {"counters": counters, "actor": agent.actor.state_dict()}}
+        return {"pending": {"counters": counters, **agent.state_dict()}}
 
     def load_state_dict(self, state: Mapping[str, Any], agent: PixelAgent) -> None:
         """Start again what was under way.
@@ -120,9 +119,9 @@ class DownstreamEvaluation:
         """
         if state["pending"] is None:
             return
-        actor = copy.deepcopy(agent.actor)
-        actor.load_state_dict(state["pending"]["actor"])
-        self.start(PixelAgent(agent.encoder, actor), state["pending"]["counters"])
+        then = agent.snapshot()
+        then.load_state_dict(state["pending"])
+        self.start(then, state["pending"]["counters"])
 
     def close(self) -> None:
         """Free the render context and end the processes. Harmless when called again."""

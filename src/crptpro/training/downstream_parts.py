@@ -8,7 +8,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -16,17 +16,12 @@ from torchrl.envs import EnvBase
 
 from crptpro.data import FrameReplay
 from crptpro.downstream_config import DownstreamConfig
-from crptpro.modules import (
-    PixelEncoder,
-    SquashedGaussianActor,
-    TwinCritic,
-    resolve_precision,
-    set_compute_dtype,
-)
-from crptpro.objectives import RADSACLoss
+from crptpro.modules import PixelEncoder, resolve_precision, set_compute_dtype
 from crptpro.pretrained import Pretrained
+from crptpro.training.agent import PixelAgent
+from crptpro.training.downstream_algorithms import DownstreamAlgorithm, Learner, make_algorithm
 from crptpro.training.frozen_features import FrozenFeatures, dense_slots
-from crptpro.training.rad_sac_learner import RADSACLearner
+from crptpro.training.trained_features import TrainedFeatures
 from crptpro.transforms import PrototypeReward, choose_feature_mode
 from crptpro.transforms.free_memory import free_bytes
 
@@ -35,15 +30,63 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Parts:
-    """Everything that learns or remembers in a downstream run."""
+    """Everything that learns or remembers in a downstream run: the loop's one partner, whatever the algorithm.
+
+    Attributes:
+        encoder: pixels to features; frozen unless the algorithm trains it.
+        algorithm: who acts and learns.
+        replay: what was seen and done.
+        features: what the encoder makes of it, to act and to learn.
+        bonus: exploration bonus, if there is one.
+        feature_mode: how features are had.
+    """
 
     encoder: PixelEncoder
-    actor: SquashedGaussianActor
-    learner: RADSACLearner
+    algorithm: DownstreamAlgorithm
     replay: FrameReplay
-    features: FrozenFeatures
+    features: FrozenFeatures | TrainedFeatures
     bonus: PrototypeReward | None
-    feature_mode: Literal["dense", "reencode"]
+    feature_mode: Literal["dense", "reencode", "trained"]
+
+    @property
+    def learner(self) -> Learner:
+        """What updates."""
+        return self.algorithm.learner
+
+    def is_due(self, agent_step: int) -> bool:
+        """Whether an update belongs before the decision ``agent_step``."""
+        return agent_step % self.algorithm.update_interval == 0
+
+    def update(self, batch_size: int, *, agent_step: int) -> dict[str, Tensor]:
+        """Sample, shift, add the bonus, and let the learner step; returns detached scalars."""
+        batch = self.features.sample(batch_size)
+        for name, value in self.algorithm.constants.items():
+            batch.set(name, value.expand(batch_size, *value.shape))
+        if self.bonus is not None:
+            batch = self.bonus(batch)
+        metrics = self.learner.update(batch, agent_step=agent_step)
+        if self.bonus is not None:
+            metrics["intrinsic_reward"] = batch["next", "intrinsic_reward"].mean()
+        return metrics
+
+    def agent(self) -> PixelAgent:
+        """Return the policy as it is now; it goes on learning."""
+        return PixelAgent(self.encoder, self.algorithm.actor, trains_encoder=self.algorithm.trains_encoder)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return all that changes; frames are already on disk, in the replay's own files."""
+        return {
+            "learner": self.learner.state_dict(),
+            "bonus": None if self.bonus is None else self.bonus.state_dict(),
+            "replay": self.replay.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what :meth:`state_dict` returned; dense feature maps are rebuilt by the caller."""
+        self.learner.load_state_dict(state["learner"])
+        if self.bonus is not None:
+            self.bonus.load_state_dict(state["bonus"])
+        self.replay.load_state_dict(state["replay"])
 
 
 def build_parts(
@@ -55,9 +98,10 @@ def build_parts(
     *,
     reserved_bytes: int = 0,
 ) -> Parts:
-    """Build networks, replay, features and bonus; encoder, projector and prototypes are frozen copies.
+    """Build networks, replay, features and bonus; encoder, projector and prototypes are copies, frozen ones.
 
-    The artifact stays as it is, on its device and in its dtype: another run may hold it too.
+    An algorithm that trains its encoder trains its copy. The artifact stays as it is, on its device and in its dtype:
+    another run may hold it too.
 
     Args:
         pretrained: encoder, and projector and prototypes for the bonus.
@@ -80,28 +124,24 @@ def build_parts(
         if module is not None:
             set_compute_dtype(module.requires_grad_(False).eval().to(config.device), dtype)
 
-    feature_dim, action_dim = encoder.feature_dim, env.action_spec.shape[-1]
-    bottleneck, hidden = config.bottleneck_dim, config.hidden_dim
-    actor = SquashedGaussianActor(feature_dim, action_dim, bottleneck_dim=bottleneck, hidden_dim=hidden)
-    critic = TwinCritic(feature_dim, action_dim, bottleneck_dim=bottleneck, hidden_dim=hidden)
-    actor, critic = actor.to(config.device), critic.to(config.device)
-    loss = RADSACLoss(
-        actor,
-        critic,
-        gamma=config.discount,
-        alpha_init=config.initial_temperature,
+    algorithm = make_algorithm(
+        encoder,
+        env.action_spec.shape[-1],
+        config,
+        seed=config.seed,
         generator=generators["policy"],
     )
-    set_compute_dtype(loss, dtype)
-    learner = RADSACLearner(
-        loss,
-        learning_rate=config.learning_rate,
-        critic_tau=config.critic_tau,
-        actor_update_interval=config.actor_update_interval,
-        target_update_interval=config.target_update_interval,
-    )
-
+    set_compute_dtype(algorithm.learner.loss, dtype)
     replay = _build_replay(env, config, generators["replay"], run_dir)
+    shifts: dict[str, Any] = {
+        "pad": config.shift_pad,
+        "generator": generators["shift"],
+        "device": config.device,
+    }
+    if algorithm.trains_encoder:
+        trained = TrainedFeatures(encoder, replay, **shifts)
+        return Parts(encoder, algorithm, replay, trained, None, "trained")
+
     slots = dense_slots(replay, _agent_steps(config))
     latent_dim = None
     if (
@@ -118,11 +158,11 @@ def build_parts(
         encoder,
         replay,
         mode=mode,
-        pad=config.shift_pad,
         slots=slots,
-        generator=generators["shift"],
-        device=config.device,
         projector=projector if keeps_projections else None,
+        n_step=algorithm.n_step,
+        discount=config.discount,
+        **shifts,
     )
     bonus = _build_bonus(
         projector,
@@ -132,7 +172,7 @@ def build_parts(
         generators["bonus"],
         reads_projections=keeps_projections,
     )
-    return Parts(encoder, actor, learner, replay, features, bonus, mode)
+    return Parts(encoder, algorithm, replay, features, bonus, mode)
 
 
 def _build_replay(

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
@@ -42,7 +41,7 @@ class DownstreamRun:
 
     Args:
         task: what to learn.
-        pretrained: the frozen encoder, and prototypes for the bonus.
+        pretrained: the encoder, and prototypes for the bonus.
         run_dir: replay, records, checkpoints and agent.
         config: every number.
         records: where metrics go.
@@ -94,7 +93,8 @@ class DownstreamRun:
         except BaseException:
             self.env.close()  # no run, nobody else to free the render context
             raise
-        self.pretrained_identity = pretrained.identity()
+        # What an encoder that is trained here began as tells nothing about the agent.
+        self.pretrained_identity = None if self.parts.algorithm.trains_encoder else pretrained.identity()
         self.agent_steps = self.updates = self.episodes = 0
         self.last_eval = -1
         self.next_eval, self.next_checkpoint = 0, config.checkpoint_interval_env_steps
@@ -166,7 +166,7 @@ class DownstreamRun:
             observation["action"] = action
             # The action is chosen: the next picture can be drawn while the update computes.
             self.env.begin_step(observation)
-            if self.agent_steps >= config.random_agent_steps:
+            if self.agent_steps >= config.random_agent_steps and parts.is_due(self.agent_steps):
                 self.update()
             transition = self.env.end_step()
             following = transition["next"]
@@ -200,21 +200,14 @@ class DownstreamRun:
         if self.agent_steps < self.config.random_agent_steps:
             shape = self.env.env.action_spec.shape
             return torch.rand(shape, generator=self.generators["random_actions"]) * 2 - 1
-        action, _ = self.parts.actor.sample(features, generator=self.generators["policy"])
-        action = action.squeeze(0).float().cpu().clamp(-1, 1)
+        action = self.parts.algorithm.explore(features).squeeze(0).float().cpu().clamp(-1, 1)
         if not torch.isfinite(action).all():
             raise not_finite(f"After update {self.updates} the policy of {self.task} acts {action.tolist()}")
         return action
 
     def update(self) -> None:
-        """Sample, shift, encode, add the bonus, and let the learner step."""
-        parts = self.parts
-        batch: TensorDictBase = parts.features.sample(self.config.batch_size)
-        if parts.bonus is not None:
-            batch = parts.bonus(batch)
-        metrics = parts.learner.update(batch, agent_step=self.agent_steps)
-        if parts.bonus is not None:
-            metrics["intrinsic_reward"] = batch["next", "intrinsic_reward"].mean()
+        """Let the learner step on a batch, and keep its metrics for the next row."""
+        metrics = self.parts.update(self.config.batch_size, agent_step=self.agent_steps)
         for key, value in metrics.items():
             self.sums[key] = self.sums.get(key, 0) + value.detach()
             self.counts[key] = self.counts.get(key, 0) + 1
@@ -244,7 +237,7 @@ class DownstreamRun:
 
     def agent(self) -> PixelAgent:
         """Return the policy as it is now."""
-        return PixelAgent(self.parts.encoder, self.parts.actor)
+        return self.parts.agent()
 
     def save_agent(self) -> Path:
         """Write the agent as it is now, with a card."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -28,6 +28,8 @@ class FrozenFeatures:
         device: where features live.
         projector: with one, ``sample`` also gives ``("next", "embedding")``, its output on the next features. In mode
             ``"dense"`` it is kept for every shift of an observation, so that no update computes it.
+        n_step: agent steps from an observation to the next one of a sample; None for plain transitions.
+        discount: per agent step, of the return over ``n_step``.
 
     Raises:
         ValueError: no slots, or (in mode ``"dense"``) an encoder without dense maps.
@@ -44,10 +46,13 @@ class FrozenFeatures:
         generator: torch.Generator,
         device: torch.device | str = "cpu",
         projector: nn.Module | None = None,
+        n_step: int | None = None,
+        discount: float = 0.99,
     ) -> None:
         self.encoder = encoder
         self.replay = replay
         self.mode = mode
+        self._window: dict[str, Any] = {} if n_step is None else {"n_step": n_step, "discount": discount}
         self.device = torch.device(device)
         self.slots = replay.window if slots is None else slots
         self.cache: DenseShiftCache | None = None
@@ -97,9 +102,11 @@ class FrozenFeatures:
 
         Returns:
             The replay's sample ``[B]`` with features ``[B, feature_dim]``, and the next embeddings ``[B, D]`` with a
-            projector, all on :attr:`device`. The features are valid until the next call.
+            projector, all on :attr:`device`. With ``n_step`` the next observation is so many agent steps ahead, the
+            reward is the return until then, and ``("next", "discount")`` weighs what follows. The features are valid
+            until the next call.
         """
-        batch = self.replay.sample(batch_size, pixels=self.cache is None)
+        batch = self.replay.sample(batch_size, pixels=self.cache is None, **self._window)
         if self.cache is None:
             return self.shifted(batch.to(self.device))
         # Slots stay on the CPU until they are looked up: there the cache can check without waiting for a device.

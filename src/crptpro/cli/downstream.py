@@ -1,0 +1,103 @@
+"""``crptpro downstream`` and ``crptpro drq``: reinforcement learning on a frozen encoder, and end to end."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from crptpro.cli.request import Logging, require_device
+from crptpro.domains import get_domain
+from crptpro.downstream_config import DownstreamConfig, drq_settings, skill_ddpg_settings
+from crptpro.errors import CRPTproError
+
+logger = logging.getLogger(__name__)
+
+RANDOM_ENCODER = "random-encoder"
+
+
+def settings_asked_for(arguments: Sequence[str]) -> DownstreamConfig:
+    """Return the settings that a command line starts from: those of the algorithm it names.
+
+    So ``crptpro downstream --algorithm skill-ddpg --help`` shows that algorithm's numbers, and each may be changed.
+
+    Args:
+        arguments: of the command; what cannot be read is left to the parser.
+    """
+    words = " ".join(arguments).replace("=", " ").split()
+    named = [after for word, after in itertools.pairwise(words) if word == "--algorithm"]
+    return skill_ddpg_settings() if named[-1:] == ["skill-ddpg"] else DownstreamConfig()
+
+
+@dataclass(frozen=True)
+class Downstream:
+    """Train SAC on a frozen encoder with the prototype-kNN exploration bonus, or BeCL's own agent on one."""
+
+    task: Positional[str]
+    """task to learn, e.g. walker_run, reach_duplo, gymnasium:HalfCheetah-v5"""
+    pretrained: str
+    """directory of the pretrained encoder, or `random-encoder` for the untrained control"""
+    out: Path
+    """run directory: eval.csv, train.csv, checkpoints, and the agent in OUT/agent"""
+    config: Annotated[DownstreamConfig, arg(name="")] = field(
+        default_factory=lambda: settings_asked_for(sys.argv)
+    )
+    """every number of the stage"""
+    logging: Logging = field(default_factory=Logging)
+    """mirrors"""
+
+    def run(self) -> None:
+        """Train, or continue."""
+        from crptpro.pretrained import load_pretrained, random_pretrained
+        from crptpro.training import train_downstream
+
+        if self.config.algorithm == "drq":
+            raise CRPTproError(
+                f"DrQ trains its encoder itself: crptpro drq {self.task} --out {self.out}, without --pretrained."
+            )
+        require_device(self.config.device)
+        get_domain(self.task)  # an unknown name is refused before the run directory is made
+        if self.pretrained == RANDOM_ENCODER:
+            artifact = random_pretrained(seed=self.config.seed)
+        else:
+            artifact = load_pretrained(self.pretrained)
+        with self.logging.open(self.out, self) as records:
+            result = train_downstream(
+                self.task, artifact, run_dir=self.out, config=self.config, logger=records
+            )
+        logger.info("agent: %s", result.agent_path)
+
+
+@dataclass(frozen=True)
+class DrQ:
+    """Train DrQ, SAC that learns its encoder along with the task: the reference without pre-training."""
+
+    task: Positional[str]
+    """task to learn, e.g. walker_run, reach_duplo, gymnasium:HalfCheetah-v5"""
+    out: Path
+    """run directory: eval.csv, train.csv, checkpoints, and the agent in OUT/agent"""
+    config: Annotated[DownstreamConfig, arg(name="")] = field(default_factory=drq_settings)
+    """every number of the run"""
+    logging: Logging = field(default_factory=Logging)
+    """mirrors"""
+
+    def run(self) -> None:
+        """Train, or continue."""
+        from crptpro.training import train_downstream
+
+        if self.config.algorithm != "drq":
+            raise CRPTproError(
+                f"{self.config.algorithm} learns on a frozen encoder: "
+                f"crptpro downstream {self.task} --pretrained ENCODER --algorithm {self.config.algorithm}."
+            )
+        require_device(self.config.device)
+        get_domain(self.task)  # an unknown name is refused before the run directory is made
+        with self.logging.open(self.out, self) as records:
+            result = train_downstream(self.task, None, run_dir=self.out, config=self.config, logger=records)
+        logger.info("agent: %s", result.agent_path)
