@@ -8,7 +8,7 @@ import torch
 
 from crptpro.artifact import CARD_FILE, WEIGHTS_FILE
 from crptpro.errors import CheckpointError
-from crptpro.modules import PixelEncoder, SquashedGaussianActor
+from crptpro.modules import DeterministicActor, FixedSkillActor, PixelEncoder, SquashedGaussianActor
 from crptpro.pretrained import random_pretrained, save_pretrained
 from crptpro.training.agent import PixelAgent, load_agent, save_agent
 
@@ -89,3 +89,41 @@ def test_a_card_that_builds_no_agent_is_one_clear_error(saved: Path) -> None:
     (saved / "card.json").write_text(json.dumps(card))
     with pytest.raises(CheckpointError, match="no agent that can be rebuilt"):
         load_agent(saved)
+
+
+def test_a_snapshot_shares_a_frozen_encoder_and_copies_one_that_learns() -> None:
+    for trains_encoder in (False, True):
+        agent = make_agent()
+        agent.trains_encoder = trains_encoder
+        snapshot, action = agent.snapshot(), agent(observation())
+        assert (snapshot.encoder is agent.encoder) is not trains_encoder
+        assert set(snapshot.state_dict()) == ({"actor", "encoder"} if trains_encoder else {"actor"})
+        with torch.no_grad():
+            trained = [*agent.actor.parameters(), *(agent.encoder.parameters() if trains_encoder else [])]
+            for parameter in trained:
+                parameter.add_(0.5)
+        assert not torch.equal(agent(observation()), action)
+        assert torch.equal(snapshot(observation()), action)
+        agent.load_state_dict(snapshot.state_dict())
+        assert torch.equal(agent(observation()), action)
+
+
+def test_an_agent_with_a_fixed_skill_comes_back_with_it(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    encoder = PixelEncoder(**ENCODER)
+    actor = DeterministicActor(encoder.feature_dim, 3, skill_dim=4, hidden_dim=8)
+    agent = PixelAgent(encoder, FixedSkillActor(actor, 2))
+    loaded, card = load_agent(save_agent(tmp_path / "agent", agent, card={"task": "toy"}))
+    assert torch.equal(loaded(observation()), agent(observation()))
+    assert (card["modules"]["actor"]["skill"], loaded.actor.skill) == (2, 2)
+    assert not torch.equal(
+        agent(observation()), PixelAgent(encoder, FixedSkillActor(actor, 1))(observation())
+    )
+
+
+def test_agents_of_before_there_were_other_actors_still_load(saved: Path) -> None:
+    card = json.loads((saved / CARD_FILE).read_text())
+    del card["classes"], card["modules"]["actor"]["has_tanh"]
+    (saved / CARD_FILE).write_text(json.dumps(card))
+    agent, _ = load_agent(saved)
+    assert torch.equal(agent(observation()), make_agent()(observation()))
