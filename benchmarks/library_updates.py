@@ -111,7 +111,7 @@ class DownstreamUpdates:
             require_dense(pretrained, config)
         self.config, self.agent_step = config, 0
         streams = {name: torch.Generator().manual_seed(0) for name in STREAMS}
-        self.parts = build_parts(pretrained, cast(EnvBase, env), config, streams, run_dir)
+        self.parts = build_parts(pretrained, "cheetah_run", cast(EnvBase, env), config, streams, run_dir)
         store_episodes(self.parts.replay, episodes)
         self.parts.features.rebuild()
 

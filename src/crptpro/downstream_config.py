@@ -72,7 +72,10 @@ class SACSettings:
     replay_capacity: int = 40_000
     """transitions kept; the oldest go first"""
     random_agent_steps: int = 1_000
-    """decisions taken uniformly at random before the first update"""
+    """decisions taken uniformly at random before the first update (by the policy, if it was transferred)"""
+    transfer_actor: bool | None = None
+    """start from the actor that explored during pre-training. Left to itself rad-sac does where the artifact has one of
+    the task's domain, which proto-rl-s leaves"""
     bottleneck_dim: int = 50
     """width that actor and critic first reduce the features to"""
     hidden_dim: int = 1024

@@ -20,7 +20,7 @@ def parts_of(pretrained: Pretrained, run_dir: Path, **settings: object) -> Parts
     config = dataclasses.replace(SMALL, action_repeat=2, **settings)
     generators = {name: torch.Generator() for name in ("replay", "shift", "bonus", "policy")}
     env = toy_env("toy", seed=0, image_size=16, frame_stack=3)
-    return build_parts(pretrained, env, config, generators, run_dir)
+    return build_parts(pretrained, "toy", env, config, generators, run_dir)
 
 
 def test_the_callers_artifact_is_neither_frozen_nor_cast_nor_moved(tmp_path: Path) -> None:
@@ -96,7 +96,9 @@ def test_projections_give_way_before_dense_maps_do_and_others_needs_are_set_apar
     found = {}
     for reserved in (0, free - room_for_maps, free - room_for_maps + 4):
         directory = tmp_path / str(reserved)
-        parts = build_parts(small_pretrained(), env, config, generators, directory, reserved_bytes=reserved)
+        parts = build_parts(
+            small_pretrained(), "toy", env, config, generators, directory, reserved_bytes=reserved
+        )
         found[reserved] = (parts.feature_mode, parts.features.keeps_projections)
         assert (parts.bonus.projector is None) is parts.features.keeps_projections
     assert list(found.values()) == [("dense", True), ("dense", False), ("reencode", False)]

@@ -20,6 +20,7 @@ from crptpro.modules import (
     TwinCritic,
 )
 from crptpro.modules.deterministic_actor import one_hot_skill
+from crptpro.modules.placement import device_of
 from crptpro.objectives import DrQLoss, RADSACLoss, SkillDDPGLoss
 from crptpro.seeding import derive_seed
 from crptpro.training.agent import FeatureActor
@@ -58,6 +59,7 @@ class DownstreamAlgorithm:
         learner: what updates.
         trains_encoder: whether the encoder is among what it trains; batches then hold images in two views, not
             features.
+        explores_at_once: whether the actor knows enough to act before its first update.
         update_interval: decisions between two updates.
         n_step: agent steps that a transition spans; the batch then carries ``("next", "discount")``. None for plain
             transitions.
@@ -68,13 +70,20 @@ class DownstreamAlgorithm:
     explore: Callable[[Tensor], Tensor]
     learner: Learner
     trains_encoder: bool = False
+    explores_at_once: bool = False
     update_interval: int = 1
     n_step: int | None = None
     constants: Mapping[str, Tensor] = field(default_factory=dict)
 
 
 def make_algorithm(
-    encoder: PixelEncoder, action_dim: int, config: SACSettings, *, seed: int, generator: torch.Generator
+    encoder: PixelEncoder,
+    action_dim: int,
+    config: SACSettings,
+    *,
+    seed: int,
+    generator: torch.Generator,
+    actor: SquashedGaussianActor | None = None,
 ) -> DownstreamAlgorithm:
     """Build the algorithm that ``config.algorithm`` names, with fresh networks.
 
@@ -85,15 +94,26 @@ def make_algorithm(
         config: every number.
         seed: decides the skill where none is given.
         generator: source of all action noise.
+        actor: of rad-sac, to start from instead of a fresh one.
     """
+    if actor is not None:
+        return _rad_sac(encoder, action_dim, config, seed, generator, actor)
     return _BUILDERS[config.algorithm](encoder, action_dim, config, seed, generator)
 
 
 def _rad_sac(
-    encoder: PixelEncoder, action_dim: int, config: SACSettings, seed: int, generator: torch.Generator
+    encoder: PixelEncoder,
+    action_dim: int,
+    config: SACSettings,
+    seed: int,
+    generator: torch.Generator,
+    transferred: SquashedGaussianActor | None = None,
 ) -> DownstreamAlgorithm:
     actor, critic = _sac_networks(encoder, action_dim, config)
-    return _sac(RADSACLoss(actor, critic, **_sac_options(config, generator)), config)
+    if transferred is not None:
+        actor = transferred.to(device_of(critic))
+    loss = RADSACLoss(actor, critic, **_sac_options(config, generator))
+    return _sac(loss, config, explores_at_once=transferred is not None)
 
 
 def _drq(
@@ -104,7 +124,9 @@ def _drq(
     return _sac(loss, config, trains_encoder=True)
 
 
-def _sac(loss: RADSACLoss, config: SACSettings, *, trains_encoder: bool = False) -> DownstreamAlgorithm:
+def _sac(
+    loss: RADSACLoss, config: SACSettings, *, trains_encoder: bool = False, explores_at_once: bool = False
+) -> DownstreamAlgorithm:
     learner = RADSACLearner(
         loss,
         learning_rate=config.learning_rate,
@@ -116,7 +138,9 @@ def _sac(loss: RADSACLoss, config: SACSettings, *, trains_encoder: bool = False)
     def explore(features: Tensor) -> Tensor:
         return loss.actor.sample(features, generator=loss.generator)[0]
 
-    return DownstreamAlgorithm(loss.actor, explore, learner, trains_encoder=trains_encoder)
+    return DownstreamAlgorithm(
+        loss.actor, explore, learner, trains_encoder=trains_encoder, explores_at_once=explores_at_once
+    )
 
 
 def _sac_networks(

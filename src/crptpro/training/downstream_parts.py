@@ -18,6 +18,7 @@ from crptpro.data import FrameReplay
 from crptpro.downstream_config import DownstreamConfig
 from crptpro.modules import PixelEncoder, resolve_precision, set_compute_dtype
 from crptpro.pretrained import Pretrained
+from crptpro.training.actor_transfer import transferred_actor
 from crptpro.training.agent import PixelAgent
 from crptpro.training.downstream_algorithms import DownstreamAlgorithm, Learner, make_algorithm
 from crptpro.training.frozen_features import FrozenFeatures, dense_slots
@@ -91,6 +92,7 @@ class Parts:
 
 def build_parts(
     pretrained: Pretrained,
+    task: str,
     env: EnvBase,
     config: DownstreamConfig,
     generators: Mapping[str, torch.Generator],
@@ -105,6 +107,7 @@ def build_parts(
 
     Args:
         pretrained: encoder, and projector and prototypes for the bonus.
+        task: what is learned; decides whether the artifact's actor is of use.
         env: what is learned in; read for its image, stack and action sizes.
         config: every number.
         generators: streams ``"replay"``, ``"shift"``, ``"bonus"`` and ``"policy"``.
@@ -124,12 +127,14 @@ def build_parts(
         if module is not None:
             set_compute_dtype(module.requires_grad_(False).eval().to(config.device), dtype)
 
+    action_dim = env.action_spec.shape[-1]
     algorithm = make_algorithm(
         encoder,
-        env.action_spec.shape[-1],
+        action_dim,
         config,
         seed=config.seed,
         generator=generators["policy"],
+        actor=transferred_actor(task, pretrained, config, action_dim=action_dim),
     )
     set_compute_dtype(algorithm.learner.loss, dtype)
     replay = _build_replay(env, config, generators["replay"], run_dir)

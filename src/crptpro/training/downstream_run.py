@@ -84,6 +84,7 @@ class DownstreamRun:
             )
             self.parts: Parts = build_parts(
                 pretrained,
+                task,
                 self.env.env,
                 config,
                 self.generators,
@@ -197,7 +198,8 @@ class DownstreamRun:
         Raises:
             NonFiniteError: if the policy has diverged; no simulator should see that.
         """
-        if self.agent_steps < self.config.random_agent_steps:
+        is_new = self.agent_steps < self.config.random_agent_steps
+        if is_new and not self.parts.algorithm.explores_at_once:
             shape = self.env.env.action_spec.shape
             return torch.rand(shape, generator=self.generators["random_actions"]) * 2 - 1
         action = self.parts.algorithm.explore(features).squeeze(0).float().cpu().clamp(-1, 1)
