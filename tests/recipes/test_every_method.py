@@ -66,8 +66,8 @@ def active(recipe: str, encoder: str, updates: int, *flags: object) -> Way:
     return Way(recipe, (*EXPLORE, *flags), f"{encoder}/{CHECKPOINT}", run, encoder, updates)
 
 
-# 120 env steps over a group of three domains are 20 decisions in each, of which 12 after the random ones: 6 turns of the
-# encoder in each. In one domain they are 60 decisions: 26 turns.
+# 120 env steps over a group of three domains are 20 decisions in each, of which 12 after the random ones: the encoder
+# learns 6 times in each. In one domain they are 60 decisions: 26 times.
 WAYS = {
     "crptpro": Way(
         "crptpro",
@@ -97,8 +97,8 @@ WAYS = {
     "apt-s": active("apt", "apt-s_pendulum_seed_0", 26, "--variant", "s", "--domain", "pendulum"),
     "proto-rl-c": active("proto_rl", "proto-rl-c_group_D_seed_0", 18, "--group", "D", *PROTOTYPES, *QUEUE),
     "proto-rl-s": active(
-        "proto_rl", f"proto-rl-s_{SHORT_TASK}_seed_0", 26, "--variant", "s", "--domain", SHORT_TASK, *PROTOTYPES, *QUEUE,
-        "--intr-loss-coef", 5e-3, "--explore.action-repeat", 2,
+        "proto_rl", f"proto-rl-s_{SHORT_TASK}_seed_0", 26, "--variant", "s", "--domain", SHORT_TASK, *PROTOTYPES,
+        *QUEUE, "--intr-loss-coef", 5e-3,
     ),
     "becl": active(
         "becl", "becl_group_D_seed_0", 54, "--group", "D", "--hidden-dim", 16, "--downstream.algorithm", "skill-ddpg"
