@@ -72,7 +72,6 @@ class Pretrain(PretrainingOptions):
 
     def run(self) -> None:
         """Pre-train, or continue, and write the artifact."""
-        from crptpro.modules import PixelEncoder
         from crptpro.objectives import get_method
         from crptpro.training import pretrain
 
@@ -84,8 +83,9 @@ class Pretrain(PretrainingOptions):
             for name in ("assignment_temperature", "intr_loss_coef")
             if (value := getattr(self, name)) is not None
         }
+        method = get_method(self.method)
         seed_everything(self.seed)
-        loss = get_method(self.method).build(PixelEncoder(3 * frame_stack, image_size=image_size), **options)
+        loss = method.build(method.build_encoder(3 * frame_stack, image_size), **options)
         with self.logging.open(self.out, self) as records:
             pretrain(
                 loss, list(self.datasets), updates=self.updates, logger=records, **self.training_arguments()

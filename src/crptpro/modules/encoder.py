@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from crptpro.modules.chunks import apply_to_chunks
+from crptpro.modules.initialisation import WeightInit, init_weights_, require_weight_init
 
 KERNEL_SIZE = 3
 
@@ -35,6 +36,7 @@ class PixelEncoder(nn.Module):
         image_size: height and width in pixels.
         pixel_scale: factor on the 0..255 values.
         pixel_offset: subtracted after scaling (0 here; 0.5 in URLB-style methods).
+        init: ``"orthogonal"``, or ``"kaiming"`` (normal, fan-in, for ReLU), as ATC's own encoder.
 
     Attributes:
         feature_dim: length of the flattened output, in (C, H, W) order.
@@ -46,7 +48,7 @@ class PixelEncoder(nn.Module):
             devices take the whole batch.
 
     Raises:
-        ValueError: lists of unequal length, or an image too small for the convolutions.
+        ValueError: lists of unequal length, an image too small for the convolutions, or an unknown ``init``.
 
     Examples:
         >>> encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=16)
@@ -63,8 +65,10 @@ class PixelEncoder(nn.Module):
         image_size: int = 84,
         pixel_scale: float = 1 / 255,
         pixel_offset: float = 0.0,
+        init: WeightInit = "orthogonal",
     ) -> None:
         super().__init__()
+        require_weight_init(init)
         if not channels or len(channels) != len(strides):
             raise ValueError(
                 f"channels and strides must be non-empty and of equal length, got {channels} and {strides}."
@@ -94,17 +98,18 @@ class PixelEncoder(nn.Module):
             "image_size": image_size,
             "pixel_scale": self.pixel_scale,
             "pixel_offset": self.pixel_offset,
+            "init": init,
         }
+        self.init: WeightInit = init
         self.compute_dtype: torch.dtype = torch.float32
         self.micro_batch: int = 64
         self.reset_parameters()
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
-        """Draw orthogonal kernels (gain sqrt 2) and zero the biases."""
+        """Draw the kernels (orthogonal ones with gain sqrt 2) and zero the biases."""
         for conv in self.conv_layers:
-            nn.init.orthogonal_(conv.weight, gain=math.sqrt(2.0))
-            nn.init.zeros_(cast(Tensor, conv.bias))
+            init_weights_(conv, self.init, gain=math.sqrt(2.0))
 
     @property
     def conv_layers(self) -> list[nn.Conv2d]:

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from crptpro.modules.initialisation import WeightInit, init_weights_, orthogonal_linear_, require_weight_init
 from crptpro.modules.precision import linear_in
 
 NORM_EPS = 1e-12
@@ -23,19 +24,27 @@ class Projector(nn.Module):
     Args:
         feature_dim: input length (39,200 for the default encoder).
         latent_dim: output length D.
+        init: ``"orthogonal"``, or ``"kaiming"`` (normal, fan-in, for ReLU), as ATC draws its own.
+
+    Raises:
+        ValueError: unknown ``init``.
     """
 
-    def __init__(self, feature_dim: int = 39_200, latent_dim: int = 128) -> None:
+    def __init__(
+        self, feature_dim: int = 39_200, latent_dim: int = 128, init: WeightInit = "orthogonal"
+    ) -> None:
         super().__init__()
+        require_weight_init(init)
         self.linear = nn.Linear(feature_dim, latent_dim)
-        self.config: dict[str, Any] = {"feature_dim": feature_dim, "latent_dim": latent_dim}
+        self.init: WeightInit = init
+        self.config: dict[str, Any] = {"feature_dim": feature_dim, "latent_dim": latent_dim, "init": init}
         self.compute_dtype: torch.dtype = torch.float32
         self.reset_parameters()
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
-        """Draw orthogonal weights and zero the bias."""
-        orthogonal_linear_(self.linear)
+        """Draw the weights and zero the bias."""
+        init_weights_(self.linear, self.init)
 
     def forward(self, features: Tensor) -> Tensor:
         """Project ``[*, feature_dim]`` (any floating dtype) to ``[*, latent_dim]``, not normalised."""
@@ -126,8 +135,15 @@ def latent_dim_of(head: nn.Module) -> int | None:
     return config.get("latent_dim") if isinstance(config, dict) else None
 
 
-def orthogonal_linear_(linear: nn.Linear, gain: float = 1.0) -> None:
-    """Initialise a linear layer in place: orthogonal weight, zero bias."""
-    nn.init.orthogonal_(linear.weight, gain=gain)
-    if linear.bias is not None:
-        nn.init.zeros_(linear.bias)
+def require_one_latent_dim(**heads: nn.Module) -> None:
+    """Refuse heads that could not be multiplied; those that do not tell their length are left to the product.
+
+    Raises:
+        ValueError: naming each head's length.
+    """
+    dims = {name: dim for name, head in heads.items() if (dim := latent_dim_of(head)) is not None}
+    if len(set(dims.values())) > 1:
+        told = ", ".join(f"{name} {dim}" for name, dim in dims.items())
+        raise ValueError(
+            f"The heads must share one latent length, got {told}; pass latent_dim= for those that are not given."
+        )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import torch
@@ -55,9 +55,9 @@ class PretrainingLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Entries that ``forward`` reads."""
+        """Entries that ``forward`` reads: all accepted keys, in the order of their definition."""
         if self._in_keys is None:
-            self._in_keys = [self.tensor_keys.observation, self.tensor_keys.next_observation]
+            self._in_keys = [getattr(self.tensor_keys, field.name) for field in fields(self.tensor_keys)]
         return self._in_keys
 
     @in_keys.setter
@@ -74,6 +74,15 @@ class PretrainingLoss(LossModule):
     @out_keys.setter
     def out_keys(self, values: list[NestedKey]) -> None:
         self._out_keys = values
+
+    @property
+    def views(self) -> dict[NestedKey, NestedKey]:
+        """Entries of ``in_keys`` that are a second view of another one: ``{"pixels_view": "pixels"}``.
+
+        No dataset holds them: who trains the loss makes them by augmenting the named entry once more,
+        independently. Empty for a loss that needs none.
+        """
+        return {}
 
     def target_state(self) -> dict[str, dict[str, Tensor]]:
         """State dictionary of every target network by its name: ``{"encoder": {"convs.0.weight": ...}}``.
@@ -115,26 +124,37 @@ class PretrainingLoss(LossModule):
         # No value estimator here; changed keys only have to show in in_keys.
         self._in_keys = None
 
-    def _read_pair(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None, torch.Size]:
-        """Images with one batch dimension and without masked rows; the mask; the original batch shape."""
-        observation = tensordict.get(self.tensor_keys.observation)
-        next_observation = tensordict.get(self.tensor_keys.next_observation)
-        for key, value in zip(self.in_keys, (observation, next_observation)):
-            if value is None:
-                raise KeyError(
-                    f"{type(self).__name__} needs the entry {key!r}; set_keys() names another one."
-                )
-        lead = observation.shape[:-3]
-        observation = observation.reshape(-1, *observation.shape[-3:])
-        next_observation = next_observation.reshape(-1, *next_observation.shape[-3:])
+    def _apply_network(self, name: str, inputs: Tensor, *, target: bool = False) -> Tensor:
+        """Output of one of ``network_names``, with its own or with its target parameters."""
+        network = getattr(self, name)
+        params = getattr(self, f"target_{name}_params" if target else f"{name}_params")
+        with params.to_module(network, preserve_module_state=False):
+            return network(inputs)
+
+    def _read(
+        self, tensordict: TensorDictBase, key: NestedKey, *, event_dims: int
+    ) -> tuple[Tensor, torch.Size]:
+        """One entry with one batch dimension, its last ``event_dims`` as they are; the original batch shape."""
+        value = tensordict.get(key, None)
+        if value is None:
+            raise KeyError(f"{type(self).__name__} needs the entry {key!r}; set_keys() names another one.")
+        split = value.ndim - event_dims
+        return value.reshape(-1, *value.shape[split:]), value.shape[:split]
+
+    def _read_images(
+        self, tensordict: TensorDictBase, first: NestedKey, second: NestedKey
+    ) -> tuple[Tensor, Tensor, Tensor | None, torch.Size]:
+        """Two entries of images without masked rows; the mask; the original batch shape."""
+        one, lead = self._read(tensordict, first, event_dims=3)
+        two, _ = self._read(tensordict, second, event_dims=3)
         valid = valid_rows(self, tensordict)
         if valid is not None:
             # Dropped, not multiplied by zero: batch-wise normalisations couple all rows.
-            observation, next_observation = observation[valid], next_observation[valid]
-        return observation, next_observation, valid, lead
+            one, two = one[valid], two[valid]
+        return one, two, valid, lead
 
     def _reduce_rows(self, rows: Tensor, valid: Tensor | None, lead: torch.Size) -> Tensor:
-        """Reduce values of :meth:`_read_pair`'s rows; ``"none"`` restores the batch shape, 0 where masked."""
+        """Reduce values of the rows that are left; ``"none"`` restores the batch shape, 0 where masked."""
         if self.reduction == "none":
             if valid is not None:
                 rows = rows.new_zeros(valid.shape).masked_scatter(valid, rows)

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictParams, dispatch
 from torch import Tensor, nn
 
 from crptpro.modules import Predictor, Projector, Prototypes
-from crptpro.modules.heads import latent_dim_of
+from crptpro.modules.heads import require_one_latent_dim
 from crptpro.objectives import metrics
 from crptpro.objectives.base import PretrainingLoss
 from crptpro.objectives.functional import (
@@ -130,7 +130,7 @@ class ProtoLoss(PretrainingLoss):
             predictor = Predictor(latent_dim, hidden_dim)
         if prototypes is None:
             prototypes = Prototypes(num_prototypes, latent_dim)
-        _check_latent_dims(projector=projector, predictor=predictor, prototypes=prototypes)
+        require_one_latent_dim(projector=projector, predictor=predictor, prototypes=prototypes)
         self.convert_to_functional(encoder, "encoder", create_target_params=True)
         self.convert_to_functional(projector, "projector", create_target_params=True)
         self.convert_to_functional(predictor, "predictor")
@@ -153,7 +153,10 @@ class ProtoLoss(PretrainingLoss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the loss terms and diagnostics of one batch; see the class."""
-        pixels, next_pixels, valid, lead = self._read_pair(tensordict)
+        keys = self.tensor_keys
+        pixels, next_pixels, valid, lead = self._read_images(
+            tensordict, keys.observation, keys.next_observation
+        )
         latents, predictions = self._online(pixels)
         targets = self._target(next_pixels)
         # The prototypes' precision from here on, also in a caller's autocast region or after a half-precision head.
@@ -178,19 +181,13 @@ class ProtoLoss(PretrainingLoss):
         return TensorDict(out, batch_size=[])
 
     def _online(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        with self.encoder_params.to_module(self.encoder, preserve_module_state=False):
-            features = self.encoder(pixels)
-        with self.projector_params.to_module(self.projector, preserve_module_state=False):
-            latents = self.projector(features)
-        with self.predictor_params.to_module(self.predictor, preserve_module_state=False):
-            return latents, self.predictor(latents)
+        latents = self._apply_network("projector", self._apply_network("encoder", pixels))
+        return latents, self._apply_network("predictor", latents)
 
     @torch.no_grad()
     def _target(self, next_pixels: Tensor) -> Tensor:
-        with self.target_encoder_params.to_module(self.encoder, preserve_module_state=False):
-            features = self.encoder(next_pixels)
-        with self.target_projector_params.to_module(self.projector, preserve_module_state=False):
-            return self.projector(features)
+        features = self._apply_network("encoder", next_pixels, target=True)
+        return self._apply_network("projector", features, target=True)
 
     def _unit_prototypes(self) -> Tensor:
         with self.prototypes_params.to_module(self.prototypes, preserve_module_state=False):
@@ -203,16 +200,6 @@ class ProtoLoss(PretrainingLoss):
             F.normalize(targets, dim=-1) @ unit_prototypes.T,
             temperature=self.temperature if temperature is None else temperature,
             iterations=self.sinkhorn_iterations,
-        )
-
-
-def _check_latent_dims(**heads: nn.Module) -> None:
-    """Refuse heads that could not be multiplied; those that do not tell their length are left to the product."""
-    dims = {name: dim for name, head in heads.items() if (dim := latent_dim_of(head)) is not None}
-    if len(set(dims.values())) > 1:
-        told = ", ".join(f"{name} {dim}" for name, dim in dims.items())
-        raise ValueError(
-            f"The heads must share one latent length, got {told}; pass latent_dim= for those that are not given."
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import inspect
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -10,6 +11,8 @@ from torch import nn
 from torchrl.objectives import LossModule
 
 from crptpro.errors import UnknownNameError
+from crptpro.modules import PixelEncoder
+from crptpro.objectives.exploration import ExplorationDefaults
 
 
 @dataclass(frozen=True)
@@ -66,12 +69,37 @@ class Method:
     is_preset: bool = False
     """A variant of another method: not listed among the methods, not the default of its class."""
 
+    encoder_options: dict[str, Any] = field(default_factory=dict)
+    """Keyword arguments of :class:`~crptpro.modules.PixelEncoder` that the method wants."""
+
+    exploration: ExplorationDefaults | None = None
+    """How it explores while it pre-trains; None for a method trained on random datasets."""
+
+    def build_encoder(self, in_channels: int = 9, image_size: int = 84) -> PixelEncoder:
+        """Build a fresh encoder of the kind that the method trains.
+
+        Args:
+            in_channels: colour channels times stacked frames.
+            image_size: height and width in pixels.
+        """
+        return PixelEncoder(in_channels, image_size=image_size, **self.encoder_options)
+
     def build(self, encoder: nn.Module, **options: Any) -> LossModule:
         """Build the loss on ``encoder``; ``options`` override the preset's own.
 
         The result remembers this method's name, so that :func:`method_defaults` returns this method's
         defaults.
+
+        Raises:
+            ValueError: an option that the loss does not have.
         """
+        parameters = inspect.signature(self.loss_class.__init__).parameters.values()
+        known = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY or p.name in options]
+        unknown = sorted(set(options) - set(known))
+        if unknown and not any(p.kind is p.VAR_KEYWORD for p in parameters):
+            raise ValueError(
+                f"The method {self.name!r} has no option {', '.join(unknown)}; it has {', '.join(known)}."
+            )
         loss = self.loss_class(encoder, **{**self.loss_options, **options})
         loss.method_name = self.name
         return loss
@@ -87,6 +115,8 @@ def register_method(
     *,
     loss_options: dict[str, Any] | None = None,
     is_preset: bool = False,
+    encoder_options: dict[str, Any] | None = None,
+    exploration: ExplorationDefaults | None = None,
 ) -> Method:
     """Make a method available by name, on the command line too.
 
@@ -96,6 +126,9 @@ def register_method(
         defaults: None for the generic defaults.
         loss_options: keyword arguments of the loss.
         is_preset: a variant of an already registered method.
+        encoder_options: keyword arguments of :class:`~crptpro.modules.PixelEncoder`, such as
+            ``{"pixel_offset": 0.5}``.
+        exploration: how the method explores, for active pre-training; None if it learns from random datasets.
 
     Returns:
         The registered method.
@@ -108,7 +141,15 @@ def register_method(
         raise ValueError(
             f"The method {name!r} is already registered for {taken.loss_class.__name__}; choose another."
         )
-    method = Method(name, loss_class, defaults or MethodDefaults(), dict(loss_options or {}), is_preset)
+    method = Method(
+        name,
+        loss_class,
+        defaults or MethodDefaults(),
+        dict(loss_options or {}),
+        is_preset,
+        dict(encoder_options or {}),
+        exploration,
+    )
     _METHODS[name] = method
     return method
 

@@ -11,11 +11,11 @@ from torch import Tensor, nn
 from crptpro.artifact import CARD_FILE, read_artifact
 from crptpro.cards import read_json
 from crptpro.errors import PretrainedError
-from crptpro.modules import PixelEncoder, Predictor, Projector, Prototypes
+from crptpro.modules import PixelEncoder, Predictor, Projector, Prototypes, SkillHead
 from crptpro.pretrained.bundle import FORMAT, QUEUE, REST, ROLES, TARGET_ROLES, VERSION, Pretrained
 
 _KNOWN_CLASSES: dict[str, type[nn.Module]] = {
-    cls.__name__: cls for cls in (PixelEncoder, Projector, Predictor, Prototypes)
+    cls.__name__: cls for cls in (PixelEncoder, Projector, Predictor, Prototypes, SkillHead)
 }
 
 

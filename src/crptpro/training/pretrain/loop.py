@@ -19,7 +19,7 @@ from crptpro.seeding import derive_seed
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.result import PretrainResult
 from crptpro.training.pretrain.run import PretrainRun
-from crptpro.training.pretrain.sources import Augment, Augmenter, open_sources
+from crptpro.training.pretrain.sources import Augment, Augmenter, open_sources, views_read
 
 
 def pretrain(
@@ -45,9 +45,10 @@ def pretrain(
     """Train a self-supervised loss on the datasets of several domains (CRPTpro, Sec. III; algorithm 1).
 
     Update u uses dataset u mod N only: one batch, one Adam step, one EMA step of the targets. Any
-    ``LossModule`` works that returns scalar ``loss_*`` terms for a batch with ``pixels`` and
-    ``("next", "pixels")``; a method ``before_update()``, if it has one, is called before each forward. The
-    loss is trained in place; its ``training_record`` afterwards says how, for the artifact's card.
+    ``LossModule`` works that returns scalar ``loss_*`` terms for a batch with the entries of its ``in_keys``
+    (``pixels`` and ``("next", "pixels")`` in every dataset); a method ``before_update()``, if it has one, is
+    called before each forward. The loss is trained in place; its ``training_record`` afterwards says how, for
+    the artifact's card.
 
     With ``run_dir`` the run can be killed at any moment: the same call with a newly built loss continues from
     the last checkpoint and, on the CPU with the same number of threads, gives the same weights as an
@@ -65,7 +66,8 @@ def pretrain(
         encoder_tau: EMA rate of the target networks; default 0.05.
         seed: seeds sampling, shifts, and what the loss draws; torch's global generator is left as it was.
         augment: ``"random_shift"`` (4 pixels, replicated border; independent per image and per sample),
-            ``"none"``, or a function of a batch and a generator.
+            ``"none"``, or a function of a batch and a generator. Entries that the loss names in ``views`` are
+            the same images, shifted once more (copies for ``"none"`` and a function).
         precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (bf16 where the hardware multiplies it natively).
             Deviation: the released code computes in fp32 throughout, which ``"fp32"`` gives.
         device: where to train. Directories are then opened on it: a GPU holds a copy of the frames.
@@ -121,7 +123,7 @@ def pretrain(
         run = PretrainRun(
             loss,
             sources,
-            Augmenter(augment, seed=seed),
+            Augmenter(augment, seed=seed, views=views_read(loss)),
             learner=Learner(
                 loss,
                 defaults,

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
 from torchrl.objectives import LossModule
 
 from crptpro.data import FrameDataset
@@ -68,25 +69,38 @@ class Source:
         )
 
     def sample_shifted(
-        self, batch_size: int, keys: Sequence[NestedKey] | None, generator: torch.Generator
+        self,
+        batch_size: int,
+        keys: Sequence[NestedKey] | None,
+        generator: torch.Generator,
+        views: Mapping[NestedKey, NestedKey] | None = None,
     ) -> TensorDictBase:
         """Draw what :meth:`sample` draws, its stacks shifted while they are read from the frames.
 
         Args:
             batch_size: transitions.
-            keys: entries that the loss reads; all if ``None``.
-            generator: source of the offsets, one draw per stack entry in the order of their names.
+            keys: entries that the loss reads from the dataset; all if ``None``.
+            generator: source of the offsets, one draw per stack entry in the order of their names, then one per
+                view.
+            views: further entries, each made of the stacks of the entry it names, with offsets of its own.
 
         Raises:
             DatasetError: if the dataset lacks one of the keys.
         """
         batch = self.dataset.sample(batch_size, pixels=False)
-        frames = self.dataset.frames.get("pixels")
-        for key, rows in sorted(self.dataset.stack_rows_of(batch).items(), key=lambda item: str(item[0])):
+        frames, rows = self.dataset.frames.get("pixels"), self.dataset.stack_rows_of(batch)
+
+        def shifted(key: NestedKey) -> Tensor:
+            offsets = draw_offsets(len(rows[key]), SHIFT_PAD, generator)
+            return shifted_stacks(frames, rows[key], offsets, pad=SHIFT_PAD)
+
+        for key in sorted(rows, key=str):
             if keys is None or key in keys:
-                offsets = draw_offsets(len(rows), SHIFT_PAD, generator)
-                batch.set(key, shifted_stacks(frames, rows, offsets, pad=SHIFT_PAD))
-        return self._select(batch, keys)
+                batch.set(key, shifted(key))
+        batch = self._select(batch, keys)
+        for view, key in sorted((views or {}).items(), key=str):
+            batch.set(view, shifted(key))
+        return batch
 
     def _select(self, batch: TensorDictBase, keys: Sequence[NestedKey] | None) -> TensorDictBase:
         if keys is None:
@@ -153,14 +167,20 @@ class Augmenter:
     """Random shift of every image entry, each with its own offsets, from its own generator.
 
     Args:
-        augment: ``"random_shift"``, ``"none"``, or ``f(batch, generator) -> batch``.
+        augment: ``"random_shift"``, ``"none"``, or ``f(batch, generator) -> batch``; a function gets the views as
+            copies of what they are views of.
         seed: seeds the generator (on the CPU, so that every device sees the same shifts).
+        views: entries that the loss reads as a second view of another one: ``{"pixels_view": "pixels"}``. They
+            are made of the same images, shifted once more.
     """
 
-    def __init__(self, augment: Augment, *, seed: int) -> None:
+    def __init__(
+        self, augment: Augment, *, seed: int, views: Mapping[NestedKey, NestedKey] | None = None
+    ) -> None:
         if augment not in ("random_shift", "none") and not callable(augment):
             raise ValueError(f"`augment` must be 'random_shift', 'none' or a function, got {augment!r}.")
         self.augment = augment
+        self.views = dict(sorted((views or {}).items(), key=str))
         self.generator = torch.Generator().manual_seed(derive_seed(seed, "pretrain", "augment"))
         self._keys: list[NestedKey] | None = None
 
@@ -178,28 +198,43 @@ class Augmenter:
     ) -> TensorDictBase:
         """Draw an augmented batch, the same one whichever way is open.
 
+        Args:
+            source: where to draw.
+            batch_size: transitions.
+            keys: entries that the loss reads, views included; all of the dataset if ``None``.
+            device: where the batch is returned.
+
         Raises:
-            DatasetError: if the dataset lacks one of the keys.
+            DatasetError: if the dataset lacks one of the keys, or what a view is made of.
         """
+        if keys is not None and self.views:
+            # No dataset holds a view; it holds what the view is made of.
+            keys = list(dict.fromkeys(self.views.get(key, key) for key in keys))
         if self.augment == "random_shift" and source.is_shifted_when_read:
-            return source.sample_shifted(batch_size, keys, self.generator).to(device)
+            return source.sample_shifted(batch_size, keys, self.generator, self.views).to(device)
         return self(source.sample(batch_size, keys).to(device))
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Augment a batch, in place for the built-in shift."""
-        if self.augment == "none":
-            return batch
-        if not isinstance(self.augment, str):
-            return self.augment(batch, self.generator)
+        """Augment a batch of a dataset's entries and add the views, in place for the built-in shift."""
+        seen = {view: batch.get(key) for view, key in self.views.items()}
+        if self.augment != "random_shift":
+            for view, pixels in seen.items():
+                batch.set(view, pixels.clone())
+            return batch if isinstance(self.augment, str) else self.augment(batch, self.generator)
         if self._keys is None:
             entries = sorted(batch.items(True, True), key=lambda item: str(item[0]))
             self._keys = [key for key, value in entries if value.ndim >= 4 and value.dtype == torch.uint8]
         for key in self._keys:
-            pixels = batch.get(key)
-            images = pixels.reshape(-1, *pixels.shape[-3:])
-            offsets = draw_offsets(images.shape[0], SHIFT_PAD, self.generator, images.device)
-            batch.set(key, random_shift(images, offsets, pad=SHIFT_PAD).reshape(pixels.shape))
+            batch.set(key, self._shift(batch.get(key)))
+        for view, pixels in seen.items():
+            # Images that the dataset has transformed in its own way are not shifted, nor is a view of them.
+            batch.set(view, self._shift(pixels) if self.views[view] in self._keys else pixels.clone())
         return batch
+
+    def _shift(self, pixels: Tensor) -> Tensor:
+        images = pixels.reshape(-1, *pixels.shape[-3:])
+        offsets = draw_offsets(images.shape[0], SHIFT_PAD, self.generator, images.device)
+        return random_shift(images, offsets, pad=SHIFT_PAD).reshape(pixels.shape)
 
 
 def open_sources(datasets: Any, *, seed: int, device: torch.device) -> list[Source]:
@@ -248,6 +283,11 @@ def keys_read(loss: LossModule) -> list[NestedKey] | None:
     except (AttributeError, NotImplementedError):
         return None
     return list(keys) if keys else None
+
+
+def views_read(loss: LossModule) -> dict[NestedKey, NestedKey]:
+    """Return which entries a loss reads as a second view of another one; none if it does not say."""
+    return dict(getattr(loss, "views", None) or {})
 
 
 def _length(dataset: Any) -> int | None:

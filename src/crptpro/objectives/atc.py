@@ -1,0 +1,128 @@
+"""Augmented temporal contrast: tell an observation's successor from those of other observations."""
+
+from __future__ import annotations
+
+from typing import ClassVar, cast
+
+import torch
+import torch.nn.functional as F
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictParams, dispatch
+from torch import Tensor, nn
+
+from crptpro.modules import AnchorHead, Projector
+from crptpro.modules.heads import latent_dim_of, require_one_latent_dim
+from crptpro.objectives import metrics
+from crptpro.objectives.base import PretrainingLoss, valid_rows
+from crptpro.objectives.functional import info_nce
+
+
+class ATCLoss(PretrainingLoss):
+    r"""Augmented temporal contrast (ATC, arXiv 2009.08319; astooke/rlpyt ``ul/algos/ul_for_rl``).
+
+    With anchors :math:`a = g_\theta(f_\theta(x_t))` and positives
+    :math:`p = g_{\bar\theta}(f_{\bar\theta}(x_{t+1}))` (no gradient), neither normalised,
+
+    .. math:: L = -\frac1B\sum_i \log\mathrm{softmax}_j\big(W(a_i + \mathrm{MLP}(a_i))\cdot p_j\big)_i .
+
+    There is no temperature. A loss that stays at ln B (6.238 for a batch of 512) says that anchors are not told
+    apart. Images must already be augmented, each independently. Softmax runs in float32 or wider. A batch of one
+    is legal and uninformative (loss 0); non-finite input propagates.
+
+    Rows that a mask entry of the batch excludes (``loss_mask_key``) are ignored as anchors, but their positives
+    stay as negatives of the other rows, as in the source. The source masks so the rows whose successor belongs to
+    another episode; in TorchRL batches ``("next", "pixels")`` is the true successor, so ends of episodes need no
+    mask.
+
+    Args:
+        encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
+        projector: features to latents ``[B, D]``; default ``Projector(encoder.feature_dim, latent_dim)`` with ATC's
+            Kaiming-normal weights.
+        anchor_head: latents of anchors to ``[B, D]``; default ``AnchorHead(latent_dim, hidden_dim)``.
+        latent_dim: D.
+        hidden_dim: width of the anchors' perceptron.
+        reduction: over the batch.
+
+    Raises:
+        ValueError: heads of different latent lengths, or an unknown reduction.
+
+    Returns (``forward``):
+        Scalar ``loss_contrast`` (nats) and, detached, ``embedding_cosine`` (mean pairwise cosine of the anchors'
+        latents).
+
+    Examples:
+        >>> from crptpro.modules import PixelEncoder
+        >>> from torchrl.objectives import SoftUpdate
+        >>> encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=12)
+        >>> loss = ATCLoss(encoder, latent_dim=4, hidden_dim=16)
+        >>> updater = SoftUpdate(loss, tau=0.01)
+        >>> pixels = torch.randint(0, 256, (6, 3, 12, 12), dtype=torch.uint8)
+        >>> loss(TensorDict({"pixels": pixels, "next": {"pixels": pixels}}, [6]))["loss_contrast"].backward()
+    """
+
+    encoder: nn.Module
+    encoder_params: TensorDictParams
+    target_encoder_params: TensorDictParams
+    projector: nn.Module
+    projector_params: TensorDictParams
+    target_projector_params: TensorDictParams
+    anchor_head: nn.Module
+    anchor_head_params: TensorDictParams
+    target_anchor_head_params: TensorDictParams
+
+    network_names: ClassVar[tuple[str, ...]] = ("encoder", "projector", "anchor_head")
+    default_out_keys: ClassVar[tuple[str, ...]] = ("loss_contrast", "embedding_cosine")
+
+    def __init__(
+        self,
+        encoder: nn.Module,
+        *,
+        projector: nn.Module | None = None,
+        anchor_head: nn.Module | None = None,
+        latent_dim: int = 128,
+        hidden_dim: int = 512,
+        reduction: str | None = None,
+    ) -> None:
+        super().__init__(reduction=reduction)
+        if projector is None:
+            projector = Projector(cast(int, encoder.feature_dim), latent_dim, init="kaiming")
+        if anchor_head is None:
+            anchor_head = AnchorHead(latent_dim, hidden_dim)
+        require_one_latent_dim(projector=projector, anchor_head=anchor_head)
+        self.convert_to_functional(encoder, "encoder", create_target_params=True)
+        self.convert_to_functional(projector, "projector", create_target_params=True)
+        self.convert_to_functional(anchor_head, "anchor_head")
+        # What an artifact's card needs to build the anchor head again.
+        self.latent_dim = latent_dim_of(anchor_head) or latent_dim
+        self.hidden_dim = getattr(anchor_head, "config", {}).get("hidden_dim", hidden_dim)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the loss and diagnostics of one batch; see the class."""
+        pixels, lead = self._read(tensordict, self.tensor_keys.observation, event_dims=3)
+        next_pixels, _ = self._read(tensordict, self.tensor_keys.next_observation, event_dims=3)
+        valid = valid_rows(self, tensordict)
+        # A masked anchor must not even be encoded: NaN in it would reach the weights' gradient as 0 * NaN.
+        anchors = self._anchors(pixels if valid is None else pixels[valid])
+        positives = self._positives(next_pixels)
+        queries = self._apply_network("anchor_head", anchors)
+        with torch.autocast(device_type=queries.device.type, enabled=False):
+            positives = positives.to(queries.dtype)
+            if valid is None:
+                rows = info_nce(queries, positives, reduction="none")
+            else:
+                every = queries.new_zeros(positives.shape).masked_scatter(valid.unsqueeze(-1), queries)
+                rows = info_nce(every, positives, valid=valid, reduction="none")[valid]
+            out = {
+                "loss_contrast": self._reduce_rows(rows, valid, lead),
+                "embedding_cosine": metrics.mean_pairwise_cosine(F.normalize(anchors.detach(), dim=-1)),
+            }
+        return TensorDict(out, batch_size=[])
+
+    def _anchors(self, pixels: Tensor) -> Tensor:
+        return self._apply_network("projector", self._apply_network("encoder", pixels))
+
+    @torch.no_grad()
+    def _positives(self, next_pixels: Tensor) -> Tensor:
+        features = self._apply_network("encoder", next_pixels, target=True)
+        return self._apply_network("projector", features, target=True)

@@ -1,0 +1,124 @@
+"""BeCL's representation loss: observations reached with the same skill belong together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, cast
+
+import torch
+import torch.nn.functional as F
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictParams, dispatch
+from torch import Tensor, nn
+
+from crptpro.modules import SkillHead
+from crptpro.modules.heads import latent_dim_of
+from crptpro.objectives import metrics
+from crptpro.objectives.base import PretrainingLoss, valid_rows
+from crptpro.objectives.functional import becl_loss
+
+
+class BeCLLoss(PretrainingLoss):
+    r"""Behaviour contrastive learning (BeCL, arXiv 2305.04477; Rooshy-yang/BeCL ``agent/becl.py``).
+
+    :func:`~crptpro.objectives.functional.becl_loss` of :math:`F = h(f_\theta(x'))` with the head h of
+    :class:`~crptpro.modules.SkillHead`: for every row, one other row of the same skill is told from all other
+    rows. :math:`x'` is the next observation (three agent steps ahead with the method's n-step batches). The
+    gradient reaches encoder and head; there is no target network.
+
+    ``projector`` is the whole head, embedding and projection: what the reward is computed from, and what an
+    artifact carries. All rows should come from one domain, where skills are comparable. Images must already be
+    augmented. Cosines and exponentials run in float32 or wider. A batch of one is legal and uninformative
+    (loss 0); masked rows (``loss_mask_key``) take no part; non-finite input propagates.
+
+    Args:
+        encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
+        projector: features to ``[B, D]``; default ``SkillHead(encoder.feature_dim, skill_dim, hidden_dim)``.
+        skill_dim: D, equal to the number of skills in the source.
+        hidden_dim: hidden width of the default head.
+        temperature: tau, divides the cosines; positive.
+        reduction: over the batch.
+
+    Raises:
+        ValueError: a temperature that is not positive, or an unknown reduction.
+
+    Returns (``forward``):
+        Scalar ``loss_contrast`` (nats) and, detached, ``embedding_cosine`` (mean pairwise cosine of F).
+
+    Examples:
+        >>> from crptpro.modules import PixelEncoder
+        >>> encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=12, pixel_offset=0.5)
+        >>> loss = BeCLLoss(encoder, skill_dim=4, hidden_dim=16)
+        >>> pixels = torch.randint(0, 256, (6, 3, 12, 12), dtype=torch.uint8)
+        >>> skill = F.one_hot(torch.arange(6) % 4, 4).float()
+        >>> loss(TensorDict({"next": {"pixels": pixels}, "skill": skill}, [6]))["loss_contrast"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can change.
+
+        Attributes:
+            next_observation: images that the skill led to.
+            skill: one-hot skills ``[B, K]``, floating.
+        """
+
+        next_observation: NestedKey = ("next", "pixels")
+        skill: NestedKey = "skill"
+
+    default_keys = _AcceptedKeys  # type: ignore[assignment]
+    tensor_keys: _AcceptedKeys  # type: ignore[assignment]
+
+    encoder: nn.Module
+    encoder_params: TensorDictParams
+    target_encoder_params: TensorDictParams
+    projector: nn.Module
+    projector_params: TensorDictParams
+    target_projector_params: TensorDictParams
+
+    network_names: ClassVar[tuple[str, ...]] = ("encoder", "projector")
+    default_out_keys: ClassVar[tuple[str, ...]] = ("loss_contrast", "embedding_cosine")
+    _schedulable_buffers = frozenset({"temperature"})
+
+    def __init__(
+        self,
+        encoder: nn.Module,
+        *,
+        projector: nn.Module | None = None,
+        skill_dim: int = 16,
+        hidden_dim: int = 1024,
+        temperature: float = 0.5,
+        reduction: str | None = None,
+    ) -> None:
+        super().__init__(reduction=reduction)
+        if not temperature > 0:
+            raise ValueError(f"temperature must be positive, got {temperature}.")
+        if projector is None:
+            projector = SkillHead(cast(int, encoder.feature_dim), skill_dim, hidden_dim)
+        self.convert_to_functional(encoder, "encoder")
+        self.convert_to_functional(projector, "projector")
+        self.skill_dim = latent_dim_of(projector) or skill_dim
+        # float64 scalar: it does not promote float32 tensors.
+        self.register_coeff_buffer("temperature", temperature, dtype=torch.float64)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the loss and diagnostics of one batch; see the class."""
+        next_pixels, lead = self._read(tensordict, self.tensor_keys.next_observation, event_dims=3)
+        skills, _ = self._read(tensordict, self.tensor_keys.skill, event_dims=1)
+        valid = valid_rows(self, tensordict)
+        if valid is not None:
+            next_pixels, skills = next_pixels[valid], skills[valid]
+        latents = self._apply_network("projector", self._apply_network("encoder", next_pixels))
+        with torch.autocast(device_type=latents.device.type, enabled=False):
+            rows = self._rows(latents, skills.argmax(dim=-1))
+            out = {
+                "loss_contrast": self._reduce_rows(rows, valid, lead),
+                "embedding_cosine": metrics.mean_pairwise_cosine(F.normalize(latents.detach(), dim=-1)),
+            }
+        return TensorDict(out, batch_size=[])
+
+    def _rows(self, latents: Tensor, skills: Tensor) -> Tensor:
+        if latents.shape[0] < 2:
+            return 0 * latents.sum(dim=-1)  # nothing to contrast with
+        return becl_loss(latents, skills, temperature=self.temperature, reduction="none")

@@ -1,0 +1,127 @@
+"""SimCLR as APT trains its encoder: tell two views of an observation from views of other observations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, cast
+
+import torch
+import torch.nn.functional as F
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictParams, dispatch
+from torch import Tensor, nn
+
+from crptpro.modules import Projector
+from crptpro.modules.heads import latent_dim_of
+from crptpro.objectives import metrics
+from crptpro.objectives.base import PretrainingLoss
+from crptpro.objectives.functional import info_nce
+
+
+class SimCLRLoss(PretrainingLoss):
+    r"""Contrast of two independently shifted views, without target network (APT, arXiv 2103.04551).
+
+    Views :math:`z = g_\theta(f_\theta(\cdot))/\|\cdot\|` of both images of B observations; each of the 2B has the
+    other view of its observation as positive and the remaining 2B - 2 as negatives:
+
+    .. math:: L = -\frac1{2B}\sum_i \log\frac{\exp(z_i\cdot z_{p(i)}/\tau)}{\sum_{j\ne i}\exp(z_i\cdot z_j/\tau)} .
+
+    It says in :attr:`views` that ``pixels_view`` is a second view of ``pixels``;
+    :func:`~crptpro.training.pretrain` makes it by shifting the same images again. Softmax runs in float32 or
+    wider. A batch of one is legal and uninformative (loss 0); masked rows (``loss_mask_key``) take no part;
+    non-finite input propagates.
+
+    Deviation: APT has published no code for DeepMind Control; loss and temperature are those of the authors' code
+    for Atari, the head (one linear layer, 128) is the one that every method here has.
+
+    Args:
+        encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
+        projector: features to latents ``[B, D]``; default ``Projector(encoder.feature_dim, latent_dim)``.
+        latent_dim: D.
+        temperature: tau, positive.
+        reduction: over the batch; a row's value is the mean of its two views'.
+
+    Raises:
+        ValueError: a temperature that is not positive, or an unknown reduction.
+
+    Returns (``forward``):
+        Scalar ``loss_contrast`` (nats) and, detached, ``embedding_cosine`` (mean pairwise cosine of the first
+        views' latents).
+
+    Examples:
+        >>> from crptpro.modules import PixelEncoder
+        >>> encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=12)
+        >>> loss = SimCLRLoss(encoder, latent_dim=4)
+        >>> pixels = torch.randint(0, 256, (6, 3, 12, 12), dtype=torch.uint8)
+        >>> loss(TensorDict({"pixels": pixels, "pixels_view": pixels}, [6]))["loss_contrast"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that ``set_keys`` can change.
+
+        Attributes:
+            observation: images.
+            observation_view: the same images, augmented independently.
+        """
+
+        observation: NestedKey = "pixels"
+        observation_view: NestedKey = "pixels_view"
+
+    default_keys = _AcceptedKeys  # type: ignore[assignment]
+    tensor_keys: _AcceptedKeys  # type: ignore[assignment]
+
+    encoder: nn.Module
+    encoder_params: TensorDictParams
+    target_encoder_params: TensorDictParams
+    projector: nn.Module
+    projector_params: TensorDictParams
+    target_projector_params: TensorDictParams
+
+    network_names: ClassVar[tuple[str, ...]] = ("encoder", "projector")
+    default_out_keys: ClassVar[tuple[str, ...]] = ("loss_contrast", "embedding_cosine")
+    _schedulable_buffers = frozenset({"temperature"})
+
+    def __init__(
+        self,
+        encoder: nn.Module,
+        *,
+        projector: nn.Module | None = None,
+        latent_dim: int = 128,
+        temperature: float = 0.07,
+        reduction: str | None = None,
+    ) -> None:
+        super().__init__(reduction=reduction)
+        if not temperature > 0:
+            raise ValueError(f"temperature must be positive, got {temperature}.")
+        if projector is None:
+            projector = Projector(cast(int, encoder.feature_dim), latent_dim)
+        self.convert_to_functional(encoder, "encoder")
+        self.convert_to_functional(projector, "projector")
+        self.latent_dim = latent_dim_of(projector) or latent_dim
+        # float64 scalar: it does not promote float32 tensors, and 0.07 stays 0.07.
+        self.register_coeff_buffer("temperature", temperature, dtype=torch.float64)
+
+    @property
+    def views(self) -> dict[NestedKey, NestedKey]:
+        """The second view of the observation, by its key."""
+        return {self.tensor_keys.observation_view: self.tensor_keys.observation}
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the loss and diagnostics of one batch; see the class."""
+        keys = self.tensor_keys
+        first, second, valid, lead = self._read_images(tensordict, keys.observation, keys.observation_view)
+        latents = self._latents(torch.cat([first, second]))
+        with torch.autocast(device_type=latents.device.type, enabled=False):
+            one, two = F.normalize(latents, dim=-1).chunk(2)
+            views = info_nce(one, two, temperature=self.temperature, negatives="both", reduction="none")
+            rows = views.view(2, -1).mean(dim=0)  # (2B,) -> (B,)
+            out = {
+                "loss_contrast": self._reduce_rows(rows, valid, lead),
+                "embedding_cosine": metrics.mean_pairwise_cosine(one.detach()),
+            }
+        return TensorDict(out, batch_size=[])
+
+    def _latents(self, pixels: Tensor) -> Tensor:
+        return self._apply_network("projector", self._apply_network("encoder", pixels))
