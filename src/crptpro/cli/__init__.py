@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from crptpro.cards import cpu_cores
 from crptpro.cli.evaluate import Evaluate
+from crptpro.cli.originals import Export, Import
 from crptpro.cli.pretraining import Finetune, Pretrain
 from crptpro.cli.request import Logging, expand_groups, require_device
 from crptpro.console import run_main
@@ -119,6 +120,8 @@ def main() -> None:
         | Annotated[Finetune, subcommand("finetune")]
         | Annotated[Downstream, subcommand("downstream")]
         | Annotated[Evaluate, subcommand("evaluate")]
+        | Annotated[Import, subcommand("import")]
+        | Annotated[Export, subcommand("export")]
     ]
     run_main(lambda: tyro.cli(commands, prog="crptpro", description=DESCRIPTION).run())
 

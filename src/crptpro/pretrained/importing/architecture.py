@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from crptpro.errors import PretrainedError
 from crptpro.modules import AnchorHead, PixelEncoder, Predictor, Projector, Prototypes, SkillHead
 from crptpro.modules.encoder import KERNEL_SIZE
+from crptpro.modules.initialisation import WeightInit
 
 IMAGE_SIZE = 84
 _MOST_CONVOLUTIONS = 8
@@ -21,6 +22,7 @@ def build_encoder(
     state: dict[str, Tensor],
     *,
     pixel_offset: float,
+    init: WeightInit = "orthogonal",
     strides: tuple[int, ...] | None = None,
     feature_dim: int | None = None,
 ) -> PixelEncoder:
@@ -29,6 +31,7 @@ def build_encoder(
     Args:
         state: ``convs.<i>.weight`` and ``.bias``.
         pixel_offset: of the source.
+        init: how the source draws weights.
         strides: of the convolutions, if known.
         feature_dim: input length of the first head, if there is one: what the strides have to fit.
 
@@ -53,6 +56,7 @@ def build_encoder(
         "image_size": IMAGE_SIZE,
         "pixel_scale": 1 / 255,
         "pixel_offset": pixel_offset,
+        "init": init,
     }
     encoder = fill(PixelEncoder, config, state, "encoder")
     if feature_dim is not None and encoder.feature_dim != feature_dim:
@@ -93,8 +97,13 @@ def infer_strides(channels: list[int], feature_dim: int | None) -> tuple[int, ..
     )
 
 
-def build_head(role: str, state: dict[str, Tensor]) -> nn.Module:
+def build_head(role: str, state: dict[str, Tensor], init: WeightInit = "orthogonal") -> nn.Module:
     """Build one of our heads from a state dict under our names.
+
+    Args:
+        role: what it is to a loss.
+        state: its tensors.
+        init: how the source draws the projector's weights.
 
     Raises:
         PretrainedError: shapes that do not belong together.
@@ -105,16 +114,17 @@ def build_head(role: str, state: dict[str, Tensor]) -> nn.Module:
     if "embed_input.weight" in sizes:
         hidden, features = sizes["embed_input.weight"]
         latent = sizes["embed_output.weight"][0]
-        config = {"feature_dim": features, "latent_dim": latent, "hidden_dim": hidden}
+        config: dict[str, Any] = {"feature_dim": features, "latent_dim": latent, "hidden_dim": hidden}
         return fill(SkillHead, config, state, role)
     if role == "projector":
         latent, features = sizes["linear.weight"]
-        return fill(Projector, {"feature_dim": features, "latent_dim": latent}, state, role)
+        config = {"feature_dim": features, "latent_dim": latent, "init": init}
+        return fill(Projector, config, state, role)
     if role == "prototypes":
         count, latent = sizes["weight"]
         return fill(Prototypes, {"num_prototypes": count, "latent_dim": latent}, state, role)
     hidden, latent = sizes["hidden.weight"]
-    head = {"predictor": Predictor, "anchor_head": AnchorHead}[role]
+    head: Any = {"predictor": Predictor, "anchor_head": AnchorHead}[role]
     return fill(head, {"latent_dim": latent, "hidden_dim": hidden}, state, role)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from crptpro.modules.initialisation import WeightInit
+
 LayoutFamily = Literal["proto", "urlb", "atc"]
 
 
@@ -31,6 +33,7 @@ class Layout:
         source: the repository.
         trunk: the ``Sequential`` of convolutions and ReLUs in the section ``encoder``.
         pixel_offset: subtracted from pixels / 255 there.
+        init: how encoder and projector are drawn there.
         heads: ours by our name.
         targets: their section to the one with its slow copy.
         queue: section and name of the candidate queue.
@@ -41,6 +44,7 @@ class Layout:
     source: str
     trunk: str
     pixel_offset: float = 0.0
+    init: WeightInit = "orthogonal"
     heads: dict[str, Head] = field(default_factory=dict)
     targets: dict[str, str] = field(default_factory=dict)
     queue: tuple[str, str] | None = None
@@ -99,6 +103,7 @@ ATC = Layout(
     "atc",
     "astooke/rlpyt, rlpyt/ul",
     trunk="conv.conv",
+    init="kaiming",
     heads={
         "projector": Head("encoder", {"linear": "head.model.0"}),
         "anchor_head": Head(
