@@ -42,8 +42,7 @@ def to_pretrained(contents: Contents, file: TorchFile) -> Pretrained:
         role: build_head(role, state, layout.init) for role, state in head_states.items()
     }
     targets: dict[str, nn.Module] = {}
-    if layout.targets:
-        section = layout.targets["encoder"]
+    if (section := layout.targets.get("encoder", "")) in contents.sections:
         targets["target_encoder"] = fill(PixelEncoder, encoder.config, reader.encoder(section), section)
         section = layout.targets[layout.heads["projector"].section]
         state = reader.head("projector", section)
