@@ -21,7 +21,7 @@ from crptpro.data.collect_worker import EpisodeRoller
 from crptpro.data.collection import DomainCollection
 from crptpro.domains import register_domain
 from crptpro.modules import PixelEncoder
-from crptpro.objectives import ProtoLoss
+from crptpro.objectives import ProtoLoss, SimCLRLoss, registry
 from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training import load_agent
 
@@ -201,6 +201,45 @@ def test_a_setting_that_pretraining_refuses_is_one_line(
     line = refused(call("pretrain", dataset, "--out", tmp_path / "out", flag, value))
     assert re.search(message, line), line
     assert not list((tmp_path / "out").rglob("*.csv"))
+
+
+@pytest.mark.parametrize("method", ["atc", "apt-c", "proto-rl-c"])
+def test_pretrain_trains_any_method_that_random_data_suffice_for(
+    call: Call, dataset: Path, tmp_path: Path, method: str
+) -> None:
+    few = ("--updates", 2, "--batch-size", 4, "--log-interval", 1)
+    assert call("pretrain", dataset, "--out", tmp_path / "out", "--method", method, *few)[0] == 0
+    loaded = load_pretrained(tmp_path / "out" / "encoder")
+    assert (loaded.method, loaded.card["training"]["updates"]) == (method, 2)
+    assert loaded.projector is not None
+
+
+def test_pretrain_names_what_a_method_misses_in_random_data(
+    call: Call, dataset: Path, tmp_path: Path
+) -> None:
+    status, _, err = call("pretrain", dataset, "--out", tmp_path, "--method", "becl", "--updates", 1)
+    assert status == 1
+    assert err.splitlines()[-1].startswith("error: The loss reads 'skill', which the dataset 'toy' lacks")
+
+
+def test_a_coefficient_of_another_method_is_refused(call: Call, dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    line = refused(call("pretrain", dataset, "--out", out, "--method", "atc", "--intr-loss-coef", 0.1))
+    assert "'atc' has no option intr_loss_coef" in line
+    assert not out.exists()
+
+
+def test_a_method_registered_elsewhere_trains_with_the_encoder_it_wants(
+    call: Call, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
+    defaults = registry.MethodDefaults(encoder_tau=None, batch_size=4)
+    options = {"pixel_offset": 0.5, "channels": (4, 4), "strides": (2, 1)}
+    registry.register_method("own", SimCLRLoss, defaults, encoder_options=options)
+    own = ("pretrain", dataset, "--out", tmp_path / "out", "--method", "own", "--updates", 2)
+    assert call(*own)[0] == 0
+    loaded = load_pretrained(tmp_path / "out" / "encoder").require(pixel_offset=0.5)
+    assert loaded.card["modules"]["encoder"]["config"]["channels"] == [4, 4]
 
 
 def test_datasets_of_different_images_are_refused(call: Call, dataset: Path, tmp_path: Path) -> None:

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.objectives import LossModule
+from torchrl.objectives import LossModule, SoftUpdate
 
 from crptpro.modules import PixelEncoder, SquashedGaussianActor, TwinCritic
-from crptpro.objectives import ProtoLoss, RADSACLoss
+from crptpro.objectives import ATCLoss, BeCLLoss, ProtoLoss, RADSACLoss, SimCLRLoss
 
 IMAGE = (3, 15, 15)
-FEATURES, ACTIONS = 12, 2
+FEATURES, ACTIONS, SKILLS = 12, 2, 3
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,31 @@ def proto(seed: int = 0, **options) -> ProtoLoss:
     return ProtoLoss(small_encoder(), num_prototypes=10, latent_dim=6, hidden_dim=16, **options)
 
 
+def view_batch(count: int = 6, seed: int = 0) -> TensorDict:
+    pair = image_batch(count, seed)
+    return TensorDict({"pixels": pair["pixels"], "pixels_view": pair["next", "pixels"]}, [count])
+
+
+def skill_batch(count: int = 6, seed: int = 0) -> TensorDict:
+    skills = torch.nn.functional.one_hot(torch.arange(count) % SKILLS, SKILLS).float()
+    return image_batch(count, seed).set("skill", skills)
+
+
+def atc(seed: int = 0, **options) -> ATCLoss:
+    torch.manual_seed(seed)
+    return ATCLoss(small_encoder(), **{"latent_dim": 6, "hidden_dim": 16, **options})
+
+
+def simclr(seed: int = 0, **options) -> SimCLRLoss:
+    torch.manual_seed(seed)
+    return SimCLRLoss(small_encoder(), **{"latent_dim": 6, **options})
+
+
+def becl(seed: int = 0, **options) -> BeCLLoss:
+    torch.manual_seed(seed)
+    return BeCLLoss(small_encoder(), **{"skill_dim": SKILLS, "hidden_dim": 16, **options})
+
+
 def transition_batch(count: int = 6, seed: int = 0) -> TensorDict:
     generator = torch.Generator().manual_seed(seed)
 
@@ -110,6 +135,41 @@ CASES = [
         rows_are_coupled=True,
     ),
     LossCase(
+        name="ATCLoss",
+        make=atc,
+        batch=image_batch,
+        routing={"loss_contrast": {"encoder_params", "projector_params", "anchor_head_params"}},
+        keys={"observation": "pixels", "next_observation": ("next", "pixels")},
+        keys_hold_under_next=False,
+        targets=("encoder", "projector"),
+        masked=("pixels",),  # positives of masked rows stay as negatives
+        per_row=("loss_contrast",),
+    ),
+    LossCase(
+        name="SimCLRLoss",
+        make=simclr,
+        batch=view_batch,
+        routing={"loss_contrast": {"encoder_params", "projector_params"}},
+        keys={"observation": "pixels", "observation_view": "pixels_view"},
+        keys_hold_under_next=False,
+        targets=(),
+        masked=("pixels", "pixels_view"),
+        per_row=("loss_contrast",),
+        rows_are_coupled=True,
+    ),
+    LossCase(
+        name="BeCLLoss",
+        make=becl,
+        batch=skill_batch,
+        routing={"loss_contrast": {"encoder_params", "projector_params"}},
+        keys={"next_observation": ("next", "pixels"), "skill": "skill"},
+        keys_hold_under_next=False,
+        targets=(),
+        masked=(("next", "pixels"), "skill"),
+        per_row=("loss_contrast",),
+        rows_are_coupled=True,
+    ),
+    LossCase(
         name="RADSACLoss",
         make=rad_sac,
         batch=transition_batch,
@@ -136,6 +196,26 @@ CASES = [
 def run(loss: LossModule, td: TensorDictBase, seed: int = 7) -> TensorDictBase:
     torch.manual_seed(seed)
     return loss(td)
+
+
+def as_images(rows: torch.Tensor) -> torch.Tensor:
+    """Vectors ``[B, D]`` as images of one pixel, which :func:`passing_through` hands on as they are."""
+    return rows.reshape(*rows.shape, 1, 1)
+
+
+def passing_through(dim: int = 2) -> tuple[torch.nn.Module, torch.nn.Module]:
+    """An encoder and a projector, in double precision, whose latents are their images' values."""
+    conv = torch.nn.Conv2d(dim, dim, 1, bias=False)
+    linear = torch.nn.Linear(dim, dim, bias=False)
+    with torch.no_grad():
+        conv.weight.copy_(as_images(torch.eye(dim)))
+        linear.weight.copy_(torch.eye(dim))
+    return torch.nn.Sequential(conv, torch.nn.Flatten()).double(), linear.double()
+
+
+def keep_targets(case: LossCase, loss: LossModule) -> Callable[[], None]:
+    """Move the targets by 0.05; a loss without targets has nothing to move."""
+    return SoftUpdate(loss, tau=0.05).step if case.targets else lambda: None
 
 
 def total(out: TensorDictBase) -> torch.Tensor:

@@ -8,8 +8,7 @@ import warnings
 
 import pytest
 import torch
-from loss_cases import CASES, LossCase, assert_same, run, total
-from torchrl.objectives import SoftUpdate
+from loss_cases import CASES, LossCase, assert_same, keep_targets, run, total
 
 pytestmark = [
     pytest.mark.parametrize("case", CASES, ids=str),
@@ -89,12 +88,12 @@ def test_networks_of_a_copy_hold_the_copied_parameters(case: LossCase) -> None:
 
 def test_soft_update_moves_targets_by_tau(case: LossCase) -> None:
     loss = case.make()
-    updater = SoftUpdate(loss, tau=0.05)
+    update_targets = keep_targets(case, loss)
     with torch.no_grad():
         for parameter in loss.parameters():
             parameter.add_(torch.randn_like(parameter))
     before = {k: v.clone() for k, v in loss.state_dict().items()}
-    updater.step()
+    update_targets()
     after = loss.state_dict()
     targets = [name for name in after if name.startswith("target_")]
     assert {name.removeprefix("target_").split("_params")[0] for name in targets} == set(case.targets)
@@ -105,7 +104,7 @@ def test_soft_update_moves_targets_by_tau(case: LossCase) -> None:
 
 def test_no_warning_once_an_updater_exists(case: LossCase) -> None:
     loss = case.make()
-    SoftUpdate(loss, tau=0.05)
+    keep_targets(case, loss)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         run(loss, case.batch())
@@ -117,7 +116,7 @@ def test_targets_loaded_after_the_updater_was_built_are_kept(case: LossCase) -> 
         for parameter in first.parameters():
             parameter.add_(1.0)
     second = case.make(seed=1)
-    SoftUpdate(second, tau=0.05)
+    keep_targets(case, second)
     second.load_state_dict(first.state_dict())
     for name, value in first.state_dict().items():
         assert torch.equal(second.state_dict()[name], value), name
@@ -154,7 +153,7 @@ def test_double_precision_runs_in_double(case: LossCase) -> None:
 
 def test_compiled_forward_equals_eager(case: LossCase) -> None:
     loss, td = case.make(), case.batch()
-    SoftUpdate(loss, tau=0.05)
+    keep_targets(case, loss)
     expected = run(loss, td)
     total(expected).backward()
     gradients = {name: p.grad.clone() for name, p in loss.named_parameters()}
@@ -213,7 +212,7 @@ def test_non_finite_parameters_propagate_to_the_loss(case: LossCase) -> None:
 
 def test_twenty_adam_updates_lower_the_loss(case: LossCase) -> None:
     loss, td = case.make(), case.batch()
-    updater = SoftUpdate(loss, tau=0.05)
+    update_targets = keep_targets(case, loss)
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
     key = next(iter(case.routing))
     first = run(loss, td)[key].item()
@@ -223,7 +222,7 @@ def test_twenty_adam_updates_lower_the_loss(case: LossCase) -> None:
         optimizer.zero_grad()
         total(run(loss, td)).backward()
         optimizer.step()
-        updater.step()
+        update_targets()
     assert run(loss, td)[key].item() < 0.9 * first
 
 

@@ -7,7 +7,9 @@ from torchrl.envs import ToTensorImage
 
 from crptpro.data import FrameDataset, FrameStorage
 from crptpro.errors import DatasetError
+from crptpro.seeding import derive_seed
 from crptpro.training.pretrain.sources import Augmenter, Source
+from crptpro.transforms.random_shift import draw_offsets, random_shift
 
 EPISODES, LENGTH, SIZE = 4, 6, 12
 
@@ -62,3 +64,82 @@ def test_an_entry_that_the_dataset_lacks_is_named_either_way() -> None:
             DatasetError, match=r"reads 'skill', which the dataset 'toy' lacks; it has .*action"
         ):
             Augmenter(augment, seed=0).sample(source, 4, ["pixels", "skill"])
+
+
+# Second views -----------------------------------------------------------------------------------------------------
+
+NEXT = ("next", "pixels")
+VIEWS = {"pixels_view": "pixels", ("next", "pixels_view"): NEXT}
+
+
+@pytest.mark.parametrize(
+    ("views", "keys"),
+    [
+        ({"pixels_view": "pixels"}, ["pixels", "pixels_view"]),
+        ({"pixels_view": "pixels"}, ["action", "pixels_view"]),
+        (VIEWS, ["pixels", NEXT, *VIEWS]),
+        (VIEWS, None),
+    ],
+)
+def test_views_are_the_same_numbers_whichever_way_the_stacks_are_read(
+    views: dict[NestedKey, NestedKey], keys: list[NestedKey] | None
+) -> None:
+    class ReadItsOwnWay(Source):
+        is_shifted_when_read = False
+
+    fused = Source("toy", make_dataset(), seed=5)
+    plain = ReadItsOwnWay("toy", make_dataset(), seed=5)
+    first, second = (Augmenter("random_shift", seed=7, views=views) for _ in range(2))
+    for _ in range(3):
+        ours, theirs = first.sample(fused, 50, keys), second.sample(plain, 50, keys)
+        assert set(views) | set(keys or []) <= set(ours.keys(True, True)) == set(theirs.keys(True, True))
+        assert all(torch.equal(ours[key], theirs[key]) for key in theirs.keys(True, True))
+    assert torch.equal(first.generator.get_state(), second.generator.get_state())
+
+
+def test_offsets_are_drawn_by_name_and_those_of_views_come_last() -> None:
+    raw = Source("toy", make_dataset(), seed=5).sample(20, ["pixels", NEXT])
+    generator = torch.Generator().manual_seed(derive_seed(7, "pretrain", "augment"))
+    expected = {
+        entry: random_shift(raw[key], draw_offsets(20, 4, generator))
+        for entry, key in (
+            (NEXT, NEXT),
+            ("pixels", "pixels"),
+            (("next", "pixels_view"), NEXT),
+            ("pixels_view", "pixels"),
+        )
+    }
+    for views in ({}, {"pixels_view": "pixels"}, VIEWS):
+        source = Source("toy", make_dataset(), seed=5)
+        batch = Augmenter("random_shift", seed=7, views=views).sample(source, 20, ["pixels", NEXT, *views])
+        assert torch.equal(batch["pixels"], expected["pixels"])
+        assert torch.equal(batch[NEXT], expected[NEXT])
+    assert all(torch.equal(batch[view], expected[view]) for view in VIEWS)
+    assert not torch.equal(batch["pixels_view"], batch["pixels"])
+
+
+def test_without_augmentation_a_view_equals_its_entry() -> None:
+    source = Source("toy", make_dataset(), seed=5)
+    batch = Augmenter("none", seed=0, views=VIEWS).sample(source, 20, ["pixels", NEXT, *VIEWS])
+    assert all(torch.equal(batch[view], batch[key]) for view, key in VIEWS.items())
+
+
+def test_an_own_augmentation_gets_every_view_as_a_copy() -> None:
+    def darken(batch: TensorDict, generator: torch.Generator) -> TensorDict:
+        batch["pixels"].zero_()
+        return batch
+
+    raw = Source("toy", make_dataset(), seed=5).sample(20, ["pixels"])
+    source = Source("toy", make_dataset(), seed=5)
+    augmenter = Augmenter(darken, seed=0, views={"pixels_view": "pixels"})
+    batch = augmenter.sample(source, 20, ["pixels", "pixels_view"])
+    assert not batch["pixels"].any()
+    assert torch.equal(batch["pixels_view"], raw["pixels"])
+
+
+def test_a_view_of_an_entry_that_the_dataset_lacks_names_that_entry() -> None:
+    source = Source("toy", make_dataset(), seed=0)
+    for augment in ("random_shift", "none"):
+        augmenter = Augmenter(augment, seed=0, views={"wide_view": "wide"})
+        with pytest.raises(DatasetError, match="reads 'wide', which the dataset 'toy' lacks"):
+            augmenter.sample(source, 4, ["pixels", "wide_view"])

@@ -98,7 +98,7 @@ class Source:
             if keys is None or key in keys:
                 batch.set(key, shifted(key))
         batch = self._select(batch, keys)
-        for view, key in sorted((views or {}).items(), key=str):
+        for view, key in sorted((views or {}).items(), key=lambda item: str(item[0])):
             batch.set(view, shifted(key))
         return batch
 
@@ -180,7 +180,7 @@ class Augmenter:
         if augment not in ("random_shift", "none") and not callable(augment):
             raise ValueError(f"`augment` must be 'random_shift', 'none' or a function, got {augment!r}.")
         self.augment = augment
-        self.views = dict(sorted((views or {}).items(), key=str))
+        self.views = dict(sorted((views or {}).items(), key=lambda item: str(item[0])))
         self.generator = torch.Generator().manual_seed(derive_seed(seed, "pretrain", "augment"))
         self._keys: list[NestedKey] | None = None
 
