@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import builtins
+import contextlib
 import io
 import pickle
+import random
 import resource
 import struct
 import sys
@@ -15,11 +17,14 @@ from typing import Any
 
 import pytest
 import torch
-from original_agents import atc_state, save
+from original_agents import PROTO, atc_state, module_file, save
 
 from crptpro.errors import PretrainedError
 from crptpro.pretrained import import_snapshot, load_pretrained
+from crptpro.pretrained.importing.convert import to_pretrained
+from crptpro.pretrained.importing.layouts import recognise
 from crptpro.pretrained.importing.restricted_pickle import Foreign, RestrictedUnpickler
+from crptpro.pretrained.importing.torch_file import TorchFile
 
 MARK = "this_file_must_not_appear"
 
@@ -321,3 +326,37 @@ def test_a_harmless_snapshot_with_a_hostile_companion_gives_its_networks_and_not
     with pytest.raises(Exception):  # noqa: B017 whatever happens to the dictionary after the call
         torch.load(file, weights_only=False)["algo_state_dict"]["optimizer"].keys()
     assert mark.exists()  # the same file, believed
+
+
+@pytest.mark.parametrize("is_legacy", [False, True], ids=["zip", "legacy"])
+def test_a_file_with_any_byte_changed_is_read_or_refused(is_legacy: bool, tmp_path: Path) -> None:
+    with module_file(tmp_path / "repository", "proto", PROTO) as proto:
+        file = save(proto.ProtoAgent(), tmp_path / "agent.pt", is_legacy=is_legacy)
+    with zipfile.ZipFile(file) if not is_legacy else contextlib.nullcontext() as archive:
+        members = {name: archive.read(name) for name in archive.namelist()} if archive else {}
+    name = next((name for name in members if name.endswith("data.pkl")), None)
+    whole = members[name] if name else file.read_bytes()
+    begin = 0 if name else 100  # beyond the magic number, where all that happens is that there is none
+    chance = random.Random(0)
+    outcomes = set()
+    for _ in range(60):
+        content = bytearray(whole)
+        for _ in range(chance.choice((1, 1, 3))):
+            content[chance.randrange(begin, min(len(content), 15_000))] = chance.choice(
+                b"(.0Kbcdehijloqrstu]a}NR\x81\x85"
+            )
+        if name:
+            with zipfile.ZipFile(file, "w") as archive:
+                for member, stored in {**members, name: bytes(content)}.items():
+                    archive.writestr(member, stored)
+        else:
+            file.write_bytes(content)
+        try:
+            with open(file, "rb") as opened:
+                snapshot = TorchFile(opened)
+                to_pretrained(recognise(snapshot.root), snapshot)
+            outcomes.add("read")
+        except PretrainedError as reason:
+            outcomes.add(str(reason))
+    assert "read" in outcomes
+    assert len(outcomes) > 3

@@ -151,7 +151,9 @@ class _Reader:
         sections = self._contents.sections
         for section, names in self._taken.items():
             if left := sorted(sections[section].keys() - names):
-                raise PretrainedError(f"its {section} has more than it should: {', '.join(left[:5])}.")
+                raise PretrainedError(
+                    f"its {section} has more than it should: {', '.join(repr(name[:80]) for name in left[:5])}."
+                )
         return [section for section in sections if section not in self._taken]
 
     def _take(self, section: str, name: str) -> Tensor:

@@ -13,7 +13,7 @@ from crptpro.pretrained.importing.restricted_pickle import Foreign, TensorRecord
 Section = dict[str, TensorRecord]
 Scalar = int | float | str | bool
 
-_MOST_TENSORS = 10_000
+_MOST_MODULES = 10_000
 _LONGEST_TEXT = 200
 _COUNTERS = {"_global_step": "agent_steps", "_global_episode": "episodes", "itr": "updates"}
 
@@ -25,7 +25,7 @@ class Contents:
     Attributes:
         layout: whose it is.
         sections: networks by attribute name, as flat state dicts; a lone tensor has the name ``""``.
-        strides: of convolutions by ``section.name``, where the snapshot holds the modules themselves.
+        strides: of the encoder's convolutions by ``encoder.name``, where the snapshot holds the modules themselves.
         settings: plain numbers and texts beside the networks, ``section.name`` for those of a network.
         counters: ``agent_steps``, ``episodes`` or ``updates`` so far, as the snapshot counts them.
         others: names of what is neither network, tensor nor setting.
@@ -60,8 +60,9 @@ def recognise(root: Any) -> Contents:
     if attributes is None:
         raise PretrainedError("it holds neither an agent nor state dicts.")
     for name, value in attributes.items():
-        if isinstance(name, str) and name not in _COUNTERS:
-            _collect(contents, name, value)
+        # Names end up in messages: nothing that steers a terminal.
+        if _is_scalar(name) and str(name).isprintable() and name not in _COUNTERS:
+            _collect(contents, str(name), value)
     contents.layout = _layout_of(contents)
     return contents
 
@@ -101,30 +102,41 @@ def _flatten(contents: Contents, section: str, module: Foreign) -> None:
         prefix, module = pending.pop()
         attributes = _attributes(module) or {}
         visited += 1
-        if visited > _MOST_TENSORS:
+        if visited > _MOST_MODULES or len(prefix) > _LONGEST_TEXT:
             raise PretrainedError("its networks have no end.")
         for group in ("_parameters", "_buffers"):
-            for name, value in (attributes[group] or {}).items():
+            for name, value in _entries(attributes, group).items():
                 if isinstance(value, TensorRecord):
                     table[join(prefix, name)] = value
-        for name, child in (attributes["_modules"] or {}).items():
+        for name, child in _entries(attributes, "_modules").items():
             if _is_module(child):
                 pending.append((join(prefix, name), child))
-        stride = attributes.get("stride")
-        if isinstance(stride, tuple):
-            _require_plain_convolution(attributes)
-            contents.strides[join(section, prefix)] = stride
+        if section == "encoder" and isinstance(attributes.get("stride"), tuple):
+            contents.strides[join(section, prefix)] = _stride_of(attributes)
         elif not prefix:
             for name, value in attributes.items():
                 if isinstance(name, str) and _is_scalar(value) and name not in ("training", "dump_patches"):
                     contents.settings[join(section, name)] = value
 
 
-def _require_plain_convolution(attributes: dict[Any, Any]) -> None:
-    """The library's encoder has un-padded square convolutions; the strides are compared later."""
-    padding, dilation = attributes.get("padding", (0, 0)), attributes.get("dilation", (1, 1))
-    if tuple(padding) != (0, 0) or tuple(dilation) != (1, 1) or attributes.get("groups", 1) != 1:
+def _entries(attributes: dict[Any, Any], group: str) -> dict[str, Any]:
+    found = attributes[group]
+    if not isinstance(found, dict):
+        return {}
+    return {
+        k: v for k, v in found.items() if isinstance(k, str) and k.isprintable() and len(k) < _LONGEST_TEXT
+    }
+
+
+def _stride_of(attributes: dict[Any, Any]) -> tuple[int, ...]:
+    """Return the strides of a convolution as this library has them: without padding, dilation or groups."""
+    stride = attributes["stride"]
+    if not 1 <= len(stride) <= 3 or any(type(step) is not int for step in stride):
+        raise PretrainedError("its convolutions have strides that are no numbers.")
+    plain = {"padding": (0,) * len(stride), "dilation": (1,) * len(stride), "groups": 1}
+    if any(attributes.get(name, value) != value for name, value in plain.items()):
         raise PretrainedError("its convolutions are padded, dilated or grouped; this library's are not.")
+    return stride
 
 
 def _is_scalar(value: Any) -> bool:
