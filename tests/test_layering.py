@@ -12,7 +12,7 @@ import crptpro
 PACKAGE = Path(crptpro.__file__).parent
 FOUNDATION = [
     "errors", "quality", "seeding", "cards", "artifact", "directory_lock", "console", "loggers", "downstream_config",
-    "active_config",
+    "active_config", "host_memory",
 ]  # fmt: skip
 ORDER = [
     "domains", "envs", "data", "modules", "objectives", "transforms", "training.evaluate", "training.checkpoint",
