@@ -110,7 +110,7 @@ class CapturedCall:
         inputs = self._take(batch)
         self._calls += 1
         device = inputs.device or next(iter(inputs.values(True, True))).device
-        if device.type != "cuda":
+        if not _is_gpu(device):
             outputs = self.function(inputs)
         elif self._graph is not None:
             self._graph.replay()
@@ -185,6 +185,10 @@ def portable_state(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
     for group in state["param_groups"]:
         group.update(lr=float(group["lr"]), capturable=False)
     return state
+
+
+def _is_gpu(device: torch.device) -> bool:
+    return device.type == "cuda"
 
 
 def _signature(batch: TensorDictBase) -> dict[str, str]:
