@@ -25,6 +25,8 @@ from crptpro.modules import (
 )
 from crptpro.objectives import RADSACLoss
 from crptpro.pretrained import Pretrained
+from crptpro.training.captured import resolve_cuda_graph
+from crptpro.training.compiled import Compiled, resolve_compile
 from crptpro.training.frozen_features import FrozenFeatures, dense_slots
 from crptpro.training.rad_sac_learner import RADSACLearner
 from crptpro.transforms import PrototypeReward, choose_feature_mode
@@ -99,6 +101,10 @@ def build_parts(
         critic_tau=config.critic_tau,
         actor_update_interval=config.actor_update_interval,
         target_update_interval=config.target_update_interval,
+        compiled=Compiled(
+            is_on=resolve_compile(config.compile, config.device), is_required=config.compile == "on"
+        ),
+        captures=resolve_cuda_graph(config.cuda_graph, config.device),
     )
 
     replay = _build_replay(env, config, generators["replay"], run_dir)
