@@ -34,7 +34,7 @@ def resolve_compile(compile: Switch, device: torch.device | str) -> bool:
     """Whether updates are compiled with ``torch.compile``: ``"auto"`` compiles on a GPU and not on a CPU.
 
     On a CPU nearly all of an update is convolutions and large matrix products, which the compiler leaves to the same
-    library calls: compiling takes half a minute and gains one or two percent (benchmarks/README.md).
+    library calls: it takes half a minute and gains nothing that can be told from noise (benchmarks/README.md).
 
     Args:
         compile: ``"auto"``, ``"on"`` or ``"off"``.

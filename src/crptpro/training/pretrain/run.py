@@ -275,7 +275,7 @@ class PretrainRun:
     def _fingerprint(self) -> dict[str, Any]:
         learner = self.learner
         schedule = learner.defaults.schedule
-        # Only where they are used: a run from before they existed can be continued.
+        # Only where used: older runs can be continued.
         switches: dict[str, Any] = {"compile": True} if learner.compiled.is_on else {}
         if self.batches is not None:
             switches["batches"] = "drawn on the device"
