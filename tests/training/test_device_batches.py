@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from host_reads import NoHostReads
+from pretrain_world import SETTINGS, same_state
 from tensordict import TensorDict
 
 from crptpro.data import FrameDataset
 from crptpro.data.frame_stacks import stack_rows
 from crptpro.data.frame_storage import FrameStorage
+from crptpro.errors import CheckpointError
+from crptpro.modules import PixelEncoder
+from crptpro.objectives import ProtoLoss
+from crptpro.training import pretrain
 from crptpro.training.compiled import Compiled
+from crptpro.training.pretrain import loop
 from crptpro.training.pretrain.device_batches import DeviceBatches
 from crptpro.transforms.random_shift import shifted_stacks
 
@@ -129,3 +136,41 @@ def test_only_datasets_of_ours_that_are_alike_and_hold_the_keys_fit() -> None:
     assert not DeviceBatches.fits({"a": dataset, "b": object()}, KEYS)
     dataset.append_transform(lambda td: td)
     assert not DeviceBatches.fits({"a": dataset}, KEYS)
+
+
+def make_loss() -> ProtoLoss:
+    torch.manual_seed(0)
+    encoder = PixelEncoder(9, channels=(4, 4), strides=(2, 1), image_size=SIZE)
+    return ProtoLoss(encoder, num_prototypes=8, latent_dim=8, hidden_dim=16)
+
+
+@pytest.fixture
+def _pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop, "_is_gpu", lambda device: True)
+    monkeypatch.setattr(loop, "resolve_cuda_graph", lambda *arguments, **keywords: True)
+
+
+def pretrain_two(updates: int, run_dir: Path | None = None) -> ProtoLoss:
+    loss = make_loss()
+    datasets = {"a": make_dataset(1), "b": make_dataset(2)}
+    pretrain(loss, datasets, updates=updates, run_dir=run_dir, **SETTINGS)
+    return loss
+
+
+@pytest.mark.usefixtures("_pretended_gpu")
+def test_pretraining_takes_its_batches_from_there_and_continues_with_the_same_ones(tmp_path: Path) -> None:
+    whole = pretrain_two(12)
+    assert whole.training_record["settings"]["batches"] == "drawn on the device"
+    assert whole.training_record["cuda_graph"]
+    pretrain_two(7, tmp_path)
+    assert same_state(pretrain_two(12, tmp_path), whole)
+
+
+def test_a_run_with_batches_of_the_cpu_is_not_continued_with_those_of_the_device(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loss = pretrain_two(4, tmp_path)
+    assert "batches" not in loss.training_record["settings"]
+    monkeypatch.setattr(loop, "_is_gpu", lambda device: True)
+    with pytest.raises(CheckpointError, match="batches was 'absent', now 'drawn on the device'"):
+        pretrain_two(8, tmp_path)

@@ -8,21 +8,14 @@ from typing import Any
 import pytest
 import torch
 from pretrain_world import SETTINGS
-from test_device_batches import SIZE, make_dataset
+from test_device_batches import make_dataset, make_loss
 
 from crptpro.data import FrameDataset
 from crptpro.data.frame_storage import FrameStorage
-from crptpro.modules import PixelEncoder
 from crptpro.objectives import ProtoLoss
 from crptpro.training import pretrain
 
 pytestmark = pytest.mark.gpu
-
-
-def make_loss() -> ProtoLoss:
-    torch.manual_seed(0)
-    encoder = PixelEncoder(9, channels=(4, 4), strides=(2, 1), image_size=SIZE)
-    return ProtoLoss(encoder, num_prototypes=8, latent_dim=8, hidden_dim=16)
 
 
 def datasets_on_gpu() -> dict[str, FrameDataset]:

@@ -174,8 +174,7 @@ def _device_batches(
     keys, views = keys_read(loss), getattr(loss, "views", {})
     if augment not in ("random_shift", "none") or not DeviceBatches.fits(datasets, keys, views):
         return None
-    frames = sources[0].dataset.frames.get("pixels")
-    if frames.device.type == "cpu" or keys is None:
+    if keys is None or not _is_gpu(sources[0].dataset.frames.get("pixels").device):
         return None
     return DeviceBatches(
         datasets,
@@ -187,3 +186,7 @@ def _device_batches(
         compiled=compiled,
         captures=captures,
     )
+
+
+def _is_gpu(device: torch.device) -> bool:
+    return device.type != "cpu"
