@@ -20,13 +20,3 @@ class NoHostReads(TorchDispatchMode):
         if func._schema.name in _READS:
             raise AssertionError(f"{func} reads a value back to the host")
         return func(*args, **(kwargs or {}))
-
-
-def test_it_notices_a_read() -> None:
-    with NoHostReads():
-        torch.ones(2).sum()
-        try:
-            torch.ones(()).item()
-        except AssertionError:
-            return
-    raise AssertionError("a read went unnoticed")

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from host_reads import NoHostReads
 from tensordict import TensorDict
 
 from crptpro.errors import CompileError
@@ -138,3 +139,11 @@ def test_auto_records_only_what_is_fit_for_it_on_a_gpu() -> None:
 def test_at_least_one_call_warms_up() -> None:
     with pytest.raises(ValueError, match="at least 1, got 0"):
         CapturedCall(lambda batch: {}, warmup=0)
+
+
+@pytest.mark.parametrize("read", [torch.Tensor.item, torch.Tensor.tolist, torch.nonzero, bool])
+def test_what_watches_for_host_reads_notices_them(read: Any) -> None:
+    with NoHostReads():
+        value = torch.ones(2).sum()
+        with pytest.raises(AssertionError, match="reads a value back"):
+            read(value)
