@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 _READS = {
@@ -14,7 +13,7 @@ _READS = {
 
 
 class NoHostReads(TorchDispatchMode):
-    """Raises where a value of a tensor, or a shape that depends on one, is read."""
+    """Raises where a value of a tensor, or a shape that depends on one, is read; ``tolist`` and ``cpu`` escape it."""
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         if func._schema.name in _READS:
