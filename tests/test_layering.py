@@ -16,7 +16,8 @@ FOUNDATION = [
 ]  # fmt: skip
 ORDER = [
     "domains", "envs", "data", "modules", "objectives", "transforms", "training.evaluate", "training.checkpoint",
-    "training.fingerprint", "training.finite", "training.stop_request", "training.collapse", "training.pretrain",
+    "training.fingerprint", "training.finite", "training.stop_request", "training.collapse", "training.compiled",
+    "training.captured", "training.pretrain",
     "pretrained", "training", "analysis", "experiments", "doctor", "cli",
 ]  # fmt: skip
 FILES = sorted(PACKAGE.rglob("*.py"))
