@@ -174,6 +174,10 @@ class DownstreamConfig(SACSettings):
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it. Deviation: the released code
     computes in fp32 throughout, which `fp32` gives"""
+    compile: Literal["auto", "on", "off"] = "auto"
+    """compile the learner's losses with torch.compile, which changes rounding only; `auto` is off"""
+    cuda_graph: Literal["auto", "on", "off"] = "auto"
+    """on a GPU, record the learner's updates and replay them, the action noise drawn there; `auto` is off"""
     eval_workers: int | None = None
     """processes that evaluate on the CPU while training goes on, 0.5 GB of memory each, at most one per episode; 0
     evaluates in between, in the training process. Left to itself a run takes one per core if it has 20 evaluation

@@ -35,6 +35,10 @@ class NonFiniteError(CRPTproError):
     """A loss or a gradient became NaN or infinite."""
 
 
+class CompileError(CRPTproError):
+    """``torch.compile`` was asked for and does not work on this machine, or not for this loss."""
+
+
 def error_name(reason: BaseException) -> str:
     """Return the name under which another process can raise this error again; empty if it is not one of ours."""
     return type(reason).__name__ if isinstance(reason, CRPTproError) else ""

@@ -1,7 +1,7 @@
 """Run as a program: downstream runs in child processes, one left alone and one killed until it completes.
 
-python downstream_kill_target.py ROOT SEED  ->  ROOT/MODE/whole and ROOT/MODE/killed for both ways to features;
-prints the number of kills of each
+python downstream_kill_target.py ROOT SEED  ->  ROOT/MODE/whole and ROOT/MODE/killed for both ways to frozen features
+and for an encoder that is trained; prints the number of kills of each
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "data"))
 import torch
 from test_downstream import SMALL, small_pretrained, toy_env
 
-from crptpro.training import train_downstream
+from crptpro.training import downstream, train_downstream
 
 torch.set_num_threads(1)
 
@@ -30,9 +30,18 @@ CONFIG = dataclasses.replace(
     log_interval_env_steps=14,
     hidden_dim=32,  # small networks: the time goes into what a kill can disturb
 )
+TRAINED = "trained"
+MODES = {
+    "dense": {"features": "dense"},
+    "reencode": {"features": "reencode"},
+    TRAINED: {"algorithm": "drq", "intrinsic_reward_coef": 0.0},
+}
+downstream.random_pretrained = lambda *, seed: (
+    small_pretrained()
+)  # DrQ's first encoder, for the toy world's images
 
 
-def start(run_dir: Path, features: str) -> int:
+def start(run_dir: Path, mode: str) -> int:
     """Fork a child that trains; returns its process id."""
     pid = os.fork()
     if pid:
@@ -41,12 +50,12 @@ def start(run_dir: Path, features: str) -> int:
     try:
         train_downstream(
             "toy",
-            small_pretrained(),
+            None if mode == TRAINED else small_pretrained(),
             run_dir=run_dir,
             config=CONFIG,
             env_factory=toy_env,
             progress=False,
-            features=features,
+            **MODES[mode],
         )
         status = 0
     finally:
@@ -64,14 +73,14 @@ def wait(pid: int, seconds: float) -> int | None:
     return None
 
 
-def kill_until_complete(root: Path, features: str, rng: random.Random) -> int:
+def kill_until_complete(root: Path, mode: str, rng: random.Random) -> int:
     """Return how often it was killed."""
     began = time.monotonic()
-    if wait(start(root / "whole", features), 120) != 0:
+    if wait(start(root / "whole", mode), 120) != 0:
         raise SystemExit("the undisturbed child failed")
     whole_s, kills = time.monotonic() - began, 0
     while True:
-        pid = start(root / "killed", features)
+        pid = start(root / "killed", mode)
         # Longer with every kill, so that it ends on a machine of any speed.
         status = wait(pid, whole_s * rng.uniform(0.05, 0.5) * 1.1**kills)
         if status is None:
@@ -86,8 +95,8 @@ def kill_until_complete(root: Path, features: str, rng: random.Random) -> int:
 
 def main(root: Path, seed: int) -> None:
     rng = random.Random(seed)
-    for features in ("dense", "reencode"):
-        print(kill_until_complete(root / features, features, rng))
+    for mode in MODES:
+        print(kill_until_complete(root / mode, mode, rng))
 
 
 if __name__ == "__main__":

@@ -250,7 +250,9 @@ def test_what_auto_became_must_agree_when_a_run_is_continued(
         train(tmp_path, precision="bf16")
     with pytest.raises(CheckpointError, match="features was 'dense', now 'reencode'"):
         train(tmp_path, features="reencode")
-    assert train(tmp_path, features="dense").env_steps == 120
+    with pytest.raises(CheckpointError, match="compile was 'absent', now 'on'"):
+        train(tmp_path, features="dense", compile="on")
+    assert train(tmp_path, features="dense", compile="off").env_steps == 120
 
 
 def test_a_finished_run_encodes_nothing_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

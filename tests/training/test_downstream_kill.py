@@ -21,7 +21,7 @@ def record(path: Path) -> list[dict[str, str]]:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[int]]:
-    """Where the runs of both modes are, and how often each was killed."""
+    """Where the runs of all modes are, and how often each was killed."""
     root = tmp_path_factory.mktemp("runs")
     script = Path(__file__).with_name("downstream_kill_target.py")
     output = subprocess.run(
@@ -36,12 +36,12 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[int]]:
     return root, [int(kills) for kills in output.stdout.split()]
 
 
-@pytest.mark.parametrize("features", ["dense", "reencode"])
+@pytest.mark.parametrize("features", ["dense", "reencode", "trained"])
 def test_killed_at_random_moments_it_completes_with_the_same_records_and_agent(
     runs: tuple[Path, list[int]], features: str
 ) -> None:
     root, kills = runs
-    assert len(kills) == 2
+    assert len(kills) == 3
     assert min(kills) >= 2
     whole, killed = root / features / "whole", root / features / "killed"
     for name in ("eval.csv", "train.csv", "episodes.csv"):

@@ -102,3 +102,12 @@ def test_projections_give_way_before_dense_maps_do_and_others_needs_are_set_apar
         found[reserved] = (parts.feature_mode, parts.features.keeps_projections)
         assert (parts.bonus.projector is None) is parts.features.keeps_projections
     assert list(found.values()) == [("dense", True), ("dense", False), ("reencode", False)]
+
+
+def test_the_switches_reach_the_learner_and_are_off_on_a_cpu_unless_asked_for(tmp_path: Path) -> None:
+    learner = parts_of(small_pretrained(), tmp_path / "auto").learner
+    assert not learner.compiled.is_on
+    assert not learner.captures
+    assert parts_of(small_pretrained(), tmp_path / "on", compile="on").learner.compiled.is_on
+    with pytest.raises(ValueError, match="`cuda_graph` 'on' needs a CUDA device"):
+        parts_of(small_pretrained(), tmp_path / "graph", cuda_graph="on")

@@ -8,11 +8,13 @@ import math
 import pytest
 import torch
 import torch.nn.functional as F
+from host_reads import NoHostReads
 from tensordict import TensorDict
 from torch import Tensor, nn
 
 from crptpro.modules import SquashedGaussianActor, TwinCritic
 from crptpro.objectives import RADSACLoss
+from crptpro.training.compiled import Compiled
 from crptpro.training.rad_sac_learner import RADSACLearner
 
 FEATURES, ACTIONS, ROWS = 12, 2, 6
@@ -186,3 +188,40 @@ def test_a_restored_learner_continues_bit_equal() -> None:
         assert all(torch.equal(ours[key], theirs[key]) for key in ours)
     for name, tensors in parts(first).items():
         assert all(map(torch.equal, tensors, parts(second)[name])), name
+
+
+def test_a_captured_update_computes_what_a_plain_one_does_and_reads_nothing_back() -> None:
+    plain, captured = make_learner(), make_learner(captures=True)
+    for step in range(5):
+        expected = plain.update(batch(step), agent_step=step)
+        with NoHostReads():
+            found = captured.update(batch(step), agent_step=step)
+        assert expected.keys() == found.keys()
+        assert all(torch.equal(expected[key], found[key]) for key in expected)
+    assert all(torch.equal(a, b) for a, b in zip(plain.loss.parameters(), captured.loss.parameters()))
+
+
+def test_a_captured_learner_and_a_plain_one_continue_each_other() -> None:
+    first, second = make_learner(captures=True), make_learner(seed=1)
+    for step in range(2):
+        first.update(batch(step), agent_step=step)
+    second.load_state_dict(copy.deepcopy(first.state_dict()))
+    second.loss.generator.set_state(first.loss.generator.get_state())
+    assert not any(group["capturable"] for o in second.optimizers.values() for group in o.param_groups)
+    for step in range(2, 4):
+        for learner in (first, second):
+            learner.update(batch(step), agent_step=step)
+    assert all(torch.equal(a, b) for a, b in zip(first.loss.parameters(), second.loss.parameters()))
+
+
+@pytest.mark.slow
+def test_compiled_losses_agree_with_eager_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    compile = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda f, **options: compile(f, backend="aot_eager", **options))
+    plain, compiled = make_learner(), make_learner(compiled=Compiled(is_on=True))
+    for step in range(4):
+        expected = plain.update(batch(step), agent_step=step)
+        found = compiled.update(batch(step), agent_step=step)
+        torch.testing.assert_close(found, expected)
+    for one, two in zip(plain.loss.parameters(), compiled.loss.parameters()):
+        torch.testing.assert_close(one, two, rtol=0, atol=1e-4)

@@ -13,6 +13,7 @@ from tyro.conf import Positional, subcommand
 from crptpro.cards import cpu_cores
 from crptpro.cli.downstream import Downstream, DrQ
 from crptpro.cli.evaluate import Evaluate
+from crptpro.cli.originals import Export, Import
 from crptpro.cli.pretraining import Finetune, Pretrain
 from crptpro.cli.request import expand_groups
 from crptpro.console import run_main
@@ -84,6 +85,8 @@ def main() -> None:
         | Annotated[Downstream, subcommand("downstream")]
         | Annotated[DrQ, subcommand("drq")]
         | Annotated[Evaluate, subcommand("evaluate")]
+        | Annotated[Import, subcommand("import")]
+        | Annotated[Export, subcommand("export")]
     ]
     run_main(lambda: tyro.cli(commands, prog="crptpro", description=DESCRIPTION).run())
 

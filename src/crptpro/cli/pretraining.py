@@ -38,6 +38,10 @@ class PretrainingOptions:
     """seeds initialisation, sampling and shifts"""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """arithmetic of the convolutions and big matrix products"""
+    compile: Literal["auto", "on", "off"] = "auto"
+    """compile the loss with torch.compile; changes rounding only (auto: off)"""
+    cuda_graph: Literal["auto", "on", "off"] = "auto"
+    """on a GPU, record the update once and replay it (auto: off)"""
     device: str = "cpu"
     """where to train"""
     checkpoint_interval: int = 500
@@ -50,7 +54,8 @@ class PretrainingOptions:
     def training_arguments(self) -> dict[str, Any]:
         """Return the keywords that `pretrain` and `finetune` share."""
         names = (
-            "batch_size", "learning_rate", "seed", "precision", "device", "checkpoint_interval", "log_interval",
+            "batch_size", "learning_rate", "seed", "precision", "compile", "cuda_graph", "device",
+            "checkpoint_interval", "log_interval",
         )  # fmt: skip
         return {name: getattr(self, name) for name in names} | {"run_dir": self.out}
 

@@ -7,10 +7,11 @@ have finished spin until the slowest comes back. Here they meet once per batch.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -27,6 +28,7 @@ ChunkFunction = Callable[[Tensor, Sequence[Tensor]], Tensor]
 
 _pools: dict[int, ThreadPoolExecutor] = {}
 _pools_lock = threading.Lock()
+_is_passed_by = False
 
 
 def apply_to_chunks(
@@ -36,7 +38,8 @@ def apply_to_chunks(
 
     The gradient of every parameter is the sum over the chunks in their order, whatever the number of threads. There is
     no second derivative. Where somebody watches or changes the operations themselves (autocast, compiling, tracing,
-    ``torch.func``), which other threads would not see, the chunks are computed here one after the other.
+    ``torch.func``), which other threads would not see, the chunks are computed here one after the other; compiling
+    passes them by inside :func:`chunks_uncompiled`.
 
     Args:
         function: maps a chunk ``[n, ...]`` and the parameters to ``[n, ...]``; must be thread-safe.
@@ -46,11 +49,39 @@ def apply_to_chunks(
     Returns:
         ``[sum of n, ...]``.
     """
+    if _is_passed_by:
+        return _apply_uncompiled(function, chunks, parameters)
+    return _apply(function, chunks, parameters)
+
+
+@contextlib.contextmanager
+def chunks_uncompiled() -> Iterator[None]:
+    """Have what is compiled inside leave :func:`apply_to_chunks` alone, threads included.
+
+    On two cores a compiled pre-training update was 13 % slower where the compiler had taken the chunks apart, and no
+    slower than an uncompiled one where it had not.
+    """
+    global _is_passed_by
+    before, _is_passed_by = _is_passed_by, True
+    try:
+        yield
+    finally:
+        _is_passed_by = before
+
+
+def _apply(function: ChunkFunction, chunks: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
     if _is_watched():
         return torch.cat([function(chunk, parameters) for chunk in chunks])
     if torch.is_grad_enabled() and any(parameter.requires_grad for parameter in parameters):
         return _Chunks.apply(function, chunks, *parameters)
     return torch.cat(map_side_by_side(lambda chunk: function(chunk, parameters), chunks))
+
+
+@torch.compiler.disable(reason="threads that compute side by side are nothing a compiler could see")
+def _apply_uncompiled(
+    function: ChunkFunction, chunks: Sequence[Tensor], parameters: Sequence[Tensor]
+) -> Tensor:
+    return _apply(function, chunks, parameters)
 
 
 def map_side_by_side(work: Callable[[T], R], items: Sequence[T]) -> list[R]:

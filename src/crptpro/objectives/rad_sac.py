@@ -14,6 +14,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SACLoss, ValueEstimators
 
 from crptpro.modules import PixelCritic, SquashedGaussianActor, TwinCritic
+from crptpro.modules.actor_critic import standard_normal_like
 from crptpro.modules.distributions import SquashedGaussian
 from crptpro.objectives.base import valid_rows
 from crptpro.objectives.masked_rows import mean_of_rows, without_masked_values
@@ -41,8 +42,8 @@ class RADSACLoss(SACLoss):
             out = loss.actor_and_temperature_loss(td)   # backward each, step both
             target_updater.step()                       # SoftUpdate(loss, tau=0.01)
 
-    Deviation: the released code bootstraps with 0.99 always. Here ``terminated`` cuts the bootstrap and
-    ``truncated`` does not, which is the same for every DeepMind Control task.
+    Deviation: the released code always bootstraps. Here ``terminated`` cuts it, ``truncated`` does not; no difference
+    for DeepMind Control tasks.
 
     Args:
         actor: on features.
@@ -58,9 +59,8 @@ class RADSACLoss(SACLoss):
 
     Returns (``forward``):
         ``loss_actor``, ``loss_qvalue``, ``loss_alpha`` and, detached scalars, ``alpha``, ``entropy`` (-log
-        pi, nats), ``q_mean``, ``target_q_mean``, ``td_error`` (mean over rows of the
-        larger of the two heads' absolute errors). Non-finite input propagates;
-        the training loop checks. Batches of any shape, one row included.
+        pi, nats), ``q_mean``, ``target_q_mean``, ``td_error`` (mean over rows of the larger of the two heads'
+        absolute errors). Non-finite input propagates; the loop checks. Batches of any shape, one row included.
 
     Raises:
         ValueError: ``gamma`` outside [0, 1], or an ``alpha_init`` that is not positive.
@@ -214,8 +214,9 @@ class RADSACLoss(SACLoss):
         """Actor loss and the detached log-probability of its actions."""
         tensordict = without_masked_values(self, tensordict)
         features = self._policy_features(self._views(tensordict)[0])
+        noise = self._noise(features)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            action, log_prob = self.actor.sample(features, generator=self.generator)
+            action, log_prob = self.actor.sample(features, noise=noise)
         # Detached weights: the gradient passes through Q to the action and to nothing else.
         with self._cached_detached_qvalue_params.to_module(self.qvalue_network, preserve_module_state=False):
             value = self._q_values_on_features(features, action).amin(-1)
@@ -235,8 +236,9 @@ class RADSACLoss(SACLoss):
         soft_values = []
         for view in self._views(tensordict.get("next")):
             features = self._policy_features(view)
+            noise = self._noise(features)
             with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-                action, log_prob = self.actor.sample(features, generator=self.generator)
+                action, log_prob = self.actor.sample(features, noise=noise)
             with self.target_qvalue_network_params.to_module(
                 self.qvalue_network, preserve_module_state=False
             ):
@@ -246,6 +248,11 @@ class RADSACLoss(SACLoss):
         estimate = tensordict.select(*[unravel_key(("next", name)) for name in names], strict=False)
         estimate.set(("next", self.value_estimator.tensor_keys.value), soft_value)
         return self.value_estimator.value_estimate(estimate).squeeze(-1)
+
+    def _noise(self, features: Tensor) -> Tensor:
+        # Drawn before the parameters are swapped in, where a compiler cannot pause for a generator.
+        like = features.new_empty(*features.shape[:-1], self.actor.action_dim, dtype=self.log_alpha.dtype)
+        return standard_normal_like(like, self.generator)
 
     # What subclasses change: how many views there are of an observation, and what lies before the features.
 

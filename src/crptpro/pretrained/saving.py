@@ -49,7 +49,7 @@ def save_pretrained(
         DiskSpaceError: if the disk is full; an artifact there is kept.
     """
     path = Path(path)
-    _refuse_foreign(path)
+    refuse_foreign(path)
     states: dict[str, Mapping[str, Tensor]] = {}
     described: dict[str, dict[str, Any]] = {}
     for role in ROLES:
@@ -80,11 +80,11 @@ def save_pretrained(
         described[ACTOR] = {"class": type(actor).__name__, "config": actor.config}
     if isinstance(queue := getattr(loss, QUEUE, None), Tensor):
         states[QUEUE] = {"latents": queue}
-    if rest := _rest_state(loss):
+    if rest := rest_state(loss):
         states[REST] = rest
     encoder = described["encoder"]["config"]
     card = {
-        **(loss.card if isinstance(loss, Pretrained) else _describe_loss(loss)),
+        **(loss.card if isinstance(loss, Pretrained) else describe_loss(loss)),
         "modules": described,
         "pixels": {
             "image_size": encoder.get("image_size"),
@@ -104,7 +104,8 @@ def save_pretrained(
         raise
 
 
-def _describe_loss(loss: LossModule) -> dict[str, Any]:
+def describe_loss(loss: LossModule) -> dict[str, Any]:
+    """Return what the card says of a loss: method, class, options, training."""
     name = getattr(loss, "method_name", None)
     if name is None:
         exact = [m for m in methods() if get_method(m).loss_class is type(loss)]
@@ -135,7 +136,8 @@ def _loss_options(loss: LossModule) -> dict[str, Any]:
     return options
 
 
-def _rest_state(loss: LossModule | Pretrained) -> dict[str, Tensor]:
+def rest_state(loss: LossModule | Pretrained) -> dict[str, Tensor]:
+    """Return the state of a loss that is not in the networks an artifact names: further heads, coefficients."""
     if isinstance(loss, Pretrained):
         return loss.rest
     covered = [f"{role}{suffix}" for role in (*ROLES, *TARGET_ROLES) for suffix in (".", "_params.")]
@@ -147,8 +149,12 @@ def _rest_state(loss: LossModule | Pretrained) -> dict[str, Tensor]:
     }
 
 
-def _refuse_foreign(path: Path) -> None:
-    """Never replace a directory that is not an artifact."""
+def refuse_foreign(path: Path) -> None:
+    """Never replace a directory that is not an artifact.
+
+    Raises:
+        PretrainedError: there is one at ``path``.
+    """
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
     is_artifact = (path / CARD_FILE).exists() and read_json(path / CARD_FILE).get("format") == FORMAT

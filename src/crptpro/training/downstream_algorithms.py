@@ -24,6 +24,7 @@ from crptpro.modules.placement import device_of
 from crptpro.objectives import DrQLoss, RADSACLoss, SkillDDPGLoss
 from crptpro.seeding import derive_seed
 from crptpro.training.agent import FeatureActor
+from crptpro.training.compiled import Compiled
 from crptpro.training.rad_sac_learner import RADSACLearner
 from crptpro.training.skill_ddpg_learner import SkillDDPGLearner
 
@@ -84,6 +85,8 @@ def make_algorithm(
     seed: int,
     generator: torch.Generator,
     actor: SquashedGaussianActor | None = None,
+    compiled: Compiled | None = None,
+    captures: bool = False,
 ) -> DownstreamAlgorithm:
     """Build the algorithm that ``config.algorithm`` names, with fresh networks.
 
@@ -95,51 +98,42 @@ def make_algorithm(
         seed: decides the skill where none is given.
         generator: source of all action noise.
         actor: of rad-sac, to start from instead of a fresh one.
+        compiled: whether the losses are compiled; of rad-sac and drq, as the next.
+        captures: whether updates are recorded as CUDA graphs.
     """
-    if actor is not None:
-        return _rad_sac(encoder, action_dim, config, seed, generator, actor)
-    return _BUILDERS[config.algorithm](encoder, action_dim, config, seed, generator)
-
-
-def _rad_sac(
-    encoder: PixelEncoder,
-    action_dim: int,
-    config: SACSettings,
-    seed: int,
-    generator: torch.Generator,
-    transferred: SquashedGaussianActor | None = None,
-) -> DownstreamAlgorithm:
-    actor, critic = _sac_networks(encoder, action_dim, config)
-    if transferred is not None:
-        actor = transferred.to(device_of(critic))
-    loss = RADSACLoss(actor, critic, **_sac_options(config, generator))
-    return _sac(loss, config, explores_at_once=transferred is not None)
-
-
-def _drq(
-    encoder: PixelEncoder, action_dim: int, config: SACSettings, seed: int, generator: torch.Generator
-) -> DownstreamAlgorithm:
-    actor, critic = _sac_networks(encoder, action_dim, config, has_tanh=True)
-    loss = DrQLoss(encoder.requires_grad_(True), actor, critic, **_sac_options(config, generator))
-    return _sac(loss, config, trains_encoder=True)
-
-
-def _sac(
-    loss: RADSACLoss, config: SACSettings, *, trains_encoder: bool = False, explores_at_once: bool = False
-) -> DownstreamAlgorithm:
+    if config.algorithm == "skill-ddpg":
+        return _skill_ddpg(encoder, action_dim, config, seed, generator)
+    trains_encoder = config.algorithm == "drq"
+    fresh, critic = _sac_networks(encoder, action_dim, config, has_tanh=trains_encoder)
+    options: dict[str, Any] = {
+        "gamma": config.discount,
+        "alpha_init": config.initial_temperature,
+        "generator": generator,
+    }
+    loss: RADSACLoss
+    if trains_encoder:
+        loss = DrQLoss(encoder.requires_grad_(True), fresh, critic, **options)
+    else:
+        loss = RADSACLoss(fresh if actor is None else actor.to(device_of(critic)), critic, **options)
     learner = RADSACLearner(
         loss,
         learning_rate=config.learning_rate,
         critic_tau=config.critic_tau,
         actor_update_interval=config.actor_update_interval,
         target_update_interval=config.target_update_interval,
+        compiled=compiled,
+        captures=captures,
     )
 
     def explore(features: Tensor) -> Tensor:
-        return loss.actor.sample(features, generator=loss.generator)[0]
+        return loss.actor.sample(features, generator=generator)[0]
 
     return DownstreamAlgorithm(
-        loss.actor, explore, learner, trains_encoder=trains_encoder, explores_at_once=explores_at_once
+        loss.actor,
+        explore,
+        learner,
+        trains_encoder=trains_encoder,
+        explores_at_once=actor is not None and not trains_encoder,
     )
 
 
@@ -151,14 +145,6 @@ def _sac_networks(
     actor = SquashedGaussianActor(encoder.feature_dim, action_dim, has_tanh=has_tanh, **widths)
     critic = TwinCritic(encoder.feature_dim, action_dim, has_tanh=has_tanh, **widths)
     return actor.to(device), critic.to(device)
-
-
-def _sac_options(config: SACSettings, generator: torch.Generator) -> dict[str, Any]:
-    return {
-        "gamma": config.discount,
-        "alpha_init": config.initial_temperature,
-        "generator": generator,
-    }
 
 
 def _skill_ddpg(
@@ -181,10 +167,3 @@ def _skill_ddpg(
         n_step=own.n_step,
         constants={"skill": one_hot_skill(skill, own.skill_dim).to(device)},
     )
-
-
-_BUILDERS: dict[str, Callable[..., DownstreamAlgorithm]] = {
-    "rad-sac": _rad_sac,
-    "drq": _drq,
-    "skill-ddpg": _skill_ddpg,
-}

@@ -21,7 +21,9 @@ STREAMS = ("train", "episodes", "eval")
 
 COUNTERS = ("agent_steps", "updates", "episodes", "last_eval", "next_eval", "next_checkpoint")
 
-FREE_TO_CHANGE = ("env_steps", "device", "features", "precision", "eval_workers", "render_ahead")
+FREE_TO_CHANGE = (
+    "env_steps", "device", "features", "precision", "compile", "cuda_graph", "eval_workers", "render_ahead",
+)  # fmt: skip
 """Settings that a run may be continued with other values of: budgets may grow, machines differ. What `auto` became
 is compared instead of what was asked."""
 
@@ -43,6 +45,12 @@ def fingerprint(run: DownstreamRun) -> dict[str, Any]:
         "features": run.parts.feature_mode,
         "projections": "kept" if run.parts.features.keeps_projections else "computed",
     }
+    # Only where they are used: a run from before they existed can be continued.
+    compiled = getattr(run.parts.learner, "compiled", None)
+    if compiled is not None and compiled.is_on:
+        resolved["compile"] = "on"
+    if getattr(run.parts.learner, "generator", None) is not None:
+        resolved["action noise"] = "drawn on the device"
     return {"task": run.task, **settings, **resolved, "pretrained": run.pretrained_identity}
 
 

@@ -20,6 +20,8 @@ from crptpro.modules import PixelEncoder, resolve_precision, set_compute_dtype
 from crptpro.pretrained import Pretrained
 from crptpro.training.actor_transfer import transferred_actor
 from crptpro.training.agent import PixelAgent
+from crptpro.training.captured import resolve_cuda_graph
+from crptpro.training.compiled import Compiled, resolve_compile
 from crptpro.training.downstream_algorithms import DownstreamAlgorithm, Learner, make_algorithm
 from crptpro.training.frozen_features import FrozenFeatures, dense_slots
 from crptpro.training.trained_features import TrainedFeatures
@@ -135,6 +137,8 @@ def build_parts(
         seed=config.seed,
         generator=generators["policy"],
         actor=transferred_actor(task, pretrained, config, action_dim=action_dim),
+        compiled=Compiled(is_on=resolve_compile(config.compile)),
+        captures=resolve_cuda_graph(config.cuda_graph, config.device),
     )
     set_compute_dtype(algorithm.learner.loss, dtype)
     replay = _build_replay(env, config, generators["replay"], run_dir)

@@ -60,13 +60,13 @@ class TrainedFeatures:
             The replay's sample ``[B]`` with shifted ``pixels`` and ``("next", "pixels")`` and, from the same images,
             ``pixels_view`` and ``("next", "pixels_view")``; uint8 ``[B, C, H, W]``, on :attr:`device`.
         """
-        batch = self.replay.sample(batch_size)
+        batch = self.replay.sample(batch_size).to(self.device)
         for part in (batch, batch["next"]):
             pixels = part["pixels"]
             for key in ("pixels", "pixels_view"):
-                offsets = draw_offsets(len(pixels), self.pad, self.generator)
+                offsets = draw_offsets(len(pixels), self.pad, self.generator, self.device)
                 part.set(key, random_shift(pixels, offsets, pad=self.pad))
-        return batch.to(self.device)
+        return batch
 
     def rebuild(self, *, progress: bool = True) -> None:
         """Nothing is kept, so nothing is to be rebuilt."""

@@ -17,9 +17,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from crptpro.host_memory import as_numpy_bits, empty_batch
 from crptpro.modules import PixelEncoder
 from crptpro.modules.chunks import split_among_threads
-from crptpro.transforms.host_memory import as_numpy_bits, empty_on_huge_pages
 from crptpro.transforms.random_shift import check_offsets
 
 
@@ -176,7 +176,7 @@ def crop_rows(
         return _crop_by_index(maps, rows, offsets, phases, (extra + 1, height, width), out)
     # Channels first although channels last would copy in longer runs: the features must come in (C, H, W)
     # order, and turning a batch around costs three times the whole copy.
-    crops = empty_on_huge_pages(shape, maps.dtype) if out is None else out
+    crops = empty_batch(shape, maps.dtype) if out is None else out
     source = as_numpy_bits(maps)
     target = as_numpy_bits(crops).reshape(batch, channels, height, width)
     where = list(zip(rows.tolist(), offsets.tolist()))

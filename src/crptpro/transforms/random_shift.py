@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.data.tensor_specs import Composite
 from torchrl.envs.transforms import Transform
 
-from crptpro.transforms.host_memory import as_numpy_bits, empty_on_huge_pages
+from crptpro.host_memory import as_numpy_bits, empty_batch
 from crptpro.transforms.keys import as_key_list
 from crptpro.transforms.root_keys import KeyPair, OnRootKeys
 
@@ -110,7 +110,7 @@ def shifted_stacks(frames: Tensor, rows: Tensor, offsets: Tensor, *, pad: int = 
         return random_shift(frames[rows].reshape(shape), offsets, pad=pad)
     check_offsets(offsets, pad)
     source = as_numpy_bits(frames)
-    shifted = empty_on_huge_pages(shape, frames.dtype)
+    shifted = empty_batch(shape, frames.dtype)
     for view, numbers, offset in zip(as_numpy_bits(shifted), rows.tolist(), (offsets - pad).tolist()):
         first, last = numbers[0], numbers[-1]
         # Where an episode begins, its first frame is repeated, and the frames are picked one by one.
@@ -145,7 +145,7 @@ def _shift_by_gather(pixels: Tensor, offsets: Tensor, pad: int) -> Tensor:
 
 
 def _shift_by_slices(pixels: Tensor, offsets: Tensor, pad: int) -> Tensor:
-    shifted = empty_on_huge_pages(pixels.shape, pixels.dtype)
+    shifted = empty_batch(pixels.shape, pixels.dtype)
     source, target = as_numpy_bits(pixels.detach()), as_numpy_bits(shifted)
     for image, view, offset in zip(source, target, (offsets - pad).tolist()):
         _copy_shifted(view, image, *offset)

@@ -8,10 +8,10 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from crptpro.host_memory import empty_on_huge_pages
 from crptpro.modules import PixelEncoder
 from crptpro.transforms.dense_shift import crop_features, crop_rows, dense_shift_geometry, dense_shift_maps
 from crptpro.transforms.free_memory import free_bytes
-from crptpro.transforms.host_memory import empty_on_huge_pages
 
 FeatureMode = Literal["auto", "dense", "reencode"]
 

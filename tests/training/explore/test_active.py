@@ -245,7 +245,9 @@ def test_a_diverged_explorer_stops_the_run(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(ActiveRun, "_update", spoil)
     with pytest.raises(NonFiniteError, match="explorer of even acts"):
-        explore(None)
+        explore(None, checkpoint_interval_env_steps=1_000)
+    with pytest.raises(NonFiniteError, match=r"trunk\.linear\.weight is not finite"):
+        explore(None, checkpoint_interval_env_steps=4)
 
 
 def test_the_artifact_carries_the_candidates_to_the_downstream_stage(tmp_path: Path) -> None:

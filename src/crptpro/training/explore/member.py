@@ -70,11 +70,6 @@ class Member:
         self._action: Tensor | None = None
         self._reward_sum = 0.0
 
-    @property
-    def is_learning(self) -> bool:
-        """Whether the random phase is over."""
-        return self.agent_steps >= self.random_agent_steps
-
     def decide(self, encoder: nn.Module, device: torch.device) -> None:
         """Choose the next action, from the settled observation, and begin the environment's step.
 
@@ -163,7 +158,7 @@ class Member:
 
     @torch.no_grad()
     def _act(self, pixels: Tensor, encoder: nn.Module, device: torch.device) -> Tensor:
-        if not self.is_learning:
+        if self.agent_steps < self.random_agent_steps:
             return torch.rand(self.action_dim, generator=self.generators["random_actions"]) * 2 - 1
         features = encoder(pixels.unsqueeze(0).to(device))
         skill = None if self.skill_dim is None else self.one_hot_skill().to(device)

@@ -37,7 +37,8 @@ class Plan:
     Attributes:
         repeats: simulator steps per decision, of each domain in the order of turns.
         agent_steps: decisions of each domain.
-        random_agent_steps: of these, without updates.
+        random_agent_steps: of these, at random.
+        first_update: decision of a domain from which on updates come with it: there is something to learn from then.
         encoder_update_interval: of a domain's own decisions.
         encoder_updates_each: encoder updates every time.
         agent_update_interval: of a domain's own decisions.
@@ -46,6 +47,7 @@ class Plan:
     repeats: tuple[int, ...]
     agent_steps: int
     random_agent_steps: int
+    first_update: int
     encoder_update_interval: int
     encoder_updates_each: int
     agent_update_interval: int
@@ -64,7 +66,7 @@ class Plan:
     def encoder_updates(self) -> int:
         """Over all domains."""
         interval = self.encoder_update_interval
-        turns = -(-self.agent_steps // interval) - -(-self.random_agent_steps // interval)
+        turns = -(-self.agent_steps // interval) - -(-self.first_update // interval)
         return max(0, turns) * self.encoder_updates_each * len(self.repeats)
 
     def env_steps_after(self, decisions: int) -> int:
@@ -74,11 +76,11 @@ class Plan:
 
     def trains_encoder(self, agent_step: int) -> bool:
         """Whether a domain's decision number ``agent_step`` (from 0) comes with encoder updates."""
-        return agent_step >= self.random_agent_steps and agent_step % self.encoder_update_interval == 0
+        return agent_step >= self.first_update and agent_step % self.encoder_update_interval == 0
 
     def trains_agent(self, agent_step: int) -> bool:
         """Whether a domain's decision number ``agent_step`` (from 0) comes with an update of its agent."""
-        return agent_step >= self.random_agent_steps and agent_step % self.agent_update_interval == 0
+        return agent_step >= self.first_update and agent_step % self.agent_update_interval == 0
 
 
 def make_plan(config: ActiveConfig, repeats: Sequence[int]) -> Plan:
@@ -97,6 +99,7 @@ def make_plan(config: ActiveConfig, repeats: Sequence[int]) -> Plan:
         repeats=tuple(repeats),
         agent_steps=-(-config.env_steps // share),
         random_agent_steps=config.random_agent_steps or 0,
+        first_update=max(config.random_agent_steps or 0, config.n_step or 1),
         encoder_update_interval=config.encoder_update_interval or 1,
         encoder_updates_each=config.encoder_updates_each or 1,
         agent_update_interval=config.agent_update_interval or 1,

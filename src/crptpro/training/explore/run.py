@@ -157,8 +157,7 @@ class ActiveRun:
         member = self.members[index]
         member.decide(self.loss.encoder, self.device)
         self.decisions += 1
-        if member.is_learning:
-            self._update(index)
+        self._update(index)
         self._log_episode(index)
 
     def _update(self, index: int) -> None:

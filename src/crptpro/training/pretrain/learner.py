@@ -12,6 +12,8 @@ from torch import Tensor
 from torchrl.objectives import LossModule, SoftUpdate
 
 from crptpro.objectives import MethodDefaults
+from crptpro.training.captured import CapturedCall, portable_state, prepare_optimizer
+from crptpro.training.compiled import Compiled
 from crptpro.training.finite import not_finite, require_finite_parameters
 
 
@@ -24,6 +26,10 @@ class Learner:
         learning_rate: peak learning rate.
         encoder_tau: EMA rate of the targets, every update; ``None`` for none.
         updates: length of the run, for the schedule.
+        compiled: whether, and how strictly, the loss is compiled; by default it is not.
+        captures: on a GPU, record the whole update as a CUDA graph and replay it. The learning rate of a
+            schedule and the number of the update are tensors then, written before each replay.
+        inputs: batches that the caller writes always into this one tensordict, where it ``captures``.
     """
 
     def __init__(
@@ -34,6 +40,9 @@ class Learner:
         learning_rate: float,
         encoder_tau: float | None,
         updates: int,
+        compiled: Compiled | None = None,
+        captures: bool = False,
+        inputs: TensorDictBase | None = None,
     ) -> None:
         self.loss = loss
         self.defaults = defaults
@@ -58,8 +67,15 @@ class Learner:
         self.names: list[str] = []
         self._loss_count = 0
         # Reading a loss from a GPU would wait for it at every update; there, `check` looks at intervals.
-        self.is_deferred = parameters[0].device.type != "cpu"
+        self.is_deferred = captures or parameters[0].device.type != "cpu"
         self._first_bad: Tensor | None = None
+        self._index = torch.zeros((), dtype=torch.int64, device=parameters[0].device)
+        self.compiled = compiled or Compiled(is_on=False)
+        self._evaluate = self.compiled.wrap(loss)
+        self._is_settled = False
+        self.captured = CapturedCall(self._captured_update, inputs=inputs) if captures else None
+        if captures:
+            self._prepare_optimizer()
 
     def update(self, batch: TensorDictBase, *, index: int, domain: str) -> Tensor:
         """Do update number ``index`` (from 0) and return the scalars of ``names`` as float64, on the device.
@@ -68,16 +84,32 @@ class Learner:
             NonFiniteError: on the CPU, before the weights change; on other devices :meth:`check` raises
                 later.
         """
+        self._set_learning_rate(index)
+        self._index.fill_(index)
+        if self._is_settled:
+            return self._step(batch, domain)
+        # What fails to compile does so before the optimiser steps, so that nothing has changed yet.
+        values = self.compiled.attempt(lambda: self._step(batch, domain))
+        self._is_settled = True
+        return values
+
+    def _step(self, batch: TensorDictBase, domain: str) -> Tensor:
+        return self._advance(batch, domain) if self.captured is None else self.captured(batch)["values"]
+
+    def _captured_update(self, batch: TensorDictBase) -> dict[str, Tensor]:
+        return {"values": self._advance(batch, "any")}
+
+    def _advance(self, batch: TensorDictBase, domain: str) -> Tensor:
+        """Do the update; without reading anything back to the host, unless losses are checked on the CPU."""
         if callable(hook := getattr(self.loss, "before_update", None)):
             hook()
-        out = self.loss(batch)
+        out = self._evaluate(batch)
         if not self.names:
             self._name_outputs(out)
         terms = [out.get(name) for name in self.names]
         total = sum(terms[: self._loss_count])
         values = torch.stack([term.detach().reshape(()).float() for term in terms]).double()
-        self._watch(values, index, domain)
-        self._set_learning_rate(index)
+        self._watch(values, domain)
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         if self.defaults.grad_clip is not None:
@@ -105,7 +137,8 @@ class Learner:
 
     def state_dict(self) -> dict[str, Any]:
         """Return weights, targets and optimiser state."""
-        return {"loss": self.loss.state_dict(), "optimizer": self.optimizer.state_dict(), "names": self.names}
+        optimizer = self.optimizer.state_dict() if self.captured is None else portable_state(self.optimizer)
+        return {"loss": self.loss.state_dict(), "optimizer": optimizer, "names": self.names}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore :meth:`state_dict`."""
@@ -113,6 +146,13 @@ class Learner:
         self.optimizer.load_state_dict(state["optimizer"])
         self.names = list(state["names"])
         self._loss_count = sum(name.startswith("loss") for name in self.names)
+        if self.captured is not None:
+            self._prepare_optimizer()
+            self.captured.forget()
+
+    def _prepare_optimizer(self) -> None:
+        rate_changes = self.defaults.schedule != "constant"
+        prepare_optimizer(self.optimizer, self._index.device, rate_changes=rate_changes)
 
     def _name_outputs(self, out: TensorDictBase) -> None:
         """Loss terms first, then diagnostics; both must be scalars."""
@@ -129,28 +169,30 @@ class Learner:
         rest = [key for key in keys if key not in terms and getattr(out.get(key), "numel", lambda: 0)() == 1]
         self.names, self._loss_count = [*terms, *rest], len(terms)
 
-    def _watch(self, values: Tensor, index: int, domain: str) -> None:
+    def _watch(self, values: Tensor, domain: str) -> None:
         finite = torch.isfinite(values)
         if not self.is_deferred:
             for name, value, is_finite in zip(
                 self.names[: self._loss_count], values.tolist(), finite.tolist()
             ):
                 if not is_finite:
-                    raise not_finite(f"Update {index + 1} on domain {domain!r}: {name} is {value}")
+                    raise not_finite(f"Update {int(self._index) + 1} on domain {domain!r}: {name} is {value}")
             return
         # No host synchronisation here: the first bad update of each term is remembered on the device.
         if self._first_bad is None:
             self._first_bad = torch.full((self._loss_count,), -1, device=values.device)
         is_first = ~finite[: self._loss_count] & (self._first_bad < 0)
-        self._first_bad = torch.where(is_first, index, self._first_bad)
+        self._first_bad.copy_(torch.where(is_first, self._index, self._first_bad))
 
     def _set_learning_rate(self, index: int) -> None:
         if self.defaults.schedule == "constant":
             return
+        rate = self.learning_rate * warmup_cosine(index, self.defaults.warmup_updates, self.updates)
         for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate * warmup_cosine(
-                index, self.defaults.warmup_updates, self.updates
-            )
+            if isinstance(group["lr"], Tensor):
+                group["lr"].fill_(rate)
+            else:
+                group["lr"] = rate
 
 
 def warmup_cosine(index: int, warmup: int, updates: int) -> float:

@@ -16,10 +16,21 @@ from crptpro.modules import resolve_precision, set_compute_dtype
 from crptpro.modules.precision import Precision
 from crptpro.objectives import method_defaults
 from crptpro.seeding import derive_seed
+from crptpro.training.captured import resolve_cuda_graph
+from crptpro.training.compiled import Compiled, Switch, resolve_compile
+from crptpro.training.pretrain.device_batches import DeviceBatches
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.result import PretrainResult
 from crptpro.training.pretrain.run import PretrainRun
-from crptpro.training.pretrain.sources import Augment, Augmenter, open_sources, views_read
+from crptpro.training.pretrain.sources import (
+    SHIFT_PAD,
+    Augment,
+    Augmenter,
+    Source,
+    keys_read,
+    open_sources,
+    views_read,
+)
 
 
 def pretrain(
@@ -33,6 +44,8 @@ def pretrain(
     seed: int = 0,
     augment: Augment = "random_shift",
     precision: Precision = "auto",
+    compile: Switch = "auto",
+    cuda_graph: Switch = "auto",
     device: str | torch.device = "cpu",
     run_dir: str | Path | None = None,
     logger: RunLogger | None = None,
@@ -70,7 +83,12 @@ def pretrain(
             the same images, shifted once more (copies for ``"none"`` and a function).
         precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (bf16 where the hardware multiplies it natively).
             Deviation: the released code computes in fp32 throughout, which ``"fp32"`` gives.
-        device: where to train. Directories are then opened on it: a GPU holds a copy of the frames.
+        compile: ``"on"``, ``"off"`` or ``"auto"`` (off): compile the loss with ``torch.compile``. Changes
+            rounding only. On a CPU the convolutions stay as they are.
+        cuda_graph: ``"on"``, ``"off"`` or ``"auto"`` (off): on a GPU, record the whole update and replay it. An
+            own loss must not read values back to the host (``.item()``) then.
+        device: where to train. Directories are then opened on it: a GPU holds a copy of the frames, and
+            batches are drawn and shifted there.
         run_dir: record (``pretrain.csv``, ``metrics.jsonl``) and checkpoints; ``None`` writes nothing.
         logger: used instead of a local record in ``run_dir``, e.g. one that mirrors to W&B.
         log_interval: updates between two rows; each holds means over the updates since the last.
@@ -89,6 +107,7 @@ def pretrain(
         NonFiniteError: naming update, domain and term; the last checkpoint is kept.
         DatasetError: if a dataset is unusable, shows other images than the encoder takes, or lacks an entry
             that the loss reads.
+        CompileError: if compiling is asked for and fails, or an update cannot be recorded.
         DiskSpaceError: if the disk cannot hold the checkpoints.
     """
     defaults = method_defaults(loss)
@@ -107,6 +126,8 @@ def pretrain(
         raise ValueError(f"`encoder_tau` must be in [0, 1], got {encoder_tau}.")
     device = torch.device(device)
     dtype = resolve_precision(precision, device)
+    compiled = Compiled(is_on=resolve_compile(compile))
+    captures = resolve_cuda_graph(cuda_graph, device)
     cuda = [device.index or 0] if device.type == "cuda" else []
     loss.to(device).train()
     with contextlib.ExitStack() as stack:
@@ -120,6 +141,9 @@ def pretrain(
         if run_dir is not None:
             stack.enter_context(DirectoryLock(run_dir, error=CheckpointError, is_reentrant=True))
             logger = logger or stack.enter_context(RunLogger(run_dir))
+        batches = _device_batches(
+            loss, sources, augment, settings["batch_size"], seed, compiled=compiled, captures=captures
+        )
         run = PretrainRun(
             loss,
             sources,
@@ -130,7 +154,11 @@ def pretrain(
                 learning_rate=defaults.lr if learning_rate is None else learning_rate,
                 encoder_tau=defaults.encoder_tau if encoder_tau is None else encoder_tau,
                 updates=settings["updates"],
+                compiled=compiled,
+                captures=captures,
+                inputs=None if batches is None else batches.batch,
             ),
+            batches=batches,
             settings={**settings, "seed": seed, "patience_updates": patience_updates},
             device=device,
             precision="bf16" if dtype == torch.bfloat16 else "fp32",
@@ -139,3 +167,36 @@ def pretrain(
         )
         run.prepare(resume=resume)
         return run.train(progress=progress)
+
+
+def _device_batches(
+    loss: LossModule,
+    sources: list[Source],
+    augment: Augment,
+    batch_size: int,
+    seed: int,
+    *,
+    compiled: Compiled,
+    captures: bool,
+) -> DeviceBatches | None:
+    """Batches made on the GPU that holds the frames, or None where they are made on the CPU."""
+    datasets = {source.name: source.dataset for source in sources}
+    keys, views = keys_read(loss), getattr(loss, "views", {})
+    if augment not in ("random_shift", "none") or not DeviceBatches.fits(datasets, keys, views):
+        return None
+    if keys is None or not _is_gpu(sources[0].dataset.frames.get("pixels").device):
+        return None
+    return DeviceBatches(
+        datasets,
+        batch_size=batch_size,
+        keys=keys,
+        views=views,
+        pad=SHIFT_PAD if augment == "random_shift" else 0,
+        seed=seed,
+        compiled=compiled,
+        captures=captures,
+    )
+
+
+def _is_gpu(device: torch.device) -> bool:
+    return device.type != "cpu"

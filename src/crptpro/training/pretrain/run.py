@@ -17,6 +17,7 @@ from crptpro.seeding import global_rng_state, set_global_rng_state
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.fingerprint import describe_loss, require_same
+from crptpro.training.pretrain.device_batches import DeviceBatches
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.progress import PretrainProgress
 from crptpro.training.pretrain.result import PretrainResult, training_record
@@ -39,6 +40,7 @@ class PretrainRun:
         sources: the datasets in cyclic order.
         augmenter: applied to every batch.
         learner: does the updates.
+        batches: draws the batches where a GPU holds the frames; the augmenter draws them otherwise.
         settings: ``updates``, ``batch_size``, intervals, ``seed``, ``patience_updates``.
         device: where to train.
         precision: for the record.
@@ -53,6 +55,7 @@ class PretrainRun:
         augmenter: Augmenter,
         *,
         learner: Learner,
+        batches: DeviceBatches | None = None,
         settings: dict[str, Any],
         device: torch.device,
         precision: str,
@@ -60,6 +63,7 @@ class PretrainRun:
         run_dir: Path | None,
     ) -> None:
         self.loss, self.sources, self.augmenter, self.learner = loss, sources, augmenter, learner
+        self.batches = batches
         self.settings, self.device, self.precision = settings, device, precision
         self.logger, self.run_dir = logger, run_dir
         self.domains = [source.name for source in sources]
@@ -145,6 +149,7 @@ class PretrainRun:
             "learner": self.learner.state_dict(),
             "sources": {source.name: source.state_dict() for source in self.sources},
             "augment": self.augmenter.generator.get_state(),
+            "batches": None if self.batches is None else self.batches.state_dict(),
             "global_rng": global_rng_state(),
             "window": self.window.state_dict(),
             "monitor": self.monitor.state_dict(),
@@ -168,6 +173,8 @@ class PretrainRun:
         for source in self.sources:
             source.load_state_dict(state["sources"][source.name])
         self.augmenter.generator.set_state(state["augment"])
+        if self.batches is not None:
+            self.batches.load_state_dict(state["batches"])
         set_global_rng_state(state["global_rng"])
         self.window.load_state_dict(state["window"], self.device)
         self.monitor.load_state_dict(state["monitor"])
@@ -184,7 +191,10 @@ class PretrainRun:
     def _update(self, log_interval: int) -> None:
         domain = self.done % len(self.sources)
         source, batch_size = self.sources[domain], self.settings["batch_size"]
-        batch = self.augmenter.sample(source, batch_size, self.keys, self.device)
+        if self.batches is not None:
+            batch = self.batches.sample(source.name)
+        else:
+            batch = self.augmenter.sample(source, batch_size, self.keys, self.device)
         values = self.learner.update(batch, index=self.done, domain=self.domains[domain])
         self.window.add(values, domain)
         self.done += 1
@@ -235,6 +245,8 @@ class PretrainRun:
             updates=self.done,
             seconds=seconds,
             precision=self.precision,
+            compile=self.learner.compiled.is_on,
+            cuda_graph=self.learner.captured is not None,
             device=str(self.device),
             settings={
                 key: value for key, value in self.fingerprint.items() if key not in ("loss", "datasets")
@@ -262,6 +274,10 @@ class PretrainRun:
     def _fingerprint(self) -> dict[str, Any]:
         learner = self.learner
         schedule = learner.defaults.schedule
+        # Only where used: older runs can be continued.
+        switches: dict[str, Any] = {"compile": True} if learner.compiled.is_on else {}
+        if self.batches is not None:
+            switches["batches"] = "drawn on the device"
         return {
             "batch_size": self.settings["batch_size"],
             "learning_rate": learner.learning_rate,
@@ -276,6 +292,7 @@ class PretrainRun:
             "seed": self.settings["seed"],
             "augment": self.augmenter.name,
             "precision": self.precision,
+            **switches,
             "loss": describe_loss(self.loss),
             "datasets": [source.identity() for source in self.sources],
         }
