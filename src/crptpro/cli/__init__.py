@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,7 @@ from crptpro.cards import cpu_cores
 from crptpro.cli.downstream import Downstream, DrQ
 from crptpro.cli.evaluate import Evaluate
 from crptpro.cli.originals import Export, Import
+from crptpro.cli.plugins import load_plugins
 from crptpro.cli.pretraining import Finetune, Pretrain
 from crptpro.cli.request import expand_groups
 from crptpro.console import run_main
@@ -88,8 +90,15 @@ def main() -> None:
         | Annotated[Import, subcommand("import")]
         | Annotated[Export, subcommand("export")]
     ]
-    run_main(lambda: tyro.cli(commands, prog="crptpro", description=DESCRIPTION).run())
+
+    def run() -> None:
+        arguments = load_plugins(sys.argv[1:])
+        tyro.cli(commands, prog="crptpro", description=DESCRIPTION, args=arguments).run()
+
+    run_main(run)
 
 
 DESCRIPTION = """Cross-domain random pre-training with prototypes for reinforcement learning from pixels.
-Start with `crptpro doctor`, then collect, pretrain and downstream; each stage continues where it was killed."""
+Start with `crptpro doctor`, then collect, pretrain and downstream; each stage continues where it was killed.
+With `--plugin FILE.py` (or a module) any command runs a file of yours first: methods, rewards and domains that it
+registers then have names here."""

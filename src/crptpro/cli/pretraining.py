@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,7 +46,7 @@ class PretrainingOptions:
     device: str = "cpu"
     """where to train"""
     checkpoint_interval: int = 500
-    """updates between two checkpoints"""
+    """updates between two checkpoints (exploring methods: --explore.checkpoint-interval-env-steps instead)"""
     log_interval: int = 50
     """updates between two rows of the record"""
     logging: Logging = field(default_factory=Logging)
@@ -75,9 +76,10 @@ class Pretrain(PretrainingOptions):
     sources: Positional[tuple[str, ...]]
     """dataset directories, e.g. data/walker data/cartpole; for exploring methods domains, tasks or group letters"""
     method: str = "crptpro"
-    """a registered method: crptpro, atc (on datasets), proto-rl-c, proto-rl-s, apt-c, apt-s, becl (exploring), ..."""
+    """a registered method: crptpro, atc (on datasets), proto-rl-c, proto-rl-s, apt-c, apt-s, becl (exploring), or one
+    of your own with --plugin FILE.py"""
     updates: int | None = None
-    """encoder updates over all domains (default: the method's; crptpro 50,000); exploring methods have
+    """encoder updates over all domains (default: the method's; crptpro 50,000); for exploring methods
     --explore.env-steps instead"""
     assignment_temperature: float | None = None
     """temperature of the Sinkhorn-Knopp targets (default: the student's, 0.1)"""
@@ -113,12 +115,10 @@ class Pretrain(PretrainingOptions):
 
     def _exploring(self, method: Method, exploration: ExplorationDefaults) -> None:
         from crptpro.training import ActiveConfig, pretrain_active
+        from crptpro.training.explore import require_explorable
 
         domains = explored_domains(self.sources, method.name)
-        if self.updates is not None:
-            raise CRPTproError(
-                f"{self.method} updates its encoder as it explores: its budget is --explore.env-steps, not --updates."
-            )
+        self._refuse_what_datasets_need()
         loss = self._build(method)
         config = ActiveConfig(
             **vars(self.explore),
@@ -129,10 +129,26 @@ class Pretrain(PretrainingOptions):
             precision=self.precision,
             device=self.device,
         )
+        require_explorable(loss, domains, config)
         with self.logging.open(self.out, self) as records:
             result = pretrain_active(loss, domains, run_dir=self.out, config=config, logger=records)
             actor = next(iter(result.actors.values())) if exploration.transfers_actor else None
             self.keep(loss, records, actor=actor)
+
+    def _refuse_what_datasets_need(self) -> None:
+        if self.updates is not None:
+            raise CRPTproError(
+                f"{self.method} updates its encoder as it explores: its budget is --explore.env-steps, not --updates."
+            )
+        instead = {
+            "checkpoint_interval": "use --explore.checkpoint-interval-env-steps",
+            "compile": "leave it out",
+            "cuda_graph": "leave it out",
+        }
+        for option in dataclasses.fields(self):
+            if option.name in instead and getattr(self, option.name) != option.default:
+                flag = f"--{option.name.replace('_', '-')}"
+                raise CRPTproError(f"{flag} is for methods that learn from datasets; {instead[option.name]}.")
 
     def _build(self, method: Method, image_size: int = 84, frame_stack: int = 3) -> LossModule:
         options = {

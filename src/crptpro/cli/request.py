@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from crptpro.domains import GROUPS, get_domain
+from crptpro.domains import GROUPS, PAPER_DOMAINS, TASKS, get_domain
 from crptpro.errors import CRPTproError, DatasetError, UnknownNameError
 from crptpro.loggers import RunLogger, WandbOptions
 
@@ -82,6 +82,12 @@ def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
         raise DatasetError(
             "Name at least one dataset directory, e.g. data/walker (made by `crptpro collect`)."
         )
+    for path in datasets:
+        if not path.exists() and str(path) in (*GROUPS, *PAPER_DOMAINS, *TASKS):
+            raise DatasetError(
+                f"{path} is no directory. This method learns from datasets: `crptpro collect {path}` makes them, "
+                "data/... by default."
+            )
     opened = {path: FrameDataset.open(path) for path in datasets}
     sizes = {path: (dataset.card["image_size"], dataset.frame_stack) for path, dataset in opened.items()}
     if len(set(sizes.values())) > 1:

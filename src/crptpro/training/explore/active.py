@@ -26,7 +26,7 @@ from crptpro.modules import resolve_precision, set_compute_dtype
 from crptpro.objectives import exploration_defaults, method_defaults
 from crptpro.seeding import derive_seed
 from crptpro.training.checkpoint import CheckpointDir
-from crptpro.training.explore.assemble import assemble, domain_names
+from crptpro.training.explore.assemble import assemble, domain_names, require_explorable
 from crptpro.training.explore.plan import resolve
 from crptpro.training.pretrain.result import PretrainResult, training_record
 
@@ -89,7 +89,8 @@ def pretrain_active(
         Metrics, verdict on collapse, budgets spent, and the actors.
 
     Raises:
-        CRPTproError: a single-domain method was given several domains, or the budget is too small for any update.
+        CRPTproError: a single-domain method was given several domains, the loss does not suffice for the reward, or
+            the budget is too small for any update.
         CheckpointError: if ``run_dir`` holds a run with other settings (named).
         NonFiniteError: if a loss or a policy became NaN or infinite; the last checkpoint is kept.
         DiskSpaceError: if the disk cannot hold the replays.
@@ -106,6 +107,7 @@ def pretrain_active(
         stack.callback(set_compute_dtype, loss, torch.float32)
         set_compute_dtype(loss, dtype)
         stack.enter_context(torch.random.fork_rng(devices=cuda))
+        require_explorable(loss, domains, config)
         torch.manual_seed(derive_seed(config.seed, "active", "loss"))
         directory = Path(run_dir or stack.enter_context(tempfile.TemporaryDirectory(prefix="crptpro-")))
         stack.enter_context(DirectoryLock(directory, error=CheckpointError, is_reentrant=True))

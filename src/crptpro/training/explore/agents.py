@@ -171,6 +171,16 @@ _AGENTS: dict[str, Callable[[int, int, ActiveConfig, torch.Generator], Exploring
 }
 
 
+def require_agent(name: str | None) -> None:
+    """Make sure that there is an agent of this name.
+
+    Raises:
+        UnknownNameError: naming the known ones.
+    """
+    if name not in _AGENTS:
+        raise UnknownNameError(f"There is no exploring agent {name!r}; known: {', '.join(sorted(_AGENTS))}.")
+
+
 def build_agent(
     config: ActiveConfig,
     *,
@@ -191,10 +201,7 @@ def build_agent(
     Raises:
         UnknownNameError: naming the known agents.
     """
-    if config.agent not in _AGENTS:
-        raise UnknownNameError(
-            f"There is no exploring agent {config.agent!r}; known: {', '.join(sorted(_AGENTS))}."
-        )
-    agent = _AGENTS[config.agent](feature_dim, action_dim, config, generator)
+    require_agent(config.agent)
+    agent = _AGENTS[str(config.agent)](feature_dim, action_dim, config, generator)
     set_compute_dtype(agent.loss, dtype)
     return agent

@@ -19,18 +19,19 @@ from crptpro.domains import Domain, get_domain
 from crptpro.envs import make_env, resolve_action_repeat
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.loggers import RunLogger
-from crptpro.objectives import ExplorationDefaults, MethodDefaults
+from crptpro.objectives import ExplorationDefaults, MethodDefaults, exploration_defaults, method_defaults
 from crptpro.seeding import derive_seed
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.env_thread import EnvThread, runs_ahead
-from crptpro.training.explore.agents import build_agent
+from crptpro.training.explore.agents import build_agent, require_agent
 from crptpro.training.explore.batches import ReplayBatches
 from crptpro.training.explore.member import Member
-from crptpro.training.explore.plan import Plan, make_plan
-from crptpro.training.explore.rewards import ExplorationReward
+from crptpro.training.explore.plan import Plan, make_plan, resolve
+from crptpro.training.explore.rewards import ExplorationReward, build_reward
 from crptpro.training.explore.run import ActiveRun
 from crptpro.training.fingerprint import describe_loss
 from crptpro.training.pretrain.learner import Learner
+from crptpro.training.pretrain.window import num_prototypes
 
 logger = logging.getLogger(__name__)
 
@@ -70,6 +71,29 @@ def domain_names(
     return named
 
 
+def require_explorable(
+    loss: LossModule, domains: str | Domain | Sequence[str | Domain], config: ActiveConfig
+) -> None:
+    """Refuse what cannot run, before anything is written.
+
+    Args:
+        loss: to be pre-trained.
+        domains: to be explored.
+        config: what was asked for.
+
+    Raises:
+        CRPTproError: several domains for a method of one, an unknown reward or agent, a reward that the loss does not
+            suffice for, or a budget too small for any update.
+        ValueError: a setting that reward or agent refuses.
+    """
+    exploration = exploration_defaults(loss)
+    config = resolve(config, exploration, method_defaults(loss))
+    named = domain_names(loss, domains, exploration)
+    make_plan(config, [_action_repeat(domain, config.action_repeat) for domain in named.values()])
+    require_agent(config.agent)
+    build_reward(config.reward or "", loss, config, torch.Generator())
+
+
 def assemble(
     loss: LossModule,
     domains: dict[str, str | Domain],
@@ -100,6 +124,7 @@ def assemble(
     repeats = {name: _action_repeat(domain, config.action_repeat) for name, domain in domains.items()}
     plan = make_plan(config, list(repeats.values()))
     _announce(plan, config, list(domains))
+    _warn_of_a_reward_of_zero(loss, config)
     device = torch.device(config.device)
     members: list[Member] = []
     batches: list[ReplayBatches] = []
@@ -182,6 +207,17 @@ def _announce(plan: Plan, config: ActiveConfig, domains: list[str]) -> None:
     )  # fmt: skip
 
 
+def _warn_of_a_reward_of_zero(loss: LossModule, config: ActiveConfig) -> None:
+    """Every prototype draws a candidate from the batch: from a small one, each row so often that it pays itself 0."""
+    count, size, k = num_prototypes(loss) or 0, config.batch_size or 1, config.knn_k or 3
+    if config.reward == "prototype" and count >= k * size:
+        logger.warning(
+            "The prototype reward will be close to 0: %d prototypes draw their candidates from batches of %d, so that "
+            "the %d nearest candidates of a row are the row itself. Take batches of more than %d, or fewer prototypes.",
+            count, size, k, count // k,
+        )  # fmt: skip
+
+
 def _make_env_thread(
     loss: LossModule,
     domain: str | Domain,
@@ -222,7 +258,7 @@ def _make_replay(
         extra_columns=columns,
     )
     logger.info(
-        "replay of %s: up to %.2f GB in %s", path.name, replay.frame_slots * 3 * height * width / 1e9, path
+        "replay of %s: up to %.2g GB in %s", path.name, replay.frame_slots * 3 * height * width / 1e9, path
     )
     return replay
 

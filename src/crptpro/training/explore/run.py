@@ -286,5 +286,8 @@ class ActiveRun:
                     self.records.truncate_to(stream, "env_steps", -1)
             return
         checkpoint.restore(self, state)
-        if self.decisions < self.plan.decisions:
-            logger.info("Active pre-training continues from %s env steps.", f"{self.env_steps:,}")
+        is_finished = self.decisions == self.plan.decisions
+        logger.info(
+            "active pre-training: %s %s env steps", "already at" if is_finished else "continuing from",
+            f"{self.env_steps:,}",
+        )  # fmt: skip

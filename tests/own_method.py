@@ -1,0 +1,54 @@
+"""Two methods that the library does not know, as a user writes them: one for datasets, one that explores."""
+
+from __future__ import annotations
+
+import torch.nn.functional as F
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs.transforms import Transform
+from torchrl.objectives import LossModule
+
+from crptpro.modules import PixelEncoder, Projector
+from crptpro.objectives import ExplorationDefaults, MethodDefaults, register_method
+from crptpro.training import register_intrinsic_reward
+
+
+class SlownessLoss(LossModule):
+    """Latents of consecutive observations are near each other and far from the batch's mean."""
+
+    in_keys = ("pixels", ("next", "pixels"))
+    out_keys = ("loss_slow",)
+
+    def __init__(self, encoder: PixelEncoder, *, margin: float = 1.0) -> None:
+        super().__init__()
+        self.encoder, self.projector = encoder, Projector(encoder.feature_dim, 4)
+        self.margin = margin
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        now, then = (self.projector(self.encoder(tensordict[key])) for key in ("pixels", ("next", "pixels")))
+        spread = (now - now.mean(dim=0)).pow(2).mean()
+        return TensorDict({"loss_slow": (now - then).pow(2).mean() + F.relu(self.margin - spread)}, [])
+
+
+class Activity(Transform):
+    """Pays for features that differ from each other."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        features = tensordict["next", "features"].float()
+        return tensordict.set(("next", "intrinsic_reward"), features.std(dim=-1, keepdim=True))
+
+
+DEFAULTS = MethodDefaults(updates=2, batch_size=4, encoder_tau=None)
+SMALL = {"channels": (4, 4), "strides": (2, 1)}
+
+register_method("slowness", SlownessLoss, DEFAULTS, encoder_options=SMALL)
+register_method(
+    "slowness-active",
+    SlownessLoss,
+    DEFAULTS,
+    loss_options={"margin": 0.5},
+    encoder_options=SMALL,
+    exploration=ExplorationDefaults(
+        reward="activity", env_steps=60, encoder_update_interval=5, random_agent_steps=10
+    ),
+)
+register_intrinsic_reward("activity", lambda loss, config, generator: Activity())
