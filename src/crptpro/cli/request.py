@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from crptpro.domains import GROUPS, PAPER_DOMAINS, TASKS, get_domain
+from crptpro.domains import GROUPS, GYMNASIUM_PREFIX, PAPER_DOMAINS, TASKS, get_domain
 from crptpro.errors import CRPTproError, DatasetError, UnknownNameError
 from crptpro.loggers import RunLogger, WandbOptions
 
@@ -55,13 +55,14 @@ def explored_domains(names: Sequence[str], method: str) -> list[str]:
     """Expand the domains that a method is to explore.
 
     Raises:
-        CRPTproError: if one is a directory: such a method collects its own data.
+        CRPTproError: if one is a path: such a method collects its own data.
         UnknownNameError: if no name is given, or one that nobody knows.
     """
     for name in names:
-        if Path(name).is_dir() and name not in GROUPS:
+        is_path = Path(name).is_dir() or ("/" in name and not name.startswith(GYMNASIUM_PREFIX))
+        if is_path and name not in GROUPS:
             raise CRPTproError(
-                f"{method} explores and collects its own data; {name} is a directory. Name domains, tasks or groups "
+                f"{method} explores and collects its own data; {name} is a path. Name domains, tasks or groups "
                 f"({', '.join(GROUPS)}), or choose a method that learns from datasets."
             )
     return expand_groups(names)

@@ -1,89 +1,22 @@
 from __future__ import annotations
 
-import csv
 import importlib.metadata
-import logging
 import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import torch
-from toy_world import FIXED, ToyEnv, fixed_length
+from command import SIZE, SMALL, TASK, Call, refused, rows, toy_dataset
 
-from crptpro import domains
 from crptpro.cli import main
 from crptpro.data import FrameDataset
-from crptpro.data.collect_worker import EpisodeRoller
-from crptpro.data.collection import DomainCollection
-from crptpro.domains import register_domain
 from crptpro.modules import PixelEncoder
-from crptpro.objectives import ProtoLoss, SimCLRLoss, registry
+from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training import load_agent
-
-SIZE = 16
-TASK = FIXED.task
-SMALL = (
-    "--env-steps", 60, "--random-agent-steps", 12, "--batch-size", 4, "--replay-capacity", 20,
-    "--eval-episodes", 1, "--eval-interval-env-steps", 20, "--checkpoint-interval-env-steps", 20,
-    "--log-interval-env-steps", 10, "--queue-size", 512, "--precision", "fp32", "--hidden-dim", 32,
-)  # fmt: skip
-
-Call = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Call]:
-    """Run the command in this process; returns exit status, standard output and standard error."""
-    library = logging.getLogger("crptpro")
-    before = library.handlers[:], library.level, library.propagate
-    monkeypatch.setattr(domains, "_registered", {})
-    register_domain(FIXED)
-
-    def run(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["crptpro", *map(str, arguments)])
-        capsys.readouterr()
-        try:
-            main()
-            status = 0
-        except SystemExit as stopped:
-            status = stopped.code if isinstance(stopped.code, int) else int(stopped.code is not None)
-        return status, *capsys.readouterr()
-
-    yield run
-    library.handlers[:], library.propagate = before[0], before[2]
-    library.setLevel(before[1])
-
-
-def refused(result: tuple[int, str, str]) -> str:
-    """The one line of a refusal."""
-    status, out, err = result
-    assert status == 1
-    assert out == ""
-    assert len(err.splitlines()) == 1, err
-    assert err.startswith("error: ")
-    return err
-
-
-def toy_dataset(path: Path, size: int = SIZE) -> Path:
-    settings = {"image_size": size, "action_repeat": 2, "camera": 0, "quality": "exact"}
-    request = {"domain": path.name, "task": f"{path.name}_go", "seed": 0, "transitions": 27, **settings}
-    collection = DomainCollection(path, request, 10)
-    roller = EpisodeRoller(lambda: ToyEnv(fixed_length, image_size=size))
-    while (job := collection.next_job()) is not None:
-        collection.accept(job.episode, roller.roll(job))
-    roller.close()
-    collection.close()
-    return path
-
-
-@pytest.fixture
-def dataset(tmp_path: Path) -> Path:
-    return toy_dataset(tmp_path / "data" / "toy")
 
 
 @pytest.fixture
@@ -91,11 +24,6 @@ def encoder(tmp_path: Path) -> Path:
     torch.manual_seed(0)
     loss = ProtoLoss(PixelEncoder(image_size=SIZE), num_prototypes=16, latent_dim=4, hidden_dim=8)
     return save_pretrained(loss, tmp_path / "encoder")
-
-
-def rows(path: Path) -> list[dict[str, str]]:
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
 
 
 # --- help ---------------------------------------------------------------------------------------------------------
@@ -106,7 +34,7 @@ def rows(path: Path) -> list[dict[str, str]]:
     (("doctor",), ["--domains"]),
     (("collect",), ["--out", "--transitions", "--seed", "--workers", "--quality {exact,fast}", "group letters"]),
     (("pretrain",), ["--out", "--method", "--updates", "--batch-size", "--learning-rate", "--precision",
-                     "--device", "--logging.wandb", "50,000"]),
+                     "--device", "--logging.wandb", "crptpro 50,", "--explore.env-steps", "proto-rl-c", "--plugin"]),
     (("finetune",), ["--out", "--updates", "--batch-size", "--learning-rate", "--logging.wandb", "PATH PATH"]),
     (("downstream",), ["--pretrained", "random-encoder", "--out", "--env-steps", "--replay-capacity",
                        "--eval-episodes", "--features", "--logging.tensorboard", "(default: 500000)"]),
@@ -209,45 +137,6 @@ def test_a_setting_that_pretraining_refuses_is_one_line(
     assert not list((tmp_path / "out").rglob("*.csv"))
 
 
-@pytest.mark.parametrize("method", ["atc", "apt-c", "proto-rl-c"])
-def test_pretrain_trains_any_method_that_random_data_suffice_for(
-    call: Call, dataset: Path, tmp_path: Path, method: str
-) -> None:
-    few = ("--updates", 2, "--batch-size", 4, "--log-interval", 1)
-    assert call("pretrain", dataset, "--out", tmp_path / "out", "--method", method, *few)[0] == 0
-    loaded = load_pretrained(tmp_path / "out" / "encoder")
-    assert (loaded.method, loaded.card["training"]["updates"]) == (method, 2)
-    assert loaded.projector is not None
-
-
-def test_pretrain_names_what_a_method_misses_in_random_data(
-    call: Call, dataset: Path, tmp_path: Path
-) -> None:
-    status, _, err = call("pretrain", dataset, "--out", tmp_path, "--method", "becl", "--updates", 1)
-    assert status == 1
-    assert err.splitlines()[-1].startswith("error: The loss reads 'skill', which the dataset 'toy' lacks")
-
-
-def test_a_coefficient_of_another_method_is_refused(call: Call, dataset: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    line = refused(call("pretrain", dataset, "--out", out, "--method", "atc", "--intr-loss-coef", 0.1))
-    assert "'atc' has no option intr_loss_coef" in line
-    assert not out.exists()
-
-
-def test_a_method_registered_elsewhere_trains_with_the_encoder_it_wants(
-    call: Call, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
-    defaults = registry.MethodDefaults(encoder_tau=None, batch_size=4)
-    options = {"pixel_offset": 0.5, "channels": (4, 4), "strides": (2, 1)}
-    registry.register_method("own", SimCLRLoss, defaults, encoder_options=options)
-    own = ("pretrain", dataset, "--out", tmp_path / "out", "--method", "own", "--updates", 2)
-    assert call(*own)[0] == 0
-    loaded = load_pretrained(tmp_path / "out" / "encoder").require(pixel_offset=0.5)
-    assert loaded.card["modules"]["encoder"]["config"]["channels"] == [4, 4]
-
-
 def test_datasets_of_different_images_are_refused(call: Call, dataset: Path, tmp_path: Path) -> None:
     other = toy_dataset(tmp_path / "data" / "other", SIZE + 2)
     line = refused(call("pretrain", dataset, other, "--out", tmp_path / "out"))
@@ -281,8 +170,8 @@ def test_every_command_does_its_part_on_a_world_without_a_simulator(
 ) -> None:
     runs = tmp_path / "runs"
     few = ("--updates", 2, "--batch-size", 4, "--log-interval", 1)
-    pretrain = ("pretrain", dataset, "--out", runs / "pretrain", *few, "--assignment-temperature", 0.05)
-    assert call(*pretrain)[0] == 0
+    first_stage = ("pretrain", dataset, "--out", runs / "pretrain", *few, "--assignment-temperature", 0.05)
+    assert call(*first_stage)[0] == 0
     first = load_pretrained(runs / "pretrain" / "encoder")
     assert first.card["training"]["updates"] == 2
     assert first.encoder.image_size == SIZE
@@ -308,7 +197,7 @@ def test_every_command_does_its_part_on_a_world_without_a_simulator(
     assert [row["env_steps"] for row in evaluations] == ["0", "20", "40", "60"]
 
     # The same command again finds everything done.
-    for command, record in ((pretrain, "pretrain/pretrain.csv"), (down, "down/eval.csv")):
+    for command, record in ((first_stage, "pretrain/pretrain.csv"), (down, "down/eval.csv")):
         before = (runs / record).read_bytes()
         assert call(*command)[0] == 0
         assert (runs / record).read_bytes() == before

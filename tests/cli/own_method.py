@@ -18,9 +18,11 @@ class SlownessLoss(LossModule):
     in_keys = ("pixels", ("next", "pixels"))
     out_keys = ("loss_slow",)
 
-    def __init__(self, encoder: PixelEncoder, *, margin: float = 1.0) -> None:
+    def __init__(
+        self, encoder: PixelEncoder, *, projector: Projector | None = None, margin: float = 1.0
+    ) -> None:
         super().__init__()
-        self.encoder, self.projector = encoder, Projector(encoder.feature_dim, 4)
+        self.encoder, self.projector = encoder, projector or Projector(encoder.feature_dim, 4)
         self.margin = margin
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:

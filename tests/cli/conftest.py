@@ -1,0 +1,45 @@
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from command import Call, toy_dataset
+from toy_world import FIXED
+
+from crptpro import domains
+from crptpro.cli import main
+from crptpro.domains import register_domain
+
+collect_ignore = ["own_method.py"]
+"""What a test hands to the command must not have been imported by looking for doctests in it."""
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Call]:
+    """Run the command in this process; returns exit status, standard output and standard error."""
+    library = logging.getLogger("crptpro")
+    before = library.handlers[:], library.level, library.propagate
+    monkeypatch.setattr(domains, "_registered", {})
+    register_domain(FIXED)
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["crptpro", *map(str, arguments)])
+        capsys.readouterr()
+        try:
+            main()
+            status = 0
+        except SystemExit as stopped:
+            status = stopped.code if isinstance(stopped.code, int) else int(stopped.code is not None)
+        return status, *capsys.readouterr()
+
+    yield run
+    library.handlers[:], library.propagate = before[0], before[2]
+    library.setLevel(before[1])
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    return toy_dataset(tmp_path / "data" / "toy")
