@@ -31,8 +31,8 @@ from crptpro.loggers import RunLogger, WandbOptions
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import load_pretrained, random_pretrained, save_pretrained
-from crptpro.seeding import derive_seed, seed_everything
-from crptpro.training import SACSettings, pretrain, train_downstream
+from crptpro.seeding import seed_everything
+from crptpro.training import DownstreamConfig, SACSettings, pretrain, train_tasks
 
 
 @dataclass
@@ -99,6 +99,9 @@ def main(config: Config) -> None:
     seed_everything(config.seed)
     out = config.out
     domains = GROUPS[config.group]
+    tasks = config.tasks or [get_domain(domain).task for domain in domains]
+    for task in tasks:
+        get_domain(task)  # an unknown name ends the recipe here, not hours later
     wandb = None
     if config.wandb != "off":
         wandb = WandbOptions(group=f"group_{config.group}", tags=(config.pretrained,), mode=config.wandb)
@@ -143,21 +146,20 @@ def main(config: Config) -> None:
             logger.artifact(path, name=f"encoder_{run_dir.name}", kind="encoder")
         pretrained = load_pretrained(path)
 
-    encoder_name = "random-encoder" if config.pretrained == "random-encoder" else f"group_{config.group}"
-    for task in config.tasks or [get_domain(domain).task for domain in domains]:
-        run_dir = out / f"{task}_{encoder_name}_seed_{config.seed}"
-        with RunLogger(run_dir, config=config, wandb=wandb) as logger:
-            train_downstream(
-                task,
-                pretrained,
-                run_dir=run_dir,
-                **vars(config.downstream),
-                seed=derive_seed(config.seed, "task", task),
-                quality=config.quality,
-                precision=config.precision,
-                device=config.device,
-                logger=logger,
-            )
+    train_tasks(
+        tasks,
+        pretrained,
+        out,
+        name="random-encoder" if config.pretrained == "random-encoder" else f"group_{config.group}",
+        config=DownstreamConfig(
+            **vars(config.downstream),
+            seed=config.seed,
+            quality=config.quality,
+            precision=config.precision,
+            device=config.device,
+        ),
+        wandb=wandb,
+    )
 
 
 if __name__ == "__main__":

@@ -17,10 +17,9 @@ from typing import Literal
 import tyro
 
 from crptpro.console import run_main
-from crptpro.domains import TASKS
-from crptpro.loggers import RunLogger, WandbOptions
-from crptpro.seeding import derive_seed
-from crptpro.training import drq_settings, train_downstream
+from crptpro.domains import TASKS, get_domain
+from crptpro.loggers import WandbOptions
+from crptpro.training import drq_settings, train_tasks
 
 
 @dataclass
@@ -87,19 +86,18 @@ class Config:
 
 def main(config: Config) -> None:
     """Learn every task; what is finished is found again."""
-    wandb = None if config.wandb == "off" else WandbOptions(group="drq", mode=config.wandb)
     for task in config.tasks:
-        settings = drq_settings(
-            **vars(config.drq),
-            seed=derive_seed(config.seed, "task", task),
-            quality=config.quality,
-            precision=config.precision,
-            device=config.device,
-        )
-        run_dir = config.out / f"{task}_drq_seed_{config.seed}"
-        with RunLogger(run_dir, config=config, wandb=wandb) as logger:
-            # No artifact: the encoder starts from the seed.
-            train_downstream(task, None, run_dir=run_dir, config=settings, logger=logger)
+        get_domain(task)  # an unknown name ends the recipe here, not hours later
+    wandb = None if config.wandb == "off" else WandbOptions(group="drq", mode=config.wandb)
+    settings = drq_settings(
+        **vars(config.drq),
+        seed=config.seed,
+        quality=config.quality,
+        precision=config.precision,
+        device=config.device,
+    )
+    # No artifact: the encoder starts from the seed.
+    train_tasks(config.tasks, None, config.out, name="drq", config=settings, wandb=wandb)
 
 
 if __name__ == "__main__":

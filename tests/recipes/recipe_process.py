@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 RECIPES = Path(__file__).parents[2] / "recipes"
@@ -35,6 +37,24 @@ def run_recipe(recipe: str, *flags: object) -> subprocess.CompletedProcess[str]:
     assert done.returncode == 0, done.stderr[-4000:]
     assert "Traceback" not in done.stderr
     return done
+
+
+def kill_recipe(out: Path, sign: str, recipe: str, *flags: object) -> None:
+    """Start a recipe and end it, and every process that it started, as soon as something below ``out`` matches."""
+    process = subprocess.Popen(
+        command_of(recipe, "--out", out, *flags),
+        env=environment(),
+        start_new_session=True,
+        stderr=subprocess.PIPE,
+    )
+    deadline = time.monotonic() + 240
+    while not any(out.glob(sign)):
+        assert process.poll() is None, process.communicate()[1].decode()[-4000:]
+        assert time.monotonic() < deadline, f"no {sign} appeared"
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL, "it had ended before it was killed"
 
 
 def rows(path: Path) -> list[dict[str, str]]:

@@ -1,10 +1,7 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from matplotlib.image import imread
-from recipe_process import SHORT_TASK, command_of, environment, free_replays, records, rows, run_recipe
+from recipe_process import SHORT_TASK, free_replays, kill_recipe, records, rows, run_recipe
 
 from crptpro.data import FrameDataset
 from crptpro.pretrained import load_pretrained
@@ -32,20 +29,7 @@ FLAGS = (
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, list[str]]]:
     """The directory of a quickstart that was killed while pre-training and started again, and what it had then."""
     out = tmp_path_factory.mktemp("quickstart") / "run"
-    # A group of its own, so that the kill ends the collecting processes too.
-    process = subprocess.Popen(
-        command_of("quickstart", "--out", out, *FLAGS),
-        env=environment(),
-        start_new_session=True,
-        stderr=subprocess.PIPE,
-    )
-    deadline = time.monotonic() + 200
-    while not (out / "pretrain").exists():
-        assert process.poll() is None, process.communicate()[1].decode()[-4000:]
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    os.killpg(process.pid, signal.SIGKILL)
-    process.communicate()
+    kill_recipe(out, "pretrain", "quickstart", *FLAGS)
     kept = [name for name in ("data", "pretrain", "encoder", "report.md") if (out / name).exists()]
     run_recipe("quickstart", "--out", out, *FLAGS)
     yield out, kept

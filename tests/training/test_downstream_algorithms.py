@@ -202,7 +202,9 @@ def test_a_pending_evaluation_keeps_the_weights_of_its_moment_encoder_included(
     agent = PixelAgent(small_pretrained().encoder, actor_for_toy(), trains_encoder=True)
     with RunLogger(tmp_path) as records:
         make_env = functools.partial(toy_env, "toy", seed=0, image_size=16, frame_stack=3)
-        evaluation = DownstreamEvaluation("toy", make_env, config, records, tmp_path, progress=False)
+        evaluation = DownstreamEvaluation(
+            "toy", make_env, config, records, tmp_path, method="toy", progress=False
+        )
         started: list[PixelAgent] = []
         monkeypatch.setattr(evaluation._pool, "start", lambda agent, **how: started.append(agent))
         evaluation.start(agent, {"env_steps": 40})

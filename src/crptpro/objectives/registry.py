@@ -197,8 +197,16 @@ def method_defaults(loss: LossModule | type[LossModule]) -> MethodDefaults:
 
 
 def exploration_defaults(loss: LossModule) -> ExplorationDefaults:
-    """How active pre-training of a loss explores: as the method that built it does, else with the generic defaults."""
+    """How active pre-training of a loss explores.
+
+    As the method that built it does; built by hand, as the first method of its class, or the nearest base class, that
+    explores. The generic defaults otherwise.
+    """
     named = _METHODS.get(getattr(loss, "method_name", None) or "")
     if named is not None and isinstance(loss, named.loss_class) and named.exploration is not None:
         return named.exploration
+    for base in type(loss).__mro__:
+        for method in _METHODS.values():
+            if method.loss_class is base and not method.is_preset and method.exploration is not None:
+                return method.exploration
     return ExplorationDefaults()

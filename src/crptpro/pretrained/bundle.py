@@ -55,6 +55,12 @@ class Pretrained:
         """Registered name of the method, or the class name of a loss that is not registered."""
         return str(self.card.get("method", "unknown"))
 
+    @property
+    def label(self) -> str:
+        """Name in records and reports: the method, with ``-finetune`` if it went on from another artifact."""
+        is_finetuned = bool((self.card.get("training") or {}).get("started_from"))
+        return f"{self.method}-finetune" if is_finetuned else self.method
+
     def identity(self) -> str:
         """Return what tells these weights from any others: the method and a checksum."""
         if "weights_sha256" in self.card:

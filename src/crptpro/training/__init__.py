@@ -12,6 +12,7 @@ from crptpro.training.agent import PixelAgent, load_agent, save_agent
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.downstream import DownstreamResult, train_downstream
+from crptpro.training.downstream_tasks import train_tasks
 from crptpro.training.evaluate import Episode, evaluate, summarize, uniform_policy
 from crptpro.training.explore import ActiveResult, pretrain_active, register_intrinsic_reward
 from crptpro.training.pretrain import PretrainResult, pretrain
@@ -39,5 +40,6 @@ __all__ = [
     "skill_ddpg_settings",
     "summarize",
     "train_downstream",
+    "train_tasks",
     "uniform_policy",
 ]

@@ -27,7 +27,11 @@ FREE_TO_CHANGE = (
 """Settings that a run may be continued with other values of: budgets may grow, machines differ. What `auto` became
 is compared instead of what was asked."""
 
-CAME_LATER: dict[str, Any] = {"algorithm": "rad-sac", "skill_ddpg": dataclasses.asdict(SkillDDPGSettings())}
+CAME_LATER: dict[str, Any] = {
+    "algorithm": "rad-sac",
+    "skill_ddpg": dataclasses.asdict(SkillDDPGSettings()),
+    "transfer_actor": None,
+}
 """Settings that checkpoints of earlier versions do not name, with what was the case then."""
 
 

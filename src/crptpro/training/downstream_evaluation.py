@@ -44,6 +44,7 @@ class DownstreamEvaluation:
         config: how many episodes, processes and videos.
         records: where rows, events and videos go.
         run_dir: videos go below it.
+        method: whose evaluations these are, in every row.
         progress: show a bar.
 
     Attributes:
@@ -58,10 +59,11 @@ class DownstreamEvaluation:
         records: RunLogger,
         run_dir: Path,
         *,
+        method: str,
         progress: bool,
     ) -> None:
         self.task, self.config, self.records, self.run_dir = task, config, records, run_dir
-        self.progress = progress
+        self.method, self.progress = method, progress
         self._make_env = make_env
         self.workers = eval_workers(task, make_env, config)
         if self.workers:
@@ -155,7 +157,8 @@ class DownstreamEvaluation:
 
     def _record(self, counters: Mapping[str, int], episodes: list[Episode], videos: list[Tensor]) -> None:
         for e in episodes:
-            row = {"episode_return": e.episode_return, "episode_agent_steps": e.agent_steps, "seed": e.seed}
+            row: dict[str, Any] = {"episode_return": e.episode_return, "episode_agent_steps": e.agent_steps}
+            row |= {"seed": e.seed, "method": self.method}
             self.records.log(row, stream="eval", episode=e.episode, **counters)
         env_steps = counters["env_steps"]
         for index, pictures in enumerate(videos):

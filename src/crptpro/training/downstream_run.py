@@ -80,7 +80,13 @@ class DownstreamRun:
         self.records = records
         try:
             self.evaluation = DownstreamEvaluation(
-                task, make_this_env, config, records, run_dir, progress=progress
+                task,
+                make_this_env,
+                config,
+                records,
+                run_dir,
+                method=config.algorithm if config.algorithm == "drq" else pretrained.label,
+                progress=progress,
             )
             self.parts: Parts = build_parts(
                 pretrained,

@@ -1,0 +1,74 @@
+"""A recipe spells the numbers of its method out; they are the ones that the library has."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import inspect
+import sys
+from types import ModuleType
+
+import pytest
+from recipe_process import RECIPES
+
+from crptpro.objectives import get_method
+from crptpro.training import ActiveConfig, SACSettings, drq_settings
+from crptpro.training.explore.plan import resolve
+
+
+def load(recipe: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"{recipe}_recipe", RECIPES / f"{recipe}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look their annotations up
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        del sys.modules[spec.name]
+    return module
+
+
+def loss_options(config: object, method: str) -> dict[str, object]:
+    """Options of the method's loss that the recipe names, with the recipe's values."""
+    names = inspect.signature(get_method(method).loss_class.__init__).parameters
+    return {name: value for name, value in vars(config).items() if name in names}
+
+
+@pytest.mark.parametrize(
+    ("recipe", "method", "bonus", "replay_capacity"),
+    [
+        ("crptpro", "crptpro", 0.2, 40_000),
+        ("atc", "atc", 0.0, 40_000),
+        ("apt", "apt-c", 0.0, 40_000),
+        ("apt", "apt-s", 0.0, 40_000),
+        ("proto_rl", "proto-rl-c", 0.2, 100_000),
+        ("proto_rl", "proto-rl-s", 0.2, 100_000),
+        ("becl", "becl", 0.0, 40_000),
+    ],
+)
+def test_a_recipe_has_the_numbers_of_its_method(
+    recipe: str, method: str, bonus: float, replay_capacity: int
+) -> None:
+    config, known = load(recipe).Config(), get_method(method)
+    assert config.pretrain_batch_size == known.defaults.batch_size
+    assert config.pretrain_learning_rate == known.defaults.lr
+    parameters = inspect.signature(known.loss_class.__init__).parameters
+    defaults = {**{name: parameter.default for name, parameter in parameters.items()}, **known.loss_options}
+    options = loss_options(config, method)
+    assert len(options) >= 2
+    assert options == {name: defaults[name] for name in options}
+    if known.exploration is None:
+        assert config.updates == known.defaults.updates
+        assert config.encoder_tau == known.defaults.encoder_tau
+    else:
+        asked = resolve(ActiveConfig(**vars(config.explore)), known.exploration, known.defaults)
+        neighbours = {"prototype": 3, "particle": 12}.get(known.exploration.reward)
+        assert asked == resolve(ActiveConfig(knn_k=neighbours), known.exploration, known.defaults)
+    assert config.downstream == SACSettings(intrinsic_reward_coef=bonus, replay_capacity=replay_capacity)
+    assert config.downstream.env_steps == 500_000
+
+
+def test_drq_has_the_numbers_of_the_library() -> None:
+    recipe = load("drq")
+    assert drq_settings(**vars(recipe.DrQ())) == drq_settings()
+    assert set(vars(recipe.DrQ())) <= {field.name for field in dataclasses.fields(drq_settings())}
+    assert len(recipe.Config().tasks) == 8
