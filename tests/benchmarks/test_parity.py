@@ -4,9 +4,9 @@ import json
 from pathlib import Path
 
 import pytest
+from benchmarks.synthetic import write_dataset
 
 from benchmarks import parity
-from benchmarks.synthetic import write_dataset
 
 
 def test_three_runs_are_compared_and_written_down(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
