@@ -31,6 +31,8 @@ class Config:
     """directory of the pretrained encoder"""
     domain: str = "pendulum"
     """the one domain"""
+    task: str | None = None
+    """what is learned then (default: the domain's task)"""
     updates: int = 2_000
     """I_f: encoder updates"""
     transitions: int = 100_000
@@ -57,6 +59,8 @@ class Config:
 
 def main(config: Config) -> None:
     """Collect, fine-tune, learn; what is finished is found again."""
+    if config.task is not None:
+        get_domain(config.task)  # an unknown name ends the recipe here, not hours later
     seed_everything(config.seed)
     dataset = collect_random(
         config.domain,
@@ -79,7 +83,7 @@ def main(config: Config) -> None:
         run_dir=run_dir,
     )
     encoder = save_pretrained(loss, run_dir / "encoder")
-    task = get_domain(config.domain).task
+    task = config.task or get_domain(config.domain).task
     train_downstream(
         task,
         encoder,

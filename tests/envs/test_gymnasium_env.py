@@ -174,3 +174,25 @@ def test_half_cheetah_renders(monkeypatch: pytest.MonkeyPatch) -> None:
     assert rollout["pixels"][0].unique().numel() > 10
     assert not torch.equal(rollout["pixels"][0, -3:], rollout["next", "pixels"][1, -3:])
     env.close()
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("env_id", ["Reacher-v5", "HalfCheetah-v5"])
+def test_an_episode_is_drawn_the_same_whatever_was_drawn_before_it(
+    env_id: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()  # real rendering
+
+    def first_frame(*seeds: int) -> torch.Tensor:
+        env = make_env(f"gymnasium:{env_id}", seed=seeds[0], frame_stack=1)
+        try:
+            for seed in seeds:
+                env.set_seed(seed)
+                frame = env.reset()["pixels"]
+            return frame
+        finally:
+            env.close()
+
+    alone = first_frame(2)
+    assert torch.equal(first_frame(1, 2), alone)
+    assert not torch.equal(first_frame(1), alone), "the seeds draw different poses"

@@ -56,6 +56,7 @@ class GymnasiumSimulator:
         self.action_size = int(np.prod(space.shape))
         self._data: Any = getattr(self._env.unwrapped, "data", None)
         self.state_size = _state_size(self._data)
+        _fix_free_camera(self._env)
         model: Any = getattr(self._env.unwrapped, "model", None)
         if shadow_size is not None and hasattr(model, "vis"):
             model.vis.quality.shadowsize = min(shadow_size, model.vis.quality.shadowsize)
@@ -151,6 +152,24 @@ def _make(env_id: str, camera: int | str | None, *, supersampled_size: int) -> A
         raise CRPTproError(f"{name} cannot be made with rgb_array rendering: {reason}.{hint}") from None
     except (ImportError, gymnasium.error.Error) as reason:
         raise CRPTproError(f"{name} cannot be made: {reason}") from None
+
+
+def _fix_free_camera(env: Any) -> None:
+    """Point Gymnasium's free camera at where the model's default pose lies.
+
+    By itself it looks at the middle of whatever state is drawn first, for good: the same episode would be drawn
+    differently as the second one of a process than as the first of a resumed one.
+    """
+    renderer = getattr(env.unwrapped, "mujoco_renderer", None)
+    config = getattr(renderer, "default_cam_config", None) or {}
+    if renderer is None or "lookat" in config:
+        return
+    import mujoco
+
+    model = env.unwrapped.model
+    pose = mujoco.MjData(model)
+    mujoco.mj_forward(model, pose)
+    renderer.default_cam_config = {**config, "lookat": np.median(pose.geom_xpos, axis=0)}
 
 
 def _require_bounded_vector(space: Any, env_id: str) -> Any:

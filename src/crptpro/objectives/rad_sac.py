@@ -42,8 +42,7 @@ class RADSACLoss(SACLoss):
             out = loss.actor_and_temperature_loss(td)   # backward each, step both
             target_updater.step()                       # SoftUpdate(loss, tau=0.01)
 
-    Deviation: the released code always bootstraps. Here ``terminated`` cuts it, ``truncated`` does not; no difference
-    for DeepMind Control tasks.
+    Deviation: the released code always bootstraps; here ``terminated`` cuts it (never so in DeepMind Control).
 
     Args:
         actor: on features.
@@ -51,10 +50,8 @@ class RADSACLoss(SACLoss):
         gamma: discount per agent step, in [0, 1].
         alpha_init: initial temperature, positive: its logarithm is what is learned.
         target_entropy: in nats; None for minus the action dimension.
-        observation: key of the features; also read under ``"next"``. Change it, and the keys of action,
-            reward, done and terminated, with ``set_keys``.
-        generator: source of all action noise; torch's global generator if None. Not part of the state
-            dictionary.
+        observation: key of the features; also read under ``"next"``. ``set_keys`` changes it and the others.
+        generator: source of all action noise; torch's global one if None. Not part of the state dictionary.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` (per-row losses).
 
     Returns (``forward``):

@@ -16,8 +16,9 @@ from crptpro.loggers import RunLogger
 from crptpro.seeding import global_rng_state, set_global_rng_state
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.collapse import CollapseMonitor
-from crptpro.training.fingerprint import describe_loss, require_same
+from crptpro.training.fingerprint import require_same
 from crptpro.training.pretrain.device_batches import DeviceBatches
+from crptpro.training.pretrain.identity import identity_of
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.progress import PretrainProgress
 from crptpro.training.pretrain.result import PretrainResult, training_record
@@ -83,7 +84,14 @@ class PretrainRun:
         self.made_with = provenance()
         self.started = self.row_started = self.saved_time = time.monotonic()
         self.row_updates = 0
-        self.fingerprint = self._fingerprint()
+        self.fingerprint = identity_of(
+            learner,
+            sources,
+            augmenter,
+            settings,
+            precision=precision,
+            draws_on_device=batches is not None,
+        )
 
     @property
     def seconds(self) -> float:
@@ -270,32 +278,6 @@ class PretrainRun:
     def _last_row(self) -> dict[str, Any]:
         rows = [] if self.logger is None else self.logger.rows(STREAM)
         return {key: value for key, value in rows[-1].items() if key != "unix_time_s"} if rows else {}
-
-    def _fingerprint(self) -> dict[str, Any]:
-        learner = self.learner
-        schedule = learner.defaults.schedule
-        # Only where used: older runs can be continued.
-        switches: dict[str, Any] = {"compile": True} if learner.compiled.is_on else {}
-        if self.batches is not None:
-            switches["batches"] = "drawn on the device"
-        return {
-            "batch_size": self.settings["batch_size"],
-            "learning_rate": learner.learning_rate,
-            "betas": list(learner.defaults.betas),
-            "eps": learner.defaults.eps,
-            "weight_decay": learner.defaults.weight_decay,
-            "grad_clip": learner.defaults.grad_clip,
-            "schedule": schedule,
-            # A schedule is stretched over the run, so a run with one cannot be extended.
-            "updates": None if schedule == "constant" else self.settings["updates"],
-            "encoder_tau": learner.encoder_tau,
-            "seed": self.settings["seed"],
-            "augment": self.augmenter.name,
-            "precision": self.precision,
-            **switches,
-            "loss": describe_loss(self.loss),
-            "datasets": [source.identity() for source in self.sources],
-        }
 
 
 def _comp(row: dict[str, float]) -> float | None:

@@ -1,0 +1,54 @@
+"""What identifies a pre-training run: all that must agree for a checkpoint to be continued."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from crptpro.training.fingerprint import describe_loss
+from crptpro.training.pretrain.learner import Learner
+from crptpro.training.pretrain.sources import Augmenter, Source
+
+
+def identity_of(
+    learner: Learner,
+    sources: Sequence[Source],
+    augmenter: Augmenter,
+    settings: Mapping[str, Any],
+    *,
+    precision: str,
+    draws_on_device: bool,
+) -> dict[str, Any]:
+    """Return everything that decides a run's numbers.
+
+    Args:
+        learner: does the updates.
+        sources: the datasets in cyclic order.
+        augmenter: applied to every batch.
+        settings: ``updates``, ``batch_size`` and ``seed``.
+        precision: as resolved.
+        draws_on_device: whether a GPU draws the batches.
+    """
+    defaults = learner.defaults
+    # Only where used: older runs can be continued.
+    switches: dict[str, Any] = {"compile": True} if learner.compiled.is_on else {}
+    if draws_on_device:
+        switches["batches"] = "drawn on the device"
+    return {
+        "batch_size": settings["batch_size"],
+        "learning_rate": learner.learning_rate,
+        "betas": list(defaults.betas),
+        "eps": defaults.eps,
+        "weight_decay": defaults.weight_decay,
+        "grad_clip": defaults.grad_clip,
+        "schedule": defaults.schedule,
+        # A schedule is stretched over the run, so a run with one cannot be extended.
+        "updates": None if defaults.schedule == "constant" else settings["updates"],
+        "encoder_tau": learner.encoder_tau,
+        "seed": settings["seed"],
+        "augment": augmenter.name,
+        "precision": precision,
+        **switches,
+        "loss": describe_loss(learner.loss),
+        "datasets": [source.identity() for source in sources],
+    }
