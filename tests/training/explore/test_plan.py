@@ -1,8 +1,9 @@
 from __future__ import annotations
 
 import pytest
+from torchrl.objectives import LossModule
 
-from crptpro.objectives import exploration_defaults, get_method
+from crptpro.objectives import ExplorationDefaults, exploration_defaults, get_method
 from crptpro.training import ActiveConfig
 from crptpro.training.explore.plan import make_plan, resolve
 
@@ -54,10 +55,13 @@ def test_domains_of_different_repeats_share_a_budget_by_turns() -> None:
     assert [plan.env_steps_after(decisions) for decisions in range(5)] == [0, 2, 6, 7, 9]
 
 
-def test_a_loss_built_by_hand_explores_with_the_generic_defaults() -> None:
+def test_a_loss_built_by_hand_explores_like_the_method_of_its_class_and_an_unknown_one_generically() -> None:
     from active_world import make_loss
 
-    loss = make_loss("becl")
-    assert exploration_defaults(loss).skill_dim == 16
-    loss.method_name = None
-    assert exploration_defaults(loss).skill_dim is None
+    for method in ("becl", "apt-c"):
+        loss = make_loss(method)
+        by_name = exploration_defaults(loss)
+        assert by_name != ExplorationDefaults()
+        loss.method_name = None
+        assert exploration_defaults(loss) == by_name
+    assert exploration_defaults(LossModule()) == ExplorationDefaults()
