@@ -175,7 +175,7 @@ def _measure(run: DownstreamRun, agent_steps: int, warmup: int, *, is_ahead: boo
 def _fill(run: DownstreamRun) -> None:
     action_dim = run.env.env.action_spec.shape[-1]
     episodes = synthetic_episodes(
-        run.config.replay_capacity, run.parts.encoder.image_size, action_dim=action_dim
+        run.config.resolved_replay_capacity, run.parts.encoder.image_size, action_dim=action_dim
     )
     store_episodes(run.parts.replay, episodes)
     run.parts.features.rebuild()

@@ -77,7 +77,7 @@ def downstream_candidates(
     Raises:
         CRPTproError: if the dense maps do not fit the memory.
     """
-    episodes = list(synthetic_episodes(config.replay_capacity, pretrained.encoder.image_size))
+    episodes = list(synthetic_episodes(config.resolved_replay_capacity, pretrained.encoder.image_size))
     ours: dict[str, DownstreamUpdates] = {}
     for features, words in (("reencode", "encoding anew"), ("dense", "dense features")):
         for precision in precisions():

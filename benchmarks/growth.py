@@ -225,7 +225,7 @@ def _config(settings: Settings, transitions: int, *, batch_size: int | None = No
 
 def _downstream(settings: Settings, config: DownstreamConfig, run_dir: Path) -> DownstreamUpdates:
     pretrained = fresh_pretrained(image_size=settings.image_size)
-    episodes = synthetic_episodes(config.replay_capacity, settings.image_size)
+    episodes = synthetic_episodes(config.resolved_replay_capacity, settings.image_size)
     return DownstreamUpdates(pretrained, episodes, config=config, run_dir=run_dir)
 
 

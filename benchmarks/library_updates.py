@@ -175,5 +175,5 @@ def _kept_latent_dim(pretrained: Pretrained, config: DownstreamConfig) -> int | 
 
 
 def _slots(config: DownstreamConfig) -> int:
-    replay = FrameReplay(config.replay_capacity, frame_shape=(1, 1, 1), action_dim=1)
+    replay = FrameReplay(config.resolved_replay_capacity, frame_shape=(1, 1, 1), action_dim=1)
     return dense_slots(replay, config.env_steps // config.resolved_action_repeat)

@@ -90,7 +90,7 @@ class Config:
     """mirror the records to Weights & Biases; auto is online when logged in, else offline"""
 
     # downstream
-    downstream: SACSettings = field(default_factory=SACSettings)
+    downstream: SACSettings = field(default_factory=lambda: SACSettings(replay_capacity=40_000))
     """SAC on the frozen encoder"""
 
 

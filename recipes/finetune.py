@@ -53,7 +53,7 @@ class Config:
     """arithmetic of the convolutions and big matrix products"""
     device: str = "cpu"
     """where to train"""
-    downstream: SACSettings = field(default_factory=SACSettings)
+    downstream: SACSettings = field(default_factory=lambda: SACSettings(replay_capacity=40_000))
     """SAC on the frozen encoder"""
 
 

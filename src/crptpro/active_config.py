@@ -65,7 +65,8 @@ class ExplorationSettings:
     queue_size: int = 2_048
     """candidates that the prototype reward keeps, a multiple of the number of prototypes"""
     per_domain_queue: bool = False
-    """a reward with a memory of its own (candidates, running scale) for every domain instead of one for all"""
+    """candidates of the prototype reward for every domain instead of one queue for all; a running scale is always a
+    domain's own"""
     checkpoint_interval_env_steps: int = 5_000
     """simulator steps, over all domains, between two checkpoints"""
     quality: Quality = "exact"

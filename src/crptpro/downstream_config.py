@@ -69,8 +69,9 @@ class SACSettings:
     """simulator steps per decision (default: the domain's, 2)"""
     batch_size: int = 512
     """transitions per update"""
-    replay_capacity: int = 40_000
-    """transitions kept; the oldest go first"""
+    replay_capacity: int | None = None
+    """transitions kept; the oldest go first (default: the method's that trained the encoder; proto-rl 100,000, all
+    others 40,000)"""
     random_agent_steps: int = 1_000
     """decisions taken uniformly at random before the first update (by the policy, if it was transferred)"""
     transfer_actor: bool | None = None
@@ -140,7 +141,7 @@ class SACSettings:
         for name in ("shift_pad", "intrinsic_reward_coef", "video_episodes"):
             if getattr(self, name) < 0:
                 raise ValueError(f"`{name}` must not be negative, got {getattr(self, name)}.")
-        if self.replay_capacity < self.random_agent_steps:
+        if self.replay_capacity is not None and self.replay_capacity < self.random_agent_steps:
             raise ValueError(
                 f"`replay_capacity` ({self.replay_capacity}) must hold the {self.random_agent_steps} transitions "
                 "of `random_agent_steps`, or no update would ever start."
@@ -150,6 +151,19 @@ class SACSettings:
                 f"`intrinsic_reward_coef` is {self.intrinsic_reward_coef}, but {self.algorithm} has no bonus: set it "
                 f"to 0, or start from {self.algorithm.replace('-', '_')}_settings(), which holds all its values."
             )
+
+    @property
+    def resolved_replay_capacity(self) -> int:
+        """Transitions kept; ``train_downstream`` asks the artifact's method for it before it starts.
+
+        Raises:
+            ValueError: if nobody has asked yet.
+        """
+        if self.replay_capacity is None:
+            raise ValueError(
+                "`replay_capacity` is the method's, which is not known here; set it to a number."
+            )
+        return self.replay_capacity
 
     @property
     def resolved_action_repeat(self) -> int:
@@ -227,6 +241,7 @@ def skill_ddpg_settings(**overrides: Any) -> DownstreamConfig:
 
     Source: rll-research/url_benchmark and Rooshy-yang/BeCL. Deviation: batch and replay are those of the other
     pre-trained methods (512 and 40,000; natively 256 to 1,024 and 1,000,000), so that what is compared is the agent.
+    Actor and critic start afresh, where the source copies the exploring actor and the critic's trunk.
 
     Args:
         **overrides: single settings of :class:`DownstreamConfig`.

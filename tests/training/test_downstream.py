@@ -14,6 +14,7 @@ from crptpro.loggers import RunLogger, WandbOptions
 from crptpro.modules import PixelEncoder, Projector, Prototypes
 from crptpro.pretrained import Pretrained, random_pretrained
 from crptpro.training import DownstreamConfig, load_agent, train_downstream
+from crptpro.training.downstream import _replay_capacity
 from crptpro.training.frozen_features import FrozenFeatures
 from crptpro.training.rad_sac_learner import RADSACLearner
 
@@ -292,3 +293,11 @@ def test_videos_and_mirrors_receive_the_run(tmp_path: Path) -> None:
     assert videos == ["env_steps_00000000_episode_0.mp4", "env_steps_00000040_episode_0.mp4"]
     assert {path.name for path in (tmp_path / "tensorboard").iterdir()} == {"train", "episodes", "eval"}
     assert list((tmp_path / "wandb").glob("offline-run-*/*.wandb"))
+
+
+@pytest.mark.parametrize(("method", "capacity"), [("proto-rl-c", 100_000), ("atc", 40_000), ("own", 40_000)])
+def test_a_run_keeps_as_many_transitions_as_the_method_of_its_encoder(method: str, capacity: int) -> None:
+    pretrained = small_pretrained()
+    pretrained.card["method"] = method
+    assert _replay_capacity(pretrained, dataclasses.replace(SMALL, replay_capacity=None)) == capacity
+    assert _replay_capacity(pretrained, SMALL) == SMALL.replay_capacity

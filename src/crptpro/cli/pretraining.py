@@ -156,6 +156,8 @@ class Pretrain(PretrainingOptions):
             for name in ("assignment_temperature", "intr_loss_coef")
             if (value := getattr(self, name)) is not None
         }
+        if method.exploration is not None and method.exploration.skill_dim and self.explore.skill_dim:
+            options["skill_dim"] = self.explore.skill_dim  # the head has one output per skill
         seed_everything(self.seed)
         return method.build(method.build_encoder(3 * frame_stack, image_size), **options)
 

@@ -22,7 +22,7 @@ register_method(
     is_preset=True,
 )
 
-# ATC's own loss and schedule on the trunk, batch and budget that all methods share.
+# ATC's own loss, head and schedule on the trunk (orthogonal weights), batch and budget that all methods share.
 _ATC = MethodDefaults(
     lr=1e-3, encoder_tau=0.01, schedule="warmup_cosine", warmup_updates=1_000, grad_clip=10.0
 )
@@ -48,12 +48,19 @@ register_method(
 # Deviation: the released code of Proto-RL has a predictor of width 512; the paper's table, which has it beside
 # CRPTpro, says 1024.
 _PROTO_RL = {"intr_loss_coef": 0.0}
-register_method("proto-rl-c", ProtoLoss, loss_options=_PROTO_RL, exploration=ExplorationDefaults())
+register_method(
+    "proto-rl-c",
+    ProtoLoss,
+    loss_options=_PROTO_RL,
+    replay_capacity=100_000,
+    exploration=ExplorationDefaults(),
+)
 register_method(
     "proto-rl-s",
     ProtoLoss,
     MethodDefaults(updates=125_000),
     loss_options=_PROTO_RL,
+    replay_capacity=100_000,
     exploration=ExplorationDefaults(env_steps=500_000, is_single_domain=True, transfers_actor=True),
 )
 # An update of BeCL's agent every second agent step brings three encoder updates: 150,000 for 50,000 of the agent.

@@ -22,7 +22,8 @@ class ExplorationDefaults:
     """Exploring agent: ``"rad-sac"``, ``"averaged-sac"`` (DrQ's K = M = 2 on detached features), ``"skill-ddpg"``."""
 
     env_steps: int = 200_000
-    """Simulator steps: in total over the domains of a group, or of the one domain."""
+    """Simulator steps: in total over the domains of a group, or of the one domain. The random phases come out of them,
+    so there are a few per cent fewer encoder updates than the steps would allow."""
 
     is_single_domain: bool = False
     """The (S) variants: pre-trained on one domain only."""

@@ -42,7 +42,7 @@ class RADSACLoss(SACLoss):
             out = loss.actor_and_temperature_loss(td)   # backward each, step both
             target_updater.step()                       # SoftUpdate(loss, tau=0.01)
 
-    Deviation: the released code always bootstraps; here ``terminated`` cuts it (never so in DeepMind Control).
+    Deviation: the released code always bootstraps; here ``terminated`` cuts it, which no task of the paper has.
 
     Args:
         actor: on features.

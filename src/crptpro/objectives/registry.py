@@ -72,6 +72,9 @@ class Method:
     encoder_options: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of :class:`~crptpro.modules.PixelEncoder` that the method wants."""
 
+    replay_capacity: int = 40_000
+    """Transitions that an agent keeps which is trained on its encoder later."""
+
     exploration: ExplorationDefaults | None = None
     """How it explores while it pre-trains; None for a method trained on random datasets."""
 
@@ -116,6 +119,7 @@ def register_method(
     loss_options: dict[str, Any] | None = None,
     is_preset: bool = False,
     encoder_options: dict[str, Any] | None = None,
+    replay_capacity: int = 40_000,
     exploration: ExplorationDefaults | None = None,
 ) -> Method:
     """Make a method available by name, on the command line too.
@@ -128,6 +132,7 @@ def register_method(
         is_preset: a variant of an already registered method.
         encoder_options: keyword arguments of :class:`~crptpro.modules.PixelEncoder`, such as
             ``{"pixel_offset": 0.5}``.
+        replay_capacity: transitions that an agent keeps which is trained on its encoder later.
         exploration: how the method explores, for active pre-training; None if it learns from random datasets.
 
     Returns:
@@ -148,6 +153,7 @@ def register_method(
         dict(loss_options or {}),
         is_preset,
         dict(encoder_options or {}),
+        replay_capacity,
         exploration,
     )
     _METHODS[name] = method

@@ -50,7 +50,11 @@ def transferred_actor(
             )
         return None
     assert isinstance(pretrained.actor, SquashedGaussianActor)
-    logger.info("actor: goes on from the one that explored %s, without a random phase", explored)
+    widths = {name: pretrained.actor.config[name] for name in ("bottleneck_dim", "hidden_dim")}
+    logger.info(
+        "actor: goes on from the one that explored %s (%s), without a random phase",
+        explored, ", ".join(f"{name} {width}" for name, width in widths.items()),
+    )  # fmt: skip
     return copy.deepcopy(pretrained.actor).requires_grad_(True).train()
 
 

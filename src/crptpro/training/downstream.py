@@ -14,6 +14,7 @@ from crptpro.downstream_config import DownstreamConfig
 from crptpro.envs import make_env, resolve_action_repeat
 from crptpro.errors import CheckpointError, PretrainedError, UnknownNameError
 from crptpro.loggers import RunLogger
+from crptpro.objectives import Method, get_method, methods
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
 from crptpro.training.agent import PixelAgent
 from crptpro.training.checkpoint import CheckpointDir
@@ -77,6 +78,7 @@ def train_downstream(
     config = dataclasses.replace(config or DownstreamConfig(), **overrides)
     config = dataclasses.replace(config, action_repeat=_action_repeat(task, config.action_repeat))
     artifact = _artifact(pretrained, config)
+    config = dataclasses.replace(config, replay_capacity=_replay_capacity(artifact, config))
     with contextlib.ExitStack() as stack:
         directory = Path(run_dir or stack.enter_context(tempfile.TemporaryDirectory(prefix="crptpro-")))
         stack.enter_context(DirectoryLock(directory, error=CheckpointError, is_reentrant=True))
@@ -112,6 +114,15 @@ def _artifact(pretrained: Pretrained | str | Path | None, config: DownstreamConf
             "the control. Only drq needs none."
         )
     return pretrained if isinstance(pretrained, Pretrained) else load_pretrained(pretrained)
+
+
+def _replay_capacity(pretrained: Pretrained, config: DownstreamConfig) -> int:
+    """Transitions to keep: as asked, or what the artifact's method keeps, and at least the random phase."""
+    if config.replay_capacity is not None:
+        return config.replay_capacity
+    known = pretrained.method in methods(presets=True)
+    usual = get_method(pretrained.method).replay_capacity if known else Method.replay_capacity
+    return max(usual, config.random_agent_steps)
 
 
 def _action_repeat(task: str, asked: int | None) -> int:

@@ -192,7 +192,7 @@ def _build_replay(
     # that while it is being written.
     slack = 2 * (config.checkpoint_interval_env_steps // config.resolved_action_repeat) + 2_000
     replay = FrameReplay(
-        config.replay_capacity,
+        config.resolved_replay_capacity,
         frame_shape=(3, height, width),
         action_dim=env.action_spec.shape[-1],
         path=run_dir / "replay",

@@ -132,3 +132,28 @@ def test_what_a_method_cannot_explore_with_is_refused_by_name() -> None:
         explore(None, loss=make_loss("apt-c"), reward="prototype")
     with pytest.raises(CRPTproError, match="skill-ddpg needs skills"):
         explore(None, agent="skill-ddpg")
+    with pytest.raises(CRPTproError, match="rad-sac learns from single transitions, got n_step 3"):
+        explore(None, n_step=3)
+
+
+def test_domains_share_candidates_but_no_running_scale(batches: list) -> None:
+    """A reward is divided by the distances that its own agent has seen."""
+    for method, is_shared in (("proto-rl-c", True), ("apt-c", False)):
+        batches.clear()
+        explore(None, loss=make_loss(method))
+        run, _ = batches[0]
+        assert (run.rewards[0] is run.rewards[1]) == is_shared
+
+
+def test_the_loss_gets_the_candidates_in_the_order_they_will_be_replaced(batches: list) -> None:
+    loss, _ = explore(None, per_domain_queue=False)
+    run, _ = batches[0]
+    transform = run.rewards[0].transform
+    assert torch.equal(loss.queue[0], transform.queue[int(transform.queue_pointer)])
+
+
+def test_an_encoder_without_the_methods_pixel_scaling_is_announced(caplog: pytest.LogCaptureFixture) -> None:
+    loss = make_loss("becl")
+    loss.encoder.config["pixel_offset"] = 0.0
+    explore(None, loss=loss, env_steps=60)
+    assert "becl wants an encoder with pixel_offset 0.5, this one has 0.0" in caplog.text

@@ -23,14 +23,14 @@ from crptpro.envs import make_env
 from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
 from crptpro.modules import resolve_precision, set_compute_dtype
-from crptpro.objectives import exploration_defaults, method_defaults
+from crptpro.objectives import exploration_defaults, get_method, method_defaults, methods
 from crptpro.seeding import derive_seed
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.explore.assemble import assemble, domain_names, require_explorable
 from crptpro.training.explore.plan import resolve
 from crptpro.training.pretrain.result import PretrainResult, training_record
 
-logger = logging.getLogger(__name__)
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -98,6 +98,7 @@ def pretrain_active(
     config = dataclasses.replace(config or ActiveConfig(), **overrides)
     defaults, exploration = method_defaults(loss), exploration_defaults(loss)
     config = resolve(config, exploration, defaults)
+    _warn_of_another_encoder(loss)
     named = domain_names(loss, domains, exploration)
     dtype = resolve_precision(config.precision, config.device)
     device = torch.device(config.device)
@@ -159,3 +160,18 @@ def pretrain_active(
             env_steps=run.env_steps,
             actors={member.name: member.agent.actor for member in run.members},
         )
+
+
+def _warn_of_another_encoder(loss: LossModule) -> None:
+    """A method's numbers belong to its own pixel scaling; a loss built by hand may have forgotten it."""
+    name = getattr(loss, "method_name", None) or next(
+        (name for name in methods() if get_method(name).loss_class is type(loss)), None
+    )
+    config = getattr(getattr(loss, "encoder", None), "config", {})
+    wanted = get_method(name).encoder_options if name in methods(presets=True) else {}
+    for option, value in wanted.items():
+        if option in config and config[option] != value:
+            _LOG.warning(
+                "%s wants an encoder with %s %s, this one has %s; get_method(%r).build_encoder() builds its own.",
+                name, option, value, config[option], name,
+            )  # fmt: skip

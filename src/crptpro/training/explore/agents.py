@@ -59,6 +59,9 @@ class SACExplorer:
         config: resolved.
         generator: source of all action noise.
         loss_class: :class:`~crptpro.objectives.RADSACLoss` or one with second views.
+
+    Raises:
+        CRPTproError: returns over several decisions.
     """
 
     def __init__(
@@ -69,6 +72,11 @@ class SACExplorer:
         generator: torch.Generator,
         loss_class: type[RADSACLoss] = RADSACLoss,
     ) -> None:
+        if (config.n_step or 1) != 1:
+            raise CRPTproError(
+                f"The explorer {config.agent} learns from single transitions, got n_step {config.n_step}; leave it "
+                "out, or choose skill-ddpg."
+            )
         bottleneck, hidden = config.bottleneck_dim, config.hidden_dim
         self.generator = generator
         actor = SquashedGaussianActor(feature_dim, action_dim, bottleneck_dim=bottleneck, hidden_dim=hidden)

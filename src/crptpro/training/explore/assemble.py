@@ -166,7 +166,7 @@ def assemble(
                     discount=config.discount,
                 )
             )
-            if config.per_domain_queue or not rewards:
+            if config.per_domain_queue or not rewards or not rewards[0].keeps_candidates:
                 rewards.append(
                     ExplorationReward(config.reward or "", loss, config, seed=derive_seed(seed, "reward"))
                 )

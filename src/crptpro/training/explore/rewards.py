@@ -68,6 +68,18 @@ class ExplorationReward:
         named = self.transform.state_dict(keep_vars=True).items()
         self._own = [key for key, value in named if id(value) not in networks]
 
+    @property
+    def keeps_candidates(self) -> bool:
+        """Whether what it remembers are candidates, which all domains share, and not a statistic of one agent's."""
+        return isinstance(getattr(self.transform, "queue", None), Tensor)
+
+    def candidates(self) -> Tensor | None:
+        """Return a copy of the candidates, the one that is overwritten next first."""
+        if not self.keeps_candidates:
+            return None
+        queue, pointer = self.transform.queue, self.transform.queue_pointer
+        return queue.roll(-int(pointer), 0).clone()
+
     def pay(self, batch: TensorDictBase) -> Tensor:
         """Replace ``("next", "reward")`` by the intrinsic reward, and return the mean of that."""
         self.transform(batch)

@@ -135,8 +135,7 @@ class ActiveRun:
         row = self.history[-1] if self.history else self._last_row()
         metrics = {name: value for name, value in row.items() if name not in ("updates", "env_steps")}
         if len(set(map(id, self.rewards))) == 1:  # downstream goes on with the candidates of all domains
-            queue = getattr(self.rewards[0].transform, "queue", None)
-            self.loss.queue = queue.clone() if isinstance(queue, Tensor) else None
+            self.loss.queue = self.rewards[0].candidates()
         return metrics, self.monitor.finish(self.updates)
 
     def close(self) -> None:
@@ -177,7 +176,8 @@ class ActiveRun:
         if trains_encoder:
             for again in range(self.plan.encoder_updates_each):
                 batch = batches.sample(size) if again else batch
-                if trains_agent and self.encodes_before_update:
+                is_last = again == self.plan.encoder_updates_each - 1
+                if is_last and trains_agent and self.encodes_before_update:
                     encode(batch, self.loss.encoder, keys)
                 values = self.learner.update(batch, index=self.updates, domain=member.name)
                 self.window.add(values, index)
