@@ -11,6 +11,9 @@ COLLECT=(--group A --transitions 20000 --workers 2)
 GROUP=(--group A --explore.env-steps 40000 --explore.random-agent-steps 667)
 SINGLE=(--variant s --domain walker --explore.env-steps 40000 --explore.random-agent-steps 2000)
 BATCH=(--pretrain-batch-size 128)
+# As many prototypes as rows, as in the paper (512 of both): with more, most rows are their own nearest candidates and
+# the prototype reward is 0.
+PROTOTYPES=(--num-prototypes 128)
 EVERY_6=(--explore.encoder-update-interval 6 --explore.checkpoint-interval-env-steps 2000)
 EVERY_18=(--explore.encoder-update-interval 18 --explore.checkpoint-interval-env-steps 2000)
 # 20,000 env steps of the same task.
@@ -22,13 +25,13 @@ DOWN="--tasks walker_stand $(task downstream)"
 
 command_of() {
     case $1 in
-        crptpro) echo crptpro.py --out "$OUT/random" "${COLLECT[@]}" --updates 3000 "${BATCH[@]}" $DOWN ;;
+        crptpro) echo crptpro.py --out "$OUT/random" "${COLLECT[@]}" --updates 3000 "${BATCH[@]}" "${PROTOTYPES[@]}" $DOWN ;;
         random-encoder) echo crptpro.py --out "$OUT/random" --pretrained random-encoder $DOWN ;;
         crptpro-finetune) echo finetune.py "$OUT/random/group_A_seed_0/encoder" --out "$OUT/random" --domain walker \
             --transitions 20000 --updates 500 --batch-size 128 --task walker_stand $(task downstream) ;;
         atc) echo atc.py --out "$OUT/random" "${COLLECT[@]}" --updates 3000 "${BATCH[@]}" $DOWN ;;
-        proto-rl-c) echo proto_rl.py --out "$OUT/active" "${GROUP[@]}" "${EVERY_6[@]}" "${BATCH[@]}" $DOWN ;;
-        proto-rl-s) echo proto_rl.py --out "$OUT/active" "${SINGLE[@]}" "${EVERY_6[@]}" "${BATCH[@]}" $DOWN ;;
+        proto-rl-c) echo proto_rl.py --out "$OUT/active" "${GROUP[@]}" "${EVERY_6[@]}" "${BATCH[@]}" "${PROTOTYPES[@]}" $DOWN ;;
+        proto-rl-s) echo proto_rl.py --out "$OUT/active" "${SINGLE[@]}" "${EVERY_6[@]}" "${BATCH[@]}" "${PROTOTYPES[@]}" $DOWN ;;
         apt-c) echo apt.py --out "$OUT/active" "${GROUP[@]}" "${EVERY_6[@]}" "${BATCH[@]}" $DOWN ;;
         apt-s) echo apt.py --out "$OUT/active" "${SINGLE[@]}" "${EVERY_6[@]}" "${BATCH[@]}" $DOWN ;;
         # Three updates each time, so a third as often.
