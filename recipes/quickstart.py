@@ -65,6 +65,8 @@ class Config:
     """transitions per update [512]"""
     pretrain_learning_rate: float = 3e-4
     """of Adam [1e-4]"""
+    num_prototypes: int = 128
+    """as many as transitions per update, here as in the paper: the exploration bonus wants that [512]"""
     assignment_temperature: float = 0.05
     """of Sinkhorn-Knopp; at the paper's the loss stands still for over a thousand updates first [0.1]"""
 
@@ -118,7 +120,11 @@ def main(config: Config) -> None:
     logger.info(
         "2/5 pre-train: %s updates of batch %d", f"{config.pretrain_updates:,}", config.pretrain_batch_size
     )
-    loss = ProtoLoss(PixelEncoder(), assignment_temperature=config.assignment_temperature)
+    loss = ProtoLoss(
+        PixelEncoder(),
+        num_prototypes=config.num_prototypes,
+        assignment_temperature=config.assignment_temperature,
+    )
     pretraining = pretrain(
         loss,
         datasets,

@@ -12,7 +12,7 @@ from torchrl.envs import Compose, SerialEnv, TransformedEnv
 
 from crptpro.modules import Projector, Prototypes
 from crptpro.transforms import FrozenEncoder, PrototypeReward
-from crptpro.transforms.prototype_reward import draw_candidates
+from crptpro.transforms.prototype_reward import draw_candidates, warn_if_mostly_zero
 
 B, D, M = 24, 6, 8
 
@@ -354,3 +354,28 @@ def test_missing_entries_are_named():
         on_latents()(TensorDict({"next": {"features": torch.zeros(2, D)}}, batch_size=[2]))
     with pytest.raises(KeyError, match="score"):
         TransformedEnv(FakePixelEnv(), with_encoder(reward_key="score")).reward_spec  # noqa: B018
+
+
+def test_batches_too_small_for_the_prototypes_are_announced(caplog: pytest.LogCaptureFixture) -> None:
+    warn_if_mostly_zero(512, 512, 3)
+    assert not caplog.text
+    warn_if_mostly_zero(512, 128, 3)
+    assert "512 prototypes draw their candidates from batches of 128" in caplog.text
+    assert "batches of more than 170" in caplog.text
+
+
+def test_most_rows_earn_nothing_where_it_is_announced_and_few_at_the_papers_sizes() -> None:
+    def share_of_zeros(batch_size: int) -> float:
+        generator = torch.Generator().manual_seed(0)
+        reward = PrototypeReward(
+            None,
+            torch.randn(512, 16, generator=generator),
+            queue_size=2048,
+            reward_key=None,
+            generator=generator,
+        )
+        values = [reward.intrinsic_reward(torch.randn(batch_size, 16, generator=generator)) for _ in range(5)]
+        return float((values[-1] == 0).float().mean())
+
+    assert share_of_zeros(128) > 0.6
+    assert share_of_zeros(512) < 0.2

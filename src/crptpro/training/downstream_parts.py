@@ -27,6 +27,7 @@ from crptpro.training.frozen_features import FrozenFeatures, dense_slots
 from crptpro.training.trained_features import TrainedFeatures
 from crptpro.transforms import PrototypeReward, choose_feature_mode
 from crptpro.transforms.free_memory import free_bytes
+from crptpro.transforms.prototype_reward import warn_if_mostly_zero
 
 logger = logging.getLogger(__name__)
 
@@ -262,6 +263,7 @@ def _build_bonus(
     if prototypes is None or projector is None:
         logger.info("no exploration bonus: the artifact has no prototypes")
         return None
+    warn_if_mostly_zero(len(prototypes.get_parameter("weight")), config.batch_size, config.knn_k)
     return PrototypeReward(
         None if reads_projections else projector,
         prototypes,

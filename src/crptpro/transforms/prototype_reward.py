@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import ClassVar, Literal
 
@@ -14,6 +15,8 @@ from torch import Tensor, nn
 from crptpro.modules.heads import latent_dim_of
 from crptpro.objectives.functional import knn_distance
 from crptpro.transforms.intrinsic_reward import IntrinsicReward
+
+logger = logging.getLogger(__name__)
 
 
 class PrototypeReward(IntrinsicReward):
@@ -206,6 +209,25 @@ def _check_latents(length: int, expected: int) -> None:
         raise ValueError(
             f"projections have length {length}, the prototypes {expected}; use the projector they were trained with."
         )
+
+
+def warn_if_mostly_zero(num_prototypes: int, batch_size: int, knn_k: int) -> None:
+    """Say so where most rows will earn nothing.
+
+    Every prototype draws a candidate from the batch: from a small one each row so often that the k nearest candidates
+    of most rows are the row itself. With 512 prototypes, k = 3 and batches of 128 three quarters of the rows get 0.
+
+    Args:
+        num_prototypes: M.
+        batch_size: B; the paper has B = M.
+        knn_k: k.
+    """
+    if num_prototypes >= knn_k * batch_size:
+        logger.warning(
+            "The prototype reward will mostly be 0: %d prototypes draw their candidates from batches of %d, so that "
+            "the %d nearest candidates of a row are the row itself. Take batches of more than %d, or fewer prototypes.",
+            num_prototypes, batch_size, knn_k, num_prototypes // knn_k,
+        )  # fmt: skip
 
 
 def draw_candidates(logits: Tensor, generator: torch.Generator | None = None) -> Tensor:

@@ -32,6 +32,7 @@ from crptpro.training.explore.run import ActiveRun
 from crptpro.training.fingerprint import describe_loss
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.window import num_prototypes
+from crptpro.transforms.prototype_reward import warn_if_mostly_zero
 
 logger = logging.getLogger(__name__)
 
@@ -124,7 +125,8 @@ def assemble(
     repeats = {name: _action_repeat(domain, config.action_repeat) for name, domain in domains.items()}
     plan = make_plan(config, list(repeats.values()))
     _announce(plan, config, list(domains))
-    _warn_of_a_reward_of_zero(loss, config)
+    if config.reward == "prototype":
+        warn_if_mostly_zero(num_prototypes(loss) or 0, config.batch_size or 1, config.knn_k or 3)
     device = torch.device(config.device)
     members: list[Member] = []
     batches: list[ReplayBatches] = []
@@ -205,17 +207,6 @@ def _announce(plan: Plan, config: ActiveConfig, domains: list[str]) -> None:
         f"{plan.env_steps:,}", ", ".join(domains), f"{plan.agent_steps:,}", f"{plan.random_agent_steps:,}",
         f"{plan.encoder_updates:,}", config.batch_size, config.reward, config.agent,
     )  # fmt: skip
-
-
-def _warn_of_a_reward_of_zero(loss: LossModule, config: ActiveConfig) -> None:
-    """Every prototype draws a candidate from the batch: from a small one, each row so often that it pays itself 0."""
-    count, size, k = num_prototypes(loss) or 0, config.batch_size or 1, config.knn_k or 3
-    if config.reward == "prototype" and count >= k * size:
-        logger.warning(
-            "The prototype reward will be close to 0: %d prototypes draw their candidates from batches of %d, so that "
-            "the %d nearest candidates of a row are the row itself. Take batches of more than %d, or fewer prototypes.",
-            count, size, k, count // k,
-        )  # fmt: skip
 
 
 def _make_env_thread(
