@@ -2,8 +2,8 @@
 
 **Runs.** A replicate redraws every task's runs, with replacement, as many as there are, and independently of the other
 tasks (stratified bootstrap; Agarwal et al., 2021, arXiv 2108.13264, section 4.1). Right when runs are independent: each
-has an encoder of its own (DrQ, the untrained control, one downstream run per pre-training and task with no task in
-common), or the statement is about *these* encoders and not about the method that made them.
+has an encoder of its own that no other run uses, on whatever task (DrQ, the untrained control), or the statement is
+about *these* encoders and not about the method that made them.
 
 **Encoders.** Right when runs share pre-trained encoders and the statement is about the pre-training method: a lucky
 encoder lifts all its runs, on all tasks of its group, so that three encoders with four runs on three tasks each are
