@@ -31,6 +31,10 @@ class PretrainedError(CRPTproError):
     """A pretrained artifact is missing, damaged or does not fit its use."""
 
 
+class RecordError(CRPTproError):
+    """The record of a run is missing, damaged, or lacks what is asked of it."""
+
+
 class NonFiniteError(CRPTproError):
     """A loss or a gradient became NaN or infinite."""
 
