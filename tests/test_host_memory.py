@@ -47,6 +47,16 @@ def test_blocks_of_another_size_are_not_given_and_only_a_few_are_remembered():
     assert torch.frombuffer(pool.take(8192), dtype=torch.uint8).data_ptr() == addresses[0]
 
 
+def test_what_is_remembered_has_a_limit_in_bytes_too():
+    pool = BlockPool(kept_bytes=3 * 4096)
+    for size in (4096, 8192, 16384):
+        pool.take(size)
+    assert not pool._blocks, "the last is larger than all that may be remembered"
+    pool.take(8192)
+    pool.take(4096)
+    assert [len(block) for block in pool._blocks] == [8192, 4096]
+
+
 def test_batches_in_use_never_share_memory_whoever_allocates():
     """Several threads take and drop batches; what one has written nobody else changes."""
 

@@ -39,7 +39,7 @@ class ExplorationSettings:
     random_agent_steps: int | None = None
     """decisions per domain taken uniformly at random before its first update (default: the method's)"""
     replay_capacity: int | None = None
-    """transitions kept per domain (default: the method's, 100,000)"""
+    """transitions kept per domain, fewer where episodes have less than 50 decisions (default: the method's, 100,000)"""
     n_step: int | None = None
     """decisions that the agent's return looks ahead (default: the method's)"""
     skill_dim: int | None = None
@@ -65,8 +65,8 @@ class ExplorationSettings:
     queue_size: int = 2_048
     """candidates that the prototype reward keeps, a multiple of the number of prototypes"""
     per_domain_queue: bool = False
-    """candidates of the prototype reward for every domain instead of one queue for all; a running scale is always a
-    domain's own"""
+    """candidates of the prototype reward for every domain instead of one queue for all, which the artifact hands to
+    downstream runs; a running scale is always a domain's own"""
     checkpoint_interval_env_steps: int = 5_000
     """simulator steps, over all domains, between two checkpoints"""
     quality: Quality = "exact"

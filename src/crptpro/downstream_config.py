@@ -211,6 +211,9 @@ class DownstreamConfig(SACSettings):
         super().__post_init__()
         if self.eval_workers is not None and self.eval_workers < 0:
             raise ValueError(f"`eval_workers` must not be negative, got {self.eval_workers}.")
+        for name in ("compile", "cuda_graph"):
+            if self.algorithm == "skill-ddpg" and getattr(self, name) == "on":
+                raise ValueError(f"`{name}` is 'on', which skill-ddpg does not have; leave it out.")
 
 
 def drq_settings(**overrides: Any) -> DownstreamConfig:

@@ -23,6 +23,9 @@ SMALLEST_BLOCK = 2**23
 KEPT_BLOCKS = 8
 """Blocks that are remembered: two images, each with a second view, of this batch and the one before."""
 
+KEPT_BYTES = 2**29
+"""Size of all of them: a single large sample must not hold its memory for ever."""
+
 
 class BlockPool:
     """Memory of batches that are gone, given to the next ones.
@@ -37,10 +40,11 @@ class BlockPool:
 
     Args:
         kept: blocks to remember; the longest remembered is forgotten first, and freed with its last tensor.
+        kept_bytes: size of all that are remembered.
     """
 
-    def __init__(self, kept: int = KEPT_BLOCKS) -> None:
-        self.kept = kept
+    def __init__(self, kept: int = KEPT_BLOCKS, kept_bytes: int = KEPT_BYTES) -> None:
+        self.kept, self.kept_bytes = kept, kept_bytes
         self._blocks: list[mmap.mmap] = []
         self._lock = threading.Lock()
 
@@ -55,6 +59,8 @@ class BlockPool:
                 block = _map_block(size)
             self._blocks.append(block)
             del self._blocks[: -self.kept]
+            while sum(map(len, self._blocks)) > self.kept_bytes:
+                del self._blocks[0]
             return block
 
 

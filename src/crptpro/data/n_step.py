@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torchrl.data import RandomSampler
 
+from crptpro.errors import DatasetError
+
 if TYPE_CHECKING:
     from crptpro.data.ring_storage import RingStorage
 
@@ -67,14 +69,15 @@ class WindowSampler(RandomSampler):
         """Return indices ``[B]``, and no further information.
 
         Raises:
-            RuntimeError: there is no transition, or none whose window fits.
+            DatasetError: no window fits.
+            RuntimeError: there is no transition.
         """
         n_step = storage.reading.n_step
         count = len(storage) - n_step + 1
         if n_step == 1 or len(storage) == 0:
             return super().sample(storage, batch_size)
         if count < 1:
-            raise RuntimeError(_NO_WINDOW.format(n=n_step, count=len(storage)))
+            raise DatasetError(_NO_WINDOW.format(n=n_step, count=len(storage)))
 
         def draw(among: int, number: int) -> Tensor:
             return torch.randint(among, (number,), generator=self._rng)
@@ -88,13 +91,13 @@ class WindowSampler(RandomSampler):
         every = torch.arange(count)
         admissible = every[storage.has_window(every, n_step)]
         if not len(admissible):
-            raise RuntimeError(_NO_WINDOW.format(n=n_step, count=len(storage)))
+            raise DatasetError(_NO_WINDOW.format(n=n_step, count=len(storage)))
         misfits = (~storage.has_window(index, n_step)).nonzero().squeeze(-1)
         index[misfits] = admissible[draw(len(admissible), len(misfits))]
         return index, {}
 
 
 _NO_WINDOW = (
-    "None of the replay's {count} transitions is followed by enough of its own episode for n_step={n}: store a "
-    "longer episode first, or use a smaller n_step."
+    "None of the replay's {count} transitions is followed by enough of its own episode for n_step={n}: use a "
+    "smaller n_step, or let more be stored before the first update (random_agent_steps)."
 )

@@ -119,7 +119,7 @@ class CapturedCall:
         elif self._calls <= self.warmup:
             outputs = self._warm_up(inputs, device)
         else:
-            self._record(inputs)
+            self._record(inputs, device)
             outputs = self._outputs
         return {name: value.clone() for name, value in outputs.items()}
 
@@ -147,19 +147,25 @@ class CapturedCall:
         main.wait_stream(side)
         return outputs
 
-    def _record(self, inputs: TensorDictBase) -> None:
+    def _record(self, inputs: TensorDictBase, device: torch.device) -> None:
         graph = torch.cuda.CUDAGraph()
         for generator in self.generators:
             graph.register_generator_state(generator)
         try:
             # Only this thread's calls are restricted: others may be rendering or copying meanwhile.
-            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
+            # A stream of this device: by default it would be one of the current device, on which nothing happens.
+            stream = torch.cuda.Stream(device)
+            with (
+                torch.cuda.device(device),
+                torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"),
+            ):
                 self._outputs = self.function(inputs)
-        except RuntimeError as reason:
+        except RuntimeError as ended:
+            reason = ended.__context__ or ended  # ending the recording fails too, and hides what made it fail
             # Not caught and gone on from: an interrupted recording leaves PyTorch's generators unusable.
             raise CompileError(
                 f"The update cannot be recorded as a CUDA graph: {reason}. cuda_graph='off' works without."
-            ) from reason
+            ) from ended
         self._graph = graph
         graph.replay()  # recording ran nothing
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from pathlib import Path
 
 import pytest
@@ -226,7 +227,7 @@ def test_a_single_domain_method_refuses_several_domains_and_a_domain_twice() -> 
 
 
 def test_a_budget_without_any_update_is_refused() -> None:
-    with pytest.raises(CRPTproError, match="no update would ever happen"):
+    with pytest.raises(CRPTproError, match="no update of encoder or explorer would ever happen"):
         explore(None, env_steps=40, random_agent_steps=10)
 
 
@@ -275,3 +276,85 @@ def test_a_queue_per_domain_keeps_candidates_apart(monkeypatch: pytest.MonkeyPat
     shared, apart = runs
     assert shared.rewards[0] is shared.rewards[1]
     assert apart.rewards[0] is not apart.rewards[1]
+
+
+def test_short_episodes_cost_frames_and_a_killed_run_of_them_is_continued_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each episode has one frame more than decisions; with few decisions the ring wraps early."""
+    whole, _ = explore(tmp_path / "whole", ("varied",), env_steps=1_200)
+    original = ActiveRun._turn
+
+    def dies(run: ActiveRun, index: int) -> None:
+        if run.decisions == 590:
+            raise Killed
+        original(run, index)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ActiveRun, "_turn", dies)
+        with pytest.raises(Killed):
+            explore(tmp_path / "killed", ("varied",), env_steps=1_200)
+    resumed, _ = explore(tmp_path / "killed", ("varied",), env_steps=1_200)
+    assert same_state(whole, resumed)
+
+
+def test_another_budget_is_refused_by_name_and_nothing_is_built_for_it(tmp_path: Path) -> None:
+    explore(tmp_path)
+
+    def no_world(domain: str, **settings: object) -> object:
+        raise AssertionError("a world was made")
+
+    with pytest.raises(CheckpointError, match="env_steps was 240, now 300"):
+        explore(tmp_path, env_steps=300, env_factory=no_world)
+
+
+def test_an_attempt_without_a_checkpoint_leaves_nothing_in_the_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def dies(run: ActiveRun, index: int) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ActiveRun, "_turn", dies)
+        with pytest.raises(Killed):
+            explore(tmp_path, replay_capacity=20)
+    _, result = explore(tmp_path, replay_capacity=50)
+    assert result.env_steps == 240
+
+
+def test_a_finished_run_needs_neither_its_replays_nor_its_worlds(tmp_path: Path) -> None:
+    loss, first = explore(tmp_path)
+    shutil.rmtree(tmp_path / "replay")
+
+    def no_world(domain: str, **settings: object) -> object:
+        raise AssertionError("a world was made")
+
+    again, second = explore(tmp_path, env_factory=no_world)
+    assert same_state(loss, again)
+    assert all(same_state(first.actors[name], second.actors[name]) for name in first.actors)
+    assert torch.equal(loss.queue, again.queue)
+    assert not (tmp_path / "replay").exists()
+
+
+def test_a_world_that_fails_is_named_and_the_others_are_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = []
+
+    def fragile(domain: str, **settings: object) -> object:
+        env = toy_env(domain, **settings)
+        made.append(env)
+        if domain == "odd":
+            step = env.step
+            env.step = lambda td: step(td) if env.base_env.steps < 5 else 1 / 0
+        return env
+
+    with pytest.raises(
+        CRPTproError, match=r"The world of odd failed in episode 0, decision 5: ZeroDivisionError"
+    ):
+        explore(None, env_factory=fragile)
+    assert all(env.is_closed for env in made)
+
+
+def test_names_that_are_no_directories_or_columns_are_refused() -> None:
+    for name in ("../outside", "", "a,b"):
+        with pytest.raises(CRPTproError, match="cannot name a directory and a column"):
+            explore(None, (name,), env_factory=lambda domain, **settings: toy_env("even", **settings))

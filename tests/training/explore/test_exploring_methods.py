@@ -6,7 +6,7 @@ import pytest
 import torch
 from active_world import explore, make_loss
 
-from crptpro.errors import CRPTproError, UnknownNameError
+from crptpro.errors import CRPTproError, DatasetError, UnknownNameError
 from crptpro.objectives import AveragedSACLoss, RADSACLoss, SkillDDPGLoss
 from crptpro.training import register_intrinsic_reward
 from crptpro.training.explore.run import ActiveRun
@@ -132,6 +132,12 @@ def test_what_a_method_cannot_explore_with_is_refused_by_name() -> None:
         explore(None, loss=make_loss("apt-c"), reward="prototype")
     with pytest.raises(CRPTproError, match="skill-ddpg needs skills"):
         explore(None, agent="skill-ddpg")
+    with pytest.raises(CRPTproError, match="skill-contrast needs skills"):
+        explore(None, reward="skill-contrast")
+    with pytest.raises(CRPTproError, match="A replay of 3 transitions holds no n_step of 3"):
+        explore(None, loss=make_loss("becl"), replay_capacity=3)
+    with pytest.raises(DatasetError, match="n_step=11"):
+        explore(None, ("even",), loss=make_loss("becl"), n_step=11)
     with pytest.raises(CRPTproError, match="rad-sac learns from single transitions, got n_step 3"):
         explore(None, n_step=3)
 

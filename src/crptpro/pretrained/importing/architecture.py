@@ -146,7 +146,8 @@ def fill(cls: Any, config: Mapping[str, Any], state: dict[str, Tensor], role: st
             raise PretrainedError(
                 f"{name} of its {role} has shape {tuple(state[name].shape)}, not {tuple(empty.shape)}."
             )
-        if not state[name].is_floating_point() or not bool(state[name].isfinite().all()):
+        # As it will be stored: a larger type may hold numbers that float32 does not.
+        if not state[name].is_floating_point() or not bool(state[name].float().isfinite().all()):
             raise PretrainedError(f"{name} of its {role} is not made of finite real numbers.")
     module.load_state_dict({name: value.float() for name, value in state.items()}, assign=True)
     return module.requires_grad_(False).eval()

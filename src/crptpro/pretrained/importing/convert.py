@@ -137,7 +137,7 @@ class _Reader:
         pointer: Any = self._contents.settings.get("queue_ptr", 0)
         if "queue_ptr" in table:
             pointer = self._take(section, "queue_ptr").flatten().tolist()[-1]
-        if queue.dim() != 2 or not queue.is_floating_point() or not bool(queue.isfinite().all()):
+        if queue.dim() != 2 or not queue.is_floating_point() or not bool(queue.float().isfinite().all()):
             raise PretrainedError("its queue is no table of finite numbers.")
         if not isinstance(pointer, int) or not 0 <= pointer < len(queue):
             raise PretrainedError(f"its queue has {len(queue)} rows and none of number {pointer}.")

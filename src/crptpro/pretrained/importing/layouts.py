@@ -14,6 +14,7 @@ Section = dict[str, TensorRecord]
 Scalar = int | float | str | bool
 
 _MOST_MODULES = 10_000
+_MOST_TENSORS = 100_000
 _LONGEST_TEXT = 200
 _COUNTERS = {"_global_step": "agent_steps", "_global_episode": "episodes", "itr": "updates"}
 
@@ -108,6 +109,8 @@ def _flatten(contents: Contents, section: str, module: Foreign) -> None:
             for name, value in _entries(attributes, group).items():
                 if isinstance(value, TensorRecord):
                     table[join(prefix, name)] = value
+            if len(table) > _MOST_TENSORS:
+                raise PretrainedError("its networks have no end.")
         for name, child in _entries(attributes, "_modules").items():
             if _is_module(child):
                 pending.append((join(prefix, name), child))

@@ -205,6 +205,8 @@ def _build(named: Any, arguments: Any) -> Any:
     if path in _ORDERED_DICTS:
         # Filled by instructions, or (old protocols) from a list of pairs.
         pairs = arguments[0] if arguments and isinstance(arguments[0], list) else []
+        if not all(isinstance(pair, (tuple, list)) and len(pair) == 2 for pair in pairs):
+            raise PretrainedError("it fills a dict with something else than pairs.")
         return _update({}, [part for pair in pairs for part in pair])
     if path in _TENSOR_BUILDERS:
         return _tensor(*arguments[:4])

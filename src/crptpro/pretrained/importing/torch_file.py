@@ -81,7 +81,7 @@ class TorchFile:
         if numel and (last >= storage.length or numel > storage.length):
             raise PretrainedError("it describes a tensor that reaches beyond its block of numbers.")
         if not numel:
-            return torch.empty(record.size, dtype=dtype)
+            raise PretrainedError("it describes a tensor without numbers.")
         try:
             content = self._storages.content(storage, dtype.itemsize)
         except PretrainedError:

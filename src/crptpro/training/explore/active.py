@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
+import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -26,8 +27,12 @@ from crptpro.modules import resolve_precision, set_compute_dtype
 from crptpro.objectives import exploration_defaults, get_method, method_defaults, methods
 from crptpro.seeding import derive_seed
 from crptpro.training.checkpoint import CheckpointDir
-from crptpro.training.explore.assemble import assemble, domain_names, require_explorable
+from crptpro.training.explore.assemble import assemble, fingerprint
+from crptpro.training.explore.checkpoint import action_sizes
 from crptpro.training.explore.plan import resolve
+from crptpro.training.explore.replays import DIRECTORY
+from crptpro.training.explore.request import domain_names, require_explorable
+from crptpro.training.fingerprint import require_same
 from crptpro.training.pretrain.result import PretrainResult, training_record
 
 _LOG = logging.getLogger(__name__)
@@ -117,6 +122,14 @@ def pretrain_active(
             raise CheckpointError(f"{run_dir} already holds a run. Choose another directory, or resume it.")
         if run_dir is not None and logger is None:
             logger = stack.enter_context(RunLogger(directory, config=config))
+        state = None if checkpoints is None else checkpoints.load_latest()
+        now = fingerprint(loss, list(named), config, defaults, dtype)
+        finished = None
+        if state is not None:
+            require_same(state["fingerprint"], now, directory)  # before environments and replays are made
+            finished = action_sizes(state) if state["is_finished"] else None
+        else:
+            shutil.rmtree(directory / DIRECTORY, ignore_errors=True)  # of an attempt without a checkpoint
         run = assemble(
             loss,
             named,
@@ -128,9 +141,10 @@ def pretrain_active(
             records=logger,
             checkpoints=checkpoints,
             env_factory=env_factory,
+            finished=finished,
         )
         stack.callback(run.close)
-        run.resume()
+        run.resume(state)
         run.train(progress=progress)
         metrics, verdict = run.finish()
         loss.training_record = training_record(

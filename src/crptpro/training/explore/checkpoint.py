@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from crptpro.seeding import global_rng_state, set_global_rng_state
-from crptpro.training.fingerprint import require_same
 
 if TYPE_CHECKING:
     from crptpro.training.explore.run import ActiveRun
@@ -20,6 +19,7 @@ def state_of(run: ActiveRun) -> dict[str, Any]:
     return {
         "fingerprint": run.fingerprint,
         "decisions": run.decisions,
+        "is_finished": run.decisions == run.plan.decisions,
         "updates": run.updates,
         "seconds": run.seconds,
         "learner": run.learner.state_dict(),
@@ -37,19 +37,15 @@ def state_of(run: ActiveRun) -> dict[str, Any]:
 
 
 def restore(run: ActiveRun, state: Mapping[str, Any]) -> None:
-    """Put a run where :func:`state_of` saw it.
-
-    Raises:
-        CheckpointError: if the state belongs to a run with other settings; nothing has changed then.
-    """
-    require_same(state["fingerprint"], run.fingerprint, run.run_dir)
+    """Put a run with the same settings where :func:`state_of` saw it."""
     run.decisions = run.saved_at = state["decisions"]
     run.updates = run.resumed_from = run.row_updates = state["updates"]
     run.earlier_seconds = state["seconds"]
     run.learner.load_state_dict(state["learner"])
     for index, member in enumerate(run.members):
         member.load_state_dict(state["members"][member.name])
-        run.batches[index].load_state_dict(state["batches"][index])
+        if run.batches:
+            run.batches[index].load_state_dict(state["batches"][index])
         run.rewards[index].load_state_dict(state["rewards"][index])
     set_global_rng_state(state["global_rng"])
     run.window.load_state_dict(state["window"], run.device)
@@ -59,3 +55,8 @@ def restore(run: ActiveRun, state: Mapping[str, Any]) -> None:
         run.records.load_state_dict(state["records"])
     if run.decisions == run.plan.decisions:
         run.made_with = state["made_with"]  # nothing is trained now: say what did it
+
+
+def action_sizes(state: Mapping[str, Any]) -> dict[str, int]:
+    """Return the length of each domain's actions, by name."""
+    return {name: member["actions"].shape[-1] for name, member in state["members"].items()}

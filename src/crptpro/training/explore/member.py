@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import step_mdp
 
 from crptpro.data import FrameReplay
+from crptpro.errors import CRPTproError
 from crptpro.seeding import derive_seed
 from crptpro.training.env_thread import EnvThread
 from crptpro.training.explore.agents import ExploringAgent
@@ -34,9 +35,10 @@ class Member:
 
     Args:
         name: of the domain.
-        env: what is explored.
-        replay: every transition goes there.
+        env: what is explored; None where nothing more will be decided.
+        replay: every transition goes there; likewise.
         agent: decides after ``random_agent_steps`` decisions, uniformly at random before.
+        action_dim: A.
         seed: of the run; episodes, actions and skills have streams of their own below it.
         random_agent_steps: decisions taken uniformly at random.
         skill_dim: number of skills, or ``None``; the current one is stored with every transition.
@@ -46,19 +48,20 @@ class Member:
     def __init__(
         self,
         name: str,
-        env: EnvThread,
-        replay: FrameReplay,
+        env: EnvThread | None,
+        replay: FrameReplay | None,
         agent: ExploringAgent,
         *,
+        action_dim: int,
         seed: int,
         random_agent_steps: int,
         skill_dim: int | None = None,
         skill_agent_steps: int = 50,
     ) -> None:
-        self.name, self.env, self.replay, self.agent = name, env, replay, agent
+        self.name, self.agent, self.action_dim = name, agent, action_dim
+        self._env, self._replay = env, replay
         self.seed, self.random_agent_steps = seed, random_agent_steps
         self.skill_dim, self.skill_agent_steps = skill_dim, skill_agent_steps
-        self.action_dim: int = env.env.action_spec.shape[-1]
         self.generators = {
             stream: torch.Generator().manual_seed(derive_seed(seed, "active", name, stream))
             for stream in ("random_actions", "skill")
@@ -69,6 +72,18 @@ class Member:
         self._observation: TensorDictBase | None = None
         self._action: Tensor | None = None
         self._reward_sum = 0.0
+
+    @property
+    def env(self) -> EnvThread:
+        """What is explored."""
+        assert self._env is not None, "the run has spent its budget"
+        return self._env
+
+    @property
+    def replay(self) -> FrameReplay:
+        """Where every transition goes."""
+        assert self._replay is not None, "the run has spent its budget"
+        return self._replay
 
     def decide(self, encoder: nn.Module, device: torch.device) -> None:
         """Choose the next action, from the settled observation, and begin the environment's step.
@@ -90,7 +105,7 @@ class Member:
         """Store the outcome of the step that has begun, if one has."""
         if self._action is None:
             return
-        transition = self.env.end_step()
+        transition = self._in_the_world(self.env.end_step)
         following, action, self._action = transition["next"], self._action, None
         columns = {} if self.skill_dim is None else {"skill": self.one_hot_skill()}
         self.replay.append(
@@ -117,7 +132,8 @@ class Member:
 
     def close(self) -> None:
         """Free the render context."""
-        self.env.close()
+        if self._env is not None:
+            self._env.close()
 
     def state_dict(self) -> dict[str, Any]:
         """Return where the domain stands; everything that has begun must be settled."""
@@ -137,6 +153,8 @@ class Member:
         for name, value in state["counters"].items():
             setattr(self, name, value)
         self.agent.load_state_dict(state["agent"])
+        if self._env is None:
+            return
         self.replay.load_state_dict(state["replay"])
         for name, generator in self.generators.items():
             generator.set_state(state["generators"][name])
@@ -150,7 +168,19 @@ class Member:
             self._draw_skill()
 
     def _reset(self) -> TensorDictBase:
-        return self.env.reset(derive_seed(self.seed, "active", self.name, "episode", self.episodes))
+        seed = derive_seed(self.seed, "active", self.name, "episode", self.episodes)
+        return self._in_the_world(lambda: self.env.reset(seed))
+
+    def _in_the_world(self, work: Callable[[], TensorDictBase]) -> TensorDictBase:
+        """Do something in the environment; its errors do not say which of several it was."""
+        try:
+            return work()
+        except CRPTproError:
+            raise
+        except Exception as reason:
+            raise CRPTproError(
+                f"The world of {self.name} failed in episode {self.episodes}, decision {len(self.actions)}: {reason!r}."
+            ) from reason
 
     def _draw_skill(self) -> None:
         assert self.skill_dim is not None
@@ -174,7 +204,7 @@ class Member:
         for action in actions:
             observation["action"] = action
             self.env.begin_step(observation)
-            transition = self.env.end_step()
+            transition = self._in_the_world(self.env.end_step)
             self._reward_sum += transition["next", "reward"].item()
             observation = step_mdp(transition)
         self._observation, self.actions = observation, actions

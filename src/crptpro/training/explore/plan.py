@@ -91,7 +91,7 @@ def make_plan(config: ActiveConfig, repeats: Sequence[int]) -> Plan:
         repeats: simulator steps per decision, of each domain.
 
     Raises:
-        CRPTproError: if the budget ends before the first encoder update.
+        CRPTproError: if the budget ends before the first update of encoder or agent.
     """
     assert config.env_steps is not None
     share = sum(repeats) if config.steps_budget == "total" else max(repeats)
@@ -104,10 +104,10 @@ def make_plan(config: ActiveConfig, repeats: Sequence[int]) -> Plan:
         encoder_updates_each=config.encoder_updates_each or 1,
         agent_update_interval=config.agent_update_interval or 1,
     )
-    if plan.encoder_updates == 0:
+    if plan.encoder_updates == 0 or not any(map(plan.trains_agent, range(plan.agent_steps))):
         raise CRPTproError(
             f"{config.env_steps:,} env steps are {plan.agent_steps:,} decisions per domain, of which the first "
-            f"{plan.random_agent_steps:,} are random: no update would ever happen. Ask for more env_steps or fewer "
-            "random_agent_steps."
+            f"{plan.random_agent_steps:,} are random: no update of encoder or explorer would ever happen. Ask for more "
+            "env_steps, fewer random_agent_steps or shorter intervals."
         )
     return plan

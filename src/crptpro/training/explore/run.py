@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +105,7 @@ class ActiveRun:
         total, count = self.plan.decisions, len(self.members)
         shown = PretrainProgress(self.plan.env_steps, self.env_steps, unit="env step", is_shown=progress)
         next_checkpoint = self._next_checkpoint()
-        with StopRequest() as stop, shown:
+        with StopRequest("Stopping after this round; press Ctrl-C again to stop at once.") as stop, shown:
             while self.decisions < total:
                 before, rows = self.env_steps, len(self.history)
                 self._turn(self.decisions % count)
@@ -182,7 +183,7 @@ class ActiveRun:
                 values = self.learner.update(batch, index=self.updates, domain=member.name)
                 self.window.add(values, index)
                 self.updates += 1
-                if "embedding_cosine" not in self.learner.names:
+                if "embedding_cosine" not in self.learner.names and self._closes_soon():
                     self.window.probe(batch, index)
                 if self.updates % config.log_interval == 0:
                     self._log()
@@ -194,6 +195,11 @@ class ActiveRun:
             for key, value in metrics.items():
                 self.sums[index][key] = self.sums[index].get(key, 0) + value.detach()
                 self.counts[index][key] = self.counts[index].get(key, 0) + 1
+
+    def _closes_soon(self) -> bool:
+        """Whether a domain's next update may belong to another window: now its images are probed, or not at all."""
+        left = -self.updates % self.config.log_interval
+        return left < 2 * len(self.members) * self.plan.encoder_updates_each
 
     # --- records ------------------------------------------------------------------------------------------------
 
@@ -271,13 +277,8 @@ class ActiveRun:
         self.checkpoints.save(checkpoint.state_of(self), counter=self.decisions)
         self.saved_at = self.decisions
 
-    def resume(self) -> None:
-        """Continue from the newest checkpoint, if there is one; otherwise clear the record for a fresh start.
-
-        Raises:
-            CheckpointError: if it belongs to a run with other settings.
-        """
-        state = None if self.checkpoints is None else self.checkpoints.load_latest()
+    def resume(self, state: Mapping[str, Any] | None) -> None:
+        """Continue from a checkpoint; without one, clear the record for a fresh start."""
         if state is None:
             if self.checkpoints is not None and self.records is not None:
                 for (
@@ -288,6 +289,6 @@ class ActiveRun:
         checkpoint.restore(self, state)
         is_finished = self.decisions == self.plan.decisions
         logger.info(
-            "active pre-training: %s %s env steps", "already at" if is_finished else "continuing from",
-            f"{self.env_steps:,}",
+            "Active pre-training: %s %s env steps.",
+            "already at" if is_finished else "continues from", f"{self.env_steps:,}",
         )  # fmt: skip
