@@ -76,7 +76,7 @@ def _pretended_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
         def wait_stream(self, other: Any) -> None: ...
 
     @contextlib.contextmanager
-    def record(graph: FakeGraph, capture_error_mode: str) -> Any:
+    def record(graph: FakeGraph, stream: object, capture_error_mode: str) -> Any:
         graph.log.append("record")
         yield
 
