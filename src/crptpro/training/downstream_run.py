@@ -69,6 +69,8 @@ class DownstreamRun:
             "image_size": encoder.image_size,
             "frame_stack": encoder.in_channels // 3,
         }
+        if config.colors != "normal":  # a factory of one's own need not know of colours
+            settings["colors"] = config.colors
         # The domain itself and not its name, which may be registered in this process only.
         name = get_domain(task) if env_factory is make_env else task
         make_this_env = functools.partial(env_factory, name, seed=config.seed, **settings)
