@@ -173,7 +173,7 @@ class DownstreamConfig(SACSettings):
     quality: Quality = "exact"
     """render quality"""
     colors: Colors = "normal"
-    """colours of the task: reversed_background for the paper's unseen colours (dm_control), reversed_image for any world"""
+    """colours of the task: reversed_background are the paper's unseen ones, reversed_image works everywhere"""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it. Deviation: the released code
     computes in fp32 throughout, which `fp32` gives"""

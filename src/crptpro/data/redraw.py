@@ -14,6 +14,7 @@ from crptpro.data.dataset import FrameDataset
 from crptpro.domains import get_domain
 from crptpro.errors import DatasetError
 from crptpro.seeding import derive_seed
+from crptpro.transforms.color_swap import swap_colors
 
 logger = logging.getLogger(__name__)
 
@@ -47,18 +48,12 @@ def redraw(dataset: FrameDataset, rows: Tensor, *, colors: Colors) -> Tensor:
     if colors == stored:
         return dataset.frames_at(rows)
     if {colors, stored} == {"normal", "reversed_image"}:
-        from crptpro.transforms.color_swap import swap_colors
-
         return swap_colors(dataset.frames_at(rows))
     wanted, where = rows.unique(return_inverse=True)
     groups = _by_episode(dataset, wanted)
     proofs = {episode: own[[0, -1]].unique() for episode, own in list(groups.items())[:PROOFS]}
-    drawn = {
-        _colors: torch.cat(_draw(dataset, part, _colors))
-        for _colors, part in ((stored, proofs), (colors, groups))
-    }
-    _compare(dataset, torch.cat(list(proofs.values())), drawn[stored])
-    return drawn[colors][where]
+    _compare(dataset, torch.cat(list(proofs.values())), _draw(dataset, proofs, stored))
+    return _draw(dataset, groups, colors)[where]
 
 
 def _by_episode(dataset: FrameDataset, rows: Tensor) -> dict[int, Tensor]:
@@ -70,14 +65,17 @@ def _by_episode(dataset: FrameDataset, rows: Tensor) -> dict[int, Tensor]:
     return {int(episode): rows[of_row == episode] for episode in of_row.unique()}
 
 
-def _draw(dataset: FrameDataset, rows: dict[int, Tensor], colors: Colors) -> list[Tensor]:
+def _draw(dataset: FrameDataset, rows: dict[int, Tensor], colors: Colors) -> Tensor:
+    # Imported late: nothing that reads datasets needs the simulators.
     from crptpro.envs import make_env
 
     card = dataset.card
     settings: dict[str, Any] = {
         name: card[name] for name in ("image_size", "action_repeat", "camera", "quality")
     }
-    env = make_env(get_domain(card["task"]), seed=0, frame_stack=1, colors=colors, **settings)
+    is_swapped = colors == "reversed_image"
+    settings["colors"] = "normal" if is_swapped else colors
+    env = make_env(get_domain(card["task"]), seed=0, frame_stack=1, **settings)
     simulator = (env.base_env if isinstance(env, TransformedEnv) else env).simulator
     images = []
     try:
@@ -90,15 +88,15 @@ def _draw(dataset: FrameDataset, rows: dict[int, Tensor], colors: Colors) -> lis
                 images.append(torch.from_numpy(simulator.render().transpose(2, 0, 1).copy())[None])
     finally:
         env.close()
-    return images
+    return swap_colors(torch.cat(images)) if is_swapped else torch.cat(images)
 
 
 def _compare(dataset: FrameDataset, rows: Tensor, drawn: Tensor) -> None:
     difference = (dataset.frames_at(rows).float() - drawn.float()).abs()
     if (mean := float(difference.mean())) > TOLERANCE:
         raise DatasetError(
-            f"The frames of {dataset.path or dataset.domain} cannot be drawn again from their physical state: they come "
-            f"out {mean:.1f} grey levels off. Collect the domain anew in these colours."
+            f"The frames of {dataset.path or dataset.domain} cannot be drawn again from their physical state: they "
+            f"come out {mean:.1f} grey levels off. Collect the domain anew in these colours."
         )
     if mean:
         logger.warning(

@@ -39,8 +39,8 @@ def reverse_background(model: Any) -> None:
     textures = np.union1d(textures[textures >= 0], skyboxes)
     if not (textures.size or is_background.any()):
         raise CRPTproError(
-            "This model has no background whose colours could be reversed: no skybox, and no plane or height field that "
-            "is fixed to the world. colors='reversed_image' works everywhere."
+            "This model has no background whose colours could be reversed: no skybox, and no plane or height field "
+            "that is fixed to the world. colors='reversed_image' works everywhere."
         )
     for texture in textures:
         first, channels = model.tex_adr[texture], model.tex_nchannel[texture]

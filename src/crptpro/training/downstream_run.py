@@ -7,6 +7,7 @@ import functools
 import logging
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -63,7 +64,7 @@ class DownstreamRun:
         self.task, self.config, self.run_dir, self.progress = task, config, run_dir, progress
         seed_everything(derive_seed(config.seed, "downstream"))
         encoder = pretrained.encoder
-        settings = {
+        settings: dict[str, Any] = {
             "quality": config.quality,
             "action_repeat": config.resolved_action_repeat,
             "image_size": encoder.image_size,
