@@ -41,8 +41,7 @@ def redraw(dataset: FrameDataset, rows: Tensor, *, colors: Colors) -> Tensor:
         uint8 ``[N, C, H, W]``.
 
     Raises:
-        CRPTproError: for a reversed background in a world whose background is not known.
-        DatasetError: if the dataset has no physical state, or its own frames cannot be drawn again.
+        DatasetError: if the dataset has no physical state, is not of dm_control, or its own frames come out different.
     """
     stored = dataset.card.get("colors", "normal")
     if colors == stored:
@@ -76,9 +75,15 @@ def _draw(dataset: FrameDataset, rows: dict[int, Tensor], colors: Colors) -> Ten
     is_swapped = colors == "reversed_image"
     settings["colors"] = "normal" if is_swapped else colors
     env = make_env(get_domain(card["task"]), seed=0, frame_stack=1, **settings)
-    simulator = (env.base_env if isinstance(env, TransformedEnv) else env).simulator
+    base = env.base_env if isinstance(env, TransformedEnv) else env
+    simulator = getattr(base, "simulator", None)
     images = []
     try:
+        if not hasattr(simulator, "set_state"):
+            raise DatasetError(
+                f"The frames of {card['domain']!r} cannot be drawn again from their physical state: that is known for "
+                "dm_control's worlds alone. The colours 'reversed_image' need no drawing."
+            )
         for episode, own in rows.items():
             env.set_seed(derive_seed(card["seed"], "collect", card["domain"], episode))
             simulator.reset()
