@@ -104,7 +104,8 @@ def rows(path: Path) -> list[dict[str, str]]:
 @pytest.mark.parametrize(("command", "named"), [
     ((), ["doctor", "collect", "pretrain", "finetune", "downstream", "drq", "evaluate", "probe"]),
     (("doctor",), ["--domains"]),
-    (("collect",), ["--out", "--transitions", "--seed", "--workers", "--quality {exact,fast}", "group letters", "--colors"]),
+    (("collect",), ["--out", "--transitions", "--seed", "--workers", "--quality {exact,fast}", "group letters",
+                    "--colors"]),
     (("pretrain",), ["--out", "--method", "--updates", "--batch-size", "--learning-rate", "--precision",
                      "--device", "--logging.wandb", "50,000"]),
     (("finetune",), ["--out", "--updates", "--batch-size", "--learning-rate", "--logging.wandb", "PATH PATH"]),
