@@ -11,13 +11,13 @@ import crptpro
 
 PACKAGE = Path(crptpro.__file__).parent
 FOUNDATION = [
-    "errors", "quality", "seeding", "cards", "artifact", "directory_lock", "console", "loggers", "downstream_config",
-    "active_config", "host_memory",
+    "errors", "quality", "colors", "seeding", "cards", "artifact", "directory_lock", "console", "loggers",
+    "downstream_config", "active_config", "host_memory",
 ]  # fmt: skip
 ORDER = [
-    "domains", "envs", "data", "modules", "objectives", "transforms", "training.evaluate", "training.checkpoint",
-    "training.fingerprint", "training.finite", "training.stop_request", "training.collapse", "training.compiled",
-    "training.captured", "training.pretrain",
+    "domains", "transforms.keys", "transforms.root_keys", "transforms.color_swap", "envs", "data", "modules",
+    "objectives", "transforms", "training.evaluate", "training.checkpoint", "training.fingerprint", "training.finite",
+    "training.stop_request", "training.collapse", "training.compiled", "training.captured", "training.pretrain",
     "pretrained", "training", "analysis", "experiments", "doctor", "cli",
 ]  # fmt: skip
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from crptpro.colors import Colors
 from crptpro.quality import Quality
 
 Algorithm = Literal["rad-sac", "drq", "skill-ddpg"]
@@ -185,6 +186,8 @@ class DownstreamConfig(SACSettings):
     """seeds initialisation, environment, exploration, replay sampling, shifts, bonus and evaluation"""
     quality: Quality = "exact"
     """render quality"""
+    colors: Colors = "normal"
+    """colours of the task: reversed_background are the paper's unseen ones, reversed_image works everywhere"""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it. Deviation: the released code
     computes in fp32 throughout, which `fp32` gives"""

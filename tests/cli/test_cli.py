@@ -30,9 +30,10 @@ def encoder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("command", "named"), [
-    ((), ["doctor", "collect", "pretrain", "finetune", "downstream", "drq", "evaluate"]),
+    ((), ["doctor", "collect", "pretrain", "finetune", "downstream", "drq", "evaluate", "probe"]),
     (("doctor",), ["--domains"]),
-    (("collect",), ["--out", "--transitions", "--seed", "--workers", "--quality {exact,fast}", "group letters"]),
+    (("collect",), ["--out", "--transitions", "--seed", "--workers", "--quality {exact,fast}", "group letters",
+                    "--colors"]),
     (("pretrain",), ["--out", "--method", "--updates", "--batch-size", "--learning-rate", "--precision",
                      "--device", "--logging.wandb", "crptpro 50,", "--explore.env-steps", "proto-rl-c", "--plugin"]),
     (("finetune",), ["--out", "--updates", "--batch-size", "--learning-rate", "--logging.wandb", "PATH PATH"]),
@@ -40,7 +41,8 @@ def encoder(tmp_path: Path) -> Path:
                        "--eval-episodes", "--features", "--logging.tensorboard", "(default: 500000)"]),
     (("downstream", "--algorithm", "skill-ddpg"), ["(default: skill-ddpg)", "--skill-ddpg.n-step", "(default: 2000)"]),
     (("drq",), ["--out", "(default: drq)", "(default: 1000000)", "(default: 0.001)"]),
-    (("evaluate",), ["random-policy", "--task", "--episodes", "--csv", "--video"]),
+    (("evaluate",), ["random-policy", "--task", "--episodes", "--csv", "--video", "--colors"]),
+    (("probe",), ["random-encoder", "--samples", "--colors", "--csv", "(default: 2000)", "held-out"]),
 ])  # fmt: skip
 def test_help_names_every_argument(call: Call, command: tuple[str, ...], named: list[str]) -> None:
     status, out, err = call(*command, "--help")
@@ -105,6 +107,7 @@ def test_a_request_that_cannot_be_met_leaves_nothing_behind(
     (("absent",), "absent does not exist"),
     (("random-policy", "--task", "walker_rum"), "Nearest: walker_run"),
     (("random-policy", "--task", TASK, "--episodes", "0"), "at least 1, got 0"),
+    (("random-policy", "--task", TASK, "--colors", "reversed_background"), "colors='reversed_image'"),
 ])  # fmt: skip
 def test_an_evaluation_that_cannot_run_says_why(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], message: str

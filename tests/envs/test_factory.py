@@ -193,7 +193,8 @@ def test_episode_length_counts_agent_steps() -> None:
 
 
 @pytest.mark.parametrize(
-    "option", [{"image_size": 0}, {"action_repeat": 0}, {"frame_stack": 0}, {"quality": "best"}]
+    "option",
+    [{"image_size": 0}, {"action_repeat": 0}, {"frame_stack": 0}, {"quality": "best"}, {"colors": "pink"}],
 )
 def test_impossible_options_are_refused_before_anything_is_loaded(option: dict[str, object]) -> None:
     with pytest.raises(CRPTproError, match=next(iter(option))):

@@ -55,9 +55,8 @@ def train(run_dir: Path | None, pretrained: Pretrained | None = None, **override
         "toy",
         small_pretrained() if pretrained is None else pretrained,
         run_dir=run_dir,
-        config=SMALL,
         progress=False,
-        **{"env_factory": toy_env, **overrides},
+        **{"config": SMALL, "env_factory": toy_env, **overrides},
     )
 
 
@@ -301,3 +300,23 @@ def test_a_run_keeps_as_many_transitions_as_the_method_of_its_encoder(method: st
     pretrained.card["method"] = method
     assert _replay_capacity(pretrained, dataclasses.replace(SMALL, replay_capacity=None)) == capacity
     assert _replay_capacity(pretrained, SMALL) == SMALL.replay_capacity
+
+
+def test_other_colours_reach_every_environment_the_card_and_what_must_agree(tmp_path: Path) -> None:
+    asked = []
+
+    def colored(task: str, **settings: object) -> EnvBase:
+        asked.append(settings.get("colors"))
+        return toy_env(task, **settings)  # type: ignore[arg-type]
+
+    train(tmp_path / "normal", env_factory=colored)
+    assert set(asked) == {None}  # a factory need not know of colours
+    asked.clear()
+    config = dataclasses.replace(SMALL, colors="reversed_image")
+    train(tmp_path / "reversed", env_factory=colored, config=config)
+    assert len(asked) > 1
+    assert set(asked) == {"reversed_image"}
+    _, card = load_agent(tmp_path / "reversed" / "agent")
+    assert card["config"]["colors"] == "reversed_image"
+    with pytest.raises(CheckpointError, match="colors was 'normal', now 'reversed_image'"):
+        train(tmp_path / "normal", env_factory=toy_env, config=config)

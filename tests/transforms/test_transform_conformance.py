@@ -17,6 +17,7 @@ from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from crptpro.transforms import (
+    ColorSwap,
     DenseShiftCache,
     DenseShiftFeatures,
     FrozenEncoder,
@@ -29,6 +30,10 @@ from crptpro.transforms import (
 
 def shift_in_place():
     return RandomShift()
+
+
+def colors_in_place():
+    return ColorSwap()
 
 
 def shift_to_a_new_key():
@@ -93,6 +98,7 @@ BONUS = {("next", "intrinsic_reward"), ("next", "reward")}
 WRITES = {
     shift_in_place: {"pixels", ("next", "pixels")},
     shift_to_a_new_key: {"shifted"},
+    colors_in_place: {"pixels", ("next", "pixels")},
     frozen_encoder: {"features"},
     reward_in_place: {("next", "features")} | BONUS,
     reward_to_a_new_key: {("next", "z"), ("next", "intrinsic_reward"), ("next", "total")},
@@ -129,7 +135,7 @@ def sampled():
 
 def offline(make):
     """The transform with what it needs on a replay batch."""
-    if make in (shift_in_place, shift_to_a_new_key, frozen_encoder, dense_features):
+    if make in (shift_in_place, shift_to_a_new_key, colors_in_place, frozen_encoder, dense_features):
         return make()
     encoder = small_encoder()
     key, options = "features", {}
@@ -259,9 +265,9 @@ def test_attaching_switches_to_evaluation_mode_and_it_still_acts(make):
     assert new == {key[-1] if isinstance(key, tuple) else key for key in WRITES[make]} - {"pixels", "reward"}
     for key in new:
         assert rollout["next"][key].any(), key
-    is_shifted_in_place = make in (shift_in_place, everything)
+    changes_in_place = make in (shift_in_place, colors_in_place, everything)
     for key in ("pixels", ("next", "pixels")):
-        assert torch.equal(rollout[key], plain[key]) is not is_shifted_in_place
+        assert torch.equal(rollout[key], plain[key]) is not changes_in_place
     if "intrinsic_reward" in new:
         external = rollout["action"].mean(-1, keepdim=True)  # what the environment pays
         total = rollout["next", "total" if "total" in new else "reward"]

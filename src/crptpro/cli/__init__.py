@@ -17,7 +17,9 @@ from crptpro.cli.evaluate import Evaluate
 from crptpro.cli.originals import Export, Import
 from crptpro.cli.plugins import load_plugins
 from crptpro.cli.pretraining import Finetune, Pretrain
+from crptpro.cli.probe import Probe
 from crptpro.cli.request import expand_groups
+from crptpro.colors import Colors
 from crptpro.console import run_main
 from crptpro.quality import Quality
 
@@ -57,6 +59,8 @@ class Collect:
     """collecting processes, shared by all domains (default: one per core)"""
     quality: Quality = "exact"
     """render quality; fast uses smaller shadow maps on software GL"""
+    colors: Colors = "normal"
+    """colours of the worlds; reversed_background are the paper's unseen ones"""
     action_repeat: int | None = None
     """simulator steps per decision (default: the domain's, 2)"""
 
@@ -71,6 +75,7 @@ class Collect:
             seed=self.seed,
             workers=self.workers,
             quality=self.quality,
+            colors=self.colors,
             action_repeat=self.action_repeat,
         )
         for name, path in paths.items():
@@ -87,6 +92,7 @@ def main() -> None:
         | Annotated[Downstream, subcommand("downstream")]
         | Annotated[DrQ, subcommand("drq")]
         | Annotated[Evaluate, subcommand("evaluate")]
+        | Annotated[Probe, subcommand("probe")]
         | Annotated[Import, subcommand("import")]
         | Annotated[Export, subcommand("export")]
     ]

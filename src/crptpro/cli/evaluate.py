@@ -9,6 +9,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from crptpro.colors import Colors
 from crptpro.errors import CRPTproError
 from crptpro.quality import Quality
 
@@ -27,6 +28,8 @@ class Evaluate:
     """seeds the episodes"""
     quality: Quality | None = None
     """render quality (default: the one the agent was trained with; exact for the random policy)"""
+    colors: Colors | None = None
+    """colours of the world (default: those the agent was trained in; normal for the random policy)"""
     action_repeat: int | None = None
     """simulator steps per decision (default: what the agent was trained with; the domain's for the random policy)"""
     csv: Path | None = None
@@ -49,6 +52,7 @@ class Evaluate:
         task = self.task or card["task"]
         trained_with = card.get("config", {})
         settings: dict[str, Any] = {"quality": self.quality or trained_with.get("quality", "exact")}
+        settings["colors"] = self.colors or trained_with.get("colors", "normal")
         if agent is not None:
             settings["image_size"] = agent.encoder.image_size
             settings["frame_stack"] = agent.encoder.in_channels // 3

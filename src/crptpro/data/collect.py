@@ -13,6 +13,7 @@ from typing import Any
 from torchrl.envs import EnvBase
 
 from crptpro.cards import require_disk
+from crptpro.colors import Colors
 from crptpro.data.collect_pool import Worker, WorkerPool
 from crptpro.data.collect_progress import CollectProgress
 from crptpro.data.collection import DomainCollection
@@ -32,6 +33,7 @@ def collect_random(
     seed: int = 0,
     workers: int = 1,
     quality: Quality = "exact",
+    colors: Colors = "normal",
     image_size: int = 84,
     action_repeat: int | None = None,
     camera: int | str | None = None,
@@ -53,6 +55,7 @@ def collect_random(
         seed=seed,
         workers=workers,
         quality=quality,
+        colors=colors,
         image_size=image_size,
         action_repeat=action_repeat,
         camera=camera,
@@ -70,6 +73,7 @@ def collect_group(
     seed: int = 0,
     workers: int = 1,
     quality: Quality = "exact",
+    colors: Colors = "normal",
     image_size: int = 84,
     action_repeat: int | None = None,
     camera: int | str | None = None,
@@ -93,6 +97,7 @@ def collect_group(
         seed: See above.
         workers: Processes; each renders on one core.
         quality: Render quality, see :func:`crptpro.envs.make_env`.
+        colors: Likewise; the episodes are the same in all colours.
         image_size: H = W, pixels.
         action_repeat: Env steps per agent step; the domain's (2) if ``None``.
         camera: The domain's if ``None``.
@@ -133,6 +138,7 @@ def collect_group(
                 "action_repeat": resolve_action_repeat(domain, action_repeat),
                 "camera": domain.camera if camera is None else camera,
                 "quality": quality,
+                "colors": colors,
             }
             request = {"domain": domain.name, "task": domain.task, "seed": seed, "transitions": transitions}
             length = episode_length(domain, action_repeat=settings["action_repeat"])

@@ -39,7 +39,7 @@ class DomainCollection:
     Args:
         path: The dataset's directory.
         request: What is asked for: domain, task, seed, transitions, image_size, action_repeat, camera,
-            quality.
+            quality, colors.
         episode_agent_steps: Usual length of an episode, ``None`` if unknown. It only saves work.
 
     Raises:

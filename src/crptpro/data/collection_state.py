@@ -12,6 +12,9 @@ from crptpro.errors import DatasetError
 
 logger = logging.getLogger(__name__)
 
+#: What requests of earlier releases do not name, with what was the case then.
+_CAME_LATER = {"colors": "normal"}
+
 _TEMPORARY = f".{COLLECTION_FILE}."
 
 
@@ -119,6 +122,7 @@ def require_request(path: Path, found: dict[str, Any], request: dict[str, Any], 
     Raises:
         DatasetError: naming every setting that differs.
     """
+    found = {**_CAME_LATER, **found}
     differing = [
         f"{name} {found.get(name)!r} there, {value!r} asked for"
         for name, value in request.items()

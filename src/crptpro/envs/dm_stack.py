@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crptpro.domains import SUITE_TASKS, Domain
+from crptpro.envs.background import reverse_background
 from crptpro.envs.mujoco_log import route_mujoco_warnings
 from crptpro.envs.rendering import first_frame_watchdog
 from crptpro.envs.simulator import ActionRange, Outcome
@@ -62,12 +63,22 @@ class SceneCamera:
         image_size: H = W, pixels.
         camera: Index or name of a camera of the model, -1 for the free camera.
         shadow_size: Side of the shadow map, texels; ``None`` keeps the model's.
+        reverses_background: Draw the background with its colours reversed.
     """
 
-    def __init__(self, image_size: int, camera: int | str, shadow_size: int | None = None):
+    def __init__(
+        self,
+        image_size: int,
+        camera: int | str,
+        shadow_size: int | None = None,
+        *,
+        reverses_background: bool = False,
+    ):
         self._image_size = image_size
         self._camera_id = camera
         self._shadow_size = shadow_size
+        self._reverses_background = reverses_background
+        self._reversed_model: Any = None
         self._model: Any = None
         self._camera: Any = None
 
@@ -81,6 +92,9 @@ class SceneCamera:
             visual.quality.shadowsize = min(self._shadow_size, visual.quality.shadowsize)
         visual.global_.offwidth = max(self._image_size, visual.global_.offwidth)
         visual.global_.offheight = max(self._image_size, visual.global_.offheight)
+        if self._reverses_background and physics.model.ptr is not self._reversed_model:
+            reverse_background(physics.model.ptr)
+            self._reversed_model = physics.model.ptr
 
     def render(self, physics: Any) -> np.ndarray:
         """Return the image, uint8 ``[H, W, 3]``, in a buffer that the next call overwrites."""
@@ -193,6 +207,15 @@ class DmControlSimulator:
         """Return ``qpos`` and ``qvel``, float64."""
         data = self._env.physics.data
         return data.qpos, data.qvel
+
+    def set_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """Put the world in a state, so that ``render`` draws it; the episode goes on as if it had been in it.
+
+        What a task draws at its reset and keeps in the model (targets, terrain, colours) stays as it is.
+        """
+        physics = self._env.physics
+        physics.data.qpos[:], physics.data.qvel[:] = qpos, qvel
+        physics.forward()
 
     def card(self) -> dict[str, Any]:
         """Return the description given at construction and the action repeat."""

@@ -6,6 +6,7 @@ from typing import Any
 
 from torchrl.envs import CatFrames, EnvBase
 
+from crptpro.colors import COLORS, Colors
 from crptpro.domains import GYMNASIUM_PREFIX, LONGEST_EPISODE_AGENT_STEPS, Domain, get_domain
 from crptpro.envs.dm_stack import FAST_SHADOW_SIZE, DmControlSimulator, SceneCamera, load_dm_env
 from crptpro.envs.episode_limit import EpisodeLimit
@@ -26,6 +27,7 @@ def make_env(
     frame_stack: int = 3,
     camera: int | str | None = None,
     quality: Quality = "exact",
+    colors: Colors = "normal",
     physics_state: bool = False,
     render: bool = True,
 ) -> EnvBase:
@@ -48,6 +50,8 @@ def make_env(
         camera: Camera index or name; ``None`` takes the domain's.
         quality: ``"exact"`` renders the model as it is; ``"fast"`` uses smaller shadow maps, up to twice as
             fast on software GL, with fewer than 1 % of the pixels changed (quadruped_escape: 8 %).
+        colors: ``"reversed_background"`` reverses the order of the RGB values of skybox and floor, the paper's unseen
+            colours (dm_control only); ``"reversed_image"`` that of whole images.
         physics_state: Also emit ``qpos`` and ``qvel``, float64, where the world has a MuJoCo state.
         render: ``False`` leaves every image black, for policies that do not look: rewards and episodes are the
             same, ten times sooner. Environments of your own draw all the same.
@@ -59,18 +63,30 @@ def make_env(
     """
     domain = get_domain(task)
     action_repeat = resolve_action_repeat(domain, action_repeat)
-    _check_options(quality, image_size=image_size, action_repeat=action_repeat, frame_stack=frame_stack)
+    _check_options(
+        quality, colors, image_size=image_size, action_repeat=action_repeat, frame_stack=frame_stack
+    )
     settings: dict[str, Any] = {
-        "image_size": image_size, "action_repeat": action_repeat, "quality": quality,
+        "image_size": image_size, "action_repeat": action_repeat, "quality": quality, "colors": colors,
         "camera": domain.camera if camera is None else camera, "physics_state": physics_state,
     }  # fmt: skip
     env: EnvBase
+    if colors == "reversed_background" and domain.source not in ("suite", "manipulation"):
+        raise CRPTproError(
+            f"What the background of {domain.name!r} is, is known for dm_control's worlds alone; "
+            "colors='reversed_image' reverses the colours of whole images in any world."
+        )
     if domain.source == "own":
         env = make_own_env(domain, seed=seed, **settings)
     elif domain.source == "gymnasium":
         env = _make_gymnasium_env(domain, render=render, **settings)
     else:
         env = _make_dm_env(domain, render=render, **settings)
+    if colors == "reversed_image":
+        # Imported late: transforms stand on networks, which no environment needs.
+        from crptpro.transforms.color_swap import ColorSwap
+
+        env = with_transform(env, ColorSwap(in_keys=["pixels"]))
     if domain.episode_env_steps is None:
         env = with_transform(env, EpisodeLimit(LONGEST_EPISODE_AGENT_STEPS))
     env.set_seed(seed)
@@ -109,12 +125,14 @@ def needs_gl(task: str | Domain) -> bool:
     return any(name in made_by for name in ("mujoco", "dm_control", "gymnasium_robotics"))
 
 
-def _check_options(quality: str, **counts: int) -> None:
+def _check_options(quality: str, colors: str, **counts: int) -> None:
     for name, value in counts.items():
         if value < 1:
             raise CRPTproError(f"{name} must be at least 1, got {value}.")
     if quality not in QUALITIES:
         raise CRPTproError(f"quality must be {' or '.join(map(repr, QUALITIES))}, got {quality!r}.")
+    if colors not in COLORS:
+        raise CRPTproError(f"colors must be {', '.join(map(repr, COLORS))}, got {colors!r}.")
 
 
 def _make_dm_env(
@@ -124,6 +142,7 @@ def _make_dm_env(
     action_repeat: int,
     camera: int | str,
     quality: Quality,
+    colors: Colors,
     physics_state: bool,
     render: bool,
 ) -> PixelEnv:
@@ -133,8 +152,11 @@ def _make_dm_env(
         env = load_dm_env(domain)
     description = {
         "task": domain.task, "image_size": image_size, "camera": camera, **backend_card(), "quality": quality,
+        "colors": colors,
     }  # fmt: skip
-    scene_camera = SceneCamera(image_size, camera, shadow_size)
+    scene_camera = SceneCamera(
+        image_size, camera, shadow_size, reverses_background=colors == "reversed_background"
+    )
     scene_camera.prepare(env.physics)
     simulator = DmControlSimulator(env, scene_camera, action_repeat=action_repeat, description=description)
     return PixelEnv(simulator, image_size=image_size, physics_state=physics_state, render=render)
@@ -147,6 +169,7 @@ def _make_gymnasium_env(
     action_repeat: int,
     camera: int | str | None,
     quality: Quality,
+    colors: Colors,
     physics_state: bool,
     render: bool,
 ) -> PixelEnv:
@@ -162,6 +185,7 @@ def _make_gymnasium_env(
         shadow_size=FAST_SHADOW_SIZE["suite"] if quality == "fast" else None,
         description={
             "task": domain.task, "image_size": image_size, "camera": camera, **gl_card, "quality": quality,
+            "colors": colors,
         },
     )  # fmt: skip
     return PixelEnv(simulator, image_size=image_size, physics_state=physics_state, render=render)

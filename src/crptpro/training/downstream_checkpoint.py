@@ -31,6 +31,7 @@ CAME_LATER: dict[str, Any] = {
     "algorithm": "rad-sac",
     "skill_ddpg": dataclasses.asdict(SkillDDPGSettings()),
     "transfer_actor": None,
+    "colors": "normal",
 }
 """Settings that checkpoints of earlier versions do not name, with what was the case then."""
 

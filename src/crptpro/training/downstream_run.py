@@ -7,6 +7,7 @@ import functools
 import logging
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -63,12 +64,14 @@ class DownstreamRun:
         self.task, self.config, self.run_dir, self.progress = task, config, run_dir, progress
         seed_everything(derive_seed(config.seed, "downstream"))
         encoder = pretrained.encoder
-        settings = {
+        settings: dict[str, Any] = {
             "quality": config.quality,
             "action_repeat": config.resolved_action_repeat,
             "image_size": encoder.image_size,
             "frame_stack": encoder.in_channels // 3,
         }
+        if config.colors != "normal":  # a factory of one's own need not know of colours
+            settings["colors"] = config.colors
         # The domain itself and not its name, which may be registered in this process only.
         name = get_domain(task) if env_factory is make_env else task
         make_this_env = functools.partial(env_factory, name, seed=config.seed, **settings)

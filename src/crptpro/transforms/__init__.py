@@ -1,5 +1,6 @@
 """TorchRL transforms: augmentation, frozen features, and exploration bonuses."""
 
+from crptpro.transforms.color_swap import ColorSwap, swap_colors
 from crptpro.transforms.dense_features import DenseShiftFeatures
 from crptpro.transforms.dense_shift import crop_features, dense_shift_geometry, dense_shift_maps
 from crptpro.transforms.frozen_encoder import FrozenEncoder
@@ -11,6 +12,7 @@ from crptpro.transforms.shift_cache import DenseShiftCache, choose_feature_mode
 from crptpro.transforms.skill_contrast_reward import SkillContrastReward
 
 __all__ = [
+    "ColorSwap",
     "DenseShiftCache",
     "DenseShiftFeatures",
     "FrozenEncoder",
@@ -25,4 +27,5 @@ __all__ = [
     "dense_shift_maps",
     "draw_offsets",
     "random_shift",
+    "swap_colors",
 ]

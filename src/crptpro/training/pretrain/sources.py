@@ -25,7 +25,7 @@ Augment = Literal["random_shift", "none"] | Callable[[TensorDictBase, torch.Gene
 SHIFT_PAD = 4
 _CARD_FACTS = (
     "domain", "task", "transitions", "episodes", "frame_stack", "action_repeat", "image_size", "seed",
-    "quality", "backend",
+    "quality", "colors", "backend",
 )  # fmt: skip
 
 

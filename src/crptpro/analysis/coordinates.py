@@ -1,0 +1,147 @@
+"""A simulator's positions and velocities as named numbers that a linear probe can be asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from crptpro.domains import GYMNASIUM_PREFIX, Domain, get_domain
+from crptpro.errors import UnknownNameError
+
+JointKind = Literal["free", "ball", "slide", "hinge", "turning"]
+
+#: Length in ``qpos`` and in ``qvel`` of each kind of joint.
+_SIZES: dict[JointKind, tuple[int, int]] = {
+    "free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1), "turning": (1, 1),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One joint of a MuJoCo model.
+
+    Args:
+        name: As in the model.
+        kind: ``"hinge"`` has limits, ``"turning"`` is a hinge without any.
+    """
+
+    name: str
+    kind: JointKind
+
+
+def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
+    """Return the joints behind a domain's ``qpos`` and ``qvel``, in order; nothing is drawn.
+
+    Returns:
+        ``None`` where they are not known: worlds of your own, and those without a MuJoCo model.
+    """
+    try:
+        domain = get_domain(domain)
+    except UnknownNameError:  # a world of one's own that is not registered in this process
+        return None
+    if domain.source in ("suite", "manipulation"):
+        from crptpro.envs.dm_stack import load_dm_env
+        from crptpro.envs.rendering import select_backend
+
+        select_backend()  # importing dm_control fixes it
+        env = load_dm_env(domain)
+        model = env.physics.model.ptr
+    elif domain.source == "gymnasium":
+        import gymnasium
+
+        env = gymnasium.make(domain.task[len(GYMNASIUM_PREFIX) :], disable_env_checker=True)
+        model = getattr(env.unwrapped, "model", None)
+    else:
+        return None
+    try:
+        return None if model is None else _joints(model)
+    finally:
+        env.close()
+
+
+def _joints(model: object) -> tuple[Joint, ...]:
+    import mujoco
+
+    kinds: tuple[JointKind, ...] = ("free", "ball", "slide", "hinge")
+    joints = []
+    for index in range(model.njnt):  # type: ignore[attr-defined]
+        kind = kinds[model.jnt_type[index]]  # type: ignore[attr-defined]
+        if kind == "hinge" and not model.jnt_limited[index]:  # type: ignore[attr-defined]
+            kind = "turning"
+        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, index)
+        joints.append(Joint(name or f"joint{index}", kind))
+    return tuple(joints)
+
+
+def position_coordinates(qpos: Tensor, joints: Sequence[Joint] | None) -> tuple[list[str], Tensor]:
+    """Return positions as numbers that do not jump where the picture does not.
+
+    Slides and limited hinges are themselves. A hinge without limits becomes its sine and cosine, for a whole turn
+    changes nothing. The orientation of a ball or free joint becomes the first two columns of its rotation matrix,
+    which determine it: unlike a quaternion, one rotation has one such form.
+
+    Args:
+        qpos: ``[N, nq]``, metres, radians, and quaternions (w, x, y, z).
+        joints: As of :func:`joints_of`; ``None``, or joints of another model, leaves ``qpos`` as it is.
+
+    Returns:
+        Names, and float64 ``[N, len(names)]``.
+    """
+    qpos = qpos.double()
+    if joints is None or sum(_SIZES[joint.kind][0] for joint in joints) != qpos.shape[1]:
+        return [f"qpos[{index}]" for index in range(qpos.shape[1])], qpos
+    names: list[str] = []
+    columns: list[Tensor] = []
+    first = 0
+    for joint in joints:
+        values = qpos[:, first : first + _SIZES[joint.kind][0]]
+        first += values.shape[1]
+        if joint.kind in ("slide", "hinge"):
+            names.append(joint.name)
+        elif joint.kind == "turning":
+            names += [f"sin {joint.name}", f"cos {joint.name}"]
+            values = torch.cat([values.sin(), values.cos()], 1)
+        else:
+            if joint.kind == "free":
+                names += [f"{joint.name}.{axis}" for axis in "xyz"]
+            names += [f"{joint.name}.r{row}{column}" for column in (1, 2) for row in (1, 2, 3)]
+            values = torch.cat([values[:, :-4], _two_columns(values[:, -4:])], 1)
+        columns.append(values)
+    return names, torch.cat(columns, 1)
+
+
+def velocity_coordinates(qvel: Tensor, joints: Sequence[Joint] | None) -> tuple[list[str], Tensor]:
+    """Return velocities, as they are, with their names.
+
+    Args:
+        qvel: ``[N, nv]``, m/s and rad/s.
+        joints: As of :func:`joints_of`.
+
+    Returns:
+        Names, and float64 ``[N, nv]``.
+    """
+    if joints is None or sum(_SIZES[joint.kind][1] for joint in joints) != qvel.shape[1]:
+        return [f"qvel[{index}]" for index in range(qvel.shape[1])], qvel.double()
+    turns = {"free": ("vx", "vy", "vz", "wx", "wy", "wz"), "ball": ("wx", "wy", "wz")}
+    names = [
+        name
+        for joint in joints
+        for name in ([f"{joint.name}.{part}" for part in turns.get(joint.kind, ())] or [joint.name])
+    ]
+    return names, qvel.double()
+
+
+def _two_columns(quaternions: Tensor) -> Tensor:
+    """Return the first two columns, ``[N, 6]``, of the rotation matrices of quaternions ``[N, 4]``."""
+    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=1).unbind(1)
+    return torch.stack(
+        [
+            1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y),
+            2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
+        ],
+        1,
+    )  # fmt: skip

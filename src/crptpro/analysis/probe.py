@@ -1,0 +1,194 @@
+"""What a frozen encoder knows of the simulator's state: the question "did pre-training learn anything?" without RL."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from crptpro.analysis.coordinates import Joint, joints_of, position_coordinates, velocity_coordinates
+from crptpro.analysis.ridge import effective_rank, fit_ridge, standardized_gram
+from crptpro.colors import Colors
+from crptpro.data import FrameDataset
+from crptpro.data.frame_stacks import stack_rows
+from crptpro.data.redraw import redraw
+from crptpro.errors import DatasetError
+from crptpro.modules.placement import device_of
+from crptpro.objectives.metrics import mean_pairwise_cosine
+from crptpro.seeding import derive_seed
+
+HELD_OUT = 0.25
+"""Part of the episodes that are held out, and of the others by which the penalty is chosen."""
+LEAST_SPREAD = 1e-3
+"""Standard deviation (m, rad, m/s, rad/s; 1 for sines and rotations) below which a coordinate counts as constant."""
+_BATCH = 64
+
+
+@dataclass(frozen=True)
+class ProbeSamples:
+    """Observations of one domain with the state that they show, and how they are split.
+
+    Attributes:
+        pixels: uint8 ``[N, C, H, W]``.
+        positions: float64 ``[N, P]``.
+        velocities: float64 ``[N, V]``.
+        position_names: P names.
+        velocity_names: V names.
+        train: int64, rows to fit; likewise ``validation`` (to choose the penalty) and ``test`` (to judge). No episode
+            contributes to two of them.
+        held_out_episodes: How many episodes ``test`` comes from.
+    """
+
+    pixels: Tensor
+    positions: Tensor
+    velocities: Tensor
+    position_names: list[str]
+    velocity_names: list[str]
+    train: Tensor
+    validation: Tensor
+    test: Tensor
+    held_out_episodes: int
+
+
+@dataclass(frozen=True)
+class ProbeResult:
+    """How well one kind of embedding of one domain tells the state.
+
+    Attributes:
+        positions: R2 on held-out episodes by coordinate.
+        velocities: Likewise.
+        left_out: Coordinates that hardly vary, in the training or in the held-out episodes.
+        effective_rank: Of the embeddings, see :func:`~crptpro.analysis.ridge.effective_rank`.
+        mean_cosine: Mean cosine between different observations' embeddings; 1 if all point the same way.
+    """
+
+    positions: dict[str, float]
+    velocities: dict[str, float]
+    left_out: tuple[str, ...]
+    effective_rank: float
+    mean_cosine: float
+
+    @property
+    def position_r2(self) -> float:
+        """Mean R2 of the positions, each at least 0: what is predicted worse than by a constant is not known."""
+        return _mean(self.positions)
+
+    @property
+    def velocity_r2(self) -> float:
+        """Mean R2 of the velocities, likewise."""
+        return _mean(self.velocities)
+
+
+def probe_samples(
+    dataset: FrameDataset,
+    *,
+    samples: int = 2_000,
+    seed: int = 0,
+    colors: Colors | None = None,
+    frame_stack: int | None = None,
+    joints: tuple[Joint, ...] | None = None,
+) -> ProbeSamples:
+    """Draw observations and states of a dataset, and divide its episodes.
+
+    The same seed draws the same observations and splits, whatever the colours.
+
+    Args:
+        dataset: With physical state.
+        samples: N, drawn without replacement; all transitions if there are fewer.
+        seed: Which ones, and which episodes are held out.
+        colors: In which colours; those that the dataset was collected in if ``None``. Others are drawn again, see
+            :func:`~crptpro.data.redraw.redraw`.
+        frame_stack: Frames per observation; the dataset's if ``None``.
+        joints: What ``qpos`` and ``qvel`` are, see :func:`~crptpro.analysis.coordinates.joints_of`, which is asked
+            if ``None``.
+
+    Raises:
+        DatasetError: if there is no physical state, or episodes or samples are too few to split.
+    """
+    generator = torch.Generator().manual_seed(derive_seed(seed, "probe", dataset.domain))
+    transitions = dataset.transitions
+    chosen = torch.randperm(len(transitions), generator=generator)[:samples].sort().values
+    row, step, episode = (transitions.get(name)[chosen] for name in ("row", "step", "episode"))
+    state = dataset.physics_at(row)
+    episodes = episode.unique()
+    episodes = episodes[torch.randperm(len(episodes), generator=generator)]
+    held_out = max(1, round(HELD_OUT * len(episodes)))
+    for_choice = max(1, round(HELD_OUT * (len(episodes) - held_out)))
+    split = (episodes[held_out + for_choice :], episodes[held_out:][:for_choice], episodes[:held_out])
+    train, validation, test = [torch.isin(episode, part).nonzero().squeeze(-1) for part in split]
+    if min(len(train), len(validation), len(test)) < 2:
+        raise DatasetError(
+            f"A probe of {dataset.path or dataset.domain} has {len(chosen)} samples of {len(episodes)} episodes; it "
+            "needs two in each of three parts that share no episode. Collect more episodes, or draw more samples."
+        )
+    if joints is None:
+        joints = joints_of(dataset.card.get("task", dataset.domain))
+    position_names, positions = position_coordinates(state["qpos"], joints)
+    velocity_names, velocities = velocity_coordinates(state["qvel"], joints)
+    rows = stack_rows(row, step, frame_stack or dataset.frame_stack)
+    own = dataset.card.get("colors", "normal")
+    frames = redraw(dataset, rows.reshape(-1), colors=own if colors is None else colors)
+    pixels = frames.reshape(len(rows), -1, *frames.shape[-2:])
+    return ProbeSamples(
+        pixels, positions, velocities, position_names, velocity_names, train, validation, test, held_out
+    )
+
+
+@torch.no_grad()
+def probe(
+    samples: ProbeSamples, encoder: nn.Module, projector: nn.Module | None = None
+) -> dict[str, ProbeResult]:
+    """Predict the state from an encoder's frozen features, and from the projections z if there is a projector.
+
+    Ridge regression on standardised features, in float64; nothing of the held-out episodes takes part in fitting,
+    standardising, or choosing the penalty. Images are not augmented.
+
+    Args:
+        samples: As of :func:`probe_samples`.
+        encoder: uint8 ``[B, C, H, W]`` to features ``[B, D]``; used where it lives.
+        projector: Features to latents ``[B, d]``.
+
+    Returns:
+        By ``"features"`` and, with a projector, ``"z"``.
+    """
+    device = device_of(encoder) or samples.pixels.device
+    features, latents = [], []
+    for batch in samples.pixels.split(_BATCH):
+        encoded = encoder(batch.to(device))
+        features.append(encoded.float().cpu())
+        if projector is not None:
+            latents.append(projector(encoded).float().cpu())
+    results = {"features": probe_embeddings(samples, torch.cat(features))}
+    if latents:
+        results["z"] = probe_embeddings(samples, torch.cat(latents))
+    return results
+
+
+@torch.no_grad()
+def probe_embeddings(samples: ProbeSamples, embeddings: Tensor) -> ProbeResult:
+    """Predict the state from embeddings ``[N, D]`` of the samples, see :func:`probe`."""
+    fitted = torch.cat([samples.train, samples.validation])
+    gram = standardized_gram(embeddings, fitted)
+    targets = torch.cat([samples.positions, samples.velocities], 1)
+    # A velocity may bear the name of its position.
+    names = [
+        *(("position", name) for name in samples.position_names),
+        *(("velocity", name) for name in samples.velocity_names),
+    ]
+    spread = torch.stack([targets[part].std(0) for part in (samples.train, fitted, samples.test)]).amin(0)
+    varies = (spread > LEAST_SPREAD).nonzero().squeeze(-1)
+    fit = fit_ridge(gram, targets[:, varies], samples.train, samples.validation, samples.test)
+    scores = {names[index]: float(r2) for index, r2 in zip(varies.tolist(), fit.r2)}
+    unit = torch.nn.functional.normalize(embeddings, dim=-1)
+    return ProbeResult(
+        positions={name: r2 for (kind, name), r2 in scores.items() if kind == "position"},
+        velocities={name: r2 for (kind, name), r2 in scores.items() if kind == "velocity"},
+        left_out=tuple(f"{kind} {name}" for kind, name in names if (kind, name) not in scores),
+        effective_rank=effective_rank(embeddings),
+        mean_cosine=float(mean_pairwise_cosine(unit.double())),
+    )
+
+
+def _mean(scores: dict[str, float]) -> float:
+    return sum(max(0.0, r2) for r2 in scores.values()) / len(scores) if scores else float("nan")

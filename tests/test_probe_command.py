@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+import csv
+import functools
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from toy_world import collection_request, random_episode, run_in_order
+
+from crptpro.cli import main
+from crptpro.data.collect_worker import EpisodeRoller
+from crptpro.data.collection import DomainCollection
+from crptpro.domains import get_domain
+from crptpro.envs import make_env
+from crptpro.modules import PixelEncoder
+from crptpro.objectives import ProtoLoss
+from crptpro.pretrained import save_pretrained
+
+SIZE = 16
+Call = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Call]:
+    """Run `crptpro probe` in this process; returns exit status, standard output and standard error."""
+    library = logging.getLogger("crptpro")
+    before = library.handlers[:], library.level, library.propagate
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["crptpro", "probe", *map(str, arguments)])
+        capsys.readouterr()
+        try:
+            main()
+            status = 0
+        except SystemExit as stopped:
+            status = stopped.code if isinstance(stopped.code, int) else int(stopped.code is not None)
+        return status, *capsys.readouterr()
+
+    yield run
+    library.handlers[:], library.propagate = before[0], before[2]
+    library.setLevel(before[1])
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    path = tmp_path / "data" / "toy"
+    collection = DomainCollection(path, collection_request(transitions=60, image_size=SIZE))
+    for index in range(6):
+        collection.next_job()
+        collection.accept(index, random_episode(10, size=SIZE, seed=index))
+    return path
+
+
+@pytest.fixture
+def encoder(tmp_path: Path) -> Path:
+    torch.manual_seed(0)
+    loss = ProtoLoss(PixelEncoder(image_size=SIZE), num_prototypes=16, latent_dim=4, hidden_dim=8)
+    loss.training_record = {"datasets": [{"domain": "toy"}]}
+    return save_pretrained(loss, tmp_path / "encoder")
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def table(out: str) -> list[list[str]]:
+    lines = [line for line in out.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
+def test_an_encoder_and_the_control_are_probed_with_table_and_csv(
+    call: Call, dataset: Path, encoder: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "new" / "probe.csv"
+    status, out, _ = call(encoder, dataset, "--colors", "normal", "reversed_image", "--csv", file)
+    assert status == 0
+    named = [line[:5] for line in table(out)]
+    assert named == [
+        ["crptpro", "toy", "yes", colors, embedding]
+        for colors in ("normal", "reversed_image")
+        for embedding in ("features", "z")
+    ]
+    found = rows(file)
+    own = [row for row in found if (row["colors"], row["embedding"]) == ("normal", "z")]
+    assert [(row["measure"], row["coordinate"]) for row in own] == [
+        *(("r2_position", f"qpos[{index}]") for index in range(4)),
+        *(("r2_velocity", f"qvel[{index}]") for index in range(3)),
+        *((name, "") for name in ("r2_position", "r2_velocity", "effective_rank", "mean_cosine")),
+    ]
+    assert {(row["encoder"], row["method"], row["samples"], row["held_out_episodes"]) for row in found} == {
+        (str(encoder), "crptpro", "60", "2")
+    }
+    assert table(out)[1][5] == f"{float(own[-4]['value']):.3f}"
+
+    status, out, _ = call("random-encoder", dataset, "--samples", 40)
+    assert status == 0
+    assert [line[:5] for line in table(out)] == [["random-encoder", "toy", "no", "normal", "features"]]
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (("absent", "DATA"), "absent does not exist"),
+    (("random-encoder", "absent"), "absent is not a directory"),
+    (("random-encoder", "DATA", "--samples", "0"), "at least 1, got 0"),
+    (("random-encoder", "DATA", "--samples", "4"), "draw more samples"),
+    (("random-encoder", "DATA", "--device", "abacus"), "'abacus' cannot be used"),
+    (("random-encoder", "DATA", "--colors", "reversed_background"), "toy_go"),
+])  # fmt: skip
+def test_a_probe_that_cannot_run_says_why_and_writes_nothing(
+    call: Call, dataset: Path, tmp_path: Path, arguments: tuple[str, ...], message: str
+) -> None:
+    file = tmp_path / "probe.csv"
+    status, out, err = call(*(dataset if part == "DATA" else part for part in arguments), "--csv", file)
+    assert (status, out) == (1, "")
+    assert message in err
+    assert err.splitlines()[-1].startswith("error: ")
+    assert not file.exists()
+
+
+def test_an_encoder_of_other_images_and_data_without_state_are_refused(
+    call: Call, encoder: Path, dataset: Path, tmp_path: Path
+) -> None:
+    small = tmp_path / "small"
+    run_in_order(DomainCollection(small, collection_request()), 0)
+    assert "image_size 16, not 8" in call(encoder, small)[2]
+    stateless = DomainCollection(tmp_path / "stateless", collection_request(transitions=9, image_size=SIZE))
+    stateless.next_job()
+    stateless.accept(0, random_episode(9, size=SIZE, state=False))
+    assert "no physical state" in call("random-encoder", tmp_path / "stateless")[2]
+
+
+def test_what_the_parser_cannot_read_is_refused(call: Call) -> None:
+    status, _, err = call("random-encoder", "data/x", "--colors", "pink")
+    assert status == 2
+    assert "pink" in err
+
+
+@pytest.mark.gl
+def test_a_real_domain_is_probed_in_its_own_colours_and_with_its_background_reversed(
+    call: Call, tmp_path: Path
+) -> None:
+    domain = get_domain("pendulum")
+    settings = {"image_size": 24, "action_repeat": 20, "camera": 0, "quality": "fast"}
+    request = {"domain": "pendulum", "task": domain.task, "seed": 0, "transitions": 300, **settings}
+    collection = DomainCollection(tmp_path / "pendulum", request)
+    roller = EpisodeRoller(
+        functools.partial(make_env, domain, seed=0, frame_stack=1, physics_state=True, **settings)
+    )
+    while not collection.is_complete:
+        job = collection.next_job()
+        collection.accept(job.episode, roller.roll(job))
+    roller.close()
+    file = tmp_path / "probe.csv"
+    both = ("--colors", "normal", "reversed_background")
+    status, out, err = call("random-encoder", tmp_path / "pendulum", "--samples", 150, *both, "--csv", file)
+    assert status == 0, err
+    assert [line[3] for line in table(out)] == list(both[1:])
+    assert {row["coordinate"] for row in rows(file)} == {"", "hinge", "sin hinge", "cos hinge"}
+    assert all(float(line[5]) > 0.2 for line in table(out))  # even a random encoder sees where the pole is
+    assert table(out)[0][5:] != table(out)[1][5:]
