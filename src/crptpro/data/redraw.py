@@ -76,7 +76,7 @@ def _draw(dataset: FrameDataset, rows: dict[int, Tensor], colors: Colors) -> Ten
     settings["colors"] = "normal" if is_swapped else colors
     env = make_env(get_domain(card["task"]), seed=0, frame_stack=1, **settings)
     base = env.base_env if isinstance(env, TransformedEnv) else env
-    simulator = getattr(base, "simulator", None)
+    simulator: Any = getattr(base, "simulator", None)
     images = []
     try:
         if not hasattr(simulator, "set_state"):

@@ -69,10 +69,10 @@ class DownstreamRun:
             "action_repeat": config.resolved_action_repeat,
             "image_size": encoder.image_size,
             "frame_stack": encoder.in_channels // 3,
+            # A factory of one's own need not know of colours.
+            **({"colors": config.colors} if config.colors != "normal" else {}),
         }
-        if config.colors != "normal":  # a factory of one's own need not know of colours
-            settings["colors"] = config.colors
-        # The domain itself and not its name, which may be registered in this process only.
+        # The domain itself, whose name may be registered in this process only.
         name = get_domain(task) if env_factory is make_env else task
         make_this_env = functools.partial(env_factory, name, seed=config.seed, **settings)
         self.env = EnvThread(make_this_env, is_ahead=runs_ahead(task, config))
