@@ -129,8 +129,7 @@ class DownstreamRun:
             leave=False,
             disable=None if self.progress else True,
         )
-        announcement = "Stopping at the end of this episode; press Ctrl-C again to stop at once."
-        with StopRequest(announcement) as stop, bar:
+        with StopRequest("Stopping after this episode; press Ctrl-C again to stop at once.") as stop, bar:
             while True:
                 is_finished = self.env_steps >= config.env_steps
                 is_new = self.last_eval != self.env_steps
@@ -189,8 +188,7 @@ class DownstreamRun:
             )
             features = parts.features.observe(following["pixels"], slot)
             episode_return += following["reward"].item()
-            agent_steps += 1
-            self.agent_steps += 1
+            agent_steps, self.agent_steps = agent_steps + 1, self.agent_steps + 1
             done = bool(following["done"].item())
             observation = step_mdp(transition)
             bar.update(config.resolved_action_repeat)
@@ -207,10 +205,12 @@ class DownstreamRun:
         Raises:
             NonFiniteError: if the policy has diverged; no simulator should see that.
         """
-        is_new = self.agent_steps < self.config.random_agent_steps
-        if is_new and not self.parts.algorithm.explores_at_once:
-            shape = self.env.env.action_spec.shape
-            return torch.rand(shape, generator=self.generators["random_actions"]) * 2 - 1
+        at_once = self.parts.algorithm.explores_at_once
+        if self.agent_steps < self.config.random_agent_steps and not at_once:
+            return (
+                torch.rand(self.env.env.action_spec.shape, generator=self.generators["random_actions"]) * 2
+                - 1
+            )
         action = self.parts.algorithm.explore(features).squeeze(0).float().cpu().clamp(-1, 1)
         if not torch.isfinite(action).all():
             raise not_finite(f"After update {self.updates} the policy of {self.task} acts {action.tolist()}")
