@@ -65,8 +65,8 @@ class Config:
     """transitions per update [512]"""
     pretrain_learning_rate: float = 3e-4
     """of Adam [1e-4]"""
-    num_prototypes: int = 128
-    """as many as transitions per update, here as in the paper: the exploration bonus wants that [512]"""
+    num_prototypes: int = 256
+    """M: fewer leave the loss's plateau later, more thin out the exploration bonus at this batch size [512]"""
     assignment_temperature: float = 0.05
     """of Sinkhorn-Knopp; at the paper's the loss stands still for over a thousand updates first [0.1]"""
 

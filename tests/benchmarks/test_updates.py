@@ -123,7 +123,7 @@ def test_a_decision_on_the_simulator_is_taken_apart_into_its_stages(
 
 
 def test_dense_features_that_do_not_fit_the_memory_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    config = library_updates.DownstreamConfig(action_repeat=2)
+    config = library_updates.DownstreamConfig(action_repeat=2, replay_capacity=40_000)
     pretrained = library_updates.fresh_pretrained(image_size=16)
     library_updates.require_dense(pretrained, config)
     monkeypatch.setattr("crptpro.transforms.shift_cache.free_bytes", lambda device: 1_000_000)
