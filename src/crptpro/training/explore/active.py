@@ -184,8 +184,12 @@ def _warn_of_another_encoder(loss: LossModule) -> None:
     config = getattr(getattr(loss, "encoder", None), "config", {})
     wanted = get_method(name).encoder_options if name in methods(presets=True) else {}
     for option, value in wanted.items():
-        if option in config and config[option] != value:
+        if option in config and _plain(config[option]) != _plain(value):
             _LOG.warning(
                 "%s wants an encoder with %s %s, this one has %s; get_method(%r).build_encoder() builds its own.",
                 name, option, value, config[option], name,
             )  # fmt: skip
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value

@@ -289,6 +289,6 @@ class ActiveRun:
         checkpoint.restore(self, state)
         is_finished = self.decisions == self.plan.decisions
         logger.info(
-            "Active pre-training: %s %s env steps.",
+            "active pre-training: %s %s env steps.",
             "already at" if is_finished else "continues from", f"{self.env_steps:,}",
         )  # fmt: skip
