@@ -73,7 +73,9 @@ class Config:
     """mirror the records to Weights & Biases; auto is online when logged in, else offline"""
 
     # downstream
-    downstream: SACSettings = field(default_factory=lambda: SACSettings(intrinsic_reward_coef=0.0))
+    downstream: SACSettings = field(
+        default_factory=lambda: SACSettings(replay_capacity=40_000, intrinsic_reward_coef=0.0)
+    )
     """SAC on the frozen encoder; without prototypes there is no exploration bonus"""
 
 

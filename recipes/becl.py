@@ -83,7 +83,9 @@ class Config:
     """how it explores. The render quality here holds for the tasks too"""
 
     # downstream
-    downstream: SACSettings = field(default_factory=lambda: SACSettings(intrinsic_reward_coef=0.0))
+    downstream: SACSettings = field(
+        default_factory=lambda: SACSettings(replay_capacity=40_000, intrinsic_reward_coef=0.0)
+    )
     """SAC on the frozen encoder, as for every other method, but without prototypes and their bonus; or, by algorithm
     skill-ddpg, the kind of agent that explored, with one skill"""
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
+# Looking for doctests would import this file once more, under a name that another conftest.py has too.
+collect_ignore = ["conftest.py"]
+
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if torch.cuda.is_available():
