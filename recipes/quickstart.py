@@ -65,8 +65,8 @@ class Config:
     """transitions per update [512]"""
     pretrain_learning_rate: float = 3e-4
     """of Adam [1e-4]"""
-    num_prototypes: int = 256
-    """M: fewer leave the loss's plateau later, more thin out the exploration bonus at this batch size [512]"""
+    num_prototypes: int = 512
+    """M; at this batch size fewer would make more of the exploration bonus, and leave the loss's plateau later"""
     assignment_temperature: float = 0.05
     """of Sinkhorn-Knopp; at the paper's the loss stands still for over a thousand updates first [0.1]"""
 
