@@ -11,11 +11,12 @@ from typing import Any
 
 from crptpro.directory_lock import DirectoryLock
 from crptpro.downstream_config import DownstreamConfig
-from crptpro.envs import make_env, resolve_action_repeat
-from crptpro.errors import CheckpointError, PretrainedError, UnknownNameError
+from crptpro.envs import make_env
+from crptpro.errors import CheckpointError, PretrainedError
 from crptpro.loggers import RunLogger
 from crptpro.objectives import Method, get_method, methods
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
+from crptpro.training.action_repeat import action_repeat_of
 from crptpro.training.agent import PixelAgent
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.downstream_run import DownstreamRun, EnvFactory
@@ -76,7 +77,7 @@ def train_downstream(
         NonFiniteError: if a loss became NaN or infinite; the last checkpoint is kept.
     """
     config = dataclasses.replace(config or DownstreamConfig(), **overrides)
-    config = dataclasses.replace(config, action_repeat=_action_repeat(task, config.action_repeat))
+    config = dataclasses.replace(config, action_repeat=action_repeat_of(task, config.action_repeat))
     artifact = _artifact(pretrained, config)
     config = dataclasses.replace(config, replay_capacity=_replay_capacity(artifact, config))
     with contextlib.ExitStack() as stack:
@@ -123,10 +124,3 @@ def _replay_capacity(pretrained: Pretrained, config: DownstreamConfig) -> int:
     known = pretrained.method in methods(presets=True)
     usual = get_method(pretrained.method).replay_capacity if known else Method.replay_capacity
     return max(usual, config.random_agent_steps)
-
-
-def _action_repeat(task: str, asked: int | None) -> int:
-    try:
-        return resolve_action_repeat(task, asked)
-    except UnknownNameError:  # an `env_factory` of the caller's may know names that the library does not
-        return asked or 2

@@ -19,6 +19,7 @@ from crptpro.envs import make_env
 from crptpro.loggers import RunLogger
 from crptpro.objectives import ExplorationDefaults, MethodDefaults
 from crptpro.seeding import derive_seed
+from crptpro.training.action_repeat import action_repeat_of
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.env_thread import EnvThread, runs_ahead
 from crptpro.training.explore.agents import build_agent
@@ -26,7 +27,6 @@ from crptpro.training.explore.batches import ReplayBatches
 from crptpro.training.explore.member import Member
 from crptpro.training.explore.plan import Plan, make_plan
 from crptpro.training.explore.replays import DIRECTORY, make_replay, require_room
-from crptpro.training.explore.request import action_repeat_of
 from crptpro.training.explore.rewards import ExplorationReward
 from crptpro.training.explore.run import ActiveRun
 from crptpro.training.fingerprint import describe_loss

@@ -10,9 +10,9 @@ from torchrl.objectives import LossModule
 
 from crptpro.active_config import ActiveConfig
 from crptpro.domains import Domain, get_domain
-from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.objectives import ExplorationDefaults, exploration_defaults, method_defaults
+from crptpro.training.action_repeat import action_repeat_of
 from crptpro.training.explore.agents import require_agent
 from crptpro.training.explore.plan import make_plan, resolve
 from crptpro.training.explore.rewards import build_reward
@@ -84,11 +84,3 @@ def require_explorable(
     if config.reward == "skill-contrast" and config.skill_dim is None:
         raise CRPTproError("The reward skill-contrast needs skills; set skill_dim (BeCL: 16).")
     build_reward(config.reward or "", loss, config, torch.Generator())
-
-
-def action_repeat_of(domain: str | Domain, asked: int | None) -> int:
-    """Return the simulator steps per decision in a domain."""
-    try:
-        return resolve_action_repeat(domain, asked)
-    except UnknownNameError:  # an `env_factory` of the caller's may know names that the library does not
-        return asked or 2
