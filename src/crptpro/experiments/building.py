@@ -1,0 +1,245 @@
+"""Make a piece: the one stage of the pipeline that its description names, resumed if it was interrupted."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from crptpro.cards import cpu_cores, provenance, read_json, write_json
+from crptpro.directory_lock import DirectoryLock
+from crptpro.errors import RecordError
+from crptpro.experiments.pieces import (
+    DatasetPiece,
+    EncoderPiece,
+    ExploredPiece,
+    FinetunedPiece,
+    Piece,
+    PretrainedPiece,
+    RunPiece,
+    UntrainedPiece,
+    piece_from_json,
+)
+
+logger = logging.getLogger(__name__)
+
+PIECES, DESCRIPTION, DONE = "pieces", "piece.json", "done.json"
+
+
+@dataclass(frozen=True)
+class JobSettings:
+    """Where and how pieces are made; none of it is part of what they are.
+
+    Args:
+        device: of networks.
+        threads: of torch, in each job.
+        workers: collecting processes of a job that collects.
+    """
+
+    device: str = "cpu"
+    threads: int = 1
+    workers: int = 1
+
+
+@dataclass(frozen=True)
+class Store:
+    """The directory in which pieces are kept and found again.
+
+    Args:
+        root: pieces lie below ``root/pieces``.
+    """
+
+    root: Path
+
+    def path(self, piece: Piece) -> Path:
+        """Directory of a piece, made or not."""
+        return self.root / PIECES / piece.key
+
+    def is_done(self, piece: Piece) -> bool:
+        """Whether a piece is finished."""
+        return (self.path(piece) / DONE).is_file()
+
+    def seconds(self, piece: Piece) -> float:
+        """Wall clock of the attempt that finished a piece."""
+        return float(read_json(self.path(piece) / DONE, error=RecordError)["seconds"])
+
+    def dataset(self, piece: DatasetPiece) -> Path:
+        """Directory of a dataset."""
+        from crptpro.data.incoming import dataset_path
+
+        return dataset_path(self.path(piece), piece.domain)
+
+    def encoder(self, piece: EncoderPiece) -> Path:
+        """Directory of an encoder's artifact."""
+        return self.path(piece) / "encoder"
+
+    def describe(self, piece: Piece) -> Path:
+        """Write a piece's description into its directory, where a job finds it."""
+        path = self.path(piece) / DESCRIPTION
+        if not path.exists():
+            write_json(path, piece.to_json())
+        return path
+
+    def described(self, key: str) -> Piece:
+        """Read a piece by its key.
+
+        Raises:
+            RecordError: if there is none.
+        """
+        return piece_from_json(read_json(self.root / PIECES / key / DESCRIPTION, error=RecordError))
+
+
+def build(piece: Piece, store: Store, job: JobSettings | None = None) -> None:
+    """Make a piece, or continue it; what it needs must be finished. A finished piece is left as it is.
+
+    Args:
+        piece: to make.
+        store: where it is kept.
+        job: where and how it is made.
+
+    Raises:
+        RecordError: if something it needs is missing, or its directory is in use.
+        CRPTproError: whatever the stage refuses.
+    """
+    if store.is_done(piece):
+        return
+    for needed in piece.needs:
+        if not store.is_done(needed):
+            raise RecordError(f"{piece.key} needs {needed.key}, which is not finished in {store.root}.")
+    job = job or JobSettings(threads=cpu_cores())
+    torch.set_num_threads(job.threads)
+    store.describe(piece)
+    directory = store.path(piece)
+    with DirectoryLock(directory, error=RecordError, is_reentrant=True):
+        began = time.monotonic()
+        make(piece, store, job)
+        seconds = time.monotonic() - began
+        write_json(directory / DONE, {"seconds": seconds, "job": asdict(job), **provenance()})
+
+
+@functools.singledispatch
+def make(piece: Piece, store: Store, job: JobSettings) -> None:
+    """Make one kind of piece; every kind registers its own way here."""
+    raise RecordError(f"Nothing makes a piece of kind {piece.kind!r}.")
+
+
+register: Callable[..., Any] = make.register
+
+
+@register
+def _(piece: DatasetPiece, store: Store, job: JobSettings) -> None:
+    from crptpro.data import collect_random
+
+    collect_random(
+        piece.domain,
+        store.path(piece),
+        transitions=piece.transitions,
+        seed=piece.seed,
+        workers=job.workers,
+        quality=piece.quality,
+        colors=piece.colors,
+    )
+
+
+@register
+def _(piece: UntrainedPiece, store: Store, job: JobSettings) -> None:
+    from crptpro.pretrained import random_pretrained, save_pretrained
+
+    save_pretrained(random_pretrained(seed=piece.seed), store.encoder(piece))
+
+
+@register
+def _(piece: PretrainedPiece, store: Store, job: JobSettings) -> None:
+    from crptpro.loggers import RunLogger
+    from crptpro.objectives import get_method
+    from crptpro.pretrained import save_pretrained
+    from crptpro.seeding import seed_everything
+    from crptpro.training import pretrain
+
+    method = get_method(piece.method)
+    seed_everything(piece.seed)
+    loss = method.build(method.build_encoder(), **dict(piece.loss))
+    run_dir = store.path(piece)
+    with RunLogger(run_dir, config=_record(piece)) as records:
+        pretrain(
+            loss,
+            [store.dataset(dataset) for dataset in piece.datasets],
+            updates=piece.updates,
+            seed=piece.seed,
+            device=job.device,
+            run_dir=run_dir,
+            logger=records,
+            **dict(piece.training),
+        )
+        save_pretrained(loss, store.encoder(piece))
+
+
+@register
+def _(piece: ExploredPiece, store: Store, job: JobSettings) -> None:
+    from crptpro.loggers import RunLogger
+    from crptpro.objectives import exploration_defaults, get_method
+    from crptpro.pretrained import save_pretrained
+    from crptpro.seeding import seed_everything
+    from crptpro.training import ActiveConfig, pretrain_active
+
+    method = get_method(piece.method)
+    seed_everything(piece.seed)
+    loss = method.build(method.build_encoder(), **dict(piece.loss))
+    run_dir = store.path(piece)
+    config = ActiveConfig(**dict(piece.explore), seed=piece.seed, device=job.device)
+    with RunLogger(run_dir, config=_record(piece)) as records:
+        result = pretrain_active(loss, piece.domains, config=config, run_dir=run_dir, logger=records)
+        hands_over = exploration_defaults(loss).transfers_actor
+        actor = next(iter(result.actors.values())) if hands_over else None
+        save_pretrained(loss, store.encoder(piece), actor=actor)
+
+
+@register
+def _(piece: FinetunedPiece, store: Store, job: JobSettings) -> None:
+    from crptpro.loggers import RunLogger
+    from crptpro.pretrained import finetune, load_pretrained, save_pretrained
+    from crptpro.seeding import seed_everything
+
+    seed_everything(piece.seed)
+    run_dir = store.path(piece)
+    with RunLogger(run_dir, config=_record(piece)) as records:
+        loss, _ = finetune(
+            load_pretrained(store.encoder(piece.base)),
+            store.dataset(piece.dataset),
+            updates=piece.updates,
+            seed=piece.seed,
+            device=job.device,
+            run_dir=run_dir,
+            logger=records,
+            **dict(piece.training),
+        )
+        save_pretrained(loss, store.encoder(piece))
+
+
+@register
+def _(piece: RunPiece, store: Store, job: JobSettings) -> None:
+    from crptpro.downstream_config import DownstreamConfig, drq_settings, skill_ddpg_settings
+    from crptpro.loggers import RunLogger
+    from crptpro.pretrained import load_pretrained
+    from crptpro.seeding import derive_seed
+    from crptpro.training import train_downstream
+
+    asked = dict(piece.config)
+    algorithm = "drq" if piece.encoder is None else asked.get("algorithm")
+    base = {"drq": drq_settings, "skill-ddpg": skill_ddpg_settings}.get(str(algorithm), DownstreamConfig)
+    seed = derive_seed(piece.seed, "task", piece.task)
+    config = base(**asked, seed=seed, colors=piece.colors, device=job.device)
+    run_dir = store.path(piece)
+    pretrained = None if piece.encoder is None else load_pretrained(store.encoder(piece.encoder))
+    with RunLogger(run_dir, config={"task": piece.task, **asdict(config)}) as records:
+        train_downstream(piece.task, pretrained, config=config, run_dir=run_dir, logger=records)
+
+
+def _record(piece: Piece) -> dict[str, Any]:
+    return {"piece": piece.to_json()}

@@ -1,0 +1,206 @@
+"""What an experiment asks for: pieces, and where each stands in its tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from crptpro.domains import GROUPS, get_domain
+from crptpro.errors import CRPTproError
+from crptpro.experiments.pieces import (
+    DatasetPiece,
+    EncoderPiece,
+    ExploredPiece,
+    FinetunedPiece,
+    Piece,
+    PretrainedPiece,
+    RunPiece,
+    Settings,
+    UntrainedPiece,
+    settings,
+)
+from crptpro.experiments.scales import Scale
+from crptpro.objectives import get_method
+
+FINETUNE, DRQ, RANDOM_ENCODER = "crptpro-finetune", "drq", "random-encoder"
+METHODS = (
+    "crptpro", FINETUNE, "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-s", "becl", DRQ, RANDOM_ENCODER,
+)  # fmt: skip
+"""Every system of the comparison, in the order of tables."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """One cell's worth of an experiment.
+
+    Args:
+        label: the system or variant, a row of the tables: ``"crptpro"``, ``"proto-rl-c with dispersion"``.
+        piece: what gives its number.
+        place: where it stands otherwise, e.g. ``(("group", "A"), ("task", "walker_run"))``.
+    """
+
+    label: str
+    piece: Piece
+    place: Settings = ()
+
+
+@dataclass(frozen=True)
+class Request:
+    """What part of an experiment is wanted, at which scale.
+
+    Args:
+        scale: every budget.
+        methods: systems, by name; the experiment's own if empty.
+        groups: letters of :data:`crptpro.domains.GROUPS`; the experiment's own if empty.
+        tasks: by name; the experiment's own if empty.
+        encoder_seeds: the first seed level: collection, exploration and pre-training.
+        seeds: the second: downstream runs on each encoder; ``None`` for as many as the scale has.
+    """
+
+    scale: Scale
+    methods: tuple[str, ...] = ()
+    groups: tuple[str, ...] = ()
+    tasks: tuple[str, ...] = ()
+    encoder_seeds: tuple[int, ...] = (0,)
+    seeds: tuple[int, ...] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse names that nobody knows.
+
+        Raises:
+            UnknownNameError: for a method or a task.
+            CRPTproError: for a group, or a repeated or missing seed.
+        """
+        for method in self.methods:
+            if method not in METHODS:
+                get_method(method)
+        for group in self.groups:
+            if group not in GROUPS:
+                raise CRPTproError(f"There is no group {group!r}; choose from {', '.join(GROUPS)}.")
+        for task in self.tasks:
+            get_domain(task)
+        for name, given in (("encoder_seeds", self.encoder_seeds), ("seeds", self.downstream_seeds)):
+            if not given or len(set(given)) != len(given):
+                raise CRPTproError(f"`{name}` must be one or several different numbers, got {given}.")
+
+    @property
+    def downstream_seeds(self) -> tuple[int, ...]:
+        """Seeds of the second level."""
+        return tuple(range(self.scale.seeds)) if self.seeds is None else self.seeds
+
+    def chosen(self, usual: Iterable[str]) -> tuple[str, ...]:
+        """Return the methods asked for, or the experiment's usual ones."""
+        return self.methods or tuple(usual)
+
+
+def dataset(scale: Scale, domain: str, seed: int, *, transitions: int | None = None) -> DatasetPiece:
+    """Return a domain's random dataset."""
+    return DatasetPiece(
+        get_domain(domain).name, transitions or scale.transitions, seed, quality=scale.quality
+    )
+
+
+def encoder(
+    scale: Scale,
+    method: str,
+    domains: Iterable[str],
+    seed: int,
+    *,
+    transitions: int | None = None,
+    loss: Settings = (),
+) -> EncoderPiece:
+    """Return the encoder that a method trains on domains.
+
+    Args:
+        scale: its budgets.
+        method: a registered name, or ``random-encoder``.
+        domains: a single one for the (S) methods.
+        seed: of data and training.
+        transitions: of each domain, instead of the scale's.
+        loss: options of the loss, instead of or besides the scale's.
+
+    Raises:
+        UnknownNameError: if there is no such method.
+    """
+    names = tuple(get_domain(domain).name for domain in domains)
+    if method == RANDOM_ENCODER:
+        return UntrainedPiece(method, seed)
+    registered = get_method(method)
+    options = settings(**{**dict(scale.loss.get(method, ())), **dict(loss)})
+    batch = {} if scale.batch_size is None else {"batch_size": scale.batch_size}
+    if registered.exploration is None:
+        datasets = tuple(dataset(scale, name, seed, transitions=transitions) for name in names)
+        return PretrainedPiece(
+            method, seed, datasets=datasets, updates=scale.updates, training=settings(**batch), loss=options
+        )
+    explore = {**dict(scale.explore.get(method, ())), **batch}
+    if scale.quality != "exact":
+        explore["quality"] = scale.quality
+    return ExploredPiece(method, seed, domains=names, explore=settings(**explore), loss=options)
+
+
+def finetuned(scale: Scale, base: EncoderPiece, domain: str, seed: int) -> FinetunedPiece:
+    """Return an encoder trained on, on one domain."""
+    name = get_domain(domain).name
+    batch = {} if scale.batch_size is None else {"batch_size": scale.batch_size}
+    return FinetunedPiece(
+        FINETUNE,
+        seed,
+        base=base,
+        dataset=dataset(scale, name, seed),
+        updates=scale.finetuning_updates(name),
+        training=settings(**batch),
+    )
+
+
+def encoder_for_task(
+    scale: Scale, method: str, domains: Iterable[str], task: str, seed: int, *, loss: Settings = ()
+) -> EncoderPiece | None:
+    """Return the encoder that a task of a group is learned on; ``None`` for DrQ, which trains its own.
+
+    The (S) methods have one per domain, and fine-tuning goes on from the group's on the task's domain.
+    """
+    if method == DRQ:
+        return None
+    if method == FINETUNE:
+        return finetuned(scale, encoder(scale, "crptpro", domains, seed), task, seed)
+    exploration = None if method == RANDOM_ENCODER else get_method(method).exploration
+    if exploration is not None and exploration.is_single_domain:
+        domains = (get_domain(task).name,)
+    return encoder(scale, method, domains, seed, loss=loss)
+
+
+def run(scale: Scale, task: str, on: EncoderPiece | None, seed: int) -> RunPiece:
+    """Return a downstream run."""
+    config = {**dict(scale.run), **(dict(scale.drq) if on is None else {})}
+    if scale.quality != "exact":
+        config["quality"] = scale.quality
+    return RunPiece(task, on, seed, config=settings(**config))
+
+
+def runs(
+    request: Request, label: str, task: str, encoders: dict[int, EncoderPiece | None], **place: str
+) -> list[Goal]:
+    """Return the runs of one cell: every downstream seed on the encoder of every encoder seed.
+
+    Where there is no encoder to share (DrQ), the encoder seeds count as further seeds of the run, so that every
+    system has as many runs.
+    """
+    where = settings(task=task, **place)
+    goals = []
+    for number, (seed, piece) in enumerate(encoders.items()):
+        for own in request.downstream_seeds:
+            shift = 0 if piece is not None else number * (max(request.downstream_seeds) + 1)
+            goal = run(request.scale, task, piece, own + shift)
+            goals.append(Goal(label, goal, settings(encoder_seed=seed, seed=own, **dict(where))))
+    return goals
+
+
+def in_colors(goals: Iterable[Goal], colors: str) -> list[Goal]:
+    """Return the same runs in a world of other colours."""
+    changed = []
+    for goal in goals:
+        assert isinstance(goal.piece, RunPiece)
+        piece = replace(goal.piece, colors=colors)  # type: ignore[arg-type]
+        changed.append(Goal(goal.label, piece, settings(colors=colors, **dict(goal.place))))
+    return changed
