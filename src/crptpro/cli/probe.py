@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from crptpro.cli.downstream import RANDOM_ENCODER
-from crptpro.cli.request import image_format, require_device
+from crptpro.cli.request import image_format
 from crptpro.colors import Colors
 
 if TYPE_CHECKING:
@@ -52,10 +52,11 @@ class Probe:
         from crptpro.data import FrameDataset
         from crptpro.errors import CRPTproError
         from crptpro.experiments.markdown import markdown_table
+        from crptpro.modules import usable_device
 
         if self.samples < 1:
             raise CRPTproError(f"--samples must be at least 1, got {self.samples}.")
-        require_device(self.device)
+        usable_device(self.device)
         image_size, frame_stack = image_format(self.datasets)
         pretrained = self._load(image_size, frame_stack)
         encoder, projector = pretrained.encoder.to(self.device), pretrained.projector
