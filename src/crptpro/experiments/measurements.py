@@ -72,6 +72,9 @@ class PrototypesPiece(Piece):
 class CoveragePiece(Piece):
     """How widely an explorer's observations are spread along its training, beside random data, as ``coverage.csv``.
 
+    A window has the same decisions of both sources: an explorer's first hundred stand beside a dataset's first hundred.
+    Where a source does not have enough of them (a smaller dataset, a replay that went round), it has no row.
+
     Args:
         explorer: whose replays are read.
         datasets: random transitions of the same domains.
