@@ -45,8 +45,8 @@ def all_pieces() -> dict[str, Piece]:
 
 
 def test_keys_are_the_same_in_every_process_and_version() -> None:
-    assert WALKER.key == "dataset-walker-seed-0-DATASETKEY"
-    assert ENCODER.key == "encoder-crptpro-walker-seed-0-ENCODERKEY"
+    assert WALKER.key == "dataset-walker-seed-0-98ce5df271"
+    assert ENCODER.key == "encoder-crptpro-walker-seed-0-f74f1a9078"
 
 
 def test_equal_pieces_have_equal_keys_and_any_number_makes_another() -> None:
