@@ -75,9 +75,13 @@ class Store:
 
         return dataset_path(self.path(piece), piece.domain)
 
-    def encoder(self, piece: EncoderPiece) -> Path:
-        """Directory of an encoder's artifact."""
-        return self.path(piece) / "encoder"
+    def encoder(self, piece: EncoderPiece, at_updates: int | None = None) -> Path:
+        """Directory of an encoder's artifact, or of one of its snapshots."""
+        from crptpro.pretrained import snapshot_path
+
+        if at_updates is None:
+            return self.path(piece) / "encoder"
+        return snapshot_path(self.path(piece), at_updates)
 
     def describe(self, piece: Piece) -> Path:
         """Write a piece's description into its directory, where a job finds it."""
@@ -158,13 +162,13 @@ def _(piece: UntrainedPiece, store: Store, job: JobSettings) -> None:
 def _(piece: PretrainedPiece, store: Store, job: JobSettings) -> None:
     from crptpro.loggers import RunLogger
     from crptpro.objectives import get_method
-    from crptpro.pretrained import save_pretrained
+    from crptpro.pretrained import encoder_snapshots, save_pretrained
     from crptpro.seeding import seed_everything
     from crptpro.training import pretrain
 
     method = get_method(piece.method)
     seed_everything(piece.seed)
-    loss = method.build(method.build_encoder(), **dict(piece.loss))
+    loss = method.build(method.build_encoder(**dict(piece.encoder)), **dict(piece.loss))
     run_dir = store.path(piece)
     with RunLogger(run_dir, config=_record(piece)) as records:
         pretrain(
@@ -175,6 +179,7 @@ def _(piece: PretrainedPiece, store: Store, job: JobSettings) -> None:
             device=job.device,
             run_dir=run_dir,
             logger=records,
+            at_updates=encoder_snapshots(run_dir, piece.snapshots),
             **dict(piece.training),
         )
         save_pretrained(loss, store.encoder(piece))
