@@ -108,7 +108,10 @@ def factors_of(scale: Scale) -> tuple[Factor, ...]:
     warmup = min(500, max(1, scale.updates // 6))
     return (
         Factor(
-            "num_prototypes", "loss", prototypes, (prototypes // 4, prototypes // 2, prototypes, 2 * prototypes)
+            "num_prototypes",
+            "loss",
+            prototypes,
+            (prototypes // 4, prototypes // 2, prototypes, 2 * prototypes),
         ),
         Factor("batch_size", "training", batch, (batch // 2, batch, 2 * batch)),
         Factor("hidden_dim", "loss", width, (width // 2, width, 2 * width)),
