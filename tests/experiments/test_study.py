@@ -36,6 +36,15 @@ def pieces(goals: list[Goal], kind: type) -> set:
     return {goal.piece for goal in goals if isinstance(goal.piece, kind)}
 
 
+def effective(piece: PretrainedPiece) -> dict:
+    """Every number that is varied, defaults included."""
+    usual = {
+        "num_prototypes": 512, "hidden_dim": 1024, "intr_loss_coef": 5e-3, "batch_size": 512,
+        "learning_rate": 1e-4, "encoder_tau": 0.05, "warmup_updates": 0, "pixel_offset": 0.0,
+    }  # fmt: skip
+    return {**usual, **dict(piece.training), **dict(piece.loss), **dict(piece.encoder)}
+
+
 @pytest.fixture(scope="module")
 def small() -> list[Goal]:
     return study(Request(SMALL))
@@ -48,10 +57,12 @@ def test_temperatures_are_compared_on_two_groups_and_two_seeds(small: list[Goal]
     assert {piece.updates for piece in encoders} == {10_000}
     assert {piece.snapshots for piece in encoders} == {(500, 1_000, 2_000, 3_000, 5_000)}
     assert {dict(piece.training)["batch_size"] for piece in encoders} == {128}
-    assert Counter(piece.loss for piece in encoders) == {
-        (("num_prototypes", 512),): 4,
-        (("assignment_temperature", 0.05), ("num_prototypes", 512)): 4,
-        (("annealing_updates", 10_000), ("assignment_temperature", 0.05), ("num_prototypes", 512)): 4,
+    assert {effective(piece)["num_prototypes"] for piece in encoders} == {512}
+    names = ("assignment_temperature", "annealing_updates")
+    assert Counter(tuple(dict(piece.loss).get(name) for name in names) for piece in encoders) == {
+        (None, None): 4,
+        (0.05, None): 4,
+        (0.05, 10_000): 4,
     }
     places = Counter((dict(g.place)["group"], dict(g.place)["value"]) for g in of(goals, PretrainedPiece))
     assert set(places.values()) == {2}
@@ -106,13 +117,19 @@ def test_a_factor_changes_one_number_and_all_share_the_baseline() -> None:
     assert (baseline.updates, baseline.seed, baseline.snapshots) == (3_000, 0, (1_000,))
     assert len({g.piece for g in goals}) == 1 + sum(len(f.values) - 1 for f in options) == 17
     for goal in goals:
-        if goal.piece != baseline:
-            changed = {name for name in ("training", "loss", "encoder", "updates", "snapshots", "datasets")
-                       if getattr(goal.piece, name) != getattr(baseline, name)}  # fmt: skip
-            (factor,) = (f for f in options if f.name == dict(goal.place)["factor"])
-            assert changed == {factor.where}
-            difference = set(getattr(goal.piece, factor.where)) ^ set(getattr(baseline, factor.where))
-            assert {name for name, _ in difference} == {factor.name}
+        name, value = dict(goal.place)["factor"], dict(goal.place)["value"]
+        expected = {**effective(baseline), name: float(value)}
+        assert effective(goal.piece) == expected
+        assert (goal.piece == baseline) == (expected == effective(baseline))
+        assert (goal.piece.updates, goal.piece.datasets) == (baseline.updates, baseline.datasets)
+
+
+def test_nothing_is_asked_for_twice(small: list[Goal]) -> None:
+    assert len(small) == len(set(small))
+    assert len(pieces(small, PretrainedPiece)) == 12 + 17
+    assert len(pieces(small, RunPiece)) == 12
+    # At 6 points of each temperature and 2 of each factor on 4 domains; 2 untrained encoders on the 6 of both groups.
+    assert len(pieces(small, ProbePiece)) == (12 * 6 + 17 * 2) * 4 + 2 * 6
 
 
 def test_the_papers_scale_has_its_batch_and_updates() -> None:

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from crptpro.domains import GROUPS, get_domain
-from crptpro.experiments.goals import RANDOM_ENCODER, Goal, Request, dataset, encoder, runs
+from crptpro.experiments import goals
+from crptpro.experiments.goals import RANDOM_ENCODER, Goal, Request, dataset, runs
 from crptpro.experiments.pieces import (
     EncoderPiece,
     PretrainedPiece,
@@ -58,7 +59,7 @@ def study(request: Request) -> list[Goal]:
     """Temperatures of the targets on two groups and two seeds, then one-factor trials on one of each."""
     if METHOD not in request.chosen((METHOD,)):
         return []
-    return [*temperatures(request), *factors(request)]
+    return list(dict.fromkeys([*temperatures(request), *factors(request)]))  # both have the control
 
 
 def temperatures(request: Request) -> list[Goal]:
@@ -74,30 +75,30 @@ def temperatures(request: Request) -> list[Goal]:
         "0.05": sharp,
         "annealed": {**sharp, "annealing_updates": updates},
     }
-    goals = []
+    found: list[Goal] = []
     for group in request.groups or ("A", "C"):
         for seed in (first, *(more or (first + 1,))):
             for value, loss in variants.items():
                 place = {"factor": "assignment_temperature", "value": value, "group": group}
                 piece = _trial(request.scale, group, seed, updates, SNAPSHOTS, loss=loss)
-                goals += _judged(request.scale, f"{METHOD}, assignment_temperature {value}", piece, place)
-                goals += _learned(request, f"{METHOD}, assignment_temperature {value}", piece, place)
-            goals += _control(request.scale, group, seed)
-    return goals
+                found += _judged(request.scale, f"{METHOD}, assignment_temperature {value}", piece, place)
+                found += _learned(request, f"{METHOD}, assignment_temperature {value}", piece, place)
+            found += _control(request.scale, group, seed)
+    return found
 
 
 def factors(request: Request) -> list[Goal]:
     """One-factor trials on the request's first group and first encoder seed; all share the baseline."""
     scale, seed = request.scale, request.encoder_seeds[0]
     group = (request.groups or ("A",))[0]
-    goals = []
+    found: list[Goal] = []
     for factor in factors_of(scale):
         for value in factor.values:
             changed = {} if value == factor.usual else {factor.where: {factor.name: value}}
             place = {"factor": factor.name, "value": f"{value:g}", "group": group}
             piece = _trial(scale, group, seed, scale.updates, FACTOR_SNAPSHOTS, **changed)
-            goals += _judged(scale, f"{METHOD}, {factor.name} {value:g}", piece, place)
-    return [*goals, *_control(scale, group, seed)]
+            found += _judged(scale, f"{METHOD}, {factor.name} {value:g}", piece, place)
+    return [*found, *_control(scale, group, seed)]
 
 
 def factors_of(scale: Scale) -> tuple[Factor, ...]:
@@ -119,8 +120,8 @@ def factors_of(scale: Scale) -> tuple[Factor, ...]:
         Factor("encoder_tau", "training", 0.05, (0.01, 0.05, 0.2)),
         Factor("learning_rate", "training", defaults.lr, (5e-5, 1e-4, 3e-4)),
         Factor("warmup_updates", "training", 0, (0, warmup)),
-        # The last one makes up for the mean over all pairs, whose gradient is about 10,000 times the comparison's
-        # less.
+        # The largest makes up for the mean over all pairs, whose gradient is about 10,000 times weaker than the
+        # comparison's.
         Factor("intr_loss_coef", "loss", 5e-3, (0.0, 5e-3, 0.5, 50.0)),
     )
 
@@ -142,32 +143,27 @@ def _trial(
     encoder: dict[str, Any] | None = None,
 ) -> PretrainedPiece:
     """The scale's encoder of a group, with what is changed."""
-    usual = _usual(scale, group, seed)
+    options = settings(**{**_loss(scale), **(loss or {})})
+    usual = goals.encoder(scale, METHOD, GROUPS[group], seed, loss=options)
+    assert isinstance(usual, PretrainedPiece)
     return replace(
         usual,
         updates=updates,
         training=settings(**{**dict(usual.training), **(training or {})}),
-        loss=settings(**{**_loss(scale), **(loss or {})}),
         encoder=settings(**(encoder or {})),
         # At least one, half-way, where the scale has fewer updates than the first.
         snapshots=tuple(done for done in snapshots if done < updates) or (max(1, updates // 2),),
     )
 
 
-def _usual(scale: Scale, group: str, seed: int) -> PretrainedPiece:
-    piece = encoder(scale, METHOD, GROUPS[group], seed)
-    assert isinstance(piece, PretrainedPiece)
-    return piece
-
-
 def _judged(scale: Scale, label: str, piece: PretrainedPiece, place: dict[str, Any]) -> list[Goal]:
     """The encoder, and its probes at each of its snapshots and at its end."""
     where = {**place, "encoder_seed": piece.seed}
-    goals = [Goal(label, piece, settings(**where))]
+    found = [Goal(label, piece, settings(**where))]
     for at_updates in (*piece.snapshots, None):
         done = piece.updates if at_updates is None else at_updates
-        goals += _probes(scale, label, piece, {**where, "updates": done}, at_updates)
-    return goals
+        found += _probes(scale, label, piece, {**where, "updates": done}, at_updates)
+    return found
 
 
 def _control(scale: Scale, group: str, seed: int) -> list[Goal]:
@@ -184,13 +180,13 @@ def _probes(
     episodes for judging the regression.
     """
     group = place["group"]
-    goals = []
+    found: list[Goal] = []
     for domain in (*GROUPS[group], UNSEEN_DOMAINS[group]):
         probe = ProbePiece(
             piece, dataset(scale, domain, piece.seed), samples=scale.probe_samples, at_updates=at_updates
         )
-        goals.append(Goal(label, probe, settings(**place, domain=get_domain(domain).name)))
-    return goals
+        found.append(Goal(label, probe, settings(**place, domain=get_domain(domain).name)))
+    return found
 
 
 def _learned(request: Request, label: str, piece: PretrainedPiece, place: dict[str, Any]) -> list[Goal]:
