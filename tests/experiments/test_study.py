@@ -153,6 +153,7 @@ def test_descriptions_come_back_and_older_ones_keep_their_names(small: list[Goal
 
 def test_other_methods_are_not_studied() -> None:
     assert study(Request(SMALL, methods=("atc",))) == []
+    assert all(goal.label.startswith("crptpro") for goal in study(Request(SMALL, methods=("crptpro",))))
 
 
 def toy_dataset(path: Path) -> None:

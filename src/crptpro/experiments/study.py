@@ -83,7 +83,7 @@ def temperatures(request: Request) -> list[Goal]:
                 piece = _trial(request.scale, group, seed, updates, SNAPSHOTS, loss=loss)
                 found += _judged(request.scale, f"{METHOD}, assignment_temperature {value}", piece, place)
                 found += _learned(request, f"{METHOD}, assignment_temperature {value}", piece, place)
-            found += _control(request.scale, group, seed)
+            found += _control(request, group, seed)
     return found
 
 
@@ -98,7 +98,7 @@ def factors(request: Request) -> list[Goal]:
             place = {"factor": factor.name, "value": f"{value:g}", "group": group}
             piece = _trial(scale, group, seed, scale.updates, FACTOR_SNAPSHOTS, **changed)
             found += _judged(scale, f"{METHOD}, {factor.name} {value:g}", piece, place)
-    return [*found, *_control(scale, group, seed)]
+    return [*found, *_control(request, group, seed)]
 
 
 def factors_of(scale: Scale) -> tuple[Factor, ...]:
@@ -166,9 +166,11 @@ def _judged(scale: Scale, label: str, piece: PretrainedPiece, place: dict[str, A
     return found
 
 
-def _control(scale: Scale, group: str, seed: int) -> list[Goal]:
+def _control(request: Request, group: str, seed: int) -> list[Goal]:
+    if RANDOM_ENCODER not in request.chosen((METHOD, RANDOM_ENCODER)):
+        return []
     where = {"factor": "control", "value": "untrained", "group": group, "encoder_seed": seed, "updates": 0}
-    return _probes(scale, RANDOM_ENCODER, UntrainedPiece(RANDOM_ENCODER, seed), where)
+    return _probes(request.scale, RANDOM_ENCODER, UntrainedPiece(RANDOM_ENCODER, seed), where)
 
 
 def _probes(
