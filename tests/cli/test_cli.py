@@ -35,7 +35,8 @@ def encoder(tmp_path: Path) -> Path:
     (("collect",), ["--out", "--transitions", "--seed", "--workers", "--quality {exact,fast}", "group letters",
                     "--colors"]),
     (("pretrain",), ["--out", "--method", "--updates", "--batch-size", "--learning-rate", "--precision",
-                     "--device", "--logging.wandb", "crptpro 50,", "--explore.env-steps", "proto-rl-c", "--plugin"]),
+                     "--device", "--logging.wandb", "crptpro 50,", "--explore.env-steps", "proto-rl-c", "--plugin",
+                     "--annealing-updates"]),
     (("finetune",), ["--out", "--updates", "--batch-size", "--learning-rate", "--logging.wandb", "PATH PATH"]),
     (("downstream",), ["--pretrained", "random-encoder", "--out", "--env-steps", "--replay-capacity",
                        "--eval-episodes", "--features", "--logging.tensorboard", "(default: 500000)"]),
@@ -131,6 +132,7 @@ def test_a_truncated_dataset_is_named(call: Call, dataset: Path, tmp_path: Path)
     ("--learning-rate", "-1", "learning_rate.*-1"),
     ("--log-interval", "0", "log_interval.*0"),
     ("--assignment-temperature", "0", "temperature.*0"),
+    ("--annealing-updates", "9", "needs an assignment_temperature"),
 ])  # fmt: skip
 def test_a_setting_that_pretraining_refuses_is_one_line(
     call: Call, dataset: Path, tmp_path: Path, flag: str, value: str, message: str

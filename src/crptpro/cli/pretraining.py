@@ -83,6 +83,9 @@ class Pretrain(PretrainingOptions):
     --explore.env-steps instead"""
     assignment_temperature: float | None = None
     """temperature of the Sinkhorn-Knopp targets (default: the student's, 0.1)"""
+    annealing_updates: int | None = None
+    """move the targets' temperature from --assignment-temperature to the student's over so many updates (default: leave
+    it)"""
     intr_loss_coef: float | None = None
     """weight of the prototype dispersion loss (default: the method's; crptpro 5e-3, proto-rl 0)"""
     explore: ExplorationSettings = field(default_factory=ExplorationSettings)
@@ -154,7 +157,7 @@ class Pretrain(PretrainingOptions):
     def _build(self, method: Method, image_size: int = 84, frame_stack: int = 3) -> LossModule:
         options = {
             name: value
-            for name in ("assignment_temperature", "intr_loss_coef")
+            for name in ("assignment_temperature", "annealing_updates", "intr_loss_coef")
             if (value := getattr(self, name)) is not None
         }
         if method.exploration is not None and method.exploration.skill_dim and self.explore.skill_dim:

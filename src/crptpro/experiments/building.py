@@ -79,9 +79,13 @@ class Store:
 
         return dataset_path(self.path(piece), piece.domain)
 
-    def encoder(self, piece: EncoderPiece) -> Path:
-        """Directory of an encoder's artifact."""
-        return self.path(piece) / "encoder"
+    def encoder(self, piece: EncoderPiece, at_updates: int | None = None) -> Path:
+        """Directory of an encoder's artifact, or of one of its snapshots."""
+        from crptpro.pretrained import snapshot_path
+
+        if at_updates is None:
+            return self.path(piece) / "encoder"
+        return snapshot_path(self.path(piece), at_updates)
 
     def describe(self, piece: Piece) -> Path:
         """Write a piece's description into its directory, where a job finds it."""
@@ -145,7 +149,8 @@ def new_loss(piece: PretrainedPiece | ExploredPiece) -> LossModule:
 
     method = get_method(piece.method)
     seed_everything(piece.seed)
-    return method.build(method.build_encoder(), **dict(piece.loss))
+    options = dict(piece.encoder) if isinstance(piece, PretrainedPiece) else {}
+    return method.build(method.build_encoder(**options), **dict(piece.loss))
 
 
 @register
@@ -173,7 +178,7 @@ def _(piece: UntrainedPiece, store: Store, job: JobSettings) -> None:
 @register
 def _(piece: PretrainedPiece, store: Store, job: JobSettings) -> None:
     from crptpro.loggers import RunLogger
-    from crptpro.pretrained import save_pretrained
+    from crptpro.pretrained import encoder_snapshots, save_pretrained
     from crptpro.training import pretrain
 
     loss = new_loss(piece)
@@ -187,6 +192,7 @@ def _(piece: PretrainedPiece, store: Store, job: JobSettings) -> None:
             device=job.device,
             run_dir=run_dir,
             logger=records,
+            at_updates=encoder_snapshots(run_dir, piece.snapshots),
             **dict(piece.training),
         )
         save_pretrained(loss, store.encoder(piece))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from crptpro.errors import UnknownNameError
 from crptpro.experiments import analyses, matrix
 from crptpro.experiments.goals import Goal, Request
+from crptpro.experiments.study import study
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,13 @@ EXPERIMENTS: dict[str, Experiment] = {
             "What a linear model reads of the simulator's state from frozen features: seen and unseen domains, normal "
             "and other colours. Not in the paper.",
             analyses.probe,
+        ),
+        Experiment(
+            "study",
+            "A better CRPTpro",
+            "The temperature of the targets, and one factor at a time, judged by the state probe along pre-training "
+            "and by reinforcement learning. Not in the paper.",
+            study,
         ),
     )
 }

@@ -49,7 +49,7 @@ def _(piece: TimingPiece, store: Store, job: JobSettings) -> None:
 @register
 def _(piece: ProbePiece, store: Store, job: JobSettings) -> None:
     found = probing.probe_rows(
-        _load(piece.encoder, store, job),
+        _load(piece.encoder, store, job, piece.at_updates),
         FrameDataset.open(store.dataset(piece.dataset)),
         encoder=piece.encoder.key,
         colors=piece.colors,
@@ -151,8 +151,8 @@ def _(piece: EmbeddingsPiece, store: Store, job: JobSettings) -> None:
     write_rows(store.path(piece) / "embeddings.csv", EMBEDDINGS_COLUMNS, rows)
 
 
-def _load(encoder: EncoderPiece, store: Store, job: JobSettings) -> Pretrained:
-    pretrained = load_pretrained(store.encoder(encoder))
+def _load(encoder: EncoderPiece, store: Store, job: JobSettings, at_updates: int | None = None) -> Pretrained:
+    pretrained = load_pretrained(store.encoder(encoder, at_updates))
     pretrained.encoder.to(job.device)
     if pretrained.projector is not None:
         pretrained.projector.to(job.device)

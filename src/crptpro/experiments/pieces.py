@@ -168,6 +168,8 @@ class PretrainedPiece(EncoderPiece):
         updates: of the encoder, over all domains.
         training: further arguments of :func:`crptpro.training.pretrain`.
         loss: options of the method's loss.
+        encoder: options of :class:`crptpro.modules.PixelEncoder`, besides the method's.
+        snapshots: updates after which the encoder is kept too, in ``<piece>/encoder_at_<updates>``.
     """
 
     kind = "encoder"
@@ -175,6 +177,8 @@ class PretrainedPiece(EncoderPiece):
     updates: int
     training: Settings = ()
     loss: Settings = ()
+    encoder: Settings = ()
+    snapshots: tuple[int, ...] = ()
 
     @property
     def domain_names(self) -> tuple[str, ...]:
@@ -278,6 +282,7 @@ class ProbePiece(Piece):
         colors: in which the same states are drawn.
         samples: drawn from the dataset.
         seed: of the draw.
+        at_updates: which of the encoder's snapshots is read; ``None`` for the finished encoder.
     """
 
     kind = "probe"
@@ -286,9 +291,11 @@ class ProbePiece(Piece):
     colors: Colors = "normal"
     samples: int = 2_000
     seed: int = 0
+    at_updates: int | None = None
 
     @property
     def title(self) -> str:
-        """Encoder's method, domain and colours."""
+        """Encoder's method, when, domain and colours."""
         colors = "" if self.colors == "normal" else f" {self.colors}"
-        return f"{self.encoder.method} seed {self.encoder.seed} on {self.dataset.domain}{colors}"
+        when = "" if self.at_updates is None else f" at {self.at_updates}"
+        return f"{self.encoder.method} seed {self.encoder.seed}{when} on {self.dataset.domain}{colors}"

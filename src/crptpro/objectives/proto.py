@@ -55,11 +55,14 @@ class ProtoLoss(PretrainingLoss):
         through_norm: differentiate the prototype normalisation (the released code does not).
         temperature: tau of the prediction.
         assignment_temperature: tau of the assignments; None follows ``temperature``.
+        annealing_updates: calls of :meth:`before_update` over which the tau of the assignments moves in a straight
+            line from ``assignment_temperature`` to ``temperature``, to stay there; None for a constant one.
+            Deviation: the paper and the released code have one constant temperature.
         sinkhorn_iterations: scalings of the assignments.
         reduction: of ``loss_comp`` over the batch; ``loss_intr`` has no batch and stays a scalar.
 
     Raises:
-        ValueError: a coefficient out of its range, or heads of different latent lengths.
+        ValueError: a coefficient out of its range, heads of different latent lengths, or annealing from nowhere.
 
     Returns (``forward``):
         Scalars ``loss_comp`` and ``loss_intr`` (already times alpha; their sum is minimised) and, detached,
@@ -89,6 +92,7 @@ class ProtoLoss(PretrainingLoss):
     prototypes: Prototypes
     prototypes_params: TensorDictParams
     target_prototypes_params: TensorDictParams
+    updates_begun: Tensor
 
     network_names: ClassVar[tuple[str, ...]] = ("encoder", "projector", "predictor", "prototypes")
     default_out_keys: ClassVar[tuple[str, ...]] = (
@@ -119,11 +123,13 @@ class ProtoLoss(PretrainingLoss):
         through_norm: bool = False,
         temperature: float = 0.1,
         assignment_temperature: float | None = None,
+        annealing_updates: int | None = None,
         sinkhorn_iterations: int = 3,
         reduction: str | None = None,
     ) -> None:
         super().__init__(reduction=reduction)
         _check_options(offset, intr_reduction, temperature, assignment_temperature, sinkhorn_iterations)
+        _check_annealing(annealing_updates, assignment_temperature)
         if projector is None:
             projector = Projector(cast(int, encoder.feature_dim), latent_dim)
         if predictor is None:
@@ -138,14 +144,22 @@ class ProtoLoss(PretrainingLoss):
         self.intr_reduction = intr_reduction
         self.through_norm = through_norm
         self.sinkhorn_iterations = sinkhorn_iterations
+        self.annealing_updates = annealing_updates
         # float64 scalars: they do not promote float32 tensors, and 0.1 stays 0.1.
         self.register_coeff_buffer("intr_loss_coef", intr_loss_coef, dtype=torch.float64)
         self.register_coeff_buffer("offset", offset, dtype=torch.float64)
         self.register_coeff_buffer("temperature", temperature, dtype=torch.float64)
         self.register_coeff_buffer("assignment_temperature", assignment_temperature, dtype=torch.float64)
+        if annealing_updates is not None:  # only then: other losses' checkpoints stay as they were
+            self.register_buffer("updates_begun", torch.zeros((), dtype=torch.int64))
 
     def before_update(self) -> ProtoLoss:
-        """Scale the prototype rows to unit length in place, outside autograd. Returns self."""
+        """Scale the prototype rows to unit length in place, outside autograd, and count the update if annealing.
+
+        Returns self.
+        """
+        if self.annealing_updates is not None:
+            self.updates_begun.add_(1)
         with self.prototypes_params.to_module(self.prototypes, preserve_module_state=False):
             self.prototypes.normalize_()
         return self
@@ -195,12 +209,22 @@ class ProtoLoss(PretrainingLoss):
 
     @torch.no_grad()
     def _assign(self, targets: Tensor, unit_prototypes: Tensor) -> Tensor:
-        temperature = self.assignment_temperature
         return sinkhorn_knopp(
             F.normalize(targets, dim=-1) @ unit_prototypes.T,
-            temperature=self.temperature if temperature is None else temperature,
+            temperature=self._assignment_temperature_now(),
             iterations=self.sinkhorn_iterations,
         )
+
+    def _assignment_temperature_now(self) -> Tensor:
+        """Tau of the assignments in the update that has begun; a tensor's arithmetic, so that it can be recorded."""
+        first, last = self.assignment_temperature, self.temperature
+        if first is None:
+            return last
+        if self.annealing_updates is None:
+            return first
+        # Update number u (from 0) has begun u + 1 times; exactly `last` at the end, as lerp is from weight 0.5 on.
+        progress = ((self.updates_begun - 1) / self.annealing_updates).clamp(0, 1)
+        return torch.lerp(first, last, progress.to(first.dtype))
 
 
 def _check_options(
@@ -222,3 +246,12 @@ def _check_options(
             raise ValueError(f"{name} must be positive, got {value}.")
     if sinkhorn_iterations < 0:
         raise ValueError(f"sinkhorn_iterations must not be negative, got {sinkhorn_iterations}.")
+
+
+def _check_annealing(annealing_updates: int | None, assignment_temperature: float | None) -> None:
+    if annealing_updates is None:
+        return
+    if annealing_updates < 1:
+        raise ValueError(f"annealing_updates must be at least 1, got {annealing_updates}.")
+    if assignment_temperature is None:
+        raise ValueError("annealing_updates needs an assignment_temperature to start from, such as 0.05.")

@@ -44,7 +44,7 @@ class MethodDefaults:
     """Learning rate over the updates."""
 
     warmup_updates: int = 0
-    """Linear warm-up from 0, for ``warmup_cosine``."""
+    """Length of the linear warm-up of the learning rate from 0; 0 for none."""
 
     grad_clip: float | None = None
     """Largest gradient norm; None for no clipping."""
@@ -78,14 +78,15 @@ class Method:
     exploration: ExplorationDefaults | None = None
     """How it explores while it pre-trains; None for a method trained on random datasets."""
 
-    def build_encoder(self, in_channels: int = 9, image_size: int = 84) -> PixelEncoder:
+    def build_encoder(self, in_channels: int = 9, image_size: int = 84, **options: Any) -> PixelEncoder:
         """Build a fresh encoder of the kind that the method trains.
 
         Args:
             in_channels: colour channels times stacked frames.
             image_size: height and width in pixels.
+            **options: of :class:`~crptpro.modules.PixelEncoder`, over the method's own.
         """
-        return PixelEncoder(in_channels, image_size=image_size, **self.encoder_options)
+        return PixelEncoder(in_channels, image_size=image_size, **{**self.encoder_options, **options})
 
     def build(self, encoder: nn.Module, **options: Any) -> LossModule:
         """Build the loss on ``encoder``; ``options`` override the preset's own.

@@ -6,9 +6,11 @@ from crptpro.pretrained.finetuning import finetune, rebuild_loss
 from crptpro.pretrained.importing import import_snapshot
 from crptpro.pretrained.loading import load_pretrained
 from crptpro.pretrained.saving import save_pretrained
+from crptpro.pretrained.snapshots import encoder_snapshots, snapshot_path
 
 __all__ = [
     "Pretrained",
+    "encoder_snapshots",
     "export_state_dict",
     "finetune",
     "import_snapshot",
@@ -16,5 +18,6 @@ __all__ = [
     "random_pretrained",
     "rebuild_loss",
     "save_pretrained",
+    "snapshot_path",
     "write_state_dict",
 ]

@@ -13,6 +13,7 @@ from crptpro.objectives import get_method, methods
 from crptpro.pretrained.bundle import ROLES, TARGET_ROLES, Pretrained
 from crptpro.pretrained.loading import load_pretrained
 from crptpro.pretrained.networks import target_state
+from crptpro.pretrained.snapshots import IS_SNAPSHOT
 
 
 def finetune(
@@ -51,10 +52,16 @@ def rebuild_loss(pretrained: Pretrained) -> LossModule:
     The artifact itself stays as it is.
 
     Raises:
-        PretrainedError: if its method is not registered, or does not take the stored networks.
+        PretrainedError: if its method is not registered, or does not take the stored networks, or if it is a snapshot
+            without all of them.
     """
     pretrained = copy.deepcopy(pretrained)  # training must not move the networks somebody else holds
     card = pretrained.card
+    if card.get(IS_SNAPSHOT):
+        raise PretrainedError(
+            "The artifact was kept along a training, to be read: it lacks the networks that training goes on with. "
+            "Take the one that the run ended with."
+        )
     if pretrained.method not in methods(presets=True):
         raise PretrainedError(
             f"The artifact was trained with {pretrained.method!r}, which is no registered method. Call "

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from crptpro.objectives import method_defaults
 from crptpro.training.fingerprint import describe_loss
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.sources import Augmenter, Source
@@ -34,6 +35,9 @@ def identity_of(
     switches: dict[str, Any] = {"compile": True} if learner.compiled.is_on else {}
     if draws_on_device:
         switches["batches"] = "drawn on the device"
+    usual = 0 if defaults.schedule == "constant" else method_defaults(learner.loss).warmup_updates
+    if defaults.warmup_updates != usual:
+        switches["warmup_updates"] = defaults.warmup_updates
     return {
         "batch_size": settings["batch_size"],
         "learning_rate": learner.learning_rate,

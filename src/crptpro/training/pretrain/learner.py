@@ -151,8 +151,11 @@ class Learner:
             self.captured.forget()
 
     def _prepare_optimizer(self) -> None:
-        rate_changes = self.defaults.schedule != "constant"
-        prepare_optimizer(self.optimizer, self._index.device, rate_changes=rate_changes)
+        prepare_optimizer(self.optimizer, self._index.device, rate_changes=self._rate_changes)
+
+    @property
+    def _rate_changes(self) -> bool:
+        return self.defaults.schedule != "constant" or self.defaults.warmup_updates > 0
 
     def _name_outputs(self, out: TensorDictBase) -> None:
         """Loss terms first, then diagnostics; both must be scalars."""
@@ -185,14 +188,29 @@ class Learner:
         self._first_bad.copy_(torch.where(is_first, self._index, self._first_bad))
 
     def _set_learning_rate(self, index: int) -> None:
-        if self.defaults.schedule == "constant":
+        if not self._rate_changes:
             return
-        rate = self.learning_rate * warmup_cosine(index, self.defaults.warmup_updates, self.updates)
+        warmup_updates = self.defaults.warmup_updates
+        if self.defaults.schedule == "constant":
+            factor = warmup(index, warmup_updates)
+        else:
+            factor = warmup_cosine(index, warmup_updates, self.updates)
+        rate = self.learning_rate * factor
         for group in self.optimizer.param_groups:
             if isinstance(group["lr"], Tensor):
                 group["lr"].fill_(rate)
             else:
                 group["lr"] = rate
+
+
+def warmup(index: int, updates: int) -> float:
+    """Factor on the learning rate at update ``index`` (from 0): linear from 0 to 1 over ``updates``, then 1.
+
+    Examples:
+        >>> [warmup(i, 2) for i in range(4)]
+        [0.0, 0.5, 1.0, 1.0]
+    """
+    return 1.0 if index >= updates else index / updates
 
 
 def warmup_cosine(index: int, warmup: int, updates: int) -> float:

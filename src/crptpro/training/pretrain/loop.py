@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +42,7 @@ def pretrain(
     updates: int | None = None,
     batch_size: int | None = None,
     learning_rate: float | None = None,
+    warmup_updates: int | None = None,
     encoder_tau: float | None = None,
     seed: int = 0,
     augment: Augment = "random_shift",
@@ -53,6 +56,7 @@ def pretrain(
     checkpoint_interval: int | None = None,
     resume: bool = True,
     patience_updates: int = 5_000,
+    at_updates: Mapping[int, Callable[[LossModule], Any]] | None = None,
     progress: bool = True,
 ) -> PretrainResult:
     """Train a self-supervised loss on the datasets of several domains (CRPTpro, Sec. III; algorithm 1).
@@ -76,6 +80,8 @@ def pretrain(
         updates: encoder updates in total over all domains; the method's default is 50,000.
         batch_size: transitions per update; default 512.
         learning_rate: of Adam; default 1e-4.
+        warmup_updates: updates over which the learning rate rises linearly from 0, before the method's schedule;
+            default 0 (ATC 1,000).
         encoder_tau: EMA rate of the target networks; default 0.05.
         seed: seeds sampling, shifts, and what the loss draws; torch's global generator is left as it was.
         augment: ``"random_shift"`` (4 pixels, replicated border; independent per image and per sample),
@@ -96,6 +102,10 @@ def pretrain(
             the run is always one.
         resume: continue what ``run_dir`` holds; ``False`` refuses a directory that holds a run.
         patience_updates: length of a plateau after which the run is called dead.
+        at_updates: what to call with the loss when so many updates are done, as
+            :func:`crptpro.pretrained.encoder_snapshots` gives it to keep the encoder at several points of one run. It
+            must leave the loss as it is. A run that was killed calls it again if it does that update again, and an
+            earlier call's updates are not done again.
         progress: show a bar (never in log files).
 
     Returns:
@@ -121,6 +131,15 @@ def pretrain(
     for name, value in settings.items():
         if value is not None and value < 1:
             raise ValueError(f"`{name}` must be at least 1, got {value}.")
+    for done in at_updates or ():
+        if not 1 <= done <= settings["updates"]:
+            raise ValueError(
+                f"`at_updates` must lie in 1 to `updates`, here {settings['updates']}, got {done}."
+            )
+    if warmup_updates is not None:
+        if warmup_updates < 0:
+            raise ValueError(f"`warmup_updates` must not be negative, got {warmup_updates}.")
+        defaults = dataclasses.replace(defaults, warmup_updates=warmup_updates)
     if learning_rate is not None and not learning_rate > 0:
         raise ValueError(f"`learning_rate` must be positive, got {learning_rate}.")
     if encoder_tau is not None and not 0 <= encoder_tau <= 1:
@@ -165,6 +184,7 @@ def pretrain(
             precision="bf16" if dtype == torch.bfloat16 else "fp32",
             logger=logger,
             run_dir=None if run_dir is None else Path(run_dir),
+            at_updates=at_updates,
         )
         run.prepare(resume=resume)
         return run.train(progress=progress)

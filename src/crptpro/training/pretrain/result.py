@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -37,6 +38,11 @@ class PretrainResult:
     def is_dead(self) -> bool:
         """Whether training ended on a plateau longer than its patience."""
         return self.collapse["verdict"] == "dead"
+
+
+def metrics_of(row: Mapping[str, Any]) -> dict[str, float]:
+    """Return what a row of the record measures."""
+    return {name: value for name, value in row.items() if name != "updates"}
 
 
 def training_record(

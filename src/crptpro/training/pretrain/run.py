@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from crptpro.training.pretrain.device_batches import DeviceBatches
 from crptpro.training.pretrain.identity import identity_of
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.progress import PretrainProgress
-from crptpro.training.pretrain.result import PretrainResult, training_record
+from crptpro.training.pretrain.result import PretrainResult, metrics_of, training_record
 from crptpro.training.pretrain.sources import Augmenter, Source, keys_read
 from crptpro.training.pretrain.window import Window, cosine_threshold, memory_row, num_prototypes
 from crptpro.training.stop_request import StopRequest
@@ -47,6 +48,7 @@ class PretrainRun:
         precision: for the record.
         logger: record, if any.
         run_dir: directory of the checkpoints, if any.
+        at_updates: what to call with the loss when so many updates are done.
     """
 
     def __init__(
@@ -62,11 +64,12 @@ class PretrainRun:
         precision: str,
         logger: RunLogger | None,
         run_dir: Path | None,
+        at_updates: Mapping[int, Callable[[LossModule], Any]] | None = None,
     ) -> None:
         self.loss, self.sources, self.augmenter, self.learner = loss, sources, augmenter, learner
         self.batches = batches
         self.settings, self.device, self.precision = settings, device, precision
-        self.logger, self.run_dir = logger, run_dir
+        self.logger, self.run_dir, self.at_updates = logger, run_dir, at_updates or {}
         self.domains = [source.name for source in sources]
         self.window = Window(loss, self.domains)
         self.monitor = CollapseMonitor(
@@ -135,6 +138,8 @@ class PretrainRun:
                     row = self._log()
                     self.window.close()
                     shown.row(self.done, row["loss"])
+                if self.done in self.at_updates:
+                    self._call_back()
                 if self.done == total or stop.signal is not None or self._checkpoint_is_due():
                     self.save()
                 if stop.signal is not None:
@@ -166,6 +171,13 @@ class PretrainRun:
         }
         self.checkpoints.save(state, counter=self.done)
         self.saved_at, self.saved_time = self.done, time.monotonic()
+
+    def _call_back(self) -> None:
+        """Hand the loss out, before this update's checkpoint: what a checkpoint has behind it was handed out."""
+        self.learner.check(self.done)
+        row = self.history[-1] if self.history else {}
+        self._describe(self.seconds, metrics_of(row), self.monitor.verdict(self.done))
+        self.at_updates[self.done](self.loss)
 
     def _load(self, state: dict[str, Any]) -> None:
         require_same(state["fingerprint"], self.fingerprint, self.run_dir)
@@ -245,9 +257,22 @@ class PretrainRun:
                 self.monitor.observe(self.done, comp=_comp(row), cosine=self.window.cosines or None)
         else:
             row = self.history[-1] if self.history else self._last_row()
-        metrics = {name: value for name, value in row.items() if name != "updates"}
+        metrics, seconds = metrics_of(row), self.seconds
         verdict = self.monitor.finish(self.done)
-        seconds = self.seconds
+        self._describe(seconds, metrics, verdict)
+        return PretrainResult(
+            updates=self.done,
+            resumed_from=self.resumed_from,
+            seconds=seconds,
+            precision=self.precision,
+            metrics=metrics,
+            collapse=verdict,
+            history=self.history,
+            run_dir=self.run_dir,
+        )
+
+    def _describe(self, seconds: float, metrics: dict[str, float], verdict: dict[str, Any]) -> None:
+        """Say on the loss how it was trained so far, for an artifact's card."""
         self.loss.training_record = training_record(
             self.loss,
             updates=self.done,
@@ -263,16 +288,6 @@ class PretrainRun:
             metrics=metrics,
             collapse=verdict,
             made_with=self.made_with,
-        )
-        return PretrainResult(
-            updates=self.done,
-            resumed_from=self.resumed_from,
-            seconds=seconds,
-            precision=self.precision,
-            metrics=metrics,
-            collapse=verdict,
-            history=self.history,
-            run_dir=self.run_dir,
         )
 
     def _last_row(self) -> dict[str, Any]:
