@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -147,6 +148,21 @@ def test_a_piece_that_fails_is_not_done_and_keeps_its_description(store: Store, 
     assert numbers == [-1, -1]
     assert not store.is_done(Number(-1))
     assert (store.path(Number(-1)) / DESCRIPTION).is_file()
+
+
+@pytest.mark.parametrize("own", [1, -1])
+def test_what_only_an_unfinished_piece_needs_goes_with_its_end(
+    store: Store, numbers: list[int], own: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Number, "leftovers", ("checkpoints", "never made"))
+    piece = Number(own)
+    checkpoint = store.path(piece) / "checkpoints" / "1.pt"
+    checkpoint.parent.mkdir(parents=True)
+    checkpoint.touch()
+    with contextlib.suppress(ValueError):
+        build(piece, store, JOB)
+    assert checkpoint.exists() == (own < 0)
+    assert store.is_done(piece) == (own > 0)
 
 
 def test_a_directory_in_use_is_refused(store: Store, numbers: list[int]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -131,6 +132,8 @@ def build(piece: Piece, store: Store, job: JobSettings | None = None) -> None:
         make(piece, store, job)
         seconds = time.monotonic() - began
         write_json(directory / DONE, {"seconds": seconds, "job": asdict(job), **provenance()})
+        for name in piece.leftovers:  # gigabytes, of a downstream run
+            shutil.rmtree(directory / name, ignore_errors=True)
 
 
 @functools.singledispatch

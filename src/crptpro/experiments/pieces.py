@@ -43,6 +43,8 @@ class Piece:
     kind: ClassVar[str] = ""
     is_exclusive: ClassVar[bool] = False
     """Must be made alone on its machine: it measures time."""
+    leftovers: ClassVar[tuple[str, ...]] = ()
+    """Directories that only an unfinished piece needs; they are removed when it is finished."""
 
     def __init_subclass__(cls) -> None:
         """Make the kind known to :func:`piece_from_json`."""
@@ -138,6 +140,7 @@ class EncoderPiece(Piece):
         seed: of everything in its training, the first of the two seed levels.
     """
 
+    leftovers = ("checkpoints",)
     method: str
     seed: int
 
@@ -258,6 +261,7 @@ class RunPiece(Piece):
     """
 
     kind = "run"
+    leftovers = ("checkpoints", "replay")
     task: str
     encoder: EncoderPiece | None
     seed: int

@@ -184,9 +184,8 @@ def _probes(
     group = place["group"]
     found: list[Goal] = []
     for domain in (*GROUPS[group], UNSEEN_DOMAINS[group]):
-        probe = ProbePiece(
-            piece, dataset(scale, domain, piece.seed), samples=scale.probe_samples, at_updates=at_updates
-        )
+        data = dataset(scale, domain, piece.seed, transitions=scale.probe_transitions)
+        probe = ProbePiece(piece, data, samples=scale.probe_samples, at_updates=at_updates)
         found.append(Goal(label, probe, settings(**place, domain=get_domain(domain).name)))
     return found
 
