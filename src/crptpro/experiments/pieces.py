@@ -41,6 +41,8 @@ class Piece:
     """Base of every piece; subclasses are frozen dataclasses."""
 
     kind: ClassVar[str] = ""
+    is_exclusive: ClassVar[bool] = False
+    """Must be made alone on its machine: it measures time."""
 
     def __init_subclass__(cls) -> None:
         """Make the kind known to :func:`piece_from_json`."""
