@@ -58,21 +58,21 @@ class InlineLauncher:
     def start(self, work: Work, *, is_exclusive: bool) -> Job:
         """Make the piece; what the library logs goes to the piece's log, too."""
         work.log.parent.mkdir(parents=True, exist_ok=True)
-        handler = logging.FileHandler(work.log)
         library = logging.getLogger("crptpro")
-        library.addHandler(handler)
-        try:
-            handler.stream.write(work.heading() + "\n")
-            refusal = work.run()
-            handler.stream.write(f"error: {refusal}\n" if refusal else "finished\n")
-            return _Ended(Outcome(refusal, is_final=True) if refusal else Outcome())
-        except Exception as error:
-            # A defect keeps its traceback, and is not met by trying again in the same process.
-            logging.getLogger(__name__).error("%s", work.key, exc_info=True)
-            return _Ended(Outcome(f"{type(error).__name__}: {error}", is_final=True))
-        finally:
-            library.removeHandler(handler)
-            handler.close()
+        with open(work.log, "a") as log:
+            handler = logging.StreamHandler(log)
+            library.addHandler(handler)
+            try:
+                log.write(work.heading() + "\n")
+                refusal = work.run()
+                log.write(f"error: {refusal}\n" if refusal else "finished\n")
+                return _Ended(Outcome(refusal, is_final=bool(refusal)))
+            except Exception as error:
+                # A defect keeps its traceback, and is not met by trying again in the same process.
+                logging.getLogger(__name__).exception("%s", work.key)
+                return _Ended(Outcome(f"{type(error).__name__}: {error}", is_final=True))
+            finally:
+                library.removeHandler(handler)
 
     def close(self) -> None:
         """Nothing is held."""
