@@ -149,7 +149,8 @@ def test_ctrl_c_stops_the_jobs_at_a_checkpoint_and_the_same_command_continues(tm
     status, out, err = first.end()
     assert status == 130, err
     assert "the same command continues" in err
-    assert not [job for job in jobs if job.is_running() and job.status() != psutil.STATUS_ZOMBIE]
+    _, alive = psutil.wait_procs(jobs, timeout=1)
+    assert not [job for job in alive if job.status() != psutil.STATUS_ZOMBIE]  # nobody is there to collect orphans
     counts = first.counts()
     assert 1 <= counts["crptpro"] < 40
     assert not list(root.glob("pieces/*/*.partial"))
@@ -167,10 +168,6 @@ def test_ctrl_c_stops_the_jobs_at_a_checkpoint_and_the_same_command_continues(tm
             0,
             counts[name],
         ]  # the job wrote a checkpoint when it was stopped, and went on from it
-
-    status, out, _ = Command(root, "fake").end()
-    assert status == 0
-    assert "About" not in out
 
 
 @pytest.mark.slow

@@ -44,7 +44,7 @@ def finish(store: Store, piece: Piece, seconds: float, device: str = "cpu") -> N
     (RunPiece("reach_duplo", None, 0, config=settings(env_steps=10_000)),
      10 + 5_000 * (0.05 + 512 * 2.5e-3) + 2 * 10 * 125 * 0.04),
     (ExploredPiece("apt-s", 0, ("walker",), explore=settings(env_steps=2_000, random_agent_steps=100, batch_size=64)),
-     10 + 1_000 * (0.05 + 64 * 1.25e-3 / 2) + 450 * 64 * 2.9e-3),
+     10 + 1_000 * (0.05 + 64 * 1.25e-3) + 450 * 64 * 2.9e-3),
 ])  # fmt: skip
 def test_seconds_follow_decisions_updates_and_batch(piece: Piece, seconds: float) -> None:
     assert core_seconds(piece) == pytest.approx(seconds)

@@ -84,8 +84,7 @@ def test_inline_leaves_the_logging_of_this_process_as_it_was(store: Store) -> No
 def test_local_jobs_make_pieces_try_again_what_was_killed_and_keep_logs(
     store: Store, source_path: None
 ) -> None:
-    data = FakePiece("data")
-    killed = FakePiece("killed", (data,), ticks=10, ends="killed")
+    killed = FakePiece("killed", ticks=10, ends="killed")
     refused, broken = FakePiece("refused", ends="refusal"), FakePiece("broken", ends="defect")
     plan = plan_of(store, killed, refused, broken, FakePiece("after", (refused,)))
     settings = JobSettings(threads=3, plugins=(PLUGIN,))
@@ -109,15 +108,22 @@ def test_local_jobs_make_pieces_try_again_what_was_killed_and_keep_logs(
     assert not list((store.root / FOLDER).iterdir())
 
 
-@pytest.mark.slow
-def test_a_job_waits_for_the_one_that_it_replaces(store: Store, source_path: None) -> None:
-    piece = FakePiece("slow-to-end", ticks=10)
-    plan = plan_of(store, piece)
+def test_a_job_waits_for_the_one_that_it_replaces(store: Store) -> None:
+    piece = FakePiece("slow-to-end")
     store.describe(piece)
     lock = DirectoryLock(store.path(piece))
-    release = threading.Timer(6.0, lock.release)
+    release = threading.Timer(1.0, lock.release)
     release.start()
-    assert run_pieces(plan, store, SETTINGS, LocalLauncher()) == []
+    assert run_pieces(plan_of(store, piece), store, SETTINGS, InlineLauncher()) == []
+
+
+def test_a_job_does_not_wait_for_ever_for_another(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("crptpro.experiments.launching.work.PATIENCE_S", 0.1)
+    piece = FakePiece("in-use")
+    store.describe(piece)
+    with DirectoryLock(store.path(piece)):
+        [failure] = run_pieces(plan_of(store, piece), store, SETTINGS, InlineLauncher())
+    assert "Another process is writing" in failure.reason
 
 
 def test_local_jobs_share_gpus_evenly(

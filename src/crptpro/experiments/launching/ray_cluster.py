@@ -84,7 +84,7 @@ class RayLauncher:
                 "`ray start --head` printed, as --ray-address HOST:6379, or `ray://HOST:10001`."
             ) from reason
         # A worker ends with its job, as a process of its own would: nothing of a job is left for the next.
-        self._make = ray.remote(_run).options(max_retries=0, max_calls=1)
+        self._make = ray.remote(max_retries=0, max_calls=1)(_run)
 
     def start(self, work: Work, *, is_exclusive: bool) -> RayJob:
         """Queue a job; Ray starts it where cores and GPUs are free."""

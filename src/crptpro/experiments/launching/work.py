@@ -78,6 +78,9 @@ class Work:
             print(self.heading(), flush=True)
             try:
                 refusal = self.run()
+            except (KeyboardInterrupt, SystemExit):
+                print("stopped", flush=True)
+                raise
             except BaseException:
                 traceback.print_exc()
                 raise
