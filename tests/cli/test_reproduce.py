@@ -150,7 +150,9 @@ def test_ctrl_c_stops_the_jobs_at_a_checkpoint_and_the_same_command_continues(tm
     assert status == 130, err
     assert "the same command continues" in err
     _, alive = psutil.wait_procs(jobs, timeout=1)
-    assert not [job for job in alive if job.status() != psutil.STATUS_ZOMBIE]  # nobody is there to collect orphans
+    assert not [
+        job for job in alive if job.status() != psutil.STATUS_ZOMBIE
+    ]  # nobody is there to collect orphans
     counts = first.counts()
     assert 1 <= counts["crptpro"] < 40
     assert not list(root.glob("pieces/*/*.partial"))

@@ -35,15 +35,6 @@ from crptpro.experiments.launching.submitted import FOLDER, LocalLauncher, Slurm
 SETTINGS = JobSettings(plugins=(PLUGIN,))
 
 
-@pytest.fixture
-def source_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Jobs find the package where this process found it."""
-    import crptpro
-
-    source = str(Path(crptpro.__file__).parents[1])
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([source, os.environ.get("PYTHONPATH", "")]))
-
-
 def when(condition: Callable[[], object], then: Callable[[], object]) -> threading.Thread:
     """Do something in another thread as soon as something holds."""
 

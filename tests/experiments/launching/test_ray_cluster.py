@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from fake_pieces import PLUGIN, FakePiece, attempts, counted, plan_of
 
-import crptpro
 from crptpro.errors import CRPTproError
 from crptpro.experiments.building import JobSettings, Store
 from crptpro.experiments.launching import Work, run_pieces
@@ -40,9 +37,7 @@ class TwoNodes:
 
 
 @pytest.fixture
-def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[TwoNodes]:
-    source = str(Path(crptpro.__file__).parents[1])
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([source, os.environ.get("PYTHONPATH", "")]))
+def nodes(source_path: None, monkeypatch: pytest.MonkeyPatch) -> Iterator[TwoNodes]:
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     nodes = TwoNodes()
     yield nodes
@@ -109,6 +104,18 @@ def test_a_job_that_is_stopped_leaves_a_checkpoint(store: Store, nodes: TwoNodes
         launcher.close()
 
 
-def test_a_cluster_that_is_not_there_is_said_in_a_line() -> None:
-    with pytest.raises(CRPTproError, match=r"127\.0\.0\.1:1 cannot be used"):
-        RayLauncher("127.0.0.1:1")
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1"])
+def test_a_cluster_that_is_not_there_is_said_in_a_line(address: str) -> None:
+    with pytest.raises(CRPTproError, match=rf"{address} cannot be used: .*refused.*--ray-address"):
+        RayLauncher(address)
+
+
+def test_without_a_cluster_ray_is_started_here(
+    store: Store, source_path: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    launcher = RayLauncher()
+    try:
+        assert run_pieces(plan_of(store, FakePiece("p")), store, SETTINGS, launcher) == []
+    finally:
+        launcher.close()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import socket
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -70,18 +72,20 @@ class RayLauncher:
         self._ray: Any = ray
         self._gpus_per_job = gpus_per_job
         options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
+        address = address or os.environ.get("RAY_ADDRESS") or None
         try:
+            _require_answer(address)
             try:
                 ray.init(address=address or "auto", **options)
             except ConnectionError:
                 if address is not None:
                     raise
-                ray.init(include_dashboard=False, **options)
-        except (ConnectionError, RuntimeError, ValueError) as reason:
+                ray.init(address="local", include_dashboard=False, **options)
+        except (OSError, RuntimeError, ValueError) as reason:
             said = (str(reason).strip().splitlines() or [type(reason).__name__])[0]
             raise CRPTproError(
-                f"The Ray cluster {address or 'of this machine'} cannot be used: {said} Give the address that "
-                "`ray start --head` printed, as --ray-address HOST:6379, or `ray://HOST:10001`."
+                f"The Ray cluster {address or 'of this machine'} cannot be used: {said}. Give the address that "
+                "`ray start --head` printed, as --ray-address HOST:6379, or ray://HOST:10001."
             ) from reason
         # A worker ends with its job, as a process of its own would: nothing of a job is left for the next.
         self._make = ray.remote(max_retries=0, max_calls=1)(_run)
@@ -100,6 +104,13 @@ class RayLauncher:
     def close(self) -> None:
         """Leave the cluster; one that was started here ends."""
         self._ray.shutdown()
+
+
+def _require_answer(address: str | None) -> None:
+    """Fail at once where nobody listens; Ray itself would go on asking for minutes."""
+    host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
+    if colon and port.isdigit():
+        socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
 
 
 def _run(work: Work) -> str:
