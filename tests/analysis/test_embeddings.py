@@ -6,7 +6,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from crptpro.analysis.embeddings import embed_samples, principal_components
+from crptpro.analysis.embeddings import embed_pixels, embed_samples, principal_components
 
 
 def dataset(brightness: int) -> ReplayBuffer:
@@ -100,3 +100,11 @@ def test_too_many_components_are_refused_with_the_limit_in_the_message() -> None
 def test_fewer_than_two_points_have_no_components(count: int, components: int) -> None:
     with pytest.raises(ValueError, match=f"at least 2, got {count}"):
         principal_components(torch.randn(count, 4), components=components)
+
+
+def test_more_pixels_than_fit_at_once_give_the_same_embeddings() -> None:
+    encoder = Brightness()
+    pixels = torch.arange(150, dtype=torch.uint8).view(150, 1, 1, 1).expand(150, 9, 8, 8)
+    assert torch.equal(embed_pixels(encoder, pixels), torch.arange(150.0).unsqueeze(1))
+    projector = nn.Linear(1, 3, dtype=torch.float64)
+    assert embed_pixels(encoder, pixels, projector=projector).shape == (150, 3)

@@ -10,6 +10,8 @@ from torchrl.data import ReplayBuffer
 
 from crptpro.modules.placement import device_of
 
+_BATCH = 64
+
 
 def sample_pixels(dataset: ReplayBuffer, samples: int, *, seed: int) -> Tensor:
     """Draw the same observations whenever asked with the same seed; the dataset's own generator is put back.
@@ -28,6 +30,26 @@ def sample_pixels(dataset: ReplayBuffer, samples: int, *, seed: int) -> Tensor:
         return dataset.sample(samples)["pixels"]
     finally:
         dataset.set_rng(before)
+
+
+@torch.no_grad()
+def embed_pixels(encoder: nn.Module, pixels: Tensor, *, projector: nn.Module | None = None) -> Tensor:
+    """Encode observations without augmentation, where the encoder lives, some at a time.
+
+    Args:
+        encoder: maps uint8 ``[B, C, H, W]`` to features ``[B, D]``.
+        pixels: ``[N, C, H, W]``, on any device.
+        projector: if given, embeddings are its outputs, else the features themselves.
+
+    Returns:
+        float32 ``[N, D]`` on the encoder's device.
+    """
+    device = device_of(encoder) or pixels.device
+    parts = []
+    for batch in pixels.split(_BATCH):
+        features = encoder(batch.to(device))
+        parts.append((features if projector is None else projector(features)).float())
+    return torch.cat(parts)
 
 
 @torch.no_grad()
@@ -58,8 +80,7 @@ def embed_samples(
     embeddings = {}
     for name, dataset in datasets.items():
         pixels = sample_pixels(dataset, samples, seed=seed)
-        features = encoder(pixels.to(device_of(encoder) or pixels.device))
-        embeddings[name] = (features if projector is None else projector(features)).float()
+        embeddings[name] = embed_pixels(encoder, pixels, projector=projector)
     return embeddings
 
 

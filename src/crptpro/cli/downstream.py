@@ -12,7 +12,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from crptpro.cli.request import Logging, require_device
+from crptpro.cli.request import Logging
 from crptpro.domains import get_domain
 from crptpro.downstream_config import DownstreamConfig, drq_settings, skill_ddpg_settings
 from crptpro.errors import CRPTproError
@@ -54,6 +54,7 @@ class Downstream:
 
     def run(self) -> None:
         """Train, or continue."""
+        from crptpro.modules import usable_device
         from crptpro.pretrained import load_pretrained, random_pretrained
         from crptpro.training import train_downstream
 
@@ -61,7 +62,7 @@ class Downstream:
             raise CRPTproError(
                 f"DrQ trains its encoder itself: crptpro drq {self.task} --out {self.out}, without --pretrained."
             )
-        require_device(self.config.device)
+        usable_device(self.config.device)
         get_domain(self.task)  # an unknown name is refused before the run directory is made
         if self.pretrained == RANDOM_ENCODER:
             artifact = random_pretrained(seed=self.config.seed)
@@ -89,6 +90,7 @@ class DrQ:
 
     def run(self) -> None:
         """Train, or continue."""
+        from crptpro.modules import usable_device
         from crptpro.training import train_downstream
 
         if self.config.algorithm != "drq":
@@ -96,7 +98,7 @@ class DrQ:
                 f"{self.config.algorithm} learns on a frozen encoder: "
                 f"crptpro downstream {self.task} --pretrained ENCODER --algorithm {self.config.algorithm}."
             )
-        require_device(self.config.device)
+        usable_device(self.config.device)
         get_domain(self.task)  # an unknown name is refused before the run directory is made
         with self.logging.open(self.out, self) as records:
             result = train_downstream(self.task, None, run_dir=self.out, config=self.config, logger=records)

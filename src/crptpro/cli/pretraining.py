@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import Positional
 
 from crptpro.active_config import ExplorationSettings
-from crptpro.cli.request import Logging, explored_domains, image_format, require_device
+from crptpro.cli.request import Logging, explored_domains, image_format
 from crptpro.errors import CRPTproError
 from crptpro.loggers import RunLogger
 from crptpro.seeding import seed_everything
@@ -90,10 +90,11 @@ class Pretrain(PretrainingOptions):
 
     def run(self) -> None:
         """Pre-train, or continue, and write the artifact."""
+        from crptpro.modules import usable_device
         from crptpro.objectives import get_method
 
         # Whatever is wrong with the request is found before the run directory is made.
-        require_device(self.device)
+        usable_device(self.device)
         method = get_method(self.method)
         if method.exploration is None:
             self._on_datasets(method)
@@ -175,9 +176,10 @@ class Finetune(PretrainingOptions):
 
     def run(self) -> None:
         """Fine-tune, or continue, and write the artifact."""
+        from crptpro.modules import usable_device
         from crptpro.pretrained import finetune, load_pretrained
 
-        require_device(self.device)
+        usable_device(self.device)
         image_size, frame_stack = image_format([self.dataset])
         pretrained = load_pretrained(
             self.pretrained, expect={"image_size": image_size, "frame_stack": frame_stack}

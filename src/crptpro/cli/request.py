@@ -95,19 +95,3 @@ def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
         listed = ", ".join(f"{path} has {size} px, {stack} frames" for path, (size, stack) in sizes.items())
         raise DatasetError(f"One encoder needs images of one size and stack: {listed}.")
     return next(iter(sizes.values()))
-
-
-def require_device(name: str) -> None:
-    """Make sure that this machine has a device.
-
-    Raises:
-        CRPTproError: with torch's reason.
-    """
-    import torch
-
-    try:
-        torch.empty(1, device=name)
-    except (RuntimeError, AssertionError, NotImplementedError) as reason:
-        raise CRPTproError(
-            f"Device {name!r} cannot be used ({str(reason).splitlines()[0]}); --device cpu always works."
-        ) from None

@@ -7,6 +7,7 @@ from crptpro.data.episode_writer import EpisodeWriter
 from crptpro.data.frame_storage import FrameStorage
 from crptpro.data.layout import Layout
 from crptpro.data.replay import FrameReplay
+from crptpro.data.stored_replay import StoredReplay
 
 __all__ = [
     "Episode",
@@ -15,6 +16,7 @@ __all__ = [
     "FrameReplay",
     "FrameStorage",
     "Layout",
+    "StoredReplay",
     "collect_group",
     "collect_random",
 ]

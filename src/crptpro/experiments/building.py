@@ -8,10 +8,11 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
+import crptpro.experiments.measurements  # noqa: F401 - makes its kinds of pieces known
 from crptpro.cards import cpu_cores, provenance, read_json, write_json
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import RecordError
@@ -26,6 +27,9 @@ from crptpro.experiments.pieces import (
     UntrainedPiece,
     piece_from_json,
 )
+
+if TYPE_CHECKING:
+    from torchrl.objectives import LossModule
 
 logger = logging.getLogger(__name__)
 
@@ -113,6 +117,8 @@ def build(piece: Piece, store: Store, job: JobSettings | None = None) -> None:
         RecordError: if something it needs is missing, or its directory is in use.
         CRPTproError: whatever the stage refuses.
     """
+    import crptpro.experiments.measuring  # noqa: F401 - imports this module; what it registers is needed below
+
     if store.is_done(piece):
         return
     for needed in piece.needs:
@@ -136,6 +142,16 @@ def make(piece: Piece, store: Store, job: JobSettings) -> None:
 
 
 register: Callable[..., Any] = make.register
+
+
+def new_loss(piece: PretrainedPiece | ExploredPiece) -> LossModule:
+    """Return what an encoder's training starts from: its method's loss on a fresh encoder."""
+    from crptpro.objectives import get_method
+    from crptpro.seeding import seed_everything
+
+    method = get_method(piece.method)
+    seed_everything(piece.seed)
+    return method.build(method.build_encoder(), **dict(piece.loss))
 
 
 @register
@@ -163,14 +179,10 @@ def _(piece: UntrainedPiece, store: Store, job: JobSettings) -> None:
 @register
 def _(piece: PretrainedPiece, store: Store, job: JobSettings) -> None:
     from crptpro.loggers import RunLogger
-    from crptpro.objectives import get_method
     from crptpro.pretrained import save_pretrained
-    from crptpro.seeding import seed_everything
     from crptpro.training import pretrain
 
-    method = get_method(piece.method)
-    seed_everything(piece.seed)
-    loss = method.build(method.build_encoder(), **dict(piece.loss))
+    loss = new_loss(piece)
     run_dir = store.path(piece)
     with RunLogger(run_dir, config=_record(piece)) as records:
         pretrain(
@@ -189,14 +201,11 @@ def _(piece: PretrainedPiece, store: Store, job: JobSettings) -> None:
 @register
 def _(piece: ExploredPiece, store: Store, job: JobSettings) -> None:
     from crptpro.loggers import RunLogger
-    from crptpro.objectives import exploration_defaults, get_method
+    from crptpro.objectives import exploration_defaults
     from crptpro.pretrained import save_pretrained
-    from crptpro.seeding import seed_everything
     from crptpro.training import ActiveConfig, pretrain_active
 
-    method = get_method(piece.method)
-    seed_everything(piece.seed)
-    loss = method.build(method.build_encoder(), **dict(piece.loss))
+    loss = new_loss(piece)
     run_dir = store.path(piece)
     config = ActiveConfig(**dict(piece.explore), seed=piece.seed, device=job.device)
     with RunLogger(run_dir, config=_record(piece)) as records:

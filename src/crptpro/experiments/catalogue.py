@@ -1,23 +1,25 @@
-"""Every experiment that can be reproduced, by name."""
+"""Every experiment by name: what it asks for, and the words that introduce it."""
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from crptpro.experiments import matrix
+from crptpro.errors import UnknownNameError
+from crptpro.experiments import analyses, matrix
 from crptpro.experiments.goals import Goal, Request
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """An experiment of the paper.
+    """One of the commands ``crptpro reproduce NAME``.
 
     Args:
-        name: as on the command line.
-        title: heading in a report.
-        summary: what it shows, in a sentence.
-        goals: what it is made of, for a request.
+        name: on the command line, in file names and in the report.
+        title: heading.
+        summary: what it asks, in a sentence or two, and where the paper has it.
+        goals: what a request makes of it.
     """
 
     name: str
@@ -29,13 +31,96 @@ class Experiment:
 EXPERIMENTS: dict[str, Experiment] = {
     experiment.name: experiment
     for experiment in (
-        Experiment("seen", "Seen domains", "Tasks of the pre-training domains (section IV.B).", matrix.seen),
-        Experiment("unseen", "Unseen domains", "Tasks of other domains (section IV.C).", matrix.unseen),
-        Experiment("colors", "Reversed colours", "Tasks in other colours (section IV.C).", matrix.colors),
-        Experiment("finetune", "Fine-tuning", "One domain more closely (section IV.D).", matrix.finetune),
-        Experiment("ablation", "Ablation", "Without parts of the method (section IV.F).", matrix.ablation),
         Experiment(
-            "sensitivity", "Sensitivity", "Weights and capacities (section IV.F).", matrix.sensitivity
+            "seen",
+            "Seen domains",
+            "Tasks of the domains that the encoder was pre-trained on, for every method (section IV.B).",
+            matrix.seen,
+        ),
+        Experiment(
+            "unseen",
+            "Unseen domains",
+            "Tasks of domains that the encoder never saw, without fine-tuning (section IV.C).",
+            matrix.unseen,
+        ),
+        Experiment(
+            "colors",
+            "Unseen colours",
+            "Tasks with the colours of the background reversed, without fine-tuning (section IV.C). The paper does not "
+            "say how it reverses them; whole images are the option.",
+            matrix.colors,
+        ),
+        Experiment(
+            "finetune",
+            "Fine-tuning",
+            "The encoder of group A trained on for a while on one domain, beside single-domain methods and DrQ "
+            "(section IV.D).",
+            matrix.finetune,
+        ),
+        Experiment(
+            "ablation",
+            "Ablation",
+            "With and without the dispersion loss, with and without decoupled collection (section IV.F).",
+            matrix.ablation,
+        ),
+        Experiment(
+            "sensitivity",
+            "Sensitivity",
+            "The weight alpha of the dispersion loss, and the capacity b of the random datasets (section IV.F).",
+            matrix.sensitivity,
+        ),
+        Experiment(
+            "efficiency",
+            "Pre-training efficiency",
+            "Wall clock and encoder updates of pre-training for one, two and three domains (section IV.E), projected "
+            "from a timed part.",
+            analyses.efficiency,
+        ),
+        Experiment(
+            "prototypes",
+            "Prototypes",
+            "How far prototypes spread, along pre-training and at its end, with and without the dispersion loss "
+            "(section IV.G).",
+            analyses.prototypes,
+        ),
+        Experiment(
+            "coverage",
+            "Coverage",
+            "How widely random data and an explorer's are spread along pre-training (section IV.H).",
+            analyses.coverage,
+        ),
+        Experiment(
+            "stability",
+            "Stability",
+            "The comparative loss along pre-training on random data and on an explorer's (section IV.H).",
+            analyses.stability,
+        ),
+        Experiment(
+            "visualize",
+            "Embeddings",
+            "Principal components of random data of three domains and of an explorer's in one of them (section IV.H).",
+            analyses.visualize,
+        ),
+        Experiment(
+            "probe",
+            "State probe",
+            "What a linear model reads of the simulator's state from frozen features: seen and unseen domains, normal "
+            "and other colours. Not in the paper.",
+            analyses.probe,
         ),
     )
 }
+"""In the order of the paper; what it does not have comes last."""
+
+
+def get_experiment(name: str) -> Experiment:
+    """Look an experiment up.
+
+    Raises:
+        UnknownNameError: if there is none of this name.
+    """
+    if name in EXPERIMENTS:
+        return EXPERIMENTS[name]
+    near = difflib.get_close_matches(name, EXPERIMENTS, n=1, cutoff=0.5)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    raise UnknownNameError(f"There is no experiment {name!r}.{hint} There are {', '.join(EXPERIMENTS)}.")

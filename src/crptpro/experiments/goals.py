@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
+from crptpro.colors import Colors
 from crptpro.domains import GROUPS, get_domain
-from crptpro.errors import CRPTproError
+from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.experiments.pieces import (
     DatasetPiece,
     EncoderPiece,
@@ -20,7 +23,7 @@ from crptpro.experiments.pieces import (
     settings,
 )
 from crptpro.experiments.scales import Scale
-from crptpro.objectives import get_method
+from crptpro.objectives import Method, get_method
 
 FINETUNE, DRQ, RANDOM_ENCODER = "crptpro-finetune", "drq", "random-encoder"
 METHODS = (
@@ -55,6 +58,7 @@ class Request:
         tasks: by name; the experiment's own if empty.
         encoder_seeds: the first seed level: collection, exploration and pre-training.
         seeds: the second: downstream runs on each encoder; ``None`` for as many as the scale has.
+        colors: what "other colours" are, where an experiment has them (decision A22).
     """
 
     scale: Scale
@@ -63,20 +67,21 @@ class Request:
     tasks: tuple[str, ...] = ()
     encoder_seeds: tuple[int, ...] = (0,)
     seeds: tuple[int, ...] | None = None
+    colors: Colors = "reversed_background"
 
     def __post_init__(self) -> None:
         """Refuse names that nobody knows.
 
         Raises:
-            UnknownNameError: for a method or a task.
-            CRPTproError: for a group, or a repeated or missing seed.
+            UnknownNameError: for a method, a group or a task.
+            CRPTproError: for a repeated or missing seed.
         """
         for method in self.methods:
             if method not in METHODS:
                 get_method(method)
         for group in self.groups:
             if group not in GROUPS:
-                raise CRPTproError(f"There is no group {group!r}; choose from {', '.join(GROUPS)}.")
+                raise UnknownNameError(f"There is no group {group!r}; choose from {', '.join(GROUPS)}.")
         for task in self.tasks:
             get_domain(task)
         for name, given in (("encoder_seeds", self.encoder_seeds), ("seeds", self.downstream_seeds)):
@@ -91,6 +96,17 @@ class Request:
     def chosen(self, usual: Iterable[str]) -> tuple[str, ...]:
         """Return the methods asked for, or the experiment's usual ones."""
         return self.methods or tuple(usual)
+
+
+def explores(method: str) -> bool:
+    """Whether a system's encoder is trained on what its own agents see."""
+    return method not in (DRQ, FINETUNE, RANDOM_ENCODER) and get_method(method).exploration is not None
+
+
+def is_single_domain(method: str) -> bool:
+    """Whether a system has an encoder per domain because it cannot be trained on several: the (S) methods."""
+    exploration = get_method(method).exploration if explores(method) else None
+    return exploration is not None and exploration.is_single_domain
 
 
 def dataset(scale: Scale, domain: str, seed: int, *, transitions: int | None = None) -> DatasetPiece:
@@ -126,7 +142,7 @@ def encoder(
     if method == RANDOM_ENCODER:
         return UntrainedPiece(method, seed)
     registered = get_method(method)
-    options = settings(**{**dict(scale.loss.get(method, ())), **dict(loss)})
+    options = _departures(registered, {**dict(scale.loss.get(method, ())), **dict(loss)})
     batch = {} if scale.batch_size is None else {"batch_size": scale.batch_size}
     if registered.exploration is None:
         datasets = tuple(dataset(scale, name, seed, transitions=transitions) for name in names)
@@ -137,6 +153,15 @@ def encoder(
     if scale.quality != "exact":
         explore["quality"] = scale.quality
     return ExploredPiece(method, seed, domains=names, explore=settings(**explore), loss=options)
+
+
+def _departures(method: Method, options: dict[str, Any]) -> Settings:
+    """Options of a loss without those that its method has anyway: they would make the same encoder another piece."""
+    signature = inspect.signature(method.loss_class.__init__).parameters
+    usual = {name: parameter.default for name, parameter in signature.items()} | method.loss_options
+    return settings(
+        **{name: value for name, value in options.items() if name not in usual or usual[name] != value}
+    )
 
 
 def finetuned(scale: Scale, base: EncoderPiece, domain: str, seed: int) -> FinetunedPiece:
@@ -164,8 +189,7 @@ def encoder_for_task(
         return None
     if method == FINETUNE:
         return finetuned(scale, encoder(scale, "crptpro", domains, seed), task, seed)
-    exploration = None if method == RANDOM_ENCODER else get_method(method).exploration
-    if exploration is not None and exploration.is_single_domain:
+    if is_single_domain(method):
         domains = (get_domain(task).name,)
     return encoder(scale, method, domains, seed, loss=loss)
 
@@ -196,11 +220,11 @@ def runs(
     return goals
 
 
-def in_colors(goals: Iterable[Goal], colors: str) -> list[Goal]:
+def in_colors(goals: Iterable[Goal], colors: Colors) -> list[Goal]:
     """Return the same runs in a world of other colours."""
     changed = []
     for goal in goals:
         assert isinstance(goal.piece, RunPiece)
-        piece = replace(goal.piece, colors=colors)  # type: ignore[arg-type]
+        piece = replace(goal.piece, colors=colors)
         changed.append(Goal(goal.label, piece, settings(colors=colors, **dict(goal.place))))
     return changed

@@ -26,6 +26,12 @@ CROSS_DOMAIN = ("crptpro", "proto-rl-c", "atc", "apt-c", "becl", RANDOM_ENCODER)
 DISPERSION = settings(intr_loss_coef=5e-3)
 """CRPTpro's weight of the dispersion loss, for a method that has none of its own."""
 NO_DISPERSION = settings(intr_loss_coef=0.0)
+VARIANTS: dict[str, tuple[tuple[str, Settings], ...]] = {
+    "crptpro": (("crptpro", ()), ("crptpro without dispersion", NO_DISPERSION)),
+    "proto-rl-c": (("proto-rl-c with dispersion", DISPERSION), ("proto-rl-c", ())),
+    "proto-rl-s": (("proto-rl-s with dispersion", DISPERSION), ("proto-rl-s", ())),
+}
+"""Methods with prototypes, each with and without the dispersion loss: label and options of the loss."""
 
 
 def seen(request: Request) -> list[Goal]:
@@ -43,9 +49,9 @@ def unseen(request: Request) -> list[Goal]:
     return _elsewhere(request, [(row.group, row.task) for row in UNSEEN])
 
 
-def colors(request: Request, *, option: str = "reversed_background") -> list[Goal]:
-    """Tasks whose background colours are reversed (section IV.C)."""
-    return in_colors(_elsewhere(request, [(row.group, row.task) for row in COLORS]), option)
+def colors(request: Request) -> list[Goal]:
+    """Tasks whose background colours are reversed, or whole images if the request says so (section IV.C)."""
+    return in_colors(_elsewhere(request, [(row.group, row.task) for row in COLORS]), request.colors)
 
 
 def finetune(request: Request) -> list[Goal]:
@@ -63,16 +69,11 @@ def ablation(request: Request) -> list[Goal]:
 
     Proto-RL(C) with the dispersion loss is CRPTpro without its decoupled collection.
     """
-    variants = {
-        "crptpro": (("crptpro", ()), ("crptpro without dispersion", NO_DISPERSION)),
-        "proto-rl-c": (("proto-rl-c with dispersion", DISPERSION), ("proto-rl-c", ())),
-        "proto-rl-s": (("proto-rl-s with dispersion", DISPERSION), ("proto-rl-s", ())),
-    }
     goals = []
     for group in request.groups or ("A", "C"):
         for task in _tasks(request, GROUPS[group]):
-            for method in request.chosen(variants):
-                for label, loss in variants.get(method, ((method, ()),)):
+            for method in request.chosen(VARIANTS):
+                for label, loss in VARIANTS.get(method, ((method, ()),)):
                     goals += _cell(request, method, group, task, label=label, loss=loss)
     return goals
 

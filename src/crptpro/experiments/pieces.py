@@ -141,6 +141,11 @@ class EncoderPiece(Piece):
     method: str
     seed: int
 
+    @property
+    def domain_names(self) -> tuple[str, ...]:
+        """Domains that it was trained on last."""
+        return ()
+
 
 @dataclass(frozen=True)
 class UntrainedPiece(EncoderPiece):
@@ -172,9 +177,14 @@ class PretrainedPiece(EncoderPiece):
     loss: Settings = ()
 
     @property
+    def domain_names(self) -> tuple[str, ...]:
+        """Domains of the datasets."""
+        return tuple(dataset.domain for dataset in self.datasets)
+
+    @property
     def title(self) -> str:
         """Method, domains and seed."""
-        return f"{self.method} {'+'.join(d.domain for d in self.datasets)} seed {self.seed}"
+        return f"{self.method} {'+'.join(self.domain_names)} seed {self.seed}"
 
 
 @dataclass(frozen=True)
@@ -191,6 +201,11 @@ class ExploredPiece(EncoderPiece):
     domains: tuple[str, ...]
     explore: Settings = ()
     loss: Settings = ()
+
+    @property
+    def domain_names(self) -> tuple[str, ...]:
+        """Domains that were explored."""
+        return self.domains
 
     @property
     def title(self) -> str:
@@ -214,6 +229,11 @@ class FinetunedPiece(EncoderPiece):
     dataset: DatasetPiece
     updates: int
     training: Settings = ()
+
+    @property
+    def domain_names(self) -> tuple[str, ...]:
+        """The one domain."""
+        return (self.dataset.domain,)
 
     @property
     def title(self) -> str:

@@ -30,6 +30,8 @@ class Scale:
         alphas: weights of the dispersion loss in ``sensitivity``, besides none and the method's own.
         capacities: random transitions per domain in ``sensitivity``.
         probe_samples: observations of a state probe.
+        probe_transitions: of the dataset that is probed, which needs several episodes; ``None`` for the one that
+            methods are trained on.
         timing_updates: encoder updates that ``efficiency`` times, after as many to warm up.
         coverage_samples: observations of a coverage estimate.
         embedded_samples: observations of each source in ``visualize``.
@@ -49,6 +51,7 @@ class Scale:
     alphas: tuple[float, ...] = (5e-4, 5e-2, 5e-1)
     capacities: tuple[int, ...] = (10_000, 50_000, 100_000)
     probe_samples: int = 4_000
+    probe_transitions: int | None = None
     timing_updates: int = 100
     coverage_samples: int = 1_024
     embedded_samples: int = 125
@@ -100,6 +103,8 @@ SMALL = Scale(
     seeds=2,
     capacities=(5_000, 20_000),
     probe_samples=2_000,
+    timing_updates=25,
+    coverage_samples=512,
 )
 """A fifth of the data, 6 % of the updates, 4 % of the env steps, a quarter of the batch: a day on two CPU cores."""
 
@@ -147,7 +152,8 @@ TINY = Scale(
     seeds=1,
     alphas=(5e-2,),
     capacities=(60, 130),
-    probe_samples=40,
+    probe_samples=60,
+    probe_transitions=1_100,  # three episodes; one has 500 decisions
     timing_updates=2,
     coverage_samples=32,
     embedded_samples=8,

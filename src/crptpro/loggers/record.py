@@ -39,7 +39,6 @@ class MetricRecord:
         self.path = self.run_dir / JSONL_NAME
         self._columns: dict[str, list[str]] = {}
         self._counts: dict[str, int] = {}
-        self._counter_names: dict[str, list[str]] = {}
         rows = self._read()
         for row in rows:
             self._register(row)
@@ -61,7 +60,7 @@ class MetricRecord:
         row = {"stream": stream, **counters, "unix_time_s": round(time.time(), 3), **metrics}
         is_known = set(row) <= {"stream", *self._columns.get(stream, ())}
         self._append_line(self.path, json.dumps(_json_row(row)) + "\n")
-        self._register(row, list(counters))
+        self._register(row)
         if is_known and self.csv_path(stream).exists():
             line = io.StringIO()
             csv.writer(line, lineterminator="\n").writerow([_cell(row.get(c)) for c in self._columns[stream]])
@@ -116,17 +115,11 @@ class MetricRecord:
         """Take back every row of ``stream`` whose ``counter`` exceeds ``value``."""
         self._replace_rows([r for r in self._read() if r["stream"] != stream or r.get(counter, 0) <= value])
 
-    def counter_names(self, stream: str) -> list[str]:
-        """Return the counters a stream was logged against in this process."""
-        return self._counter_names.get(stream, [])
-
-    def _register(self, row: Mapping[str, Any], counters: list[str] | None = None) -> None:
+    def _register(self, row: Mapping[str, Any]) -> None:
         stream = row["stream"]
         columns = self._columns.setdefault(stream, [])
         columns.extend(key for key in row if key != "stream" and key not in columns)
         self._counts[stream] = self._counts.get(stream, 0) + 1
-        if counters is not None:
-            self._counter_names[stream] = counters
 
     def _read(self) -> list[dict[str, Any]]:
         """All rows; a torn or foreign line is dropped from the file with a warning."""

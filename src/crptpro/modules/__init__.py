@@ -6,6 +6,7 @@ from crptpro.modules.deterministic_actor import DeterministicActor, FixedSkillAc
 from crptpro.modules.encoder import PixelEncoder
 from crptpro.modules.heads import Predictor, Projector, Prototypes
 from crptpro.modules.pixel_critic import PixelCritic
+from crptpro.modules.placement import usable_device
 from crptpro.modules.precision import resolve_precision, set_compute_dtype
 
 __all__ = [
@@ -22,4 +23,5 @@ __all__ = [
     "TwinCritic",
     "resolve_precision",
     "set_compute_dtype",
+    "usable_device",
 ]

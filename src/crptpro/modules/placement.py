@@ -1,4 +1,4 @@
-"""Where a network lives."""
+"""Where a network lives, or can live."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from itertools import chain
 
 import torch
 from torch import nn
+
+from crptpro.errors import CRPTproError
 
 
 def device_of(module: nn.Module) -> torch.device | None:
@@ -17,3 +19,19 @@ def device_of(module: nn.Module) -> torch.device | None:
     """
     first = next(chain(module.parameters(), module.buffers()), None)
     return None if first is None else first.device
+
+
+def usable_device(name: str | torch.device) -> torch.device:
+    """Return a device, once a tensor could be put there.
+
+    Raises:
+        CRPTproError: with torch's reason, if this machine or this build of torch has no such device.
+    """
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError, NotImplementedError) as reason:
+        raise CRPTproError(
+            f"Device {str(name)!r} cannot be used ({str(reason).splitlines()[0]}); 'cpu' always works."
+        ) from None
+    return device

@@ -14,6 +14,7 @@ from crptpro.downstream_config import DownstreamConfig
 from crptpro.envs import make_env
 from crptpro.errors import CheckpointError, PretrainedError
 from crptpro.loggers import RunLogger
+from crptpro.modules import usable_device
 from crptpro.objectives import Method, get_method, methods
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
 from crptpro.training.action_repeat import action_repeat_of
@@ -71,12 +72,14 @@ def train_downstream(
         The agent and every evaluated episode.
 
     Raises:
+        CRPTproError: if the device cannot be used.
         PretrainedError: if the artifact does not fit, e.g. another image size, or actor weights only; if there is none
             for a frozen encoder, or one for DrQ.
         CheckpointError: if ``run_dir`` holds a run with other settings.
         NonFiniteError: if a loss became NaN or infinite; the last checkpoint is kept.
     """
     config = dataclasses.replace(config or DownstreamConfig(), **overrides)
+    usable_device(config.device)
     config = dataclasses.replace(config, action_repeat=action_repeat_of(task, config.action_repeat))
     artifact = _artifact(pretrained, config)
     config = dataclasses.replace(config, replay_capacity=_replay_capacity(artifact, config))

@@ -23,7 +23,7 @@ from crptpro.domains import Domain
 from crptpro.envs import make_env
 from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
-from crptpro.modules import resolve_precision, set_compute_dtype
+from crptpro.modules import resolve_precision, set_compute_dtype, usable_device
 from crptpro.objectives import exploration_defaults, get_method, method_defaults, methods
 from crptpro.seeding import derive_seed
 from crptpro.training.checkpoint import CheckpointDir
@@ -94,19 +94,19 @@ def pretrain_active(
         Metrics, verdict on collapse, budgets spent, and the actors.
 
     Raises:
-        CRPTproError: a single-domain method was given several domains, the loss does not suffice for the reward, or
-            the budget is too small for any update.
+        CRPTproError: a single-domain method was given several domains, the loss does not suffice for the reward,
+            the budget is too small for any update, or the device cannot be used.
         CheckpointError: if ``run_dir`` holds a run with other settings (named).
         NonFiniteError: if a loss or a policy became NaN or infinite; the last checkpoint is kept.
         DiskSpaceError: if the disk cannot hold the replays.
     """
     config = dataclasses.replace(config or ActiveConfig(), **overrides)
+    device = usable_device(config.device)
     defaults, exploration = method_defaults(loss), exploration_defaults(loss)
     config = resolve(config, exploration, defaults)
     _warn_of_another_encoder(loss)
     named = domain_names(loss, domains, exploration)
     dtype = resolve_precision(config.precision, config.device)
-    device = torch.device(config.device)
     cuda = [device.index or 0] if device.type == "cuda" else []
     loss.to(device).train()
     with contextlib.ExitStack() as stack:

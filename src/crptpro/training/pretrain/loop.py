@@ -12,7 +12,7 @@ from torchrl.objectives import LossModule
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
-from crptpro.modules import resolve_precision, set_compute_dtype
+from crptpro.modules import resolve_precision, set_compute_dtype, usable_device
 from crptpro.modules.precision import Precision
 from crptpro.objectives import method_defaults
 from crptpro.seeding import derive_seed
@@ -107,6 +107,7 @@ def pretrain(
         NonFiniteError: naming update, domain and term; the last checkpoint is kept.
         DatasetError: if a dataset is unusable, shows other images than the encoder takes, or lacks an entry
             that the loss reads.
+        CRPTproError: if the device cannot be used.
         CompileError: if compiling is asked for and fails, or an update cannot be recorded.
         DiskSpaceError: if the disk cannot hold the checkpoints.
     """
@@ -124,7 +125,7 @@ def pretrain(
         raise ValueError(f"`learning_rate` must be positive, got {learning_rate}.")
     if encoder_tau is not None and not 0 <= encoder_tau <= 1:
         raise ValueError(f"`encoder_tau` must be in [0, 1], got {encoder_tau}.")
-    device = torch.device(device)
+    device = usable_device(device)
     dtype = resolve_precision(precision, device)
     compiled = Compiled(is_on=resolve_compile(compile))
     captures = resolve_cuda_graph(cuda_graph, device)

@@ -1,0 +1,128 @@
+"""Pieces that measure what others have made: cost, prototypes, coverage of data, principal components."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from crptpro.experiments.pieces import DatasetPiece, EncoderPiece, ExploredPiece, Piece
+
+
+@dataclass(frozen=True)
+class TimingPiece(Piece):
+    """What training encoders costs, measured on a short part of it, as ``timing.csv``.
+
+    Args:
+        encoders: one, or, of a method that has an encoder per domain, several whose costs add up. They need not be
+            made.
+        updates: encoder updates that are timed at least, after as many to warm up.
+        paper_updates: encoder updates at the scale of the paper, over all encoders.
+        paper_decisions: decisions of exploring agents, likewise.
+    """
+
+    kind = "timing"
+    is_exclusive = True
+    encoders: tuple[EncoderPiece, ...]
+    updates: int
+    paper_updates: int
+    paper_decisions: int
+
+    @property
+    def title(self) -> str:
+        """Method and domains."""
+        return f"{self.encoders[0].method} {'+'.join(d for e in self.encoders for d in e.domain_names)}"
+
+    @property
+    def needs(self) -> tuple[Piece, ...]:
+        """The data of a single encoder; of several, the timing of each."""
+        return self.parts if len(self.encoders) > 1 else self.encoders[0].needs
+
+    @property
+    def parts(self) -> tuple[TimingPiece, ...]:
+        """The same for each encoder alone."""
+        count = len(self.encoders)
+        return tuple(
+            replace(
+                self,
+                encoders=(encoder,),
+                paper_updates=self.paper_updates // count,
+                paper_decisions=self.paper_decisions // count,
+            )
+            for encoder in self.encoders
+        )
+
+
+@dataclass(frozen=True)
+class PrototypesPiece(Piece):
+    """How far the prototypes of an encoder have spread, along its training and at its end, as ``prototypes.csv``.
+
+    Args:
+        encoder: of a method that has prototypes.
+    """
+
+    kind = "prototypes"
+    encoder: EncoderPiece
+
+    @property
+    def title(self) -> str:
+        """The encoder's method, domains and seed."""
+        return f"{self.encoder.method} {'+'.join(self.encoder.domain_names)} seed {self.encoder.seed}"
+
+
+@dataclass(frozen=True)
+class CoveragePiece(Piece):
+    """How widely an explorer's observations are spread along its training, beside random data, as ``coverage.csv``.
+
+    A window has the same decisions of both sources: an explorer's first hundred stand beside a dataset's first hundred.
+    Where a source does not have enough of them (a smaller dataset, a replay that went round), it has no row.
+
+    Args:
+        explorer: whose replays are read.
+        datasets: random transitions of the same domains.
+        encoder: which embeds both; the same for all that is compared.
+        samples: observations per estimate.
+        windows: of the training, of equal length; fewer where one would have less than ``samples`` decisions of a
+            domain.
+        seed: of the draw.
+    """
+
+    kind = "coverage"
+    explorer: ExploredPiece
+    datasets: tuple[DatasetPiece, ...]
+    encoder: EncoderPiece
+    samples: int = 1_024
+    windows: int = 10
+    seed: int = 0
+
+    @property
+    def title(self) -> str:
+        """The explorer's method, domains and seed."""
+        return f"{self.explorer.method} {'+'.join(self.explorer.domains)} seed {self.explorer.seed}"
+
+
+@dataclass(frozen=True)
+class EmbeddingsPiece(Piece):
+    """Principal components of random data of several domains and of an explorer's, as ``embeddings.csv``.
+
+    Args:
+        encoder: which embeds all of them.
+        datasets: random transitions.
+        explorer: of one domain; the last quarter of what it keeps is drawn from.
+        samples: observations of each source.
+        seed: of the draw.
+    """
+
+    kind = "embeddings"
+    encoder: EncoderPiece
+    datasets: tuple[DatasetPiece, ...]
+    explorer: ExploredPiece
+    samples: int = 125
+    seed: int = 0
+
+    @property
+    def title(self) -> str:
+        """The encoder, its domains, and the explorer's domain."""
+        domains = "+".join(d.domain for d in self.datasets)
+        explored = "+".join(self.explorer.domains)
+        return (
+            f"{self.encoder.method} {domains} and {self.explorer.method} {explored} seed {self.encoder.seed}"
+        )

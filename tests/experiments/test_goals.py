@@ -1,0 +1,180 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from crptpro.errors import CRPTproError, UnknownNameError
+from crptpro.experiments.budgets import budget
+from crptpro.experiments.goals import (
+    DRQ,
+    FINETUNE,
+    METHODS,
+    RANDOM_ENCODER,
+    Request,
+    dataset,
+    encoder,
+    encoder_for_task,
+    explores,
+    finetuned,
+    is_single_domain,
+    run,
+    runs,
+)
+from crptpro.experiments.pieces import (
+    ExploredPiece,
+    FinetunedPiece,
+    PretrainedPiece,
+    RunPiece,
+    UntrainedPiece,
+    settings,
+)
+from crptpro.experiments.published import EFFICIENCY, EfficiencyRow
+from crptpro.experiments.scales import PAPER, SMALL, TINY, get_scale
+
+A = ("cheetah", "walker", "quadruped")
+
+
+def test_a_method_on_datasets_has_one_of_each_domain_and_the_papers_budget() -> None:
+    piece = encoder(PAPER, "crptpro", A, 3)
+    assert isinstance(piece, PretrainedPiece)
+    assert [(d.domain, d.transitions, d.seed) for d in piece.datasets] == [(name, 100_000, 3) for name in A]
+    assert (piece.method, piece.seed, piece.updates) == ("crptpro", 3, 50_000)
+    assert (piece.training, piece.loss) == ((), ())
+
+
+def test_tasks_name_their_domains_and_transitions_may_be_given() -> None:
+    piece = encoder(PAPER, "atc", ("walker_run",), 0, transitions=10_000)
+    assert isinstance(piece, PretrainedPiece)
+    assert piece.datasets == (dataset(PAPER, "walker", 0, transitions=10_000),)
+
+
+def test_an_exploring_method_has_no_datasets() -> None:
+    piece = encoder(TINY, "becl", A, 0)
+    assert isinstance(piece, ExploredPiece)
+    assert piece.domains == A
+    explore = dict(piece.explore)
+    assert (explore["env_steps"], explore["batch_size"], explore["quality"]) == (120, 4, "fast")
+    assert encoder(PAPER, "becl", A, 0).to_json().get("explore") is None
+
+
+def test_the_untrained_encoder_depends_on_its_seed_alone() -> None:
+    assert encoder(PAPER, RANDOM_ENCODER, A, 1) == encoder(TINY, RANDOM_ENCODER, ("walker",), 1)
+    assert isinstance(encoder(PAPER, RANDOM_ENCODER, A, 1), UntrainedPiece)
+
+
+def test_an_option_that_the_method_has_anyway_does_not_make_another_encoder() -> None:
+    plain = encoder(PAPER, "crptpro", A, 0)
+    assert encoder(PAPER, "crptpro", A, 0, loss=settings(intr_loss_coef=5e-3)) == plain
+    assert encoder(PAPER, "crptpro", A, 0, loss=settings(intr_loss_coef=0.0)) != plain
+    exploring = encoder(PAPER, "proto-rl-c", A, 0)
+    assert encoder(PAPER, "proto-rl-c", A, 0, loss=settings(intr_loss_coef=0.0)) == exploring
+    assert encoder(PAPER, "proto-rl-c", A, 0, loss=settings(intr_loss_coef=5e-3)) != exploring
+    small = encoder(SMALL, "crptpro", A, 0, loss=settings(temperature=0.2))
+    assert dict(small.loss) == {"num_prototypes": 128, "temperature": 0.2}  # type: ignore[attr-defined]
+
+
+def test_drq_has_no_encoder() -> None:
+    assert encoder_for_task(PAPER, DRQ, A, "walker_run", 0) is None
+    with pytest.raises(UnknownNameError, match="drq"):
+        encoder(PAPER, DRQ, A, 0)
+
+
+@pytest.mark.parametrize("method", ["proto-rl-s", "apt-s"])
+def test_a_single_domain_method_has_the_tasks_domain_alone(method: str) -> None:
+    piece = encoder_for_task(PAPER, method, A, "walker_run", 0)
+    assert piece == encoder(PAPER, method, ("walker",), 0)
+    assert piece == encoder_for_task(PAPER, method, ("walker", "pendulum"), "walker_stand", 0)
+
+
+def test_which_systems_explore_and_which_do_so_in_one_domain() -> None:
+    exploring = {"proto-rl-c", "proto-rl-s", "apt-c", "apt-s", "becl"}
+    assert {method for method in METHODS if explores(method)} == exploring
+    assert {method for method in METHODS if is_single_domain(method)} == {"proto-rl-s", "apt-s"}
+
+
+@pytest.mark.parametrize(
+    ("task", "updates"),
+    [
+        ("pendulum_swingup", 2_000),
+        ("reach_duplo", 2_000),
+        ("cartpole_swingup_sparse", 3_000),
+        ("cheetah_run", 1_000),
+        ("walker_run", 500),
+        ("finger_spin", 3_000),  # the paper has none: the largest
+    ],
+)
+def test_fine_tuning_takes_the_papers_updates_of_the_domain(task: str, updates: int) -> None:
+    piece = encoder_for_task(PAPER, FINETUNE, A, task, 0)
+    assert isinstance(piece, FinetunedPiece)
+    assert piece.base == encoder(PAPER, "crptpro", A, 0)
+    assert piece.updates == updates
+    assert piece == finetuned(PAPER, piece.base, task, 0)
+
+
+def test_a_run_takes_the_scales_settings_and_drqs_its_own_besides() -> None:
+    on = encoder(TINY, "crptpro", A, 0)
+    assert dict(run(TINY, "walker_run", on, 5).config) == {**dict(TINY.run), "quality": "fast"}
+    assert run(PAPER, "walker_run", None, 5) == RunPiece("walker_run", None, 5)
+
+
+def test_every_encoder_has_every_downstream_seed() -> None:
+    request = Request(PAPER, encoder_seeds=(0, 7), seeds=(0, 1, 2))
+    encoders = {seed: encoder(PAPER, "atc", A, seed) for seed in request.encoder_seeds}
+    goals = runs(request, "atc", "walker_run", encoders, group="A")
+    assert [goal.piece for goal in goals] == [
+        run(PAPER, "walker_run", encoders[first], second) for first in (0, 7) for second in (0, 1, 2)
+    ]
+    assert dict(goals[-1].place) == {"task": "walker_run", "group": "A", "encoder_seed": 7, "seed": 2}
+
+
+def test_a_system_without_encoder_has_as_many_different_runs() -> None:
+    request = Request(PAPER, encoder_seeds=(0, 7), seeds=(0, 3))
+    goals = runs(request, DRQ, "walker_run", {0: None, 7: None})
+    assert [goal.piece.seed for goal in goals] == [0, 3, 4, 7]  # type: ignore[attr-defined]
+
+
+def test_downstream_seeds_are_the_scales_unless_given() -> None:
+    assert Request(PAPER).downstream_seeds == (0, 1, 2)
+    assert Request(SMALL, seeds=(5,)).downstream_seeds == (5,)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: Request(PAPER, methods=("crtpro",)), UnknownNameError, "crptpro"),
+        (lambda: Request(PAPER, groups=("E",)), UnknownNameError, "'E'; choose from A, B, C, D"),
+        (lambda: Request(PAPER, tasks=("walker_rum",)), UnknownNameError, "walker_run"),
+        (lambda: get_scale("huge"), UnknownNameError, "'huge'; choose tiny, small, paper"),
+        (lambda: Request(PAPER, encoder_seeds=()), CRPTproError, "`encoder_seeds`"),
+        (lambda: Request(PAPER, seeds=(1, 1)), CRPTproError, r"`seeds`.*\(1, 1\)"),
+    ],
+)
+def test_a_request_that_nobody_can_meet_is_refused(
+    make: Callable[[], object], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        make()
+
+
+@pytest.mark.parametrize("row", EFFICIENCY, ids=lambda row: row.method)
+def test_the_papers_scale_has_nearly_the_papers_encoder_updates(row: EfficiencyRow) -> None:
+    # The random decisions come out of the published env steps; BeCL updates its encoder three times per agent update.
+    each = 3 if row.method == "becl" else 1
+    for domains, published in zip((A[:1], A[:2], A), row.encoder_updates):
+        sets = [(name,) for name in domains] if is_single_domain(row.method) else [domains]
+        updates = sum(budget(encoder(PAPER, row.method, names, 0)).updates for names in sets)
+        assert 0.93 * published * each <= updates <= published * each
+
+
+@pytest.mark.parametrize("method", ["proto-rl-c", "apt-c", "becl"])
+def test_at_the_small_scale_exploring_methods_have_as_many_updates_as_the_others(method: str) -> None:
+    assert budget(encoder(SMALL, method, A, 0)).updates == pytest.approx(SMALL.updates, rel=2e-3)
+
+
+def test_the_budget_of_an_exploration_is_counted_over_all_domains() -> None:
+    # 120 env steps are 20 decisions in each of three domains, 8 of them random; the encoder learns at 8, 10, ..., 18.
+    assert budget(encoder(TINY, "proto-rl-c", A, 0)) == (18, 60)
+    assert budget(encoder(TINY, "proto-rl-s", ("walker",), 0)) == (26, 60)
+    assert budget(encoder(TINY, "crptpro", A, 0)) == (6, 0)
+    assert budget(encoder(TINY, RANDOM_ENCODER, A, 0)) == (0, 0)
