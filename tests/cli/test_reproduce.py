@@ -59,7 +59,7 @@ def test_a_part_of_an_experiment_has_a_smaller_plan(call: Call, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    (("sen", "--scale", "tiny"), "no experiment 'sen'; choose from seen, unseen"),
+    (("sen", "--scale", "tiny"), "no experiment 'sen'. Did you mean 'seen'?"),
     (("seen", "--scale", "tiny", "--methods", "atcc"), "'atcc'"),
     (("seen", "--scale", "tiny", "--groups", "E"), "no group 'E'"),
     (("seen", "--scale", "tiny", "--groups", "A", "--tasks", "hopper_hop"), "Nothing of seen"),

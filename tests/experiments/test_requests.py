@@ -30,6 +30,7 @@ def test_goals_are_read_back_with_their_pieces(tmp_path: Path) -> None:
     assert [goal.goal(store) for goal in asked.goals] == goals
     assert asked.request == {
         "methods": ["crptpro", "drq"], "groups": ["A"], "tasks": ["walker_run"], "encoder_seeds": [0], "seeds": [0, 1],
+        "colors": "reversed_background",
     }  # fmt: skip
 
 

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from tyro.conf import Positional
 
-from crptpro.cli.request import require_device
-
 if TYPE_CHECKING:
     from crptpro.experiments.goals import Goal, Request
     from crptpro.experiments.launching import Launcher, Resources
@@ -43,7 +41,7 @@ class Reproduce:
     encoder_seeds: tuple[int, ...] = (0,)
     """of data and pre-training"""
     colors_by: Literal["background", "image"] = "background"
-    """`colors`: what is reversed, the colours of the background or of the whole image"""
+    """what other colours are, where an experiment has them: reversed in the background or in the whole image"""
     out: Path = Path("runs/reproduce")
     """ROOT, where everything is kept and found again"""
     dry_run: bool = False
@@ -82,12 +80,13 @@ class Reproduce:
         from crptpro.experiments.plan import make_plan
         from crptpro.experiments.plan_text import failures_text, plan_text
         from crptpro.experiments.requests import write_request
+        from crptpro.modules import usable_device
         from crptpro.plugins import loaded_plugins
 
         if self.attempts < 1:
             raise CRPTproError(f"--attempts must be at least 1, got {self.attempts}.")
         if self.launcher in ("local", "inline"):
-            require_device(self.device)
+            usable_device(self.device)
         resources = divide(
             self.launcher,
             device=self.device,
@@ -104,7 +103,7 @@ class Reproduce:
         print(plan_text(plan, cost, jobs=resources.jobs, device=self.device), flush=True)
         if self.dry_run:
             return
-        require_disk(self.out, sum(cost.bytes.values()), "What this plan has yet to make")
+        require_disk(self.out, cost.disk_bytes, "What this plan has yet to make")
         # What a launcher lacks is said before anything is written.
         launcher = self._launcher(resources) if plan.missing else None
         for name, goals in wanted.items():
@@ -133,17 +132,14 @@ class Reproduce:
             tasks=self.tasks,
             encoder_seeds=self.encoder_seeds,
             seeds=self.seeds or None,
+            colors="reversed_image" if self.colors_by == "image" else "reversed_background",
         )
 
     def _goals(self, name: str, request: Request) -> list[Goal]:
         from crptpro.errors import CRPTproError
         from crptpro.experiments.catalogue import EXPERIMENTS
-        from crptpro.experiments.matrix import colors
 
-        if name == "colors":
-            goals = colors(request, option=f"reversed_{self.colors_by}")
-        else:
-            goals = EXPERIMENTS[name].goals(request)
+        goals = EXPERIMENTS[name].goals(request)
         if not goals:
             raise CRPTproError(
                 f"Nothing of {name} is among these groups, tasks and methods; leave out --groups, --tasks or --methods."
@@ -162,13 +158,9 @@ class Reproduce:
 def _names(experiments: Sequence[str]) -> list[str]:
     """Check names, put every experiment for `all`, and drop repeats."""
     from crptpro.errors import UnknownNameError
-    from crptpro.experiments.catalogue import EXPERIMENTS
+    from crptpro.experiments.catalogue import EXPERIMENTS, get_experiment
 
-    for name in experiments:
-        if name != ALL and name not in EXPERIMENTS:
-            raise UnknownNameError(
-                f"There is no experiment {name!r}; choose from {', '.join(EXPERIMENTS)}, or {ALL}."
-            )
     if not experiments:
         raise UnknownNameError(f"Name an experiment: {', '.join(EXPERIMENTS)}, or {ALL}.")
-    return list(EXPERIMENTS) if ALL in experiments else list(dict.fromkeys(experiments))
+    names = [get_experiment(name).name for name in experiments if name != ALL]
+    return list(EXPERIMENTS) if ALL in experiments else list(dict.fromkeys(names))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import shutil
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -133,6 +134,14 @@ def build(piece: Piece, store: Store, job: JobSettings | None = None) -> None:
         make(piece, store, job)
         seconds = time.monotonic() - began
         write_json(directory / DONE, {"seconds": seconds, "job": asdict(job), **provenance()})
+        _drop_what_continues(piece, directory)
+
+
+def _drop_what_continues(piece: Piece, directory: Path) -> None:
+    """Remove what only an unfinished piece needs, often most of it; explorers' replays are data."""
+    shutil.rmtree(directory / "checkpoints", ignore_errors=True)
+    if isinstance(piece, RunPiece):
+        shutil.rmtree(directory / "replay", ignore_errors=True)
 
 
 @functools.singledispatch

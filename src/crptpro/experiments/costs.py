@@ -1,176 +1,20 @@
-"""What a plan will cost: hours on this machine and bytes on its disk, before anything is made.
-
-An estimate, and no more than that. Times are core-seconds as measured on one core of an AMD EPYC (Zen 4 with
-AVX512-BF16), corrected by what finished pieces of the same kind took here.
-"""
+"""What a plan will cost: hours on this machine and bytes on its disk, before anything is made."""
 
 from __future__ import annotations
 
-import functools
 import heapq
 import json
 import statistics
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from crptpro.active_config import ActiveConfig
-from crptpro.domains import get_domain
-from crptpro.downstream_config import DownstreamConfig, drq_settings, skill_ddpg_settings
 from crptpro.experiments.building import DONE, Store
-from crptpro.experiments.pieces import (
-    DatasetPiece,
-    ExploredPiece,
-    FinetunedPiece,
-    Piece,
-    PretrainedPiece,
-    RunPiece,
-    Settings,
-    UntrainedPiece,
-)
+from crptpro.experiments.piece_costs import core_seconds, stored_bytes, working_bytes
 from crptpro.experiments.plan import Plan
-from crptpro.objectives import ExplorationDefaults, get_method
-from crptpro.training.action_repeat import action_repeat_of
-from crptpro.training.explore.plan import Plan as ExplorationPlan
-from crptpro.training.explore.plan import make_plan as make_exploration_plan
-from crptpro.training.explore.plan import resolve
 
-START_S = 10.0
-"""Imports, the first picture, the first update."""
-DECISION_S = {"quadruped": 0.06}
-USUAL_DECISION_S = 0.03
-"""One decision: the simulator, and a picture with exact pixels."""
-ENCODER_ROW_S = 2.9e-3
-"""An encoder update, for each row of its batch."""
-ACT_S, EVALUATE_S = 0.05, 0.04
-"""A decision of an agent: picture, features, action; while it learns, and while it is evaluated."""
-AGENT_ROW_S, EXPLORER_ROW_S, DRQ_ROW_S = 0.5e-3, 1.25e-3, 2.5e-3
-"""An agent's update for each row: on stored features, on pixels, on pixels with its encoder."""
-PROBE_S = 60.0
-USUAL_EPISODE_ENV_STEPS = 1_000
-
-TRANSITION_BYTES = 21_200
-"""A picture of 84 x 84 x 3 bytes, and no more than 32 bytes of rest."""
-ENCODER_BYTES, AGENT_BYTES, OTHER_BYTES = 150_000_000, 120_000_000, 1_000_000
-"""Encoder with its last checkpoint, two optimisers' moments included; likewise an agent; small records."""
-
-
-@functools.singledispatch
-def core_seconds(piece: Piece) -> float:
-    """Estimate the seconds that a piece takes on one core of the reference machine.
-
-    A kind without a way of its own is taken for a measurement of a minute.
-    """
-    return PROBE_S
-
-
-@functools.singledispatch
-def stored_bytes(piece: Piece) -> int:
-    """Estimate the most that a piece occupies on disk."""
-    return OTHER_BYTES
-
-
-register_seconds: Callable[..., Any] = core_seconds.register
-register_bytes: Callable[..., Any] = stored_bytes.register
-
-
-@register_seconds
-def _(piece: DatasetPiece) -> float:
-    return START_S + piece.transitions * DECISION_S.get(piece.domain, USUAL_DECISION_S)
-
-
-@register_bytes
-def _(piece: DatasetPiece) -> int:
-    return piece.transitions * TRANSITION_BYTES
-
-
-@register_seconds
-def _(piece: UntrainedPiece) -> float:
-    return START_S
-
-
-@register_bytes
-def _(piece: UntrainedPiece) -> int:
-    return ENCODER_BYTES // 4
-
-
-@register_seconds
-def _(piece: PretrainedPiece) -> float:
-    return START_S + piece.updates * _batch_size(piece.method, piece.training) * ENCODER_ROW_S
-
-
-@register_seconds
-def _(piece: FinetunedPiece) -> float:
-    return START_S + piece.updates * _batch_size(piece.base.method, piece.training) * ENCODER_ROW_S
-
-
-@register_bytes
-def _(piece: PretrainedPiece) -> int:
-    return ENCODER_BYTES
-
-
-@register_bytes
-def _(piece: FinetunedPiece) -> int:
-    return ENCODER_BYTES
-
-
-@register_seconds
-def _(piece: ExploredPiece) -> float:
-    plan = _exploration(piece)[1]
-    batch = _batch_size(piece.method, piece.explore)
-    deciding = plan.decisions * (ACT_S + EXPLORER_ROW_S * batch / plan.agent_update_interval)
-    return START_S + deciding + plan.encoder_updates * ENCODER_ROW_S * batch
-
-
-@register_bytes
-def _(piece: ExploredPiece) -> int:
-    config, plan = _exploration(piece)
-    kept = min(plan.agent_steps, config.replay_capacity or plan.agent_steps) * len(piece.domains)
-    return kept * TRANSITION_BYTES + ENCODER_BYTES + AGENT_BYTES * len(piece.domains)
-
-
-@register_seconds
-def _(piece: RunPiece) -> float:
-    config = _run_config(piece)
-    decisions = config.env_steps / action_repeat_of(piece.task, config.action_repeat)
-    row_s = DRQ_ROW_S if config.algorithm == "drq" else AGENT_ROW_S
-    episode = get_domain(piece.task).episode_env_steps or USUAL_EPISODE_ENV_STEPS
-    evaluations = config.env_steps // config.eval_interval_env_steps + 1
-    evaluated = (
-        evaluations * config.eval_episodes * episode / action_repeat_of(piece.task, config.action_repeat)
-    )
-    return START_S + decisions * (ACT_S + row_s * config.batch_size) + evaluated * EVALUATE_S
-
-
-@register_bytes
-def _(piece: RunPiece) -> int:
-    config = _run_config(piece)
-    replay = config.replay_capacity or 40_000
-    decisions = -(-config.env_steps // action_repeat_of(piece.task, config.action_repeat))
-    return min(replay, decisions) * TRANSITION_BYTES + AGENT_BYTES
-
-
-def _batch_size(method: str, options: Settings) -> int:
-    return dict(options).get("batch_size") or get_method(method).defaults.batch_size
-
-
-def _exploration(piece: ExploredPiece) -> tuple[ActiveConfig, ExplorationPlan]:
-    method = get_method(piece.method)
-    asked = ActiveConfig(**dict(piece.explore))
-    config = resolve(asked, method.exploration or ExplorationDefaults(), method.defaults)
-    repeats = [action_repeat_of(domain, config.action_repeat) for domain in piece.domains]
-    return config, make_exploration_plan(config, repeats)
-
-
-def _run_config(piece: RunPiece) -> DownstreamConfig:
-    asked = dict(piece.config)
-    algorithm = "drq" if piece.encoder is None else str(asked.get("algorithm"))
-    base = {"drq": drq_settings, "skill-ddpg": skill_ddpg_settings}.get(algorithm, DownstreamConfig)
-    return base(**asked)
-
-
-# --- what was learned here ----------------------------------------------------------------------------------------
+SHORTEST_S = 60.0
+"""Estimate up to which a finished piece says nothing about a longer one."""
 
 
 def corrections(store: Store, device: str = "cpu") -> dict[str, float]:
@@ -181,15 +25,17 @@ def corrections(store: Store, device: str = "cpu") -> dict[str, float]:
         device: only of jobs on this kind of device.
 
     Returns:
-        Kind of piece to the median of measured by estimated seconds; kinds of which none is finished are missing.
+        Kind of piece to the median of measured by estimated seconds; kinds of which none is finished that took more
+        than moments are missing.
     """
     found: dict[str, list[float]] = {}
     for path in sorted(store.root.glob(f"pieces/*/{DONE}")):
         try:
             done = json.loads(path.read_text())
             piece = store.described(path.parent.name)
-            if str(done["job"]["device"]).split(":")[0] == device.split(":")[0]:
-                found.setdefault(piece.kind, []).append(float(done["seconds"]) / core_seconds(piece))
+            expected = core_seconds(piece)
+            if expected > SHORTEST_S and _kind(str(done["job"]["device"])) == _kind(device):
+                found.setdefault(piece.kind, []).append(float(done["seconds"]) / expected)
         except Exception:  # of another version, or of a plugin that is not loaded: says nothing about costs
             continue
     return {kind: statistics.median(ratios) for kind, ratios in found.items()}
@@ -201,15 +47,22 @@ class Cost:
 
     Args:
         seconds: of each missing piece, by key.
-        bytes: that are not on the disk yet, likewise.
+        bytes: that are not on the disk yet and will stay there, likewise.
+        working_bytes: besides, while the largest ``jobs`` of them are made at a time.
         wall_seconds: until all are made.
         corrected: kinds whose estimate follows what was measured here.
     """
 
     seconds: Mapping[str, float]
     bytes: Mapping[str, int]
+    working_bytes: int
     wall_seconds: float
     corrected: frozenset[str]
+
+    @property
+    def disk_bytes(self) -> int:
+        """All that has to be free."""
+        return sum(self.bytes.values()) + self.working_bytes
 
 
 def estimate(plan: Plan, store: Store, *, jobs: int, device: str = "cpu") -> Cost:
@@ -224,7 +77,9 @@ def estimate(plan: Plan, store: Store, *, jobs: int, device: str = "cpu") -> Cos
     ratios = corrections(store, device)
     seconds = {piece.key: core_seconds(piece) * ratios.get(piece.kind, 1.0) for piece in plan.missing}
     sizes = {piece.key: max(0, stored_bytes(piece) - _size(store.path(piece))) for piece in plan.missing}
-    return Cost(seconds, sizes, wall_seconds(plan, seconds, jobs), frozenset(ratios))
+    working = sorted(map(working_bytes, plan.missing), reverse=True)[:jobs]
+    wall_s = wall_seconds(plan, seconds, jobs)
+    return Cost(seconds, sizes, sum(working), wall_s, frozenset(ratios))
 
 
 def wall_seconds(plan: Plan, seconds: Mapping[str, float], jobs: int) -> float:
@@ -255,3 +110,7 @@ def wall_seconds(plan: Plan, seconds: Mapping[str, float], jobs: int) -> float:
 
 def _size(directory: Path) -> int:
     return sum(path.stat().st_size for path in directory.rglob("*") if path.is_file())
+
+
+def _kind(device: str) -> str:
+    return device.split(":")[0]

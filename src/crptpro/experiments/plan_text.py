@@ -17,7 +17,10 @@ KIND_NAMES = {
     "finetuned": "encoders fine-tuned",
     "run": "downstream runs",
     "probe": "state probes",
-    "timing": "timings, each alone on the machine",
+    "timing": "timings, alone on the machine",
+    "prototypes": "prototype measurements",
+    "coverage": "coverage measurements",
+    "embeddings": "embeddings",
 }
 
 
@@ -39,11 +42,10 @@ def plan_text(plan: Plan, cost: Cost, *, jobs: int, device: str) -> str:
     table = _table([("pieces", "needed", "done", "to do", "core hours", "disk"), *rows])
     if not plan.missing:
         return table
-    total = sum(cost.bytes.values())
     lines = [
         table,
         "",
-        f"About {duration(cost.wall_seconds)} with {jobs} at a time, and {_gigabytes(total)} of disk.",
+        f"About {duration(cost.wall_seconds)} with {jobs} at a time, and {_gigabytes(cost.disk_bytes)} of disk.",
         _basis(plan, cost, device),
     ]
     return "\n".join(lines)

@@ -119,6 +119,7 @@ def _plain(request: Request) -> dict[str, Any]:
         "tasks": list(request.tasks),
         "encoder_seeds": list(request.encoder_seeds),
         "seeds": list(request.downstream_seeds),
+        "colors": request.colors,
     }
 
 
