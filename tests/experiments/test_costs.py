@@ -65,8 +65,8 @@ def test_disk_follows_what_is_kept() -> None:
 def test_a_run_needs_its_replay_and_two_checkpoints_while_it_is_made() -> None:
     # Actor 3.06 and critic 4.16 million numbers, with two moments each, and a target critic.
     checkpoints = 2 * 4 * (3 * (3.06e6 + 4.16e6) + 4.16e6)
-    assert working_bytes(RUN) == pytest.approx(10_000 * 22.4e3 + checkpoints, rel=0.01)
-    assert stored_bytes(RUN) < 60e6
+    assert working_bytes(RUN) == pytest.approx((40_000 + 5_000 + 2_000) * 84 * 84 * 3 + checkpoints, rel=0.01)
+    assert stored_bytes(RUN) == pytest.approx(4 * 3.06e6 + 1e6, rel=0.05)  # the actor
 
 
 @pytest.mark.parametrize("scale", SCALES)

@@ -51,6 +51,9 @@ FEATURES = 39_200
 """Width of an encoder's output."""
 NUMBER_BYTES = 4
 KEPT_CHECKPOINTS = 2
+FRAME_BYTES = 3 * IMAGE_SIZE**2
+SLACK_FRAMES = 2_000
+"""A replay has room for these beyond its transitions, and for what its last checkpoints refer to."""
 OTHER_BYTES = 1_000_000
 """Records of a training, results of a measurement."""
 
@@ -146,7 +149,8 @@ def _(piece: EncoderPiece) -> int:
 def _(piece: ExploredPiece) -> int:
     plan, config = exploration_plan(piece), exploration_config(piece)
     kept = min(plan.agent_steps, config.replay_capacity or plan.agent_steps)
-    replays = len(piece.domains) * estimate_bytes(kept, IMAGE_SIZE, None)
+    slack = 4 * (config.checkpoint_interval_env_steps // sum(plan.repeats)) + SLACK_FRAMES
+    replays = len(piece.domains) * (kept + slack) * FRAME_BYTES
     return OTHER_BYTES + NUMBER_BYTES * _parameters(piece)[1] + replays
 
 
@@ -175,16 +179,17 @@ def _(piece: RunPiece) -> float:
 @register_stored
 def _(piece: RunPiece) -> int:
     config = _run_config(piece)
-    return OTHER_BYTES + _agent_checkpoint(config.bottleneck_dim, config.hidden_dim) // 3
+    return OTHER_BYTES + NUMBER_BYTES * _actor_and_critic(config.bottleneck_dim, config.hidden_dim)[0]
 
 
 @register_working
 def _(piece: RunPiece) -> int:
     config = _run_config(piece)
-    decisions = -(-config.env_steps // action_repeat_of(piece.task, config.action_repeat))
-    kept = decisions if config.replay_capacity is None else min(config.replay_capacity, decisions)
+    kept = config.replay_capacity or _replay_capacity(piece.encoder)
+    repeat = action_repeat_of(piece.task, config.action_repeat)
+    slack = 2 * (config.checkpoint_interval_env_steps // repeat) + SLACK_FRAMES
     checkpoints = KEPT_CHECKPOINTS * _agent_checkpoint(config.bottleneck_dim, config.hidden_dim)
-    return estimate_bytes(kept, IMAGE_SIZE, None) + checkpoints
+    return (kept + slack) * FRAME_BYTES + checkpoints
 
 
 # --- settings -----------------------------------------------------------------------------------------------------
@@ -207,12 +212,21 @@ def _run_config(piece: RunPiece) -> DownstreamConfig:
     return base(**asked)
 
 
+def _replay_capacity(encoder: EncoderPiece | None) -> int:
+    """What an encoder's method keeps for agents."""
+    if isinstance(encoder, FinetunedPiece):
+        return _replay_capacity(encoder.base)
+    if encoder is None or isinstance(encoder, UntrainedPiece):
+        return get_method("crptpro").replay_capacity
+    return get_method(encoder.method).replay_capacity
+
+
 def _parameters(piece: EncoderPiece) -> tuple[int, int]:
     """Numbers that are trained, and all numbers, targets included; without a training, an encoder's own."""
     if isinstance(piece, FinetunedPiece):
         return _parameters(piece.base)
     if isinstance(piece, UntrainedPiece):
-        return 0, 5_000_000
+        return 0, 300_000
     return _loss_parameters(piece.method, getattr(piece, "loss", ()))
 
 
@@ -225,9 +239,13 @@ def _loss_parameters(method: str, options: Settings) -> tuple[int, int]:
     return sum(parameter.numel() for parameter in loss.parameters()), every
 
 
-def _agent_checkpoint(bottleneck: int, hidden: int) -> int:
-    """Bytes of actor, twin critic, its target, and the optimisers' moments."""
+def _actor_and_critic(bottleneck: int, hidden: int) -> tuple[int, int]:
     trunk = FEATURES * bottleneck
     inner = bottleneck * hidden + hidden**2
-    actor, critic = trunk + inner, trunk + 2 * inner
+    return trunk + inner, trunk + 2 * inner
+
+
+def _agent_checkpoint(bottleneck: int, hidden: int) -> int:
+    """Bytes of actor, twin critic, its target, and the optimisers' moments."""
+    actor, critic = _actor_and_critic(bottleneck, hidden)
     return NUMBER_BYTES * (3 * (actor + critic) + critic)
