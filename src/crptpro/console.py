@@ -40,7 +40,7 @@ def run_main(main: Callable[[], object]) -> None:
     try:
         main()
     except (CRPTproError, ValueError, OSError) as error:
-        if not _is_expected(error):
+        if not is_expected(error):
             raise
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from None
@@ -49,7 +49,8 @@ def run_main(main: Callable[[], object]) -> None:
         raise SystemExit(130) from None
 
 
-def _is_expected(error: Exception) -> bool:
+def is_expected(error: BaseException) -> bool:
+    """Whether an error is one that a user can act on, not a defect."""
     if isinstance(error, CRPTproError):
         return True
     if isinstance(error, OSError):

@@ -18,6 +18,7 @@ from crptpro.cli.originals import Export, Import
 from crptpro.cli.plugins import load_plugins
 from crptpro.cli.pretraining import Finetune, Pretrain
 from crptpro.cli.probe import Probe
+from crptpro.cli.reproduce import Reproduce
 from crptpro.cli.request import expand_groups
 from crptpro.colors import Colors
 from crptpro.console import run_main
@@ -93,6 +94,7 @@ def main() -> None:
         | Annotated[DrQ, subcommand("drq")]
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Probe, subcommand("probe")]
+        | Annotated[Reproduce, subcommand("reproduce")]
         | Annotated[Import, subcommand("import")]
         | Annotated[Export, subcommand("export")]
     ]
@@ -106,5 +108,6 @@ def main() -> None:
 
 DESCRIPTION = """Cross-domain random pre-training with prototypes for reinforcement learning from pixels.
 Start with `crptpro doctor`, then collect, pretrain and downstream; each stage continues where it was killed.
+Or `crptpro reproduce` a whole experiment of the paper.
 With `--plugin FILE.py` (or a module) any command runs a file of yours first: methods, rewards and domains that it
 registers then have names here."""

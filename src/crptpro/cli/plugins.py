@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from crptpro.errors import CRPTproError
-
-FLAG = "--plugin"
+from crptpro.plugins import FLAG, load_plugin
 
 
 def load_plugins(arguments: Sequence[str]) -> list[str]:
@@ -34,29 +30,5 @@ def load_plugins(arguments: Sequence[str]) -> list[str]:
         name = value if equals else next(words, "")
         if not name or name.startswith("-"):
             raise CRPTproError(f"{FLAG} needs a module or a Python file, e.g. {FLAG} my_method.py.")
-        _load(name)
+        load_plugin(name)
     return rest
-
-
-def _load(name: str) -> None:
-    path = Path(name)
-    is_file = path.suffix == ".py"
-    if is_file and not path.is_file():
-        raise CRPTproError(f"{FLAG} {name}: there is no such file.")
-    # An installed command does not look where it is called. Last on the path: nothing installed is hidden. Processes
-    # that the command starts have the same path and find the module by its name.
-    folder = str(path.resolve().parent if is_file else Path.cwd())
-    if folder not in sys.path:
-        sys.path.append(folder)
-    module_name = path.stem if is_file else name
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as reason:
-        if reason.name is None or reason.name != module_name.split(".")[0]:
-            raise CRPTproError(f"{FLAG} {name}: it cannot be imported ({reason}).") from reason
-        raise CRPTproError(
-            f"{FLAG} {name}: there is no such module; name an installed one, one of this directory, or a .py file."
-        ) from None
-    found = getattr(module, "__file__", None)
-    if is_file and (found is None or Path(found).resolve() != path.resolve()):
-        raise CRPTproError(f"{FLAG} {name}: {module_name!r} is the name of another module; rename the file.")

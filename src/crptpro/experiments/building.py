@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-PIECES, DESCRIPTION, DONE = "pieces", "piece.json", "done.json"
+PIECES, DESCRIPTION, DONE, LOG = "pieces", "piece.json", "done.json", "log.txt"
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,13 @@ class JobSettings:
         device: of networks.
         threads: of torch, in each job.
         workers: collecting processes of a job that collects.
+        plugins: modules that a job loads first, for methods and domains of the user's own.
     """
 
     device: str = "cpu"
     threads: int = 1
     workers: int = 1
+    plugins: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,10 @@ class Store:
     def path(self, piece: Piece) -> Path:
         """Directory of a piece, made or not."""
         return self.root / PIECES / piece.key
+
+    def log(self, piece: Piece) -> Path:
+        """What the jobs that made a piece said."""
+        return self.path(piece) / LOG
 
     def is_done(self, piece: Piece) -> bool:
         """Whether a piece is finished."""

@@ -11,6 +11,7 @@ from tyro.conf import Positional
 
 from crptpro.console import run_main
 from crptpro.experiments.building import JobSettings, Store, build
+from crptpro.plugins import load_plugin
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,8 @@ class Job:
 
     def run(self) -> None:
         """Make it."""
+        for plugin in self.settings.plugins:
+            load_plugin(plugin)
         store = Store(self.root)
         build(store.described(self.key), store, self.settings)
 

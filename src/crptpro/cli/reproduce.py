@@ -1,0 +1,166 @@
+"""``crptpro reproduce``: an experiment of the paper, at a scale that can be afforded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from tyro.conf import Positional
+
+if TYPE_CHECKING:
+    from crptpro.experiments.goals import Goal, Request
+    from crptpro.experiments.launching import Launcher, Resources
+
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Reproduce:
+    """Make an experiment of the paper again: print the plan, then make whatever is missing.
+
+    Experiments: seen, unseen, colors, finetune, efficiency, ablation, sensitivity, prototypes, coverage, stability,
+    visualize, probe, or all. Whatever is finished, by this or another experiment, is used again; interrupted, the same
+    command continues. At the end `crptpro report ROOT` makes tables and figures of it.
+    """
+
+    experiments: Positional[tuple[str, ...]]
+    """which, e.g. `seen`, or several, or `all`"""
+    scale: Literal["tiny", "small", "paper"]
+    """tiny shows in minutes that everything runs; small fits two CPU cores; paper has the paper's numbers"""
+    methods: tuple[str, ...] = ()
+    """only these systems, e.g. `crptpro drq random-encoder` (default: the experiment's)"""
+    groups: tuple[str, ...] = ()
+    """only these pre-training groups, of A B C D (default: the experiment's)"""
+    tasks: tuple[str, ...] = ()
+    """only these tasks, e.g. `walker_run` (default: the experiment's)"""
+    seeds: tuple[int, ...] = ()
+    """of downstream runs on each encoder (default: as many as the scale has, from 0)"""
+    encoder_seeds: tuple[int, ...] = (0,)
+    """of data and pre-training"""
+    colors_by: Literal["background", "image"] = "background"
+    """what other colours are, where an experiment has them: reversed in the background or in the whole image"""
+    out: Path = Path("runs/reproduce")
+    """ROOT, where everything is kept and found again"""
+    dry_run: bool = False
+    """print the plan and make nothing"""
+    device: str = "cpu"
+    """of networks: cpu, cuda (jobs share this machine's GPUs, or have one of the cluster's), or cuda:1"""
+    launcher: Literal["local", "slurm", "ray", "inline"] = "local"
+    """local: processes here; slurm, ray: a cluster whose nodes share ROOT; inline: in this process, one at a time"""
+    jobs: int | None = None
+    """most pieces at a time (default: one per core or GPU; on a cluster 16). Each needs memory: a run at paper scale
+    several GB"""
+    cores_per_job: int | None = None
+    """cores of each job (default: this machine's divided by jobs; on a cluster 1, beside a GPU 4)"""
+    jobs_per_gpu: int = 1
+    """local, ray: jobs that share a GPU"""
+    attempts: int = 3
+    """jobs that may try a piece before it counts as failed; each continues where the one before was lost"""
+    partition: str | None = None
+    """slurm: partition (default: the cluster's)"""
+    hours: float = 24.0
+    """slurm: time limit of a job; one that reaches it is queued again and continues"""
+    memory_gb: float = 16.0
+    """slurm: memory of a job"""
+    sbatch: tuple[str, ...] = ()
+    """slurm: further options as `key=value`, e.g. `account=robots qos=high`"""
+    ray_address: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
+    """ray: head of the cluster (default: RAY_ADDRESS, or one on this machine)"""
+
+    def run(self) -> None:
+        """Print the plan, make what is missing, list what failed."""
+        from crptpro.cards import require_disk
+        from crptpro.errors import CRPTproError
+        from crptpro.experiments.building import Store
+        from crptpro.experiments.costs import estimate
+        from crptpro.experiments.launching import divide, run_pieces
+        from crptpro.experiments.plan import make_plan
+        from crptpro.experiments.plan_text import failures_text, plan_text
+        from crptpro.experiments.requests import write_request
+        from crptpro.modules import usable_device
+        from crptpro.plugins import loaded_plugins
+
+        if self.attempts < 1:
+            raise CRPTproError(f"--attempts must be at least 1, got {self.attempts}.")
+        if self.launcher in ("local", "inline"):
+            usable_device(self.device)
+        resources = divide(
+            self.launcher,
+            device=self.device,
+            jobs=self.jobs,
+            cores_per_job=self.cores_per_job,
+            jobs_per_gpu=self.jobs_per_gpu,
+        )
+        request = self._request()
+        wanted = {name: self._goals(name, request) for name in _names(self.experiments)}
+        store = Store(self.out)
+        plan = make_plan([goal.piece for goals in wanted.values() for goal in goals], store)
+        cost = estimate(plan, store, jobs=resources.jobs, device=self.device)
+        print(f"{', '.join(wanted)} at scale {self.scale} in {self.out}\n")
+        print(plan_text(plan, cost, jobs=resources.jobs, device=self.device), flush=True)
+        if self.dry_run:
+            return
+        require_disk(self.out, cost.disk_bytes, "What this plan has yet to make")
+        # What a launcher lacks is said before anything is written.
+        launcher = self._launcher(resources) if plan.missing else None
+        for name, goals in wanted.items():
+            write_request(store, name, request, goals)
+        if launcher is not None:
+            settings = resources.job_settings(self.device, loaded_plugins())
+            try:
+                failures = run_pieces(
+                    plan, store, settings, launcher, jobs=resources.jobs, attempts=self.attempts
+                )
+            finally:
+                launcher.close()
+            if failures:
+                print(failures_text(failures), flush=True)
+                raise SystemExit(1)
+        print(f"\nAll of it is there. Tables and figures: crptpro report {self.out}", flush=True)
+
+    def _request(self) -> Request:
+        from crptpro.experiments.goals import Request
+        from crptpro.experiments.scales import get_scale
+
+        return Request(
+            get_scale(self.scale),
+            methods=self.methods,
+            groups=self.groups,
+            tasks=self.tasks,
+            encoder_seeds=self.encoder_seeds,
+            seeds=self.seeds or None,
+            colors="reversed_image" if self.colors_by == "image" else "reversed_background",
+        )
+
+    def _goals(self, name: str, request: Request) -> list[Goal]:
+        from crptpro.errors import CRPTproError
+        from crptpro.experiments.catalogue import EXPERIMENTS
+
+        goals = EXPERIMENTS[name].goals(request)
+        if not goals:
+            raise CRPTproError(
+                f"Nothing of {name} is among these groups, tasks and methods; leave out --groups, --tasks or --methods."
+            )
+        return goals
+
+    def _launcher(self, resources: Resources) -> Launcher:
+        from crptpro.experiments.launching import SlurmRequest, make_launcher
+
+        slurm = SlurmRequest(self.partition, self.hours, self.memory_gb, self.sbatch)
+        return make_launcher(
+            self.launcher, resources, device=self.device, slurm=slurm, ray_address=self.ray_address
+        )
+
+
+def _names(experiments: Sequence[str]) -> list[str]:
+    """Check names, put every experiment for `all`, and drop repeats."""
+    from crptpro.errors import UnknownNameError
+    from crptpro.experiments.catalogue import EXPERIMENTS, get_experiment
+
+    if not experiments:
+        raise UnknownNameError(f"Name an experiment: {', '.join(EXPERIMENTS)}, or {ALL}.")
+    names = [get_experiment(name).name for name in experiments if name != ALL]
+    return list(EXPERIMENTS) if ALL in experiments else list(dict.fromkeys(names))

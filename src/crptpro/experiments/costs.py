@@ -1,0 +1,116 @@
+"""What a plan will cost: hours on this machine and bytes on its disk, before anything is made."""
+
+from __future__ import annotations
+
+import heapq
+import json
+import statistics
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from crptpro.experiments.building import DONE, Store
+from crptpro.experiments.piece_costs import core_seconds, stored_bytes, working_bytes
+from crptpro.experiments.plan import Plan
+
+SHORTEST_S = 60.0
+"""Estimate up to which a finished piece says nothing about a longer one."""
+
+
+def corrections(store: Store, device: str = "cpu") -> dict[str, float]:
+    """Compare finished pieces with their estimates.
+
+    Args:
+        store: all of its pieces are looked at.
+        device: only of jobs on this kind of device.
+
+    Returns:
+        Kind of piece to the median of measured by estimated seconds; kinds of which none is finished that took more
+        than moments are missing.
+    """
+    found: dict[str, list[float]] = {}
+    for path in sorted(store.root.glob(f"pieces/*/{DONE}")):
+        try:
+            done = json.loads(path.read_text())
+            piece = store.described(path.parent.name)
+            expected = core_seconds(piece)
+            if expected > SHORTEST_S and _kind(str(done["job"]["device"])) == _kind(device):
+                found.setdefault(piece.kind, []).append(float(done["seconds"]) / expected)
+        except Exception:  # of another version, or of a plugin that is not loaded: says nothing about costs
+            continue
+    return {kind: statistics.median(ratios) for kind, ratios in found.items()}
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What is still to be spent on a plan.
+
+    Args:
+        seconds: of each missing piece, by key.
+        bytes: that are not on the disk yet and will stay there, likewise.
+        working_bytes: besides, while the largest ``jobs`` of them are made at a time.
+        wall_seconds: until all are made.
+        corrected: kinds whose estimate follows what was measured here.
+    """
+
+    seconds: Mapping[str, float]
+    bytes: Mapping[str, int]
+    working_bytes: int
+    wall_seconds: float
+    corrected: frozenset[str]
+
+    @property
+    def disk_bytes(self) -> int:
+        """All that has to be free."""
+        return sum(self.bytes.values()) + self.working_bytes
+
+
+def estimate(plan: Plan, store: Store, *, jobs: int, device: str = "cpu") -> Cost:
+    """Estimate what the missing pieces of a plan cost.
+
+    Args:
+        plan: what is wanted.
+        store: whose finished pieces correct the estimate.
+        jobs: at a time.
+        device: of networks.
+    """
+    ratios = corrections(store, device)
+    seconds = {piece.key: core_seconds(piece) * ratios.get(piece.kind, 1.0) for piece in plan.missing}
+    sizes = {piece.key: max(0, stored_bytes(piece) - _size(store.path(piece))) for piece in plan.missing}
+    working = sorted(map(working_bytes, plan.missing), reverse=True)[:jobs]
+    wall_s = wall_seconds(plan, seconds, jobs)
+    return Cost(seconds, sizes, sum(working), wall_s, frozenset(ratios))
+
+
+def wall_seconds(plan: Plan, seconds: Mapping[str, float], jobs: int) -> float:
+    """Play a plan through: each piece starts when its needs are there and one of ``jobs`` is free.
+
+    Args:
+        plan: what is wanted.
+        seconds: of each missing piece, by key.
+        jobs: at a time.
+    """
+    finished, waiting = set(plan.done), list(plan.missing)
+    running: list[tuple[float, str]] = []
+    now = 0.0
+    while waiting or running:
+        ready = [p for p in waiting if len(running) < jobs and all(n.key in finished for n in p.needs)]
+        shared = [piece for piece in ready if not piece.is_exclusive]
+        for piece in shared[: jobs - len(running)]:
+            waiting.remove(piece)
+            heapq.heappush(running, (now + seconds[piece.key], piece.key))
+        if not running:  # only such as must be alone are left
+            alone = ready[0]
+            waiting.remove(alone)
+            heapq.heappush(running, (now + seconds[alone.key], alone.key))
+        now, key = heapq.heappop(running)
+        finished.add(key)
+    return now
+
+
+def _size(directory: Path) -> int:
+    return sum(path.stat().st_size for path in directory.rglob("*") if path.is_file())
+
+
+def _kind(device: str) -> str:
+    return device.split(":")[0]

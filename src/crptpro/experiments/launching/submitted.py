@@ -1,0 +1,251 @@
+"""Jobs through submitit: processes of this machine, or a Slurm cluster; what they run is the same."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from crptpro.errors import CRPTproError
+from crptpro.experiments.launching.launchers import Outcome
+from crptpro.experiments.launching.work import THREAD_VARIABLES, Work
+
+FOLDER = "jobs"
+"""Below ROOT: what submitit keeps of a job while it runs."""
+
+ENDLESS_MINUTES = 60 * 24 * 365
+MAX_REQUEUES = 1_000
+"""How often a Slurm job goes on after its time was up. Each time it has got further."""
+
+
+@dataclass(frozen=True)
+class SubmittedWork:
+    """The function that submitit pickles."""
+
+    work: Work
+
+    def __call__(self) -> str:
+        """Make the piece in a process of submitit's."""
+        with contextlib.suppress(
+            OSError
+        ):  # away from the terminal: Ctrl-C is the scheduler's to pass on, once
+            os.setsid()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, _leave)
+        return self.work.run_logged()
+
+    def checkpoint(self) -> Any:
+        """Have Slurm queue the job again when its time is up; the piece continues from its own checkpoint."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self)
+
+
+def _leave(number: int, frame: object) -> None:
+    raise SystemExit(128 + number)
+
+
+@dataclass
+class SubmittedJob:
+    """A job of submitit's.
+
+    Args:
+        job: as submitit knows it.
+        folder: that submitit keeps it in; removed when it has ended.
+        work: what it does.
+    """
+
+    job: Any
+    folder: Path
+    work: Work
+    is_asked_to_stop: bool = field(default=False, init=False)
+    outcome: Outcome | None = field(default=None, init=False)
+
+    def poll(self) -> Outcome | None:
+        """How it ended, or ``None``."""
+        if self.outcome is None and self.job.done():
+            self.outcome = self._read()
+            shutil.rmtree(self.folder, ignore_errors=True)
+        return self.outcome
+
+    def _read(self) -> Outcome:
+        failure = self.job.exception()
+        if failure is None:
+            refusal = self.job.result()
+            return Outcome(refusal, is_final=bool(refusal))
+        lines = str(failure).strip().splitlines()
+        if type(failure).__name__ != "UncompletedJobError":
+            trace = [line for line in lines[:-3] if line.strip(" -")]
+            return Outcome(trace[-1].strip() if trace else "it failed")
+        said = (self.job.stderr() or "").strip()
+        if said:  # it did not get as far as the piece's log, or the system said why it ended the job
+            with open(self.work.log, "a") as log:
+                log.write(said + "\n")
+        return Outcome(f"the job was lost ({self._state()})")
+
+    def _state(self) -> str:
+        return str(self.job.state).lower()
+
+    def stop(self) -> None:
+        """Pass SIGTERM on; the stages write a checkpoint when it arrives, and leave at once at the second."""
+        process = getattr(self.job, "_process", None)
+        with contextlib.suppress(OSError):
+            if process is not None:
+                process.send_signal(signal.SIGTERM)  # submitit's controller hands it to the job
+            elif self.is_asked_to_stop:
+                subprocess.call(["scancel", self.job.job_id])
+            else:
+                subprocess.call(["scancel", "--state=PENDING", self.job.job_id])
+                subprocess.call(["scancel", "--signal=TERM", self.job.job_id])
+        self.is_asked_to_stop = True
+
+
+class LocalLauncher:
+    """Processes of this machine.
+
+    Args:
+        gpus: one or several, by index or UUID, that jobs share evenly; empty leaves jobs what this process sees.
+
+    Raises:
+        CRPTproError: without submitit.
+    """
+
+    is_one_machine = True
+
+    def __init__(self, gpus: Sequence[str] = ()) -> None:
+        require_submitit("local")
+        self.gpus = tuple(gpus)
+        self._jobs: list[SubmittedJob] = []
+
+    def start(self, work: Work, *, is_exclusive: bool) -> SubmittedJob:
+        """Start a process; the scheduler sees to it that nothing of ours runs beside an exclusive one."""
+        from submitit.local.local import LocalExecutor
+
+        self._jobs = [job for job in self._jobs if job.outcome is None]
+        # submitit hides all GPUs from a job that asks it for none; the job itself brings them back.
+        seen = os.environ.get("CUDA_VISIBLE_DEVICES", _all_gpus())
+        if self.gpus:
+            seen = min(self.gpus, key=lambda gpu: sum(job.work.gpus == gpu for job in self._jobs))
+        work = Work(work.root, work.key, work.settings, gpus=seen)
+        folder = _new_folder(work)
+        executor = LocalExecutor(folder)
+        executor.update_parameters(timeout_min=ENDLESS_MINUTES)
+        with _environment_of_jobs(work.settings.threads):
+            submitted: Any = executor.submit(SubmittedWork(work))
+        submitted._results_timeout_s = 0  # the result is on this machine's disk when the process has ended
+        self._jobs.append(SubmittedJob(submitted, folder, work))
+        return self._jobs[-1]
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+class SlurmLauncher:
+    """A Slurm cluster, whose nodes share ROOT and the environment of this process.
+
+    Args:
+        parameters: of submitit's executor: ``partition``, ``time`` (minutes), ``mem``, ``gpus_per_node``, ...
+
+    Raises:
+        CRPTproError: without submitit, or where there is no Slurm.
+    """
+
+    is_one_machine = False
+
+    def __init__(self, parameters: dict[str, Any]) -> None:
+        require_submitit("slurm")
+        if shutil.which("srun") is None or shutil.which("sbatch") is None:
+            raise CRPTproError(
+                "--launcher slurm needs sbatch and srun, which are not here: call it on a login node of the cluster, "
+                "or choose --launcher local."
+            )
+        self.parameters = parameters
+
+    def start(self, work: Work, *, is_exclusive: bool) -> SubmittedJob:
+        """Queue a job; an exclusive one asks for a node of its own."""
+        from submitit.slurm.slurm import SlurmExecutor
+
+        folder = _new_folder(work)
+        executor = SlurmExecutor(folder, max_num_timeout=MAX_REQUEUES)
+        threads = str(work.settings.threads)
+        parameters = {
+            "job_name": work.key,
+            "cpus_per_task": work.settings.threads,
+            "setup": [f"export {name}={threads}" for name in THREAD_VARIABLES],
+            **self.parameters,
+        }
+        if is_exclusive:
+            parameters["exclusive"] = True
+        executor.update_parameters(**parameters)
+        try:
+            submitted: Any = executor.submit(SubmittedWork(work))
+        except Exception as reason:
+            if type(reason).__name__ != "FailedJobError":
+                raise
+            said = (str(reason).strip().splitlines() or ["it gave no reason"])[-1]
+            raise CRPTproError(
+                f"sbatch refused a job: {said} Change --partition, --hours or --sbatch."
+            ) from reason
+        return SubmittedJob(submitted, folder, work)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def require_submitit(launcher: str) -> None:
+    """Make sure that submitit can be imported.
+
+    Raises:
+        CRPTproError: naming the command that installs it.
+    """
+    try:
+        import submitit  # noqa: F401
+    except ImportError as reason:
+        raise CRPTproError(
+            f"--launcher {launcher} needs submitit ({reason}): pip install 'crptpro[launch]', "
+            "or choose --launcher inline."
+        ) from None
+
+
+def _new_folder(work: Work) -> Path:
+    """A directory for one submission: submitit names its files by process ids, which come again."""
+    parent = Path(work.root) / FOLDER
+    parent.mkdir(parents=True, exist_ok=True)
+    return Path(tempfile.mkdtemp(prefix=f"{work.key}-", dir=parent))
+
+
+def _all_gpus() -> str:
+    import torch
+
+    return ",".join(map(str, range(torch.cuda.device_count())))
+
+
+@contextlib.contextmanager
+def _environment_of_jobs(threads: int) -> Iterator[None]:
+    """What a process that is started inside inherits: numbers of threads, and a deaf ear to Ctrl-C.
+
+    A terminal sends Ctrl-C to every process. submitit's controller would kill its job a second later; the job asks
+    for signals itself.
+    """
+    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(threads)))
+    is_main = threading.current_thread() is threading.main_thread()
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
+    try:
+        yield
+    finally:
+        if is_main:
+            signal.signal(signal.SIGINT, handler)
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

@@ -1,0 +1,127 @@
+"""What was asked of a reproduction: a file per experiment and scale, from which the report knows what belongs to it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from crptpro.cards import read_json, write_json
+from crptpro.errors import RecordError
+from crptpro.experiments.building import Store
+from crptpro.experiments.goals import Goal, Request
+from crptpro.experiments.pieces import Settings, settings
+
+EXPERIMENTS_DIRECTORY = "experiments"
+
+
+@dataclass(frozen=True)
+class AskedGoal:
+    """One goal as it is written down: its piece is named by its key, and described in the store.
+
+    Args:
+        label: row of the tables.
+        key: of the piece.
+        place: where it stands otherwise.
+    """
+
+    label: str
+    key: str
+    place: Settings = ()
+
+    def goal(self, store: Store) -> Goal:
+        """Return the goal with its piece.
+
+        Raises:
+            RecordError: if the store has no such piece.
+        """
+        return Goal(self.label, store.described(self.key), self.place)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """An experiment at one scale, with everything that was ever asked of it.
+
+    Args:
+        experiment: its name.
+        scale: name of the scale.
+        request: the part that was asked for last.
+        goals: of all requests, the last one's first.
+    """
+
+    experiment: str
+    scale: str
+    request: dict[str, Any]
+    goals: tuple[AskedGoal, ...]
+
+
+def request_path(root: Path, experiment: str, scale: str) -> Path:
+    """File of an experiment at a scale."""
+    return root / EXPERIMENTS_DIRECTORY / f"{experiment}-{scale}.json"
+
+
+def write_request(store: Store, experiment: str, request: Request, goals: Iterable[Goal]) -> Asked:
+    """Write down what is asked for, without losing what was asked for before; every goal's piece is described.
+
+    Args:
+        store: of the reproduction.
+        experiment: its name.
+        request: which part of it.
+        goals: that it amounts to.
+
+    Raises:
+        RecordError: if the file is there and cannot be read.
+    """
+    new = []
+    for goal in goals:
+        store.describe(goal.piece)
+        new.append(AskedGoal(goal.label, goal.piece.key, goal.place))
+    path = request_path(store.root, experiment, request.scale.name)
+    before = read_request(path).goals if path.exists() else ()
+    merged = dict.fromkeys([*new, *before])
+    asked = Asked(experiment, request.scale.name, _plain(request), tuple(merged))
+    content = {
+        "experiment": asked.experiment,
+        "scale": asked.scale,
+        "request": asked.request,
+        "goals": [{"label": g.label, "key": g.key, "place": dict(g.place)} for g in asked.goals],
+    }
+    write_json(path, content)
+    return asked
+
+
+def read_request(path: Path) -> Asked:
+    """Read what was asked for.
+
+    Raises:
+        RecordError: if the file is missing or no such record.
+    """
+    content = read_json(path, error=RecordError)
+    try:
+        goals = tuple(AskedGoal(g["label"], g["key"], _settings(g["place"])) for g in content["goals"])
+        return Asked(content["experiment"], content["scale"], content["request"], goals)
+    except (KeyError, TypeError) as reason:
+        raise RecordError(
+            f"{path} does not say what was asked for ({reason!r}); remove it and ask again."
+        ) from reason
+
+
+def read_requests(root: Path) -> list[Asked]:
+    """Read all of a reproduction, by name."""
+    return [read_request(path) for path in sorted((root / EXPERIMENTS_DIRECTORY).glob("*.json"))]
+
+
+def _plain(request: Request) -> dict[str, Any]:
+    return {
+        "methods": list(request.methods),
+        "groups": list(request.groups),
+        "tasks": list(request.tasks),
+        "encoder_seeds": list(request.encoder_seeds),
+        "seeds": list(request.downstream_seeds),
+        "colors": request.colors,
+    }
+
+
+def _settings(place: dict[str, Any]) -> Settings:
+    return settings(**{k: tuple(v) if isinstance(v, list) else v for k, v in place.items()})

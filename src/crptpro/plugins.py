@@ -1,0 +1,53 @@
+"""Modules of the user's own, run before anything else, so that what they register has names in this process."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+
+from crptpro.errors import CRPTproError
+
+FLAG = "--plugin"
+
+_loaded: list[str] = []
+
+
+def load_plugin(name: str) -> None:
+    """Import a module, or a Python file.
+
+    Args:
+        name: of an installed module or one in the working directory, or a path that ends in ``.py``.
+
+    Raises:
+        CRPTproError: there is none of this name, it cannot be imported, or the file has another module's name.
+    """
+    path = Path(name)
+    is_file = path.suffix == ".py"
+    if is_file and not path.is_file():
+        raise CRPTproError(f"{FLAG} {name}: there is no such file.")
+    # An installed command does not look where it is called. Last on the path: nothing installed is hidden. Processes
+    # that the command starts have the same path and find the module by its name.
+    folder = str(path.resolve().parent if is_file else Path.cwd())
+    if folder not in sys.path:
+        sys.path.append(folder)
+    module_name = path.stem if is_file else name
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as reason:
+        if reason.name is None or reason.name != module_name.split(".")[0]:
+            raise CRPTproError(f"{FLAG} {name}: it cannot be imported ({reason}).") from reason
+        raise CRPTproError(
+            f"{FLAG} {name}: there is no such module; name an installed one, one of this directory, or a .py file."
+        ) from None
+    found = getattr(module, "__file__", None)
+    if is_file and (found is None or Path(found).resolve() != path.resolve()):
+        raise CRPTproError(f"{FLAG} {name}: {module_name!r} is the name of another module; rename the file.")
+    kept = str(path.resolve()) if is_file else name
+    if kept not in _loaded:
+        _loaded.append(kept)
+
+
+def loaded_plugins() -> tuple[str, ...]:
+    """Return what :func:`load_plugin` has loaded in this process, files by their absolute paths."""
+    return tuple(_loaded)

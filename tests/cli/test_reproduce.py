@@ -1,0 +1,183 @@
+"""``crptpro reproduce``: the plan, refusals, and an experiment of a plugin's from nothing to an interrupted end."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from command import Call, refused
+
+import crptpro
+
+MAIN = "from crptpro.cli import main; main()"
+FAKE_EXPERIMENT = Path(__file__).parents[1] / "experiments" / "launching" / "fake_experiment.py"
+
+
+def numbers(out: str, pieces: str) -> list[str]:
+    """Needed, done and to do, of a kind of pieces in a plan."""
+    [row] = [line for line in out.splitlines() if line.startswith(pieces)]
+    return row.removeprefix(pieces).split()[:3]
+
+
+def test_a_dry_run_prints_the_plan_and_makes_nothing(call: Call, tmp_path: Path) -> None:
+    status, out, err = call("reproduce", "seen", "--scale", "tiny", "--dry-run", "--out", tmp_path / "root")
+    assert (status, err) == (0, "")
+    assert numbers(out, "datasets of random transitions") == ["8", "0", "8"]
+    # Twelve tasks and ten methods, of which four do not ask for the group that four tasks are in twice.
+    assert numbers(out, "downstream runs") == [str(12 * 10 - 4 * 4), "0", str(12 * 10 - 4 * 4)]
+    assert "at a time" in out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_part_of_an_experiment_has_a_smaller_plan(call: Call, tmp_path: Path) -> None:
+    part = (
+        "--methods",
+        "crptpro",
+        "random-encoder",
+        "--groups",
+        "A",
+        "--tasks",
+        "walker_run",
+        "--seeds",
+        3,
+        4,
+    )
+    asked = ("reproduce", "seen", "--scale", "tiny", *part, "--encoder-seeds", 0, 1)
+    _, out, _ = call(*asked, "--dry-run", "--out", tmp_path)
+    assert numbers(out, "downstream runs") == [
+        "8",
+        "0",
+        "8",
+    ]  # two methods, two encoders each, two runs on each
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (("sen", "--scale", "tiny"), "no experiment 'sen'. Did you mean 'seen'?"),
+    (("seen", "--scale", "tiny", "--methods", "atcc"), "'atcc'"),
+    (("seen", "--scale", "tiny", "--groups", "E"), "no group 'E'"),
+    (("seen", "--scale", "tiny", "--groups", "A", "--tasks", "hopper_hop"), "Nothing of seen"),
+    (("seen", "--scale", "tiny", "--jobs", "0"), "--jobs must be at least 1, got 0"),
+    (("seen", "--scale", "tiny", "--attempts", "0"), "--attempts must be at least 1, got 0"),
+    (("seen", "--scale", "tiny", "--device", "cuda:99"), "cuda:99"),
+])  # fmt: skip
+def test_a_request_that_cannot_be_met_leaves_nothing_behind(
+    call: Call, tmp_path: Path, arguments: tuple[str, ...], message: str
+) -> None:
+    line = refused(call("reproduce", *arguments, "--out", tmp_path / "root"))
+    assert message in line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_the_extra_nothing_is_written(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    status, out, err = call(
+        "reproduce", "seen", "--scale", "tiny", "--launcher", "ray", "--out", tmp_path / "root"
+    )
+    assert status == 1
+    assert "downstream runs" in out
+    assert "pip install 'crptpro[ray]'" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_plan_that_the_disk_cannot_hold_is_refused(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shutil.disk_usage", lambda path: type("Usage", (), {"free": 10**9})())
+    status, _, err = call(
+        "reproduce", "seen", "--scale", "paper", "--launcher", "inline", "--out", tmp_path / "root"
+    )
+    assert status == 1
+    assert "has 1.00 GB free" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_colours_are_reversed_by_background_or_image(call: Call, tmp_path: Path) -> None:
+    part = ("--methods", "random-encoder", "--tasks", "cheetah_run", "--scale", "tiny")
+    for by in ("background", "image"):
+        assert call("reproduce", "colors", *part, "--colors-by", by, "--dry-run", "--out", tmp_path)[0] == 0
+
+
+# --- an experiment that takes seconds -----------------------------------------------------------------------------
+
+
+class Command:
+    """The command in a process of its own, the first of a process group as in a terminal."""
+
+    def __init__(self, root: Path, *arguments: object) -> None:
+        command = [sys.executable, "-c", MAIN, "--plugin", FAKE_EXPERIMENT, "reproduce", *arguments]
+        source = str(Path(crptpro.__file__).parents[1])
+        path = os.pathsep.join([source, os.environ.get("PYTHONPATH", "")])
+        self.root = root
+        self.process = subprocess.Popen(
+            [*map(str, command), "--scale", "tiny", "--out", str(root)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            env={**os.environ, "PYTHONPATH": path},
+        )
+
+    def end(self) -> tuple[int, str, str]:
+        out, err = self.process.communicate(timeout=120)
+        return self.process.returncode, out, err
+
+    def counts(self) -> dict[str, int]:
+        return {
+            path.parent.name.split("-")[1]: int(path.read_text())
+            for path in self.root.glob("pieces/*/count.txt")
+        }
+
+
+@pytest.mark.slow
+def test_ctrl_c_stops_the_jobs_at_a_checkpoint_and_the_same_command_continues(tmp_path: Path) -> None:
+    root = tmp_path / "root"
+    first = Command(root, "fake", "--jobs", 2)
+    deadline = time.monotonic() + 90
+    while time.monotonic() < deadline and not {"crptpro", "atc"} <= set(first.counts()):
+        time.sleep(0.05)
+    jobs = psutil.Process(first.process.pid).children(recursive=True)
+    os.killpg(first.process.pid, signal.SIGINT)  # as a terminal does
+    status, out, err = first.end()
+    assert status == 130, err
+    assert "the same command continues" in err
+    _, alive = psutil.wait_procs(jobs, timeout=1)
+    assert not [
+        job for job in alive if job.status() != psutil.STATUS_ZOMBIE
+    ]  # nobody is there to collect orphans
+    counts = first.counts()
+    assert 1 <= counts["crptpro"] < 40
+    assert not list(root.glob("pieces/*/*.partial"))
+    assert len(list(root.glob("pieces/*/done.json"))) == 1
+    asked = json.loads((root / "experiments" / "fake-tiny.json").read_text())
+    assert [goal["label"] for goal in asked["goals"]] == ["crptpro", "atc"]
+
+    status, out, err = Command(root, "fake", "--jobs", 2).end()
+    assert status == 0, err
+    assert f"crptpro report {root}" in out
+    for name in ("crptpro", "atc"):
+        [path] = root.glob(f"pieces/*-{name}-*/attempts.txt")
+        begun = [int(line.split()[0].removeprefix("from=")) for line in path.read_text().splitlines()]
+        assert begun == [
+            0,
+            counts[name],
+        ]  # the job wrote a checkpoint when it was stopped, and went on from it
+
+
+@pytest.mark.slow
+def test_failures_are_listed_with_their_logs_and_the_exit_status_says_so(tmp_path: Path) -> None:
+    status, out, err = Command(tmp_path / "root", "broken", "--launcher", "local").end()
+    assert status == 1, err
+    assert "1 failed:" in out
+    assert "missing-data will never do." in out
+    [log] = [Path(line.split("log: ")[1]) for line in out.splitlines() if "log: " in line]
+    assert "error: missing-data will never do." in log.read_text()
+    assert "1 skipped" in out

@@ -1,0 +1,151 @@
+"""What a plan is said to cost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from crptpro.cards import write_json
+from crptpro.experiments.building import DONE, Store
+from crptpro.experiments.costs import corrections, estimate, wall_seconds
+from crptpro.experiments.goals import Request
+from crptpro.experiments.matrix import seen
+from crptpro.experiments.piece_costs import core_seconds, stored_bytes, working_bytes
+from crptpro.experiments.pieces import (
+    DatasetPiece,
+    ExploredPiece,
+    Piece,
+    PretrainedPiece,
+    ProbePiece,
+    RunPiece,
+    UntrainedPiece,
+    settings,
+)
+from crptpro.experiments.plan import Plan, make_plan
+from crptpro.experiments.plan_text import plan_text
+from crptpro.experiments.scales import SCALES
+
+WALKER = DatasetPiece("walker", 1_000, 0)
+ENCODER = PretrainedPiece("crptpro", 0, (WALKER,), updates=100)
+RUN = RunPiece("walker_run", ENCODER, 0, config=settings(env_steps=20_000, batch_size=128))
+
+
+def finish(store: Store, piece: Piece, seconds: float, device: str = "cpu") -> None:
+    store.describe(piece)
+    write_json(store.path(piece) / DONE, {"seconds": seconds, "job": {"device": device}})
+
+
+@pytest.mark.parametrize(("piece", "seconds"), [
+    (WALKER, 10 + 30),
+    (DatasetPiece("quadruped", 1_000, 0), 10 + 60),
+    (ENCODER, 10 + 100 * 512 * 2.9e-3),
+    # 10,000 decisions; evaluations at 0, 10,000 and 20,000 env steps, of 10 episodes with 500 decisions each
+    (RUN, 10 + 10_000 * (0.05 + 128 * 0.5e-3) + 3 * 10 * 500 * 0.04),
+    (RunPiece("reach_duplo", None, 0, config=settings(env_steps=10_000)),
+     10 + 5_000 * (0.05 + 512 * 2.5e-3) + 2 * 10 * 125 * 0.04),
+    (ExploredPiece("apt-s", 0, ("walker",), explore=settings(env_steps=2_000, random_agent_steps=100, batch_size=64)),
+     10 + 1_000 * (0.05 + 64 * 1.25e-3) + 450 * 64 * 2.9e-3),
+])  # fmt: skip
+def test_seconds_follow_decisions_updates_and_batch(piece: Piece, seconds: float) -> None:
+    assert core_seconds(piece) == pytest.approx(seconds)
+
+
+def test_disk_follows_what_is_kept() -> None:
+    assert stored_bytes(DatasetPiece("walker", 100_000, 0)) == pytest.approx(2.24e9, rel=0.01)
+    few, many, more = (
+        stored_bytes(ExploredPiece("apt-s", 0, ("walker",), explore=settings(env_steps=env_steps)))
+        for env_steps in (100_000, 200_000, 400_000)
+    )
+    assert few < many == more  # the replay keeps 100,000 transitions
+    # The artifact has what the loss has: 5.4 million numbers, of which nearly all have targets.
+    assert stored_bytes(ENCODER) == pytest.approx(4 * 10.4e6 + 1e6, rel=0.01)
+
+
+def test_a_run_needs_its_replay_and_two_checkpoints_while_it_is_made() -> None:
+    # Actor 3.06 and critic 4.16 million numbers, with two moments each, and a target critic.
+    checkpoints = 2 * 4 * (3 * (3.06e6 + 4.16e6) + 4.16e6)
+    assert working_bytes(RUN) == pytest.approx((40_000 + 5_000 + 2_000) * 84 * 84 * 3 + checkpoints, rel=0.01)
+    assert stored_bytes(RUN) == pytest.approx(4 * 3.06e6 + 1e6, rel=0.05)  # the actor
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_every_piece_of_an_experiment_has_a_cost(scale: str, tmp_path: Path) -> None:
+    plan = make_plan([goal.piece for goal in seen(Request(SCALES[scale]))], Store(tmp_path))
+    cost = estimate(plan, Store(tmp_path), jobs=4)
+    assert set(cost.seconds) == set(cost.bytes) == {piece.key for piece in plan.pieces}
+    assert min(cost.seconds.values()) > 0
+    assert cost.disk_bytes == sum(cost.bytes.values()) + cost.working_bytes
+    assert sum(cost.seconds.values()) / 4 <= cost.wall_seconds < sum(cost.seconds.values())
+
+
+def test_finished_pieces_correct_the_estimate_of_their_kind(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for seed, factor in enumerate((2.0, 3.0, 40.0)):
+        piece = DatasetPiece("walker", 10_000, seed)
+        finish(store, piece, factor * core_seconds(piece))
+    finish(store, DatasetPiece("walker", 100, 0), 1e6)  # too short to say anything
+    assert corrections(store) == {"dataset": pytest.approx(3.0)}
+    assert corrections(store, "cuda") == {}
+    cost = estimate(make_plan([ENCODER], store), store, jobs=1)
+    assert cost.seconds[WALKER.key] == pytest.approx(3 * core_seconds(WALKER))
+    assert cost.seconds[ENCODER.key] == pytest.approx(core_seconds(ENCODER))
+    assert cost.corrected == {"dataset"}
+
+
+def test_a_record_that_cannot_be_read_corrects_nothing(tmp_path: Path) -> None:
+    directory = tmp_path / "pieces" / "odd"
+    directory.mkdir(parents=True)
+    (directory / DONE).write_text("{}")
+    (directory / "piece.json").write_text('{"kind": "of another time"}')
+    assert corrections(Store(tmp_path)) == {}
+
+
+def test_what_lies_on_the_disk_is_not_needed_again(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    plan = make_plan([WALKER], store)
+    before = estimate(plan, store, jobs=1).bytes[WALKER.key]
+    store.path(WALKER).mkdir(parents=True)
+    (store.path(WALKER) / "pixels").write_bytes(bytes(5_000_000))
+    assert estimate(plan, store, jobs=1).bytes[WALKER.key] == before - 5_000_000
+
+
+def test_wall_clock_keeps_to_needs_and_to_the_number_of_jobs(tmp_path: Path) -> None:
+    control = RunPiece("walker_run", UntrainedPiece("random-encoder", 0), 0)
+    plan = make_plan([RUN, control], Store(tmp_path))
+    seconds = {WALKER.key: 5.0, ENCODER.key: 10.0, RUN.key: 20.0, control.key: 7.0}
+    seconds[UntrainedPiece("random-encoder", 0).key] = 1.0
+    assert wall_seconds(plan, seconds, 1) == 43.0
+    assert wall_seconds(plan, seconds, 2) == 35.0
+    assert wall_seconds(plan, seconds, 9) == 35.0
+
+
+def test_the_plan_says_how_many_of_each_kind_and_where_the_estimate_comes_from(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    plan = make_plan([RUN, ProbePiece(ENCODER, WALKER)], store)
+    text = plan_text(plan, estimate(plan, store, jobs=2), jobs=2, device="cpu")
+    row = next(line for line in text.splitlines() if line.startswith("downstream runs"))
+    assert row.split()[2:5] == ["1", "0", "1"]
+    assert "with 2 at a time" in text
+    assert "reference machine" in text
+    assert "GPU" not in text
+    assert "GPU" in plan_text(plan, estimate(plan, store, jobs=2), jobs=2, device="cuda")
+
+    finish(store, RUN, 1_000.0)
+    finish(store, ENCODER, 100.0)
+    other = RunPiece("walker_run", ENCODER, 1)
+    text = plan_text(
+        plan := make_plan([RUN, other], store), estimate(plan, store, jobs=2), jobs=2, device="cpu"
+    )
+    row = next(line for line in text.splitlines() if line.startswith("downstream runs"))
+    assert row.split()[2:5] == ["2", "1", "1"]
+    assert "what finished pieces took here" in text
+
+
+def test_a_plan_without_anything_to_do_promises_nothing(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    finish(store, WALKER, 1.0)
+    plan = make_plan([WALKER], store)
+    assert isinstance(plan, Plan)
+    text = plan_text(plan, estimate(plan, store, jobs=2), jobs=2, device="cpu")
+    assert "About" not in text

@@ -1,0 +1,69 @@
+"""What was asked of a reproduction is written down, and nothing of it is lost."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from crptpro.errors import RecordError
+from crptpro.experiments.building import Store
+from crptpro.experiments.goals import Goal, Request
+from crptpro.experiments.matrix import seen
+from crptpro.experiments.requests import read_request, read_requests, request_path, write_request
+from crptpro.experiments.scales import TINY
+
+
+def ask(store: Store, **part: object) -> list[Goal]:
+    request = Request(TINY, groups=("A",), tasks=("walker_run",), **part)  # type: ignore[arg-type]
+    goals = seen(request)
+    write_request(store, "seen", request, goals)
+    return goals
+
+
+def test_goals_are_read_back_with_their_pieces(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    goals = ask(store, methods=("crptpro", "drq"), seeds=(0, 1))
+    [asked] = read_requests(tmp_path)
+    assert (asked.experiment, asked.scale) == ("seen", "tiny")
+    assert [goal.goal(store) for goal in asked.goals] == goals
+    assert asked.request == {
+        "methods": ["crptpro", "drq"], "groups": ["A"], "tasks": ["walker_run"], "encoder_seeds": [0], "seeds": [0, 1],
+        "colors": "reversed_background",
+    }  # fmt: skip
+
+
+def test_what_was_asked_for_before_is_kept(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    before = ask(store, methods=("crptpro", "drq"))
+    after = ask(store, methods=("drq", "atc"))
+    asked = read_request(request_path(tmp_path, "seen", "tiny"))
+    crptpro = [goal for goal in before if goal.label == "crptpro"]
+    assert [goal.goal(store) for goal in asked.goals] == [*after, *crptpro]
+    assert asked.request["methods"] == ["drq", "atc"]
+    assert [path.name for path in (tmp_path / "experiments").iterdir()] == ["seen-tiny.json"]
+
+
+def test_asking_again_changes_nothing(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    ask(store)
+    first = request_path(tmp_path, "seen", "tiny").read_text()
+    ask(store)
+    assert request_path(tmp_path, "seen", "tiny").read_text() == first
+
+
+def test_a_place_with_several_values_is_read_back(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    request = Request(TINY)
+    goal = Goal("x", seen(request)[0].piece, (("domains", ("walker", "hopper")), ("seed", 0)))
+    write_request(store, "probe", request, [goal])
+    assert read_requests(tmp_path)[0].goals[0].goal(store) == goal
+
+
+def test_a_damaged_file_is_refused_by_name(tmp_path: Path) -> None:
+    path = request_path(tmp_path, "seen", "tiny")
+    path.parent.mkdir()
+    path.write_text(json.dumps({"experiment": "seen"}))
+    with pytest.raises(RecordError, match=r"seen-tiny\.json does not say what was asked for"):
+        ask(Store(tmp_path))
