@@ -57,8 +57,8 @@ def contents(source: Source) -> tuple[Block, ...]:
         blocks.append(
             Paragraph(
                 f"{len(source.runs)} finished downstream runs: {', '.join(methods)} on {', '.join(tasks)}. No "
-                "experiment planned them: the group of their encoders is not recorded, so that the paper's numbers, which depend "
-                "on it, stand beside DrQ's only."
+                "experiment planned them: the group of their encoders is not recorded, and of the paper's numbers only "
+                "DrQ's, which do not depend on it, stand beside."
             )
         )
     if source.problems:
