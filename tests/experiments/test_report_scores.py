@@ -135,7 +135,7 @@ def test_a_single_run_has_no_deviation_and_no_interval(tmp_path: Path) -> None:
 
 def test_a_finished_run_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     made = fill(tmp_path)
-    (broken,) = [p for p in (tmp_path / "pieces").glob("run-cheetah_run-atc-encoder-0-seed-0-*")]
+    (broken,) = (tmp_path / "pieces").glob("run-cheetah_run-atc-encoder-0-seed-0-*")
     (broken / "eval.csv").write_text("torn")
     blocks = blocks_of(page_of(made.root), "seen-small")
     assert "Finished, but not readable" in words(blocks)

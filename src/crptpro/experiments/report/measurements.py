@@ -185,7 +185,7 @@ def coverage(asked: Asked) -> tuple[Block, ...]:
 def embeddings(asked: Asked) -> tuple[Block, ...]:
     """Embeddings of several sources in their first three principal components."""
     rows, blocks = rows_of(asked, "embeddings")
-    for key in dict.fromkeys(row.goal.piece.key for row in rows):
+    for place, key in enumerate(dict.fromkeys(row.goal.piece.key for row in rows)):
         own = [row for row in rows if row.goal.piece.key == key]
         goal = own[0].goal
         clouds: dict[str, list[list[float]]] = {}
@@ -199,7 +199,7 @@ def embeddings(asked: Asked) -> tuple[Block, ...]:
             f"Embeddings of {goal.label}{', ' if goal.where else ''}{goal.where}: {len(own)} observations."
         )
         picture = drawing.scatter(drawn, names, ((0, 1), (0, 2), (1, 2)))
-        blocks.append(Figure(f"{asked.name}-{key}", caption, picture))
+        blocks.append(Figure(f"{asked.name}-{place + 1}", caption, picture))
     return tuple(blocks)
 
 

@@ -11,7 +11,7 @@ from crptpro.errors import RecordError
 from crptpro.experiments.intervals import Bootstrap
 from crptpro.experiments.report.blocks import Block, Page, Paragraph, Section, figures_of
 from crptpro.experiments.report.cards import piece_cards, run_cards
-from crptpro.experiments.report.diagnostics import stability, study
+from crptpro.experiments.report.diagnostics import stability
 from crptpro.experiments.report.figures import save
 from crptpro.experiments.report.html import Saved, html_page
 from crptpro.experiments.report.markdown import markdown_page
@@ -22,6 +22,7 @@ from crptpro.experiments.report.probes import probes
 from crptpro.experiments.report.reading import Asked, Source, read_source
 from crptpro.experiments.report.runs import placed_runs, unplaced_runs
 from crptpro.experiments.report.scores import blocks_of_runs, score_blocks
+from crptpro.experiments.report.study import study
 
 logger = logging.getLogger(__name__)
 
@@ -52,7 +53,7 @@ MEASURED: dict[str, Measured] = {
     "probe": probes,
     "study": study,
 }
-"""Experiments whose numbers are no downstream scores."""
+"""Experiments with numbers that are no downstream scores."""
 
 
 def build_report(
@@ -127,8 +128,7 @@ def _experiment(asked: Asked, source: Source, bootstrap: Bootstrap) -> Section:
     try:
         if asked.experiment in MEASURED:
             blocks += MEASURED[asked.experiment](asked)
-        else:
-            blocks += score_blocks(asked, bootstrap)
+        blocks += score_blocks(asked, bootstrap)
     except RecordError as reason:
         logger.warning("%s: %s", asked.name, reason)
         blocks += (Paragraph(f"The rest of this section cannot be made: {reason}", "warning"),)

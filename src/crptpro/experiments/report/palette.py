@@ -46,7 +46,9 @@ _VARIANTS = (
     ("v", (0, (5, 1, 1, 1, 1, 1))),
     ("P", (0, (1, 3))),
 )
-_OTHERS = ("#0b80c3", "#d9640a", "#109e77", "#c76aa2", "#8f8a2a", "#8a7bd8", "#e69f00", "#858a91", "#bb5566")
+_OTHERS = (
+    "#0b80c3", "#d9640a", "#109e77", "#c76aa2", "#8f8a2a", "#8a7bd8", "#e69f00", "#858a91", "#bb5566",
+)  # fmt: skip
 
 
 def styles(labels: Iterable[str]) -> dict[str, Style]:
@@ -61,7 +63,10 @@ def styles(labels: Iterable[str]) -> dict[str, Style]:
     found: dict[str, Style] = {}
     variants: dict[str, int] = {}
     others = 0
-    for label in dict.fromkeys(labels):
+    unique = list(dict.fromkeys(labels))
+    taken = {_STYLES[base].color for label in unique if (base := base_method(label))}
+    free = [color for color in _OTHERS if color not in taken]
+    for label in unique:
         base = base_method(label)
         if label in _STYLES:
             found[label] = _STYLES[label]
@@ -70,8 +75,8 @@ def styles(labels: Iterable[str]) -> dict[str, Style]:
             marker, dashes = _VARIANTS[place % len(_VARIANTS)]
             found[label] = replace(_STYLES[base], marker=marker, dashes=dashes)  # type: ignore[arg-type]
         else:
-            marker, dashes = _VARIANTS[others // len(_OTHERS) % len(_VARIANTS)]
-            found[label] = Style(_OTHERS[others % len(_OTHERS)], marker, dashes)  # type: ignore[arg-type]
+            marker, dashes = _VARIANTS[others // len(free) % len(_VARIANTS)]
+            found[label] = Style(free[others % len(free)], marker, dashes)  # type: ignore[arg-type]
             others += 1
     return found
 
@@ -83,7 +88,7 @@ def base_method(label: str) -> str:
         >>> base_method("proto-rl-c with dispersion"), base_method("crptpro-finetune"), base_method("mine")
         ('proto-rl-c', 'crptpro-finetune', '')
     """
-    fitting = [m for m in _STYLES if label == m or label.startswith((f"{m} ", f"{m},"))]
+    fitting = [m for m in _STYLES if label == m or label.startswith((f"{m} ", f"{m},", f"{m}-"))]
     return max(fitting, key=len, default="")
 
 

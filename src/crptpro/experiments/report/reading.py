@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -82,8 +83,8 @@ class Asked:
 
     @property
     def name(self) -> str:
-        """For anchors and files."""
-        return f"{self.experiment}-{self.scale}"
+        """For anchors and files, whatever the request calls itself."""
+        return re.sub(r"[^a-zA-Z0-9]+", "-", f"{self.experiment}-{self.scale}")
 
     @property
     def finished(self) -> list[Wanted]:
