@@ -82,14 +82,18 @@ def theme() -> Iterator[None]:
         yield
 
 
-def lines(panels: Sequence[Panel]) -> Any:
-    """Draw curves, up to three panels side by side, with one legend below.
+def lines(panels: Sequence[Panel], *, columns: int = 3) -> Any:
+    """Draw curves with one legend below.
+
+    Args:
+        panels: at least one.
+        columns: panels side by side, at most.
 
     Returns:
         Matplotlib's figure.
     """
     with theme():
-        figure, axes = _grid(len(panels))
+        figure, axes = _grid(len(panels), columns)
         named: dict[str, Any] = {}
         for axis, panel in zip(axes, panels):
             for line in panel.lines:
@@ -132,7 +136,9 @@ def bars(groups: Sequence[str], series: Mapping[str, Sequence[float | None]], un
             ]
             known = [length for length in lengths if length is not None]
             drawn = axis.barh(places, known, thickness * 0.9, color=shades[index % len(shades)], label=label)
-            axis.bar_label(drawn, [f"{length:.3g}" for length in known], padding=3, fontsize=7.5, color=INK)
+            axis.bar_label(
+                drawn, [f"{_short(length)}" for length in known], padding=3, fontsize=7.5, color=INK
+            )
         axis.set_yticks(range(len(groups)), groups)
         axis.invert_yaxis()
         axis.grid(visible=False, axis="y")
@@ -171,7 +177,7 @@ def scatter(
         pairs: which two dimensions each panel shows.
     """
     with theme():
-        figure, axes = _grid(len(pairs), height=3.3)
+        figure, axes = _grid(len(pairs), 3, height=3.3)
         named = {}
         for axis, (first, second) in zip(axes, pairs):
             for label, (style, points) in clouds.items():
@@ -204,10 +210,10 @@ def strips(rows: Mapping[str, Sequence[np.ndarray]], *, size: float = 1.0) -> An
         return figure
 
 
-def _grid(panels: int, *, height: float = 2.9) -> tuple[Any, list[Any]]:
-    columns = min(max(panels, 1), 3)
-    width = 3.7 if columns > 1 else 6.2
-    figure, axes = make_figure(math.ceil(max(panels, 1) / columns), columns, width=width, height=height)
+def _grid(panels: int, most: int, *, height: float = 2.9) -> tuple[Any, list[Any]]:
+    columns = min(panels, most)
+    width = {1: 6.2, 2: 5.2}.get(columns, 3.7)
+    figure, axes = make_figure(math.ceil(panels / columns), columns, width=width, height=height)
     flat = list(axes.flat)
     for axis in flat[panels:]:
         axis.set_axis_off()
@@ -234,3 +240,7 @@ def _legend(figure: Any, named: Mapping[str, Any]) -> None:
         longest = max(len(name) for name in named)
         columns = max(1, min(len(named), int(width * 13 / (longest + 8))))
         figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=columns, fontsize=8)
+
+
+def _short(value: float) -> str:
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"

@@ -11,11 +11,12 @@ from crptpro.errors import RecordError
 from crptpro.experiments.intervals import Bootstrap
 from crptpro.experiments.report.blocks import Block, Page, Paragraph, Section, figures_of
 from crptpro.experiments.report.cards import piece_cards, run_cards
+from crptpro.experiments.report.costs import efficiency
 from crptpro.experiments.report.diagnostics import stability
 from crptpro.experiments.report.figures import save
 from crptpro.experiments.report.html import Saved, html_page
 from crptpro.experiments.report.markdown import markdown_page
-from crptpro.experiments.report.measurements import coverage, efficiency, embeddings, prototypes
+from crptpro.experiments.report.measurements import coverage, embeddings, prototypes
 from crptpro.experiments.report.overview import caveats, contents, progress, provenance
 from crptpro.experiments.report.pictures import observations, videos
 from crptpro.experiments.report.probes import probes
