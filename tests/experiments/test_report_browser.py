@@ -10,10 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
-from whole_reproduction import make_whole
 
-from crptpro.experiments.intervals import Bootstrap
-from crptpro.experiments.report import build_report
 from crptpro.experiments.report.html import POLICY
 
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
@@ -22,8 +19,8 @@ DARK, LIGHT = 0, 1
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_report(make_whole(tmp_path_factory.mktemp("whole")).root, bootstrap=Bootstrap(replicates=20))
+def page(whole_report: Path) -> Path:
+    return whole_report
 
 
 def browse(

@@ -23,21 +23,28 @@ LEVEL = {
 }  # fmt: skip
 
 
-def make_whole(root: Path) -> Reproduction:
-    """Fill a root; one method is missing on one task, and one experiment has nothing finished."""
+def make_whole(root: Path, *, is_brief: bool = True) -> Reproduction:
+    """Fill a root; one method is missing on one task, and one experiment has nothing finished.
+
+    Args:
+        root: of the reproduction.
+        is_brief: leave methods out, for tests; a look at the page wants all of them.
+    """
     made = Reproduction(root)
-    two = Request(SMALL, groups=("A",), encoder_seeds=(0, 1))
+    few = ("crptpro", "proto-rl-c", "becl", "drq", "random-encoder")
+    two = Request(SMALL, methods=few if is_brief else (), groups=("A",), encoder_seeds=(0, 1))
     goals = seen(two)
     made.ask("seen", goals)
     _runs(made, [g for g in goals if not (g.label == "becl" and ("task", "quadruped_run") in g.place)])
     for name, experiment in (("unseen", unseen), ("finetune", finetune), ("ablation", ablation)):
-        some = experiment(Request(SMALL, groups=("A",), tasks=("walker_run", "pendulum_swingup")))
+        tasks = ("walker_run", "pendulum_swingup")
+        some = experiment(Request(SMALL, groups=("A",), tasks=tasks, seeds=(0,) if is_brief else None))
         made.ask(name, some)
         _runs(made, some)
     some = colors(Request(SMALL, methods=("crptpro", "atc", "random-encoder")))
     made.ask("colors", some)
     _runs(made, some)
-    some = sensitivity(Request(SMALL, tasks=("walker_run",)))
+    some = sensitivity(Request(SMALL, tasks=("walker_run",), seeds=(0,) if is_brief else None))
     made.ask("sensitivity", some)
     _runs(made, some)
     made.ask("seen", seen(Request(SMALL, groups=("B",), methods=("crptpro",))), scale="tiny")
@@ -53,7 +60,7 @@ def _runs(made: Reproduction, goals: Iterable[Goal]) -> None:
         level = LEVEL[max((m for m in LEVEL if goal.label.startswith(m)), key=len)]
         directory = made.run(goal, float(level + rng.normal(0, 30)), pause_s=40_000.0 * (rng.random() < 0.2))
         assert isinstance(goal.piece, RunPiece)
-        if goal.label == "crptpro" and goal.piece.seed == 0:
+        if goal.label == "crptpro" and goal.piece.seed == 0 and goal.piece.task == "walker_run":
             write_video(pictures(), directory / "videos" / "env_steps_00020000_episode_0.mp4")
 
 
@@ -132,19 +139,32 @@ def _measurements(made: Reproduction) -> None:
             made.encoder(variant, plateau=600 - 250 * place + 30 * seed)
             where = settings(factor="assignment temperature", value=value, seed=seed)
             tried.append(Goal(f"crptpro, temperature {value}", variant, where))
-            piece = ProbePiece(variant, random_data.datasets[1])
-            tried.append(_probe(made, f"crptpro, temperature {value}", piece, where))
-    made.ask("study", tried)
+            for updates in (500, 1000):
+                piece = ProbePiece(variant, random_data.datasets[1], samples=updates)
+                at = settings(**{**dict(where), "updates": updates})
+                level = 0.1 * place + updates / 5000
+                tried.append(_probe(made, f"crptpro, temperature {value}", piece, at, velocity=level))
+    control = ProbePiece(encoder(SMALL, "random-encoder", (), 0), random_data.datasets[1])
+    where = settings(factor="control", value="untrained", updates=0)
+    made.ask("study", [*tried, _probe(made, "random-encoder", control, where, velocity=0.05)])
 
 
-def _probe(made: Reproduction, label: str, piece: ProbePiece, place: tuple = (), has_z: bool = False) -> Goal:
+def _probe(
+    made: Reproduction,
+    label: str,
+    piece: ProbePiece,
+    place: tuple = (),
+    *,
+    has_z: bool = False,
+    velocity: float = 0.4,
+) -> Goal:
     rows = []
     for embedding in ("features", "z") if has_z else ("features",):
         base = {
             "encoder": "encoder", "method": label, "domain": piece.dataset.domain, "seen": "yes",
             "colors": piece.colors, "embedding": embedding, "samples": 2000, "held_out_episodes": 3, "seed": 0,
         }  # fmt: skip
-        values = {"r2_position": 0.7, "r2_velocity": 0.4, "effective_rank": 30.0, "mean_cosine": 0.9}
+        values = {"r2_position": 0.7, "r2_velocity": velocity, "effective_rank": 30.0, "mean_cosine": 0.9}
         rows += [
             {**base, "measure": measure, "coordinate": "", "value": value}
             for measure, value in values.items()

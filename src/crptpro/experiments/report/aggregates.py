@@ -50,7 +50,8 @@ def aggregates(placed: Sequence[Placed], name: str, bootstrap: Bootstrap) -> lis
     if normalizable:
         normalized = {label: _normalized(table.only(normalizable)) for label, table in kept.items()}
         blocks += _improvement(normalized, name, bootstrap)
-        blocks.append(_profiles(normalized, name, bootstrap))
+        if not any(p.varied[0] for p in placed):  # a dozen values of one setting would hide each other
+            blocks.append(_profiles(normalized, name, bootstrap))
     return blocks
 
 

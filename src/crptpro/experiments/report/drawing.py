@@ -109,7 +109,7 @@ def lines(panels: Sequence[Panel], *, columns: int = 3) -> Any:
                 axis.set_yscale("log")
             largest = max((float(np.max(line.x)) for line in panel.lines if np.size(line.x)), default=0)
             if largest >= 10_000:
-                axis.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k")
+                axis.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
         _legend(figure, named)
         return figure
 
@@ -151,7 +151,7 @@ def bars(groups: Sequence[str], series: Mapping[str, Sequence[float | None]], un
 def intervals(
     rows: Sequence[tuple[str, Style, float, tuple[float, float] | None]], unit: str, mark: float
 ) -> Any:
-    """Draw one number and its interval a row, against a mark that means no difference."""
+    """Draw one probability and its interval a row, against a mark that means no difference."""
     with theme():
         figure, axes = make_figure(width=6.4, height=max(0.9 + 0.3 * len(rows), 1.6))
         axis = axes[0, 0]
@@ -162,6 +162,7 @@ def intervals(
         axis.axvline(mark, color=INK, linestyle=(0, (4, 3)), linewidth=0.8)
         axis.set_yticks(range(len(rows)), [name for name, *_ in rows])
         axis.set_ylim(len(rows) - 0.5, -0.5)
+        axis.set_xlim(-0.03, 1.03)
         axis.set(xlabel=unit)
         return figure
 
@@ -212,7 +213,7 @@ def strips(rows: Mapping[str, Sequence[np.ndarray]], *, size: float = 1.0) -> An
 
 def _grid(panels: int, most: int, *, height: float = 2.9) -> tuple[Any, list[Any]]:
     columns = min(panels, most)
-    width = {1: 6.2, 2: 5.2}.get(columns, 3.7)
+    width = {1: 7.4, 2: 5.2}.get(columns, 3.7)
     figure, axes = make_figure(math.ceil(panels / columns), columns, width=width, height=height)
     flat = list(axes.flat)
     for axis in flat[panels:]:
@@ -235,11 +236,15 @@ def _draw(axis: Any, line: Line) -> Any:
 
 
 def _legend(figure: Any, named: Mapping[str, Any]) -> None:
-    if named:
-        width = figure.get_size_inches()[0]
-        longest = max(len(name) for name in named)
-        columns = max(1, min(len(named), int(width * 13 / (longest + 8))))
-        figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=columns, fontsize=8)
+    """One legend for all panels, below them; the figure grows by what it takes."""
+    if not named:
+        return
+    width, height = figure.get_size_inches()
+    entry = 0.6 + 0.062 * max(len(name) for name in named)  # inches
+    columns = max(1, min(len(named), int(width / entry)))
+    rows = math.ceil(len(named) / columns)
+    figure.set_size_inches(width, height + 0.17 * rows + 0.1)
+    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=columns, fontsize=8)
 
 
 def _short(value: float) -> str:

@@ -106,7 +106,7 @@ def coverage(asked: Asked) -> tuple[Block, ...]:
         curves.setdefault((domain, label), {})[numbers] = own
     if not curves:
         return tuple(blocks)
-    labels = in_order(sorted({label for _, label in curves}, key=lambda label: (label != RANDOM, label)))
+    labels = in_order(sorted({label for _, label in curves}))
     look = styles(labels)
     panels, lines = [], []
     for domain in dict.fromkeys(domain for domain, _ in curves):

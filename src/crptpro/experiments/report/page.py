@@ -97,16 +97,18 @@ def make_page(source: Source, bootstrap: Bootstrap) -> Page:
     """
     now = datetime.datetime.now(datetime.timezone.utc)
     scales = list(dict.fromkeys(asked.scale for asked in source.asked))
-    what = f"reproduction at scale {', '.join(scales)}" if scales else "downstream runs"
+    what = f"reproduction at scale {' and '.join(scales)}" if scales else "downstream runs"
     summary = (
-        f"CRPTpro (cross-domain random pre-training with prototypes, arXiv 2302.05614), {what}, beside the numbers "
-        f"that the paper printed. Made on {now:%Y-%m-%d at %H:%M} UTC from {source.root.resolve().name}."
+        "Cross-domain random pre-training with prototypes (arXiv 2302.05614): what was measured here, beside the "
+        f"numbers that the paper printed. Made on {now:%Y-%m-%d at %H:%M} UTC from {source.root.resolve().name}."
     )
     placed = unplaced_runs(source.runs)
     sections = [Section("What is here", contents(source), "contents")]
     sections.append(Section("What this scale cannot show", caveats(source), "caveats"))
-    sections += [_experiment(asked, source, bootstrap) for asked in source.asked]
-    for asked in source.asked:
+    order = [*TITLES, *(asked.experiment for asked in source.asked)]
+    experiments = sorted(source.asked, key=lambda asked: (order.index(asked.experiment), asked.scale))
+    sections += [_experiment(asked, source, bootstrap) for asked in experiments]
+    for asked in experiments:
         placed += placed_runs(asked)[0]
     if source.runs:
         sections.append(Section("Scores", blocks_of_runs(placed, "runs", bootstrap), "scores"))
@@ -116,7 +118,7 @@ def make_page(source: Source, bootstrap: Bootstrap) -> Page:
         Section("Versions and hardware", provenance(source), "provenance"),
         Section("Cards", (*piece_cards(source.pieces), *run_cards(source.runs)), "cards"),
     ]
-    title = f"crptpro: {', '.join(dict.fromkeys(a.experiment for a in source.asked)) or 'downstream runs'}"
+    title = f"CRPTpro: {what}"
     return Page(title, summary, tuple(section for section in sections if section.blocks))
 
 

@@ -35,8 +35,9 @@ _STYLES = {
     "becl": Style("#8f8a2a", "<"),
     "drq": Style("#8a7bd8", ">"),
     "random-encoder": Style("#858a91", "h", ":"),
+    "random policy": Style("#858a91", ".", ":"),
 }
-assert set(_STYLES) == set(METHODS)
+assert set(METHODS) <= set(_STYLES)
 
 _VARIANTS = (
     ("o", "-"),
@@ -71,7 +72,7 @@ def styles(labels: Iterable[str]) -> dict[str, Style]:
         if label in _STYLES:
             found[label] = _STYLES[label]
         elif base:
-            place = variants[base] = variants.get(base, 0) + 1
+            place = variants[base] = variants.get(base, 0 if base in unique else -1) + 1
             marker, dashes = _VARIANTS[place % len(_VARIANTS)]
             found[label] = replace(_STYLES[base], marker=marker, dashes=dashes)  # type: ignore[arg-type]
         else:

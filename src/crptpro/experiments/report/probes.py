@@ -14,8 +14,8 @@ from crptpro.experiments.report.reading import Asked
 MEASURES = {
     "r2_position": ("R2 of positions", ".3f"),
     "r2_velocity": ("R2 of velocities", ".3f"),
-    "effective_rank": ("Effective rank of the embeddings", ".1f"),
-    "mean_cosine": ("Mean pairwise cosine of the embeddings", ".4f"),
+    "effective_rank": ("Effective rank", ".1f"),
+    "mean_cosine": ("Mean pairwise cosine", ".4f"),
 }
 """Measure of a probe's table to what it is and how it is printed."""
 
@@ -44,7 +44,7 @@ def _table(rows: Sequence[Row], measure: str, embedding: str) -> Table:
             lines.append(cells(label, group or ABSENT, *(_cell(own, column, spec) for column in columns)))
     headings = [domain if colors == "normal" else f"{domain}, {colors}" for domain, colors in columns]
     what = "features of the frozen encoder" if embedding == "features" else f"embedding {embedding}"
-    caption = f"{name}, {what}: mean over encoders (n), domains that pre-training saw and did not see."
+    caption = f"{name}, {what}: mean over encoders (n), and whether their pre-training saw the domain."
     return Table(caption, ("encoder", "group", *headings), tuple(lines), labels=2)
 
 

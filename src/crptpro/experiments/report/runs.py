@@ -102,6 +102,7 @@ def tables_of(
     placed: Iterable[Placed], *, score: Callable[[Run], float] = lambda run: run.final_score
 ) -> dict[str, ScoreTable]:
     """Sort runs into one table per label, keyed by :class:`Spot`."""
+    placed = list(placed)
     labels: dict[int, Placed] = {}
     runs = []
     for p in placed:
@@ -113,7 +114,7 @@ def tables_of(
         return labels[id(run)].spot
 
     found = score_tables(runs, score=score, key=key)
-    return {label: found[label] for label in in_order(found)}
+    return {label: found[label] for label in labels_of(placed)}
 
 
 def published(spot: Spot, label: str) -> Score | None:

@@ -109,7 +109,7 @@ def _budgets(placed: Sequence[Placed]) -> Paragraph:
         "for the (S) methods in these tables."
     )
     if any(budget < ENV_STEPS for budget in budgets):
-        text += " Numbers of a smaller budget are not comparable with the paper's; both are shown to be looked at."
+        text += " Scores of a smaller budget do not compare with the paper's."
     return Paragraph(text, "note")
 
 

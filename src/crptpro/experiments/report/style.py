@@ -33,7 +33,8 @@ figure.drawing .sheet > svg { min-width:min(34rem, 100%); }
 table { border-collapse:collapse; font-size:.9rem; font-variant-numeric:tabular-nums; }
 th, td { text-align:right; vertical-align:top; padding:.32rem .7rem; border-bottom:1px solid var(--rule);
   white-space:nowrap; }
-thead th { font-weight:600; border-bottom:1.5px solid var(--dim); vertical-align:bottom; }
+thead th { font-weight:600; border-bottom:1.5px solid var(--dim); vertical-align:bottom; white-space:normal;
+  min-width:3.5rem; max-width:8.5rem; }
 tbody th { font-weight:500; }
 .name { text-align:left; }
 tbody tr:hover { background:var(--soft); }
