@@ -113,7 +113,7 @@ def test_every_figure_says_how_many_runs_it_shows(blocks: tuple) -> None:
 
 def test_what_is_missing_is_counted_named_and_not_made_up(tmp_path: Path) -> None:
     blocks = blocks_of(page_of(fill(tmp_path, label="atc", task="walker_run").root), "seen-small")
-    assert "20 of 24 numbers are there; missing: atc 4" in words(blocks)
+    assert "20 of 24 pieces are there; missing: atc 4" in words(blocks)
     missing = table_in(blocks, "Not finished")
     assert [row[0].text for row in missing.rows] == ["atc"] * 4
     assert all("task walker_run" in row[1].text and row[2].text == "not begun" for row in missing.rows)
@@ -188,7 +188,7 @@ def test_time_leaves_out_the_pause_of_a_run_that_was_continued(tmp_path: Path) -
     straight, continued = (active_seconds(read_run(tmp_path / name)) for name in ("straight", "continued"))
     assert straight[20_000] == pytest.approx(3600)
     assert straight[10_000] == continued[10_000] == pytest.approx(1800)
-    assert continued[20_000] == pytest.approx(3240)  # without the distance that the pause is a part of
+    assert continued[20_000] == pytest.approx(3600)
 
 
 def test_curves_are_compared_where_all_runs_were_evaluated(tmp_path: Path) -> None:

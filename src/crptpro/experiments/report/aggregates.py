@@ -66,7 +66,7 @@ def _tables(tables: Mapping[str, ScoreTable], shared: Sequence[Spot], bootstrap:
     how = f"{bootstrap.replicates:,} stratified bootstrap replicates, seed {bootstrap.seed}"
     rows = []
     for label, table in tables.items():
-        row = [label, *_counts(table)]
+        row: list[str | Cell] = [label, *_counts(table)]
         row.append(
             _with_interval(
                 estimate(table.scores, mean, bootstrap=bootstrap), ".0f", _paper_mean(shared, label)

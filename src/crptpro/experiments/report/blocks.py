@@ -149,7 +149,9 @@ def cells(*values: str | Cell) -> tuple[Cell, ...]:
 
 def facts(caption: str, pairs: dict[str, str]) -> Table:
     """Return a table of names and values."""
-    return Table(caption, ("what", "value"), tuple(cells(name, value) for name, value in pairs.items()))
+    return Table(
+        caption, ("what", "value"), tuple(cells(name, value) for name, value in pairs.items()), labels=2
+    )
 
 
 def figures_of(blocks: tuple[Block, ...]) -> list[Figure]:

@@ -73,7 +73,7 @@ def _card(piece: Made, pieces: Mapping[str, Made]) -> Fold:
     for name, value in piece.description.items():
         if name != "kind":
             rows += _described(name, value, pieces)
-    blocks: list[Block] = [Table("Description", ("what", "value"), tuple(rows))]
+    blocks: list[Block] = [Table("Description", ("what", "value"), tuple(rows), labels=2)]
     if card := dict(_flat(_artifact_card(piece))):
         blocks.append(facts("Card of what it left", card))
     return Fold(piece.key, tuple(blocks), anchor_of(piece.key))

@@ -67,7 +67,7 @@ def theme() -> Iterator[None]:
     """Draw and save with this report's look."""
     import matplotlib
 
-    look = {
+    look: Any = {
         "svg.fonttype": "none",
         "svg.hashsalt": "crptpro",  # the same numbers give the same file
         "font.size": 9,
@@ -179,7 +179,7 @@ def scatter(
     """
     with theme():
         figure, axes = _grid(len(pairs), 3, height=3.3)
-        named = {}
+        named: dict[str, Any] = {}
         for axis, (first, second) in zip(axes, pairs):
             for label, (style, points) in clouds.items():
                 drawn = axis.plot(

@@ -42,6 +42,7 @@ def inline_svg(text: str, name: str) -> str:
         text = text.replace(color, page)
     tag, rest = text.split(">", 1)
     width = re.search(r'\bwidth="([\d.]+)pt"', tag)
-    points = float(width[1]) if width else 480.0
+    pixels = (float(width[1]) if width else 480.0) * 4 / 3
     tag = re.sub(r'\s(width|height)="[^"]*"', "", tag)
-    return f'{tag} style="width:{points * 4 / 3:.0f}px">{rest}'
+    # Below three quarters its letters are too small to read: then it scrolls.
+    return f'{tag} style="width:{pixels:.0f}px;min-width:{0.75 * pixels:.0f}px">{rest}'

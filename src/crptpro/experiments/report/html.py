@@ -99,7 +99,7 @@ def _bullets(block: Bullets) -> str:
 
 def _table(block: Table) -> str:
     head = "".join(
-        f'<th scope="col"{_name(index, block)}>{escape(column)}</th>'
+        f'<th scope="col"{_name(index, block)}>{_words(column)}</th>'
         for index, column in enumerate(block.columns)
     )
     body = "\n".join(
@@ -107,13 +107,18 @@ def _table(block: Table) -> str:
         for row in block.rows
     )
     # Facts hold sentences and paths, tables of numbers must not break.
-    longest = max((len(cell.text) for row in block.rows for cell in row[block.labels :]), default=0)
+    longest = max((len(cell.text) for row in block.rows for cell in row), default=0)
     wide = ' class="wide"' if longest > 40 else ""
     return (
         f'<figure class="table"><figcaption>{escape(block.caption)}</figcaption><div class="sheet" tabindex="0" '
         f'role="region" aria-label="{escape(block.caption)}"><table{wide}>\n<thead><tr>{head}</tr></thead>\n'
         f"<tbody>\n{body}\n</tbody></table></div></figure>"
     )
+
+
+def _words(heading: str) -> str:
+    """A heading may break between words, and not at the hyphens of a method's name."""
+    return " ".join(f"<span>{escape(word)}</span>" for word in heading.split())
 
 
 def _name(index: int, block: Table) -> str:

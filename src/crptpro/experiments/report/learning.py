@@ -55,8 +55,8 @@ def learning_curves(placed: Sequence[Placed], name: str, bootstrap: Bootstrap) -
         Figure(
             f"{name}-curves-time",
             "The same against the time since a run's first record, mean over runs (n in the legend). Pauses of a run "
-            "that was continued do not count: whatever is longer than ten minutes and than twenty usual distances "
-            "between records. Runs that shared a machine slowed each other down.",
+            "that was continued do not count: what is longer than ten minutes and than twenty usual distances between "
+            "records counts as one of these. Runs that shared a machine slowed each other down.",
             drawing.lines(by_hours),
         ),
     ]
@@ -73,7 +73,8 @@ def active_seconds(run: Run) -> dict[int, float]:
     """Return how long a run had been at work when each of its evaluations was recorded.
 
     Time counts from the first record; a pause between two records that is longer than ten minutes and than twenty
-    times their median distance is taken for the time in which an interrupted run did not run.
+    times their median distance is taken for the time in which an interrupted run did not run, and counts as one usual
+    distance.
 
     Args:
         run: as read.
@@ -86,7 +87,7 @@ def active_seconds(run: Run) -> dict[int, float]:
     distances = np.diff(marks)
     usual = np.median(distances[distances > 1]) if (distances > 1).any() else 0.0
     is_pause = distances > max(PAUSE_S, PAUSE_FACTOR * usual)
-    worked = np.concatenate([[0.0], np.cumsum(np.where(is_pause, 0.0, distances))])
+    worked = np.concatenate([[0.0], np.cumsum(np.where(is_pause, usual, distances))])
     return {at: float(worked[np.searchsorted(marks, end)]) for at, end in ends.items()}
 
 

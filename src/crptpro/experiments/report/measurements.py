@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,7 +20,8 @@ SPREAD = {"kne_3": "KNE, k = 3", "kne_half": "KNE, k = M/2", "ane": "ANE", "intr
 RANDOM = "random policy"
 
 
-class Row(NamedTuple):
+@dataclass(frozen=True)
+class Row:
     """A row of a measurement, with the goal that it belongs to."""
 
     goal: Wanted

@@ -106,8 +106,12 @@ def provenance(source: Source) -> tuple[Block, ...]:
     versions = [json.loads(text) for text, _ in found.most_common()]
     packages = list(dict.fromkeys(name for version in versions for name in version))
     columns = (
-        "package",
-        *(f"set {i + 1}: {count} piece(s)" for i, (_, count) in enumerate(found.most_common())),
+        ("package", "version")
+        if len(versions) == 1
+        else (
+            "package",
+            *(f"set {i + 1}: {count} piece(s)" for i, (_, count) in enumerate(found.most_common())),
+        )
     )
     rows = tuple(cells(name, *(version.get(name, ABSENT) for version in versions)) for name in packages)
     blocks.append(Table("Versions", columns, rows))
@@ -118,7 +122,7 @@ def progress(asked: Asked, pieces: Mapping[str, Made]) -> tuple[Block, ...]:
     """Say how much of an experiment is there, and name what is not."""
     missing = asked.missing
     if not missing:
-        return (Paragraph(f"All {len(asked.goals)} numbers that were asked for are there."),)
+        return (Paragraph(f"Complete: all that was asked for is there ({len(asked.goals)} pieces)."),)
     counts = ", ".join(f"{label} {n}" for label, n in Counter(goal.label for goal in missing).items())
     rows = tuple(
         cells(
@@ -129,10 +133,10 @@ def progress(asked: Asked, pieces: Mapping[str, Made]) -> tuple[Block, ...]:
         )
         for goal in missing
     )
-    table = Table("Not finished", ("system", "where", "state", "piece"), rows, labels=2)
+    table = Table("Not finished", ("system", "where", "state", "piece"), rows, labels=4)
     return (
         Paragraph(
-            f"{len(asked.finished)} of {len(asked.goals)} numbers are there; missing: {counts}. Nothing stands in for "
+            f"{len(asked.finished)} of {len(asked.goals)} pieces are there; missing: {counts}. Nothing stands in for "
             "what is missing.",
             "warning",
         ),

@@ -125,7 +125,7 @@ def make_page(source: Source, bootstrap: Bootstrap) -> Page:
 def _experiment(asked: Asked, source: Source, bootstrap: Bootstrap) -> Section:
     title = f"{TITLES.get(asked.experiment, asked.experiment)} ({asked.scale})"
     if not asked.finished:
-        text = f"Nothing of `{asked.experiment}` is finished yet: {len(asked.goals)} numbers were asked for."
+        text = f"Nothing is finished yet: {len(asked.goals)} pieces were asked for."
         return Section(title, (Paragraph(text),), asked.name)
     blocks: tuple[Block, ...] = progress(asked, source.pieces)
     try:

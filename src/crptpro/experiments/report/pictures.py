@@ -67,7 +67,7 @@ def videos(placed: Iterable[Placed]) -> tuple[Block, ...]:
     newest: dict[str, Path] = {}
     for p in placed:
         found = sorted((p.run.directory / "videos").glob("*.mp4"))
-        if found:
+        if found and found[-1] not in newest.values():  # two variants may be one run
             newest.setdefault(f"{p.label} on {p.spot}", found[-1])
     if not newest:
         return ()
@@ -107,8 +107,9 @@ def stills(path: Path, count: int = STILLS) -> list[np.ndarray]:
     """
     import imageio.v2 as imageio
 
-    with imageio.get_reader(path, format="FFMPEG") as reader:  # type: ignore[arg-type]
-        length = int(reader.count_frames())  # type: ignore[attr-defined]
+    opened: Any = imageio.get_reader(path, format="FFMPEG")  # type: ignore[arg-type]
+    with opened as reader:
+        length = int(reader.count_frames())
         wanted = set(np.linspace(0, max(length - 1, 0), min(count, max(length, 1))).astype(int).tolist())
         pictures = [np.asarray(picture) for at, picture in enumerate(reader) if at in wanted]
     if not pictures:

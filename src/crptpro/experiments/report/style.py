@@ -29,17 +29,17 @@ figure .sheet, figure.table .sheet { overflow-x:auto; }
 figcaption { color:var(--dim); font-size:.9rem; margin:.4rem 0; max-width:46rem; }
 figure.table figcaption { color:var(--ink); font-weight:600; }
 figure svg, figure img { display:block; max-width:100%; height:auto; color:var(--ink); }
-figure.drawing .sheet > svg { min-width:min(34rem, 100%); }
 table { border-collapse:collapse; font-size:.9rem; font-variant-numeric:tabular-nums; }
 th, td { text-align:right; vertical-align:top; padding:.32rem .7rem; border-bottom:1px solid var(--rule);
   white-space:nowrap; }
-thead th { font-weight:600; border-bottom:1.5px solid var(--dim); vertical-align:bottom; white-space:normal;
-  min-width:3.5rem; max-width:8.5rem; }
+thead th { font-weight:600; border-bottom:1.5px solid var(--dim); vertical-align:bottom; white-space:normal; }
+thead th span { white-space:nowrap; }
 tbody th { font-weight:500; }
 .name { text-align:left; }
 tbody tr:hover { background:var(--soft); }
 td:first-child, th:first-child { padding-left:.1rem; }
-.wide td { white-space:normal; overflow-wrap:anywhere; min-width:9rem; max-width:34rem; }
+.wide td, .wide tbody th { white-space:normal; font-weight:400; overflow-wrap:anywhere; min-width:9rem;
+  max-width:34rem; }
 td small { display:block; color:var(--dim); font-size:.82em; line-height:1.35; }
 details { margin:.5rem 0; border:1px solid var(--rule); border-radius:4px; padding:.35rem .8rem; max-width:100%; }
 details[open] { padding-bottom:.6rem; }
