@@ -159,9 +159,9 @@ def test_coverage_probe_stability_and_study_have_their_numbers(page: Page) -> No
     last = np.mean([np.log(128) * (1 - (updates - 200) / 1000) for updates in (920, 940, 960, 980, 1000)])
     assert cell(finals, "comparative loss [nats]", "crptpro").text == f"{last:.4g}"
     tried = blocks_of(page, "study-small")
-    assert cell(table_in(tried, "Diagnostics at the end"), "encoders", "0.05").text == "2"
+    assert cell(table_in(tried, "diagnostics at the end"), "encoders", "0.05").text == "2"
     assert (
-        cell(table_in(tried, "State probe"), "walker, features, velocities", "annealed").text
+        cell(table_in(tried, "state probe"), "walker, features, velocities", "annealed").text
         == "0.400 ± 0.000"
     )
 

@@ -13,6 +13,13 @@ ABSENT = "\N{EN DASH}"
 
 
 @dataclass(frozen=True)
+class Heading:
+    """The title of a part of a section."""
+
+    text: str
+
+
+@dataclass(frozen=True)
 class Paragraph:
     """A few sentences.
 
@@ -110,7 +117,7 @@ class Fold:
     anchor: str = ""
 
 
-Block = Paragraph | Bullets | Table | Figure | Fold
+Block = Heading | Paragraph | Bullets | Table | Figure | Fold
 
 
 @dataclass(frozen=True)
@@ -145,6 +152,16 @@ def cells(*values: str | Cell) -> tuple[Cell, ...]:
         'walker_run'
     """
     return tuple(value if isinstance(value, Cell) else Cell(value) for value in values)
+
+
+def sentence(text: str) -> str:
+    """Return a text with a capital at its beginning.
+
+    Examples:
+        >>> sentence("group A: diagnostics.")
+        'Group A: diagnostics.'
+    """
+    return text[:1].upper() + text[1:]
 
 
 def facts(caption: str, pairs: dict[str, str]) -> Table:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from crptpro.experiments.report import drawing
-from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Figure, Paragraph, Table, cells
+from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Figure, Paragraph, Table, cells, sentence
 from crptpro.experiments.report.palette import in_order, styles
 from crptpro.experiments.report.reading import Asked, Wanted, number, read_table
 
@@ -84,8 +84,8 @@ def diagnostics(records: Sequence[Record], name: Naming, heading: str, figure: s
     panels = [panel for column in DRAWN if (panel := _panel(records, column, name)).lines]
     blocks: list[Block] = []
     if panels:
-        caption = f"{of}Diagnostics along pre-training, a line per encoder (n in the legend)."
-        blocks.append(Figure(figure, caption, drawing.lines(panels)))
+        caption = f"{of}diagnostics along pre-training, a line per encoder (n in the legend)."
+        blocks.append(Figure(figure, sentence(caption), drawing.lines(panels)))
     return [*blocks, _finals(records, name, heading, of)]
 
 
@@ -115,9 +115,9 @@ def _finals(records: Sequence[Record], name: Naming, heading: str, of: str) -> T
         updates = " or ".join(f"{at:,.0f}" for at in sorted(reached))
         lines.append(cells(label, str(len(own)), updates, *(_final(own, column) for column in NAMES)))
     caption = (
-        f"{of}Diagnostics at the end of pre-training, mean of the last {WINDOW} rows, then over encoders."
+        f"{of}diagnostics at the end of pre-training, mean of the last {WINDOW} rows, then over encoders."
     )
-    return Table(caption, (heading, "encoders", "updates", *NAMES.values()), tuple(lines))
+    return Table(sentence(caption), (heading, "encoders", "updates", *NAMES.values()), tuple(lines))
 
 
 def _final(records: Sequence[list[dict[str, str]]], column: str) -> Cell:
@@ -134,4 +134,4 @@ def _dashed(group: str) -> str:
 
 
 def _of(group: str) -> str:
-    return f"Group {group}. " if group else ""
+    return f"group {group}: " if group else ""

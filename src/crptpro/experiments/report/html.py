@@ -13,6 +13,7 @@ from crptpro.experiments.report.blocks import (
     Cell,
     Figure,
     Fold,
+    Heading,
     Page,
     Paragraph,
     Section,
@@ -75,6 +76,7 @@ def _section(section: Section, figures: Mapping[str, Saved]) -> str:
 
 def _block(block: Block, figures: Mapping[str, Saved]) -> str:
     renderers: dict[type, Callable[..., str]] = {
+        Heading: lambda block: f"<h3>{escape(block.text)}</h3>",
         Paragraph: _paragraph,
         Bullets: _bullets,
         Table: _table,

@@ -3,7 +3,17 @@
 from __future__ import annotations
 
 from crptpro.experiments.markdown import markdown_table
-from crptpro.experiments.report.blocks import Block, Bullets, Cell, Figure, Fold, Page, Paragraph, Table
+from crptpro.experiments.report.blocks import (
+    Block,
+    Bullets,
+    Cell,
+    Figure,
+    Fold,
+    Heading,
+    Page,
+    Paragraph,
+    Table,
+)
 
 
 def markdown_page(page: Page, *, figures: str = "figures") -> str:
@@ -21,6 +31,8 @@ def markdown_page(page: Page, *, figures: str = "figures") -> str:
 
 
 def _block(block: Block, figures: str) -> str:
+    if isinstance(block, Heading):
+        return f"### {_text(block.text)}"
     if isinstance(block, Paragraph):
         text = _text(block.text)
         return f"> {text}" if block.tone == "warning" else text

@@ -76,7 +76,7 @@ def styles(labels: Iterable[str]) -> dict[str, Style]:
             marker, dashes = _VARIANTS[place % len(_VARIANTS)]
             found[label] = replace(_STYLES[base], marker=marker, dashes=dashes)  # type: ignore[arg-type]
         else:
-            marker, dashes = _VARIANTS[others // len(free) % len(_VARIANTS)]
+            marker, dashes = _VARIANTS[others % len(_VARIANTS)]
             found[label] = Style(free[others % len(free)], marker, dashes)  # type: ignore[arg-type]
             others += 1
     return found

@@ -107,7 +107,7 @@ def stills(path: Path, count: int = STILLS) -> list[np.ndarray]:
     """
     import imageio.v2 as imageio
 
-    opened: Any = imageio.get_reader(path, format="FFMPEG")  # type: ignore[arg-type]
+    opened: Any = imageio.get_reader(path, format="FFMPEG")
     with opened as reader:
         length = int(reader.count_frames())
         wanted = set(np.linspace(0, max(length - 1, 0), min(count, max(length, 1))).astype(int).tolist())

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from crptpro.experiments.report import drawing
-from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Figure, Table
+from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Figure, Heading, Table, sentence
 from crptpro.experiments.report.diagnostics import diagnostics, group_of, groups_of, records_of
 from crptpro.experiments.report.measurements import Row, rows_of
 from crptpro.experiments.report.palette import in_order, styles
@@ -33,8 +33,11 @@ def study(asked: Asked) -> tuple[Block, ...]:
             continue
         goals = [goal for goal in asked.finished if _factor(goal) == factor]
         for group in groups_of(goals):
-            of = ", ".join(part for part in (factor, f"group {group}" * bool(group)) if part)
-            of = f"{of[0].upper()}{of[1:]}. " if of else ""
+            of = ", ".join(part for part in (_words(factor), f"group {group}" * bool(group)) if part)
+            if of:
+                blocks.append(Heading(sentence(of)))
+                of = f"{of}: "
+            heading = _words(factor) or "variant"
             name = f"{asked.name}-{number + 1}{group}"
             own = [
                 (goal, rows) for goal, rows in records if (_factor(goal), group_of(goal)) == (factor, group)
@@ -45,9 +48,9 @@ def study(asked: Asked) -> tuple[Block, ...]:
                 if _factor(row.goal) in (factor, CONTROL) and group_of(row.goal) == group
             ]
             if own:
-                blocks += diagnostics(own, _value, factor or "variant", name, of)
+                blocks += diagnostics(own, _value, heading, name, of)
             if read:
-                blocks.append(_table(read, factor or "variant", of))
+                blocks.append(_table(read, heading, of))
                 blocks += _along(read, f"{name}-probe", of)
     return tuple(blocks)
 
@@ -57,6 +60,7 @@ def _table(rows: Sequence[Row], heading: str, of: str) -> Table:
     ends = [row for row in rows if _updates(row) == last[_encoder(row)]]
     columns = list(dict.fromkeys(_column(row) for row in ends))
     lines = []
+    ends.sort(key=lambda row: _factor(row.goal) == CONTROL)
     for label in in_order(_value(row.goal) for row in ends):
         line = [Cell(label)]
         for column in columns:
@@ -66,8 +70,8 @@ def _table(rows: Sequence[Row], heading: str, of: str) -> Table:
             told = Cell(f"{np.mean(values):.3f}{spread}", f"n = {len(values)}") if values else Cell(ABSENT)
             line.append(told)
         lines.append(tuple(line))
-    caption = f"{of}State probe at the end: R2 on held-out episodes, mean over encoders (n)."
-    return Table(caption, (heading, *columns), tuple(lines))
+    caption = f"{of}state probe at the end, R2 on held-out episodes, mean over encoders (n)."
+    return Table(sentence(caption), (heading, *columns), tuple(lines))
 
 
 def _along(rows: Sequence[Row], name: str, of: str) -> list[Block]:
@@ -95,12 +99,16 @@ def _along(rows: Sequence[Row], name: str, of: str) -> list[Block]:
         panels.append(
             drawing.Panel(column.split(",")[0], "encoder updates", "R2 of velocities", curves, marks)
         )
-    caption = f"{of}State probe of the features along training, mean over encoders (n in the legend)."
-    return [Figure(name, caption, drawing.lines(panels, columns=2))]
+    caption = f"{of}state probe of the features along training, mean over encoders (n in the legend)."
+    return [Figure(name, sentence(caption), drawing.lines(panels, columns=2))]
 
 
 def _factor(goal: Wanted) -> str:
     return str(goal.place.get("factor", ""))
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def _value(goal: Wanted) -> str:

@@ -15,6 +15,7 @@ main, header, nav { max-width:76rem; margin:0 auto; padding:0 1.25rem; }
 header { padding-top:2.2rem; }
 h1 { font-size:1.75rem; line-height:1.2; margin:0 0 .5rem; letter-spacing:-.01em; }
 h2 { font-size:1.3rem; line-height:1.25; margin:0 0 .75rem; padding-top:2.2rem; border-top:1px solid var(--rule); }
+h3 { font-size:1.08rem; margin:2rem 0 .5rem; }
 section { margin-top:2.4rem; }
 p, ul { max-width:46rem; margin:.6rem 0; overflow-wrap:anywhere; }
 ul { padding-left:1.2rem; }
