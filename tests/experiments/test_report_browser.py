@@ -13,6 +13,8 @@ from matplotlib.image import imread
 
 from crptpro.experiments.report.html import POLICY
 
+pytestmark = pytest.mark.slow  # the page with everything takes a while to be made
+
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
 DARK, LIGHT = 0, 1
 """What Chromium calls the two colour schemes."""

@@ -21,6 +21,8 @@ from crptpro.experiments.report import build_report
 from crptpro.experiments.report.blocks import Page
 from crptpro.experiments.scales import SMALL
 
+pytestmark = pytest.mark.slow  # the page with everything takes a while to be made
+
 FIGURES = 30
 """At least so many figures has a page with every experiment."""
 

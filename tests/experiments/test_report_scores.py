@@ -206,7 +206,14 @@ def test_any_directory_of_runs_gives_scores_and_curves(tmp_path: Path) -> None:
             tmp_path / f"mine_{seed}", method="crptpro", task="walker_run", score=200 + 100 * seed, seed=seed
         )
         write_run(tmp_path / f"drq_{seed}", method="drq", task="walker_run", score=100, seed=seed)
+    write_run(tmp_path / "going_on", method="crptpro", task="walker_run", score=900, seed=2)
+    config = (tmp_path / "going_on" / "config.json").read_text()
+    (tmp_path / "going_on" / "config.json").write_text(config.replace("20000", "40000"))
     page = page_of(tmp_path)
+    assert "going_on is not finished: 20,000 of 40,000 env steps" in words(blocks_of(page, "contents"))
+    assert "Made on A CPU, 2 cores, 24 GiB, no GPU, from source revision 0123456789ab" in words(
+        blocks_of(page, "contents")
+    )
     blocks = blocks_of(page, "scores")
     assert cell(table_in(blocks, FINAL), "crptpro", "walker_run").text == "250 ± 71"
     assert cell(table_in(blocks, FINAL), "crptpro", "walker_run").published == ""

@@ -61,8 +61,13 @@ def contents(source: Source) -> tuple[Block, ...]:
                 "DrQ's, which do not depend on it, stand beside."
             )
         )
+    machines = dict.fromkeys(_machine(record.get("hardware") or {}) for record in source.provenance)
+    revisions = dict.fromkeys(str(record.get("git_revision", "unknown")) for record in source.provenance)
+    if machines:
+        text = f"Made on {'; '.join(machines)}, from source revision {', '.join(revisions)}; versions are at the end."
+        blocks.append(Paragraph(text))
     if source.problems:
-        blocks += [Paragraph("Could not be read:", "warning"), Bullets(source.problems)]
+        blocks += [Paragraph("Left out:", "warning"), Bullets(source.problems)]
     return tuple(blocks)
 
 

@@ -144,7 +144,13 @@ def read_source(root: str | Path) -> Source:
             problems.append(f"{path} is no request of an experiment ({type(reason).__name__}: {reason}).")
     if asked:
         return Source(root, tuple(asked), pieces, problems=tuple(problems))
-    runs = find_runs(root)
+    found = find_runs(root, unfinished=True)
+    runs = [run for run in found if run.is_finished]
+    problems += [
+        f"{run.directory} is not finished: {run.episodes[-1].env_steps:,} of {run.env_steps:,} env steps."
+        for run in found
+        if not run.is_finished
+    ]
     if not runs:
         detail = f" {problems[0]}" if problems else ""
         raise RecordError(
