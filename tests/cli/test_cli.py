@@ -43,6 +43,7 @@ def encoder(tmp_path: Path) -> Path:
     (("downstream", "--algorithm", "skill-ddpg"), ["(default: skill-ddpg)", "--skill-ddpg.n-step", "(default: 2000)"]),
     (("drq",), ["--out", "(default: drq)", "(default: 1000000)", "(default: 0.001)"]),
     (("evaluate",), ["random-policy", "--task", "--episodes", "--csv", "--video", "--colors"]),
+    (("report",), ["--out", "--bootstrap-seed", "--replicates", "(default: 2000)", "DIRECTORY/report"]),
     (("probe",), ["random-encoder", "--samples", "--colors", "--csv", "(default: 2000)", "held-out"]),
 ])  # fmt: skip
 def test_help_names_every_argument(call: Call, command: tuple[str, ...], named: list[str]) -> None:

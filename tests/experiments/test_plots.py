@@ -40,14 +40,14 @@ def evaluations(tmp_path: Path) -> Path:
 def axes(monkeypatch: pytest.MonkeyPatch) -> list:
     """Every axis that is drawn on, for a look at what it shows."""
     drawn: list = []
-    make = plots._figure
+    make = plots.make_figure
 
     def spy(*args: object, **options: object) -> object:
         figure, grid = make(*args, **options)
         drawn.extend(grid.flat)
         return figure, grid
 
-    monkeypatch.setattr(plots, "_figure", spy)
+    monkeypatch.setattr(plots, "make_figure", spy)
     return drawn
 
 

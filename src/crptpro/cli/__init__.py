@@ -18,6 +18,7 @@ from crptpro.cli.originals import Export, Import
 from crptpro.cli.plugins import load_plugins
 from crptpro.cli.pretraining import Finetune, Pretrain
 from crptpro.cli.probe import Probe
+from crptpro.cli.report import Report
 from crptpro.cli.reproduce import Reproduce
 from crptpro.cli.request import expand_groups
 from crptpro.colors import Colors
@@ -95,6 +96,7 @@ def main() -> None:
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Probe, subcommand("probe")]
         | Annotated[Reproduce, subcommand("reproduce")]
+        | Annotated[Report, subcommand("report")]
         | Annotated[Import, subcommand("import")]
         | Annotated[Export, subcommand("export")]
     ]

@@ -34,7 +34,10 @@ def read_columns(path: str | Path, *columns: str) -> list[tuple[float, ...]]:
     return [tuple(float(row[c]) for c in columns) for row in rows if all(row.get(c) for c in columns)]
 
 
-def _figure(rows: int = 1, columns: int = 1, *, width: float = 6.0, height: float = 3.6) -> tuple[Any, Any]:
+def make_figure(
+    rows: int = 1, columns: int = 1, *, width: float = 6.0, height: float = 3.6
+) -> tuple[Any, Any]:
+    """Return a figure without a window, and its axes ``[rows, columns]``; sizes are a panel's, in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -57,7 +60,7 @@ def plot_pretraining(record: str | Path, out: str | Path, *, num_prototypes: int
     Raises:
         FileNotFoundError: there is no such record, or no directory for the picture.
     """
-    figure, axes = _figure(2, 2)
+    figure, axes = make_figure(2, 2)
     uniform = math.log(num_prototypes)
     panels: tuple[tuple[str, str, float | None], ...] = (
         ("comp", "comparative loss [nats]", uniform),
@@ -100,7 +103,7 @@ def plot_learning_curves(
     Raises:
         FileNotFoundError: there is no such record, or no directory for the picture.
     """
-    figure, axes = _figure(width=7)
+    figure, axes = make_figure(width=7)
     axis = axes[0, 0]
     for label, record in records.items():
         returns = defaultdict(list)
@@ -131,12 +134,35 @@ def plot_learning_curves(
     return Path(out)
 
 
-def plot_stacks(datasets: Mapping[str, ReplayBuffer], out: str | Path, *, stacks: int = 4) -> Path:
+def draw_stacks(datasets: Mapping[str, ReplayBuffer], *, stacks: int = 4) -> Any:
     """Show sampled observations, one domain a row: the pictures of each stack, oldest to newest, side by side.
 
     Args:
         datasets: domain name to replay buffer whose samples hold ``pixels`` uint8 ``[B, 3k, H, W]``. Their
             generators are left as they were.
+        stacks: observations per domain.
+
+    Returns:
+        Matplotlib's figure.
+    """
+    import torch
+
+    figure, axes = make_figure(len(datasets), stacks, width=2.6, height=1.15)
+    for row, (name, dataset) in zip(axes, datasets.items()):
+        pixels = sample_pixels(dataset, stacks, seed=0).cpu()  # (B, C, H, W)
+        for axis, stack in zip(row, pixels):
+            strip = torch.cat(list(stack.unflatten(0, (-1, 3))), -1)  # (3, H, W * frame_stack)
+            axis.imshow(strip.permute(1, 2, 0).numpy())
+            axis.set(xticks=[], yticks=[])
+        row[0].set_ylabel(name, fontsize=8)
+    return figure
+
+
+def plot_stacks(datasets: Mapping[str, ReplayBuffer], out: str | Path, *, stacks: int = 4) -> Path:
+    """Write what :func:`draw_stacks` shows.
+
+    Args:
+        datasets: as of :func:`draw_stacks`.
         out: picture to write (its suffix chooses the format).
         stacks: observations per domain.
 
@@ -146,17 +172,7 @@ def plot_stacks(datasets: Mapping[str, ReplayBuffer], out: str | Path, *, stacks
     Raises:
         FileNotFoundError: there is no directory for the picture.
     """
-    import torch
-
-    figure, axes = _figure(len(datasets), stacks, width=2.6, height=1.15)
-    for row, (name, dataset) in zip(axes, datasets.items()):
-        pixels = sample_pixels(dataset, stacks, seed=0).cpu()  # (B, C, H, W)
-        for axis, stack in zip(row, pixels):
-            strip = torch.cat(list(stack.unflatten(0, (-1, 3))), -1)  # (3, H, W * frame_stack)
-            axis.imshow(strip.permute(1, 2, 0).numpy())
-            axis.set(xticks=[], yticks=[])
-        row[0].set_ylabel(name, fontsize=8)
-    figure.savefig(out)
+    draw_stacks(datasets, stacks=stacks).savefig(out)
     return Path(out)
 
 
@@ -180,7 +196,7 @@ def plot_embeddings(embeddings: Mapping[str, Tensor], out: str | Path, *, title:
 
     points = torch.cat([part.cpu() for part in embeddings.values()])
     coordinates, explained = principal_components(points, components=2)
-    figure, axes = _figure(width=5, height=4.2)
+    figure, axes = make_figure(width=5, height=4.2)
     axis = axes[0, 0]
     for name, part in zip(embeddings, coordinates.split([len(e) for e in embeddings.values()])):
         axis.scatter(*part.T.numpy(), s=8, alpha=0.7, label=name)

@@ -1,0 +1,121 @@
+"""The card of every piece, closed until it is opened: what determines it, what made it, how long it took."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
+
+from crptpro.cards import read_json
+from crptpro.data.incoming import dataset_path
+from crptpro.errors import CRPTproError, RecordError
+from crptpro.experiments.pieces import piece_from_json
+from crptpro.experiments.records import Run
+from crptpro.experiments.report.blocks import Block, Cell, Fold, Table, cells, facts
+from crptpro.experiments.report.reading import Made
+
+LENGTHY = {"versions", "hardware", "modules", "crc32", "layout", "tensors", "records", "git_revision"}
+"""Entries of cards that a page has elsewhere, or that tell a reader nothing."""
+LONGEST = 160
+"""Characters of a value that is shown."""
+
+
+def anchor_of(key: str) -> str:
+    """Return the anchor of a piece's card."""
+    return f"piece-{key}"
+
+
+def piece_cards(pieces: Mapping[str, Made]) -> tuple[Block, ...]:
+    """Return one closed card per piece, by kind.
+
+    Args:
+        pieces: key to piece.
+    """
+    by_kind: dict[str, list[Made]] = {}
+    for piece in pieces.values():
+        by_kind.setdefault(piece.kind, []).append(piece)
+    return tuple(
+        Fold(f"{kind}: {len(own)} piece(s)", tuple(_card(piece, pieces) for piece in own))
+        for kind, own in by_kind.items()
+    )
+
+
+def run_cards(runs: Iterable[Run]) -> tuple[Block, ...]:
+    """Return one closed card per run of a directory that is no reproduction."""
+    found = []
+    for run in runs:
+        values = {"directory": str(run.directory), "encoder": run.encoder or "its own, or not recorded"}
+        values |= dict(_flat(run.config.get("config", {})))
+        title = f"{run.method} on {run.task}, seed {run.seed}"
+        found.append(Fold(title, (facts("Settings", values),)))
+    return tuple(found)
+
+
+def duration(seconds: float) -> str:
+    """Return a time in words.
+
+    Examples:
+        >>> duration(42.0), duration(3_725.0), duration(90_061.0)
+        ('42 s', '1 h 02 min', '25 h 01 min')
+    """
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    hours, minutes = divmod(round(seconds / 60), 60)
+    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min"
+
+
+def _card(piece: Made, pieces: Mapping[str, Made]) -> Fold:
+    rows = [cells("state", piece.state)]
+    if piece.done is not None:
+        if isinstance(seconds := piece.done.get("seconds"), (int, float)):
+            rows.append(cells("wall clock of the last attempt", duration(seconds)))
+        rows += [cells(f"job {name}", value) for name, value in _flat(piece.done.get("job", {}))]
+        rows.append(cells("git revision", str(piece.done.get("git_revision", "unknown"))))
+    for name, value in piece.description.items():
+        if name != "kind":
+            rows += _described(name, value, pieces)
+    blocks: list[Block] = [Table("Description", ("what", "value"), tuple(rows), labels=2)]
+    if card := dict(_flat(_artifact_card(piece))):
+        blocks.append(facts("Card of what it left", card))
+    return Fold(piece.key, tuple(blocks), anchor_of(piece.key))
+
+
+def _described(name: str, value: Any, pieces: Mapping[str, Made]) -> list[tuple[Cell, ...]]:
+    """Rows for a field; a piece within becomes a link to its card."""
+    parts = value if isinstance(value, list) else [value]
+    if parts and all(isinstance(part, Mapping) for part in parts):
+        return [cells(name, _link(part, pieces)) for part in parts]
+    if parts and all(isinstance(part, list) and len(part) == 2 for part in parts):
+        return [cells(f"{name} {key}", str(setting)) for key, setting in parts]
+    return [cells(name, ", ".join(str(part) for part in parts))]
+
+
+def _link(description: Mapping[str, Any], pieces: Mapping[str, Made]) -> Cell:
+    try:
+        key = piece_from_json(dict(description)).key
+    except RecordError:
+        return Cell(str(description.get("kind", "a piece")))
+    return Cell(key, anchor=anchor_of(key) if key in pieces else "")
+
+
+def _artifact_card(piece: Made) -> Mapping[str, Any]:
+    folder = {"dataset": "", "run": "agent"}.get(piece.kind, "encoder")
+    directory = piece.directory / folder
+    if piece.kind == "dataset":
+        directory = dataset_path(piece.directory, str(piece.description.get("domain")))
+    try:
+        return read_json(directory / "card.json", error=RecordError)
+    except CRPTproError:
+        return {}
+
+
+def _flat(content: Any, prefix: str = "", depth: int = 3) -> Iterator[tuple[str, str]]:
+    if not isinstance(content, Mapping):
+        return
+    for name, value in content.items():
+        if name in LENGTHY:
+            continue
+        if isinstance(value, Mapping):
+            if depth > 1:
+                yield from _flat(value, f"{prefix}{name} ", depth - 1)
+        elif value is not None and len(str(value)) <= LONGEST:
+            yield f"{prefix}{name}", str(value)

@@ -1,0 +1,112 @@
+"""What pre-training costs: hours and encoder updates by number of domains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from crptpro.experiments.published import EFFICIENCY
+from crptpro.experiments.report import drawing
+from crptpro.experiments.report.blocks import Block, Cell, Figure, Paragraph, Table, cells
+from crptpro.experiments.report.measurements import Row, mean_of, rows_of
+from crptpro.experiments.report.palette import in_order
+from crptpro.experiments.report.reading import Asked
+
+PAPER = {entry.method: entry for entry in EFFICIENCY}
+Timings = Mapping[tuple[str, int], Sequence[Row]]
+
+
+def efficiency(asked: Asked) -> tuple[Block, ...]:
+    """Hours and encoder updates of pre-training, by number of domains, beside the paper's on a P100."""
+    rows, blocks = rows_of(asked, "timing")
+    found: dict[tuple[str, int], list[Row]] = {}
+    for row in rows:
+        found.setdefault((row["method"], int(row.number("domains") or 0)), []).append(row)
+    if not found:
+        return tuple(blocks)
+    methods, counts = in_order(method for method, _ in found), sorted({count for _, count in found})
+    blocks += [_table(found, methods, counts), *_figures(asked.name, found, methods, counts)]
+    where = sorted(
+        {f"{row['device'] or 'device not recorded'}, {row['threads'] or '?'} thread(s)" for row in rows}
+    )
+    text = (
+        f"Timed on {'; '.join(where)} (hardware below). Hours are those of pre-training proper: environments that "
+        "explore are part of it, the collection of random datasets, which is done once for all, has its own column."
+    )
+    return (*blocks, Paragraph(text, "note"))
+
+
+def _table(found: Timings, methods: Sequence[str], counts: Sequence[int]) -> Table:
+    lines = []
+    for method in methods:
+        for count in counts:
+            if not (own := found.get((method, count))):
+                continue
+            hours, updates = _paper(method, count)
+            lines.append(
+                cells(
+                    method,
+                    str(count),
+                    Cell(mean_of(own, "seconds_per_update", 1, ".3g"), f"n = {len(own)}"),
+                    mean_of(own, "seconds_per_decision", 1, ".3g"),
+                    mean_of(own, "budget_updates", 1, ",.0f"),
+                    mean_of(own, "projected_hours", 1, ".3g"),
+                    mean_of(own, "collection_seconds", 1 / 3600, ".3g"),
+                    Cell(
+                        mean_of(own, "paper_updates", 1, ",.0f"),
+                        published="" if updates is None else f"{updates:,}",
+                    ),
+                    Cell(
+                        mean_of(own, "paper_projected_hours", 1, ".3g"),
+                        published="" if hours is None else f"{hours:g}",
+                    ),
+                )
+            )
+    columns = (
+        "method", "domains", "s per encoder update", "s per decision", "encoder updates at this scale",
+        "hours at this scale", "hours of collection", "encoder updates, paper's budget", "hours, paper's budget",
+    )  # fmt: skip
+    caption = (
+        "Pre-training by number of domains: some updates timed here (n timings), projected to whole budgets; the "
+        "paper's hours are those of an NVIDIA Tesla P100."
+    )
+    return Table(caption, columns, tuple(lines), labels=2)
+
+
+def _figures(name: str, found: Timings, methods: Sequence[str], counts: Sequence[int]) -> list[Block]:
+    most = max(counts)
+    timings = sum(len(own) for own in found.values())
+    hours: dict[str, list[float | None]] = {
+        f"projected here, {_domains(most)}": [
+            _mean(found, m, most, "paper_projected_hours") for m in methods
+        ],
+        f"paper on a P100, {_domains(most)}": [_paper(m, most)[0] for m in methods],
+    }
+    updates = {
+        _domains(count): [_mean(found, m, count, "paper_updates") for m in methods] for count in counts
+    }
+    caption = f"Hours of pre-training with the paper's budget for {_domains(most)}; {timings} timings of all counts."
+    return [
+        Figure(f"{name}-hours", caption, drawing.bars(methods, hours, "hours")),
+        Figure(
+            f"{name}-updates",
+            "Encoder updates of the paper's budget by number of domains.",
+            drawing.bars(methods, updates, "encoder updates"),
+        ),
+    ]
+
+
+def _paper(method: str, count: int) -> tuple[float | None, int | None]:
+    if method not in PAPER or count not in (1, 2, 3):
+        return None, None
+    return PAPER[method].hours[count - 1], PAPER[method].encoder_updates[count - 1]
+
+
+def _mean(found: Timings, method: str, count: int, column: str) -> float | None:
+    values = [value for row in found.get((method, count), ()) if (value := row.number(column)) is not None]
+    return float(np.mean(values)) if values else None
+
+
+def _domains(count: int) -> str:
+    return f"{count} domain" if count == 1 else f"{count} domains"

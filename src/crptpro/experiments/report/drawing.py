@@ -1,0 +1,251 @@
+"""Lines, bars, points and pictures, in colours that a page can turn to light or dark."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crptpro.experiments.plots import make_figure
+from crptpro.experiments.report.palette import Style
+
+INK, PAPER, RULE = "#1f2328", "#fefefd", "#d8dce1"
+"""Text, background and grid of the files; inline in a page they are the page's own."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A curve, with its interval if there is one.
+
+    Args:
+        label: in the legend.
+        style: of its system.
+        x: ``[K]``.
+        y: ``[K]``.
+        low: lower ends ``[K]``, or ``None``.
+        high: upper ends ``[K]``, or ``None``.
+    """
+
+    label: str
+    style: Style
+    x: ArrayLike
+    y: ArrayLike
+    low: ArrayLike | None = None
+    high: ArrayLike | None = None
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One pair of axes.
+
+    Args:
+        title: what distinguishes it from its neighbours.
+        x: name and unit of the horizontal axis.
+        y: of the vertical one.
+        lines: curves.
+        marks: heights of dashed lines, with what they say.
+        is_log: logarithmic vertical axis.
+        ticks: names of the places 0, 1, ... of the horizontal axis, instead of numbers.
+    """
+
+    title: str
+    x: str
+    y: str
+    lines: Sequence[Line]
+    marks: Mapping[str, float] = field(default_factory=dict)
+    is_log: bool = False
+    ticks: Sequence[str] = ()
+
+
+@contextlib.contextmanager
+def theme() -> Iterator[None]:
+    """Draw and save with this report's look."""
+    import matplotlib
+
+    look: Any = {
+        "svg.fonttype": "none",
+        "svg.hashsalt": "crptpro",  # the same numbers give the same file
+        "font.size": 9,
+        "text.color": INK, "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "axes.edgecolor": INK,
+        "figure.facecolor": PAPER, "axes.facecolor": PAPER, "savefig.facecolor": PAPER,
+        "axes.grid": True, "grid.color": RULE, "grid.linewidth": 0.6, "axes.axisbelow": True,
+        "axes.spines.top": False, "axes.spines.right": False,
+        "axes.titlesize": 9.5, "axes.titlelocation": "left", "axes.titleweight": "bold",
+        "legend.frameon": False,
+    }  # fmt: skip
+    with matplotlib.rc_context(look):
+        yield
+
+
+def lines(panels: Sequence[Panel], *, columns: int = 3) -> Any:
+    """Draw curves with one legend below.
+
+    Args:
+        panels: at least one.
+        columns: panels side by side, at most.
+
+    Returns:
+        Matplotlib's figure.
+    """
+    with theme():
+        figure, axes = _grid(len(panels), columns)
+        named: dict[str, Any] = {}
+        for axis, panel in zip(axes, panels):
+            for line in panel.lines:
+                drawn = _draw(axis, line)
+                named.setdefault(line.label, drawn)
+            for name, height in panel.marks.items():
+                mark = axis.axhline(height, color=INK, linestyle=(0, (4, 3)), linewidth=0.8)
+                named.setdefault(name, mark)
+            axis.set(xlabel=panel.x, ylabel=panel.y, title=panel.title)
+            if panel.ticks:
+                axis.set_xticks(range(len(panel.ticks)), panel.ticks)
+            if panel.is_log:
+                axis.set_yscale("log")
+            largest = max((float(np.max(line.x)) for line in panel.lines if np.size(line.x)), default=0)
+            if largest >= 10_000:
+                axis.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
+        _legend(figure, named)
+        return figure
+
+
+def bars(groups: Sequence[str], series: Mapping[str, Sequence[float | None]], unit: str) -> Any:
+    """Draw horizontal bars: a group of them per name, one per series, with their numbers.
+
+    Args:
+        groups: names, from top to bottom.
+        series: label to a length per group; ``None`` leaves a gap.
+        unit: of the lengths.
+    """
+    with theme():
+        height = 0.45 + 0.24 * len(groups) * max(len(series), 2)
+        figure, axes = make_figure(width=7.4, height=max(height, 2.0))
+        axis = axes[0, 0]
+        thickness = 0.8 / max(len(series), 1)
+        shades = ("#0b80c3", "#8a9099", "#109e77", "#d9640a")
+        for index, (label, lengths) in enumerate(series.items()):
+            places = [
+                row - 0.4 + thickness * (index + 0.5)
+                for row, length in enumerate(lengths)
+                if length is not None
+            ]
+            known = [length for length in lengths if length is not None]
+            drawn = axis.barh(places, known, thickness * 0.9, color=shades[index % len(shades)], label=label)
+            axis.bar_label(
+                drawn, [f"{_short(length)}" for length in known], padding=3, fontsize=7.5, color=INK
+            )
+        axis.set_yticks(range(len(groups)), groups)
+        axis.invert_yaxis()
+        axis.grid(visible=False, axis="y")
+        axis.set(xlabel=unit)
+        axis.margins(x=0.12)
+        _legend(figure, dict(zip(series, axis.containers)))
+        return figure
+
+
+def intervals(
+    rows: Sequence[tuple[str, Style, float, tuple[float, float] | None]], unit: str, mark: float
+) -> Any:
+    """Draw one probability and its interval a row, against a mark that means no difference."""
+    with theme():
+        figure, axes = make_figure(width=6.4, height=max(0.9 + 0.3 * len(rows), 1.6))
+        axis = axes[0, 0]
+        for place, (_, style, value, ends) in enumerate(rows):
+            if ends is not None:
+                axis.plot(ends, (place, place), color=style.color, linewidth=2.2, alpha=0.55)
+            axis.plot(value, place, marker=style.marker, color=style.color, markersize=6)
+        axis.axvline(mark, color=INK, linestyle=(0, (4, 3)), linewidth=0.8)
+        axis.set_yticks(range(len(rows)), [name for name, *_ in rows])
+        axis.set_ylim(len(rows) - 0.5, -0.5)
+        axis.set_xlim(-0.03, 1.03)
+        axis.set(xlabel=unit)
+        return figure
+
+
+def scatter(
+    clouds: Mapping[str, tuple[Style, np.ndarray]], names: Sequence[str], pairs: Sequence[tuple[int, int]]
+) -> Any:
+    """Draw points in several projections.
+
+    Args:
+        clouds: label to points ``[N, D]``.
+        names: of the dimensions.
+        pairs: which two dimensions each panel shows.
+    """
+    with theme():
+        figure, axes = _grid(len(pairs), 3, height=3.3)
+        named: dict[str, Any] = {}
+        for axis, (first, second) in zip(axes, pairs):
+            for label, (style, points) in clouds.items():
+                drawn = axis.plot(
+                    points[:, first], points[:, second], style.marker, color=style.color, markersize=3.2,
+                    alpha=0.65, markeredgewidth=0, linestyle="none",
+                )  # fmt: skip
+                named.setdefault(f"{label} ({len(points)} points)", drawn[0])
+            axis.set(xlabel=names[first], ylabel=names[second])
+        _legend(figure, named)
+        return figure
+
+
+def strips(rows: Mapping[str, Sequence[np.ndarray]], *, size: float = 1.0) -> Any:
+    """Show pictures ``[H, W, 3]`` in rows, each row with its name.
+
+    Args:
+        rows: name to its pictures, from left to right.
+        size: of a picture's side in inches.
+    """
+    with theme():
+        columns = max(len(pictures) for pictures in rows.values())
+        figure, axes = make_figure(len(rows), columns, width=size, height=size * 1.05)
+        for line, (name, pictures) in zip(axes, rows.items()):
+            for axis in line:
+                axis.set_axis_off()
+            for axis, picture in zip(line, pictures):
+                axis.imshow(picture, interpolation="nearest")
+            line[0].set_title(name, fontsize=8)
+        return figure
+
+
+def _grid(panels: int, most: int, *, height: float = 2.9) -> tuple[Any, list[Any]]:
+    columns = min(panels, most)
+    width = {1: 7.4, 2: 5.2}.get(columns, 3.7)
+    figure, axes = make_figure(math.ceil(panels / columns), columns, width=width, height=height)
+    flat = list(axes.flat)
+    for axis in flat[panels:]:
+        axis.set_axis_off()
+    return figure, flat
+
+
+def _draw(axis: Any, line: Line) -> Any:
+    x = np.asarray(line.x, dtype=float)
+    style = line.style
+    # A marker per point hides a long curve.
+    every = max(len(x) // 12, 1)
+    (drawn,) = axis.plot(
+        x, line.y, color=style.color, marker=style.marker, linestyle=style.dashes, markersize=3.6, markevery=every,
+        linewidth=1.5,
+    )  # fmt: skip
+    if line.low is not None and line.high is not None:
+        axis.fill_between(x, line.low, line.high, color=style.color, alpha=0.18, linewidth=0)
+    return drawn
+
+
+def _legend(figure: Any, named: Mapping[str, Any]) -> None:
+    """One legend for all panels, below them; the figure grows by what it takes."""
+    if not named:
+        return
+    width, height = figure.get_size_inches()
+    entry = 0.6 + 0.062 * max(len(name) for name in named)  # inches
+    columns = max(1, min(len(named), int(width / entry)))
+    rows = math.ceil(len(named) / columns)
+    figure.set_size_inches(width, height + 0.17 * rows + 0.1)
+    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=columns, fontsize=8)
+
+
+def _short(value: float) -> str:
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"

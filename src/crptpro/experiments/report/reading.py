@@ -1,0 +1,212 @@
+"""What a directory holds to report on: the pieces and requests of a reproduction, or runs that nobody planned."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from crptpro.cards import read_json
+from crptpro.errors import RecordError
+from crptpro.experiments.building import DESCRIPTION, DONE, PIECES
+from crptpro.experiments.records import Run, find_runs
+
+EXPERIMENTS = "experiments"
+
+
+@dataclass(frozen=True)
+class Made:
+    """A piece as it lies on disk, finished or not.
+
+    Args:
+        key: name of its directory.
+        directory: where it lies.
+        description: content of ``piece.json``; empty if there is none yet.
+        done: content of ``done.json``; ``None`` if it is not finished.
+    """
+
+    key: str
+    directory: Path
+    description: Mapping[str, Any]
+    done: Mapping[str, Any] | None
+
+    @property
+    def kind(self) -> str:
+        """Kind of piece, also of one that was not begun."""
+        return str(self.description.get("kind") or self.key.split("-", 1)[0])
+
+    @property
+    def state(self) -> str:
+        """How far it is, in words."""
+        if self.done is not None:
+            return "finished"
+        return "begun, not finished" if self.directory.is_dir() else "not begun"
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A goal of an experiment, with the piece that gives its number.
+
+    Args:
+        label: the system or variant.
+        place: where it stands otherwise.
+        piece: what gives its number.
+    """
+
+    label: str
+    place: Mapping[str, Any]
+    piece: Made
+
+    @property
+    def where(self) -> str:
+        """The place in words."""
+        return ", ".join(f"{name} {value}" for name, value in self.place.items())
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One experiment at one scale, as it was asked for.
+
+    Args:
+        experiment: its name.
+        scale: name of its scale.
+        goals: everything it asks for.
+    """
+
+    experiment: str
+    scale: str
+    goals: tuple[Wanted, ...]
+
+    @property
+    def name(self) -> str:
+        """For anchors and files, whatever the request calls itself."""
+        return re.sub(r"[^a-zA-Z0-9]+", "-", f"{self.experiment}-{self.scale}")
+
+    @property
+    def finished(self) -> list[Wanted]:
+        """Goals whose number can be read."""
+        return [goal for goal in self.goals if goal.piece.done is not None]
+
+    @property
+    def missing(self) -> list[Wanted]:
+        """Goals without a number yet."""
+        return [goal for goal in self.goals if goal.piece.done is None]
+
+
+@dataclass(frozen=True)
+class Source:
+    """What is reported on.
+
+    Args:
+        root: the directory.
+        asked: experiments, if it is that of a reproduction.
+        pieces: key to every piece below it.
+        runs: downstream runs of a directory that is none.
+        problems: what could not be read, a sentence each.
+    """
+
+    root: Path
+    asked: tuple[Asked, ...]
+    pieces: Mapping[str, Made]
+    runs: tuple[Run, ...] = ()
+    problems: tuple[str, ...] = ()
+
+    @cached_property
+    def provenance(self) -> list[Mapping[str, Any]]:
+        """Versions, hardware and revision of everything finished."""
+        records: list[Mapping[str, Any]] = [p.done for p in self.pieces.values() if p.done is not None]
+        return records + [run.config for run in self.runs]
+
+
+def read_source(root: str | Path) -> Source:
+    """Read a directory.
+
+    Args:
+        root: of a reproduction, or any directory with downstream runs in or below it.
+
+    Raises:
+        RecordError: there is no such directory, or nothing in it to report on.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise RecordError(f"There is no directory {root} to report on.")
+    problems: list[str] = []
+    pieces = _pieces(root, problems)
+    asked = []
+    for path in sorted((root / EXPERIMENTS).glob("*.json")):
+        try:
+            asked.append(_asked(root, path, pieces))
+        except (RecordError, KeyError, TypeError, AttributeError, ValueError) as reason:
+            problems.append(f"{path} is no request of an experiment ({type(reason).__name__}: {reason}).")
+    if asked:
+        return Source(root, tuple(asked), pieces, problems=tuple(problems))
+    found = find_runs(root, unfinished=True)
+    runs = [run for run in found if run.is_finished]
+    problems += [
+        f"{run.directory} is not finished: {run.episodes[-1].env_steps:,} of {run.env_steps:,} env steps."
+        for run in found
+        if not run.is_finished
+    ]
+    if not runs:
+        detail = f" {problems[0]}" if problems else ""
+        raise RecordError(
+            f"{root} holds nothing to report on: no experiment of `crptpro reproduce` ({EXPERIMENTS}/*.json) and no "
+            f"finished downstream run.{detail}"
+        )
+    return Source(root, (), pieces, tuple(runs), tuple(problems))
+
+
+def read_table(path: Path) -> list[dict[str, str]]:
+    """Read the rows of a measurement.
+
+    Raises:
+        RecordError: there is no such file, or it cannot be read.
+    """
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+    except FileNotFoundError:
+        raise RecordError(f"{path.parent.name} has no {path.name}, although it is finished.") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as reason:
+        raise RecordError(f"{path} cannot be read: {reason}.") from None
+
+
+def number(row: Mapping[str, str], column: str) -> float | None:
+    """Return a cell as a number; ``None`` for an empty or missing one, or no number at all."""
+    try:
+        return float(row[column])
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def _pieces(root: Path, problems: list[str]) -> dict[str, Made]:
+    found = {}
+    for directory in sorted(path for path in (root / PIECES).glob("*") if path.is_dir()):
+        try:
+            found[directory.name] = _made(directory)
+        except RecordError as reason:
+            problems.append(str(reason))
+            found[directory.name] = Made(directory.name, directory, {}, None)
+    return found
+
+
+def _made(directory: Path) -> Made:
+    description, done = (
+        read_json(directory / name, error=RecordError) if (directory / name).exists() else None
+        for name in (DESCRIPTION, DONE)
+    )
+    return Made(directory.name, directory, description or {}, done)
+
+
+def _asked(root: Path, path: Path, pieces: Mapping[str, Made]) -> Asked:
+    content = read_json(path, error=RecordError)
+    goals = []
+    for goal in content["goals"]:
+        key = str(goal["key"])
+        piece = pieces.get(key) or Made(key, root / PIECES / key, {}, None)
+        goals.append(Wanted(str(goal["label"]), dict(goal.get("place") or {}), piece))
+    return Asked(str(content["experiment"]), str(content["scale"]), tuple(goals))

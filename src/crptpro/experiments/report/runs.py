@@ -1,0 +1,148 @@
+"""The downstream runs of an experiment, each with where it stands, and what the paper printed for that place."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from crptpro.errors import RecordError
+from crptpro.experiments.published import COLORS, SEEN, UNSEEN, Score
+from crptpro.experiments.records import Run, read_run
+from crptpro.experiments.report.palette import in_order
+from crptpro.experiments.report.reading import Asked
+from crptpro.experiments.score_table import ScoreTable, score_tables
+
+LAST = 10
+"""Evaluations at the end that a steadier score averages over."""
+
+
+class Spot(NamedTuple):
+    """A row of a score table.
+
+    Args:
+        group: whose domains the encoder was pre-trained on; empty if it is not known.
+        task: what was learned.
+        colors: of its world; ``"normal"`` for the usual.
+    """
+
+    group: str
+    task: str
+    colors: str = "normal"
+
+    def __str__(self) -> str:
+        """Return e.g. ``A cheetah_run`` or ``C reach_duplo, reversed_background``."""
+        colors = "" if self.colors == "normal" else f", {self.colors}"
+        return f"{self.group} {self.task}{colors}".strip()
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A run, under the label that its row has.
+
+    Args:
+        label: the system or variant.
+        spot: which row of the table.
+        run: what was read.
+        varied: what a sensitivity study varies, with its value; empty otherwise.
+    """
+
+    label: str
+    spot: Spot
+    run: Run
+    varied: tuple[str, str] = ("", "")
+
+
+def placed_runs(asked: Asked) -> tuple[list[Placed], list[str]]:
+    """Read the finished runs of an experiment.
+
+    Returns:
+        The runs, and a sentence for each that is finished and cannot be read.
+    """
+    found, problems = [], []
+    for goal in asked.finished:
+        if goal.piece.kind != "run":
+            continue
+        try:
+            run = read_run(goal.piece.directory)
+            if not run.is_finished:
+                raise RecordError(f"{goal.piece.key} is called finished and has no evaluation at its end.")
+        except RecordError as reason:
+            problems.append(f"Left out: {reason}")
+            continue
+        place = goal.place
+        spot = Spot(str(place.get("group", "")), run.task, str(place.get("colors", "normal")))
+        varied = (str(place.get("varied", "")), str(place.get("value", "")))
+        found.append(Placed(goal.label, spot, run, varied))
+    return found, problems
+
+
+def unplaced_runs(runs: Iterable[Run]) -> list[Placed]:
+    """Give runs that no experiment asked for their own method as label; their group is not known."""
+    placed = []
+    for run in runs:
+        outer = run.config.get("config", {})
+        inner = outer.get("config", outer)
+        placed.append(Placed(run.method, Spot("", run.task, str(inner.get("colors", "normal"))), run))
+    return placed
+
+
+def labels_of(placed: Iterable[Placed]) -> list[str]:
+    """Return the labels in the order of tables."""
+    return in_order(p.label for p in placed)
+
+
+def spots_of(placed: Iterable[Placed]) -> list[Spot]:
+    """Return the rows by group, and within a group as they were asked for."""
+    return sorted(dict.fromkeys(p.spot for p in placed), key=lambda spot: spot.group)
+
+
+def tables_of(
+    placed: Iterable[Placed], *, score: Callable[[Run], float] = lambda run: run.final_score
+) -> dict[str, ScoreTable]:
+    """Sort runs into one table per label, keyed by :class:`Spot`."""
+    placed = list(placed)
+    labels: dict[int, Placed] = {}
+    runs = []
+    for p in placed:
+        run = dataclasses.replace(p.run, method=p.label)
+        labels[id(run)] = p
+        runs.append(run)
+
+    def key(run: Run) -> Hashable:
+        return labels[id(run)].spot
+
+    found = score_tables(runs, score=score, key=key)
+    return {label: found[label] for label in labels_of(placed)}
+
+
+def published(spot: Spot, label: str) -> Score | None:
+    """Return what the paper printed for a system at a place; ``None`` where it printed nothing.
+
+    Its tables have no control and no (S) methods. DrQ trains its own encoder, so that its score belongs to a task
+    whatever the group.
+    """
+    if label == "drq" and spot.colors == "normal":
+        return next((row.scores["drq"] for row in SEEN if row.task == spot.task), None)
+    rows = (*SEEN, *UNSEEN) if spot.colors == "normal" else COLORS
+    if spot.colors not in ("normal", "reversed_background"):
+        return None
+    return next(
+        (
+            row.scores[label]
+            for row in rows
+            if (row.group, row.task) == (spot.group, spot.task) and label in row.scores
+        ),
+        None,
+    )
+
+
+def printed(score: Score | None) -> str:
+    """Return a published score as the paper prints it; empty for none."""
+    return "" if score is None else f"{score.mean:g} ± {score.std:g}"
+
+
+def evaluations(run: Run) -> int:
+    """Number of evaluations of a run."""
+    return len({episode.env_steps for episode in run.episodes})
