@@ -22,8 +22,8 @@ class Reproduce:
     """Make an experiment of the paper again: print the plan, then make whatever is missing.
 
     Experiments: seen, unseen, colors, finetune, efficiency, ablation, sensitivity, prototypes, coverage, stability,
-    visualize, probe, or all. Whatever is finished, by this or another experiment, is used again; interrupted, the same
-    command continues. At the end `crptpro report ROOT` makes tables and figures of it.
+    visualize, probe, study, or all. Whatever is finished, by this or another experiment, is used again; interrupted,
+    the same command continues. At the end `crptpro report ROOT` makes tables and figures of it.
     """
 
     experiments: Positional[tuple[str, ...]]

@@ -1,0 +1,81 @@
+"""Every experiment of the paper at its smallest, from nothing to its report, on the real simulator."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from crptpro.experiments.building import Store
+from crptpro.experiments.catalogue import EXPERIMENTS
+from crptpro.experiments.goals import METHODS
+
+pytestmark = [pytest.mark.gl, pytest.mark.slow, pytest.mark.timeout(1_200)]
+
+Asked = dict[str, tuple[str, ...]]
+
+# Episodes of manipulation are a quarter as long as the others', so evaluations are.
+GROUP_B = ("--groups", "B", "--tasks", "reach_duplo")
+FEW = ("--methods", "crptpro", "random-encoder")
+ROOTS: dict[str, Asked] = {
+    "every method": {"seen": GROUP_B, "finetune": GROUP_B},
+    "prototypical methods": {
+        "ablation": GROUP_B,
+        "sensitivity": (*GROUP_B, "--methods", "crptpro"),
+        "prototypes": GROUP_B,
+        "stability": GROUP_B,
+        "coverage": GROUP_B,
+        "visualize": GROUP_B,
+    },
+    "few methods": {
+        "unseen": ("--groups", "A", "--tasks", "reach_duplo", *FEW),
+        "colors": ("--groups", "C", "--tasks", "reach_duplo", *FEW),
+        "efficiency": ("--groups", "B", "--methods", "crptpro", "proto-rl-c", "apt-s"),
+        "probe": ("--groups", "B", "--tasks", "pendulum_swingup", *FEW),
+    },
+}
+
+
+def crptpro(*arguments: object) -> str:
+    """Run the command; return what it printed, failures with what it said."""
+    done = subprocess.run(
+        [sys.executable, "-c", "from crptpro.cli import main; main()", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    assert "Traceback" not in done.stderr
+    return done.stdout
+
+
+def test_no_experiment_of_the_paper_is_left_out() -> None:
+    asked = [name for experiments in ROOTS.values() for name in experiments]
+    assert sorted(asked) == sorted(set(EXPERIMENTS) - {"study"})
+
+
+@pytest.mark.parametrize("experiments", ROOTS.values(), ids=ROOTS.keys())
+def test_experiments_run_from_nothing_to_their_report(experiments: Asked, tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for name, flags in experiments.items():
+        command = ("reproduce", name, "--scale", "tiny", "--launcher", "inline", "--out", tmp_path, *flags)
+        crptpro(*command)
+        written = json.loads((tmp_path / "experiments" / f"{name}-tiny.json").read_text())
+        assert written["goals"]
+        assert all(store.is_done(store.described(goal["key"])) for goal in written["goals"])
+        again = crptpro(*command)
+        assert "at a time" not in again and "All of it is there" in again
+
+    crptpro("report", tmp_path)
+    page = (tmp_path / "report" / "index.html").read_text()
+    text = (tmp_path / "report" / "report.md").read_text()
+    for name in experiments:
+        assert EXPERIMENTS[name].title in page
+        assert EXPERIMENTS[name].title in text
+    if "seen" in experiments:
+        assert all(method in text for method in METHODS)
