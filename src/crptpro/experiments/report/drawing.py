@@ -77,6 +77,7 @@ def theme() -> Iterator[None]:
         "axes.spines.top": False, "axes.spines.right": False,
         "axes.titlesize": 9.5, "axes.titlelocation": "left", "axes.titleweight": "bold",
         "legend.frameon": False,
+        "axes.formatter.useoffset": False,
     }  # fmt: skip
     with matplotlib.rc_context(look):
         yield

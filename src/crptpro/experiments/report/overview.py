@@ -127,7 +127,7 @@ def progress(asked: Asked, pieces: Mapping[str, Made]) -> tuple[Block, ...]:
     """Say how much of an experiment is there, and name what is not."""
     missing = asked.missing
     if not missing:
-        return (Paragraph(f"Complete: all that was asked for is there ({len(asked.goals)} pieces)."),)
+        return (Paragraph(f"Complete: {len(asked.goals)} of {len(asked.goals)} pieces are there."),)
     counts = ", ".join(f"{label} {n}" for label, n in Counter(goal.label for goal in missing).items())
     rows = tuple(
         cells(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import datetime
 import logging
 from collections.abc import Callable
@@ -102,13 +103,14 @@ def make_page(source: Source, bootstrap: Bootstrap) -> Page:
         "Cross-domain random pre-training with prototypes (arXiv 2302.05614): what was measured here, beside the "
         f"numbers that the paper printed. Made on {now:%Y-%m-%d at %H:%M} UTC from {source.root.resolve().name}."
     )
+    order = [*TITLES, *(asked.experiment for asked in source.asked)]
+    in_order = sorted(source.asked, key=lambda asked: (order.index(asked.experiment), asked.scale))
+    source = dataclasses.replace(source, asked=tuple(in_order))
     placed = unplaced_runs(source.runs)
     sections = [Section("What is here", contents(source), "contents")]
     sections.append(Section("What this scale cannot show", caveats(source), "caveats"))
-    order = [*TITLES, *(asked.experiment for asked in source.asked)]
-    experiments = sorted(source.asked, key=lambda asked: (order.index(asked.experiment), asked.scale))
-    sections += [_experiment(asked, source, bootstrap) for asked in experiments]
-    for asked in experiments:
+    sections += [_experiment(asked, source, bootstrap) for asked in source.asked]
+    for asked in source.asked:
         placed += placed_runs(asked)[0]
     if source.runs:
         sections.append(Section("Scores", blocks_of_runs(placed, "runs", bootstrap), "scores"))
