@@ -28,5 +28,5 @@ def test_a_file_is_kept_if_its_successor_cannot_be_written(tmp_path: Path) -> No
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(RecordError, match=r"a\.csv cannot be read"):
+    with pytest.raises(RecordError, match=r"has no a\.csv"):
         read_rows(tmp_path / "a.csv")

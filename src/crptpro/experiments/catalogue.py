@@ -34,71 +34,71 @@ EXPERIMENTS: dict[str, Experiment] = {
     for experiment in (
         Experiment(
             "seen",
-            "Seen domains",
+            "Tasks of seen domains",
             "Tasks of the domains that the encoder was pre-trained on, for every method (section IV.B).",
             matrix.seen,
         ),
         Experiment(
             "unseen",
-            "Unseen domains",
+            "Tasks of unseen domains",
             "Tasks of domains that the encoder never saw, without fine-tuning (section IV.C).",
             matrix.unseen,
         ),
         Experiment(
             "colors",
-            "Unseen colours",
+            "Reversed background colours",
             "Tasks with the colours of the background reversed, without fine-tuning (section IV.C). The paper does not "
             "say how it reverses them; whole images are the option.",
             matrix.colors,
         ),
         Experiment(
             "finetune",
-            "Fine-tuning",
+            "Fine-tuning on one domain",
             "The encoder of group A trained on for a while on one domain, beside single-domain methods and DrQ "
             "(section IV.D).",
             matrix.finetune,
         ),
         Experiment(
             "ablation",
-            "Ablation",
+            "Ablation: dispersion loss, decoupled collection",
             "With and without the dispersion loss, with and without decoupled collection (section IV.F).",
             matrix.ablation,
         ),
         Experiment(
             "sensitivity",
-            "Sensitivity",
+            "Sensitivity: weight of the dispersion loss, amount of data",
             "The weight alpha of the dispersion loss, and the capacity b of the random datasets (section IV.F).",
             matrix.sensitivity,
         ),
         Experiment(
             "efficiency",
-            "Pre-training efficiency",
+            "Cost of pre-training",
             "Wall clock and encoder updates of pre-training for one, two and three domains (section IV.E), projected "
             "from a timed part.",
             analyses.efficiency,
         ),
         Experiment(
             "prototypes",
-            "Prototypes",
+            "Spread of the prototypes",
             "How far prototypes spread, along pre-training and at its end, with and without the dispersion loss "
             "(section IV.G).",
             analyses.prototypes,
         ),
         Experiment(
             "coverage",
-            "Coverage",
+            "Coverage of the data",
             "How widely random data and an explorer's are spread along pre-training (section IV.H).",
             analyses.coverage,
         ),
         Experiment(
             "stability",
-            "Stability",
+            "Stability of pre-training",
             "The comparative loss along pre-training on random data and on an explorer's (section IV.H).",
             analyses.stability,
         ),
         Experiment(
             "visualize",
-            "Embeddings",
+            "Embeddings of random data and of an explorer's",
             "Principal components of random data of three domains and of an explorer's in one of them (section IV.H).",
             analyses.visualize,
         ),
@@ -111,7 +111,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         ),
         Experiment(
             "study",
-            "A better CRPTpro",
+            "One-factor study of pre-training",
             "The temperature of the targets, and one factor at a time, judged by the state probe along pre-training "
             "and by reinforcement learning. Not in the paper.",
             study,

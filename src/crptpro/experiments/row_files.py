@@ -36,10 +36,13 @@ def read_rows(path: str | Path) -> list[dict[str, str]]:
     """Read a CSV file with a header.
 
     Raises:
-        RecordError: if it is missing.
+        RecordError: there is no such file, or it cannot be read.
     """
+    path = Path(path)
     try:
-        with open(path, newline="") as file:
+        with open(path, newline="", encoding="utf-8") as file:
             return list(csv.DictReader(file))
-    except OSError as reason:
+    except FileNotFoundError:
+        raise RecordError(f"{path.parent.name} has no {path.name}.") from None
+    except (OSError, UnicodeDecodeError, csv.Error) as reason:
         raise RecordError(f"{path} cannot be read: {reason}.") from None

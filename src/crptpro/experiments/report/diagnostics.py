@@ -9,7 +9,8 @@ import numpy as np
 from crptpro.experiments.report import drawing
 from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Figure, Paragraph, Table, cells, sentence
 from crptpro.experiments.report.palette import in_order, styles
-from crptpro.experiments.report.reading import Asked, Wanted, number, read_table
+from crptpro.experiments.report.reading import Asked, Wanted, number
+from crptpro.experiments.row_files import read_rows
 
 PRETRAINED = ("encoder", "explored", "finetuned")
 """Kinds of pieces that leave ``pretrain.csv``."""
@@ -57,7 +58,7 @@ def records_of(asked: Asked) -> list[Record]:
     for goal in asked.finished:
         path = goal.piece.directory / "pretrain.csv"
         if goal.piece.kind in PRETRAINED and path.exists():
-            found.append((goal, read_table(path)))
+            found.append((goal, read_rows(path)))
     return found
 
 

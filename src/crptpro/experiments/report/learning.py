@@ -13,8 +13,9 @@ from crptpro.experiments.records import Run
 from crptpro.experiments.report import drawing
 from crptpro.experiments.report.blocks import Block, Figure
 from crptpro.experiments.report.palette import Style, styles
-from crptpro.experiments.report.reading import number, read_table
+from crptpro.experiments.report.reading import number
 from crptpro.experiments.report.runs import Placed, Spot, labels_of, spots_of
+from crptpro.experiments.row_files import read_rows
 from crptpro.experiments.statistics import Array, evaluation_means, mean
 
 PAUSE_S, PAUSE_FACTOR = 600.0, 20.0
@@ -95,7 +96,7 @@ def _marks(run: Run) -> list[float]:
     found = []
     for stream in STREAMS:
         try:
-            rows = read_table(run.directory / f"{stream}.csv")
+            rows = read_rows(run.directory / f"{stream}.csv")
         except RecordError:
             continue  # a run without training rows has its evaluations
         found += [at for row in rows if (at := number(row, "unix_time_s")) is not None]

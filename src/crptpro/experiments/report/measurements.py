@@ -13,7 +13,8 @@ from crptpro.experiments.published import PROTOTYPE_METRICS
 from crptpro.experiments.report import drawing
 from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Figure, Paragraph, Table, cells
 from crptpro.experiments.report.palette import Style, in_order, styles
-from crptpro.experiments.report.reading import Asked, Wanted, number, read_table
+from crptpro.experiments.report.reading import Asked, Wanted, number
+from crptpro.experiments.row_files import read_rows
 
 SPREAD = {"kne_3": "KNE, k = 3", "kne_half": "KNE, k = M/2", "ane": "ANE", "intr": "L_intr"}
 """Column of ``prototypes.csv`` to what it is."""
@@ -46,7 +47,7 @@ def rows_of(asked: Asked, kind: str) -> tuple[list[Row], list[Block]]:
     for goal in asked.finished:
         if goal.piece.kind == kind:
             try:
-                rows += [Row(goal, row) for row in read_table(goal.piece.directory / f"{kind}.csv")]
+                rows += [Row(goal, row) for row in read_rows(goal.piece.directory / f"{kind}.csv")]
             except RecordError as reason:
                 problems.append(str(reason))
     return rows, [Paragraph(f"Left out: {problem}", "warning") for problem in problems]

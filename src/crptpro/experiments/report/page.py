@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from crptpro.errors import RecordError
+from crptpro.experiments.catalogue import EXPERIMENTS
 from crptpro.experiments.intervals import Bootstrap
 from crptpro.experiments.report.blocks import Block, Page, Paragraph, Section, figures_of
 from crptpro.experiments.report.cards import piece_cards, run_cards
@@ -27,23 +28,6 @@ from crptpro.experiments.report.scores import blocks_of_runs, score_blocks
 from crptpro.experiments.report.study import study
 
 logger = logging.getLogger(__name__)
-
-TITLES = {
-    "seen": "Tasks of seen domains",
-    "unseen": "Tasks of unseen domains",
-    "colors": "Reversed background colours",
-    "finetune": "Fine-tuning on one domain",
-    "ablation": "Ablation: dispersion loss, decoupled collection",
-    "sensitivity": "Sensitivity: weight of the dispersion loss, amount of data",
-    "efficiency": "Cost of pre-training",
-    "prototypes": "Spread of the prototypes",
-    "coverage": "Coverage of the data",
-    "stability": "Stability of pre-training",
-    "visualize": "Embeddings of random data and of an explorer's",
-    "probe": "State probe",
-    "study": "One-factor study of pre-training",
-}
-"""Experiment to the heading of its section."""
 
 Measured = Callable[[Asked], tuple[Block, ...]]
 MEASURED: dict[str, Measured] = {
@@ -103,7 +87,7 @@ def make_page(source: Source, bootstrap: Bootstrap) -> Page:
         "Cross-domain random pre-training with prototypes (arXiv 2302.05614): what was measured here, beside the "
         f"numbers that the paper printed. Made on {now:%Y-%m-%d at %H:%M} UTC from {source.root.resolve().name}."
     )
-    order = [*TITLES, *(asked.experiment for asked in source.asked)]
+    order = [*EXPERIMENTS, *(asked.experiment for asked in source.asked)]
     in_order = sorted(source.asked, key=lambda asked: (order.index(asked.experiment), asked.scale))
     source = dataclasses.replace(source, asked=tuple(in_order))
     placed = unplaced_runs(source.runs)
@@ -125,11 +109,13 @@ def make_page(source: Source, bootstrap: Bootstrap) -> Page:
 
 
 def _experiment(asked: Asked, source: Source, bootstrap: Bootstrap) -> Section:
-    title = f"{TITLES.get(asked.experiment, asked.experiment)} ({asked.scale})"
+    known = EXPERIMENTS.get(asked.experiment)  # a plugin's own experiment may not be loaded here
+    title = f"{asked.experiment if known is None else known.title} ({asked.scale})"
+    summary = () if known is None else (Paragraph(known.summary),)
     if not asked.finished:
         text = f"Nothing is finished yet: {len(asked.goals)} pieces were asked for."
         return Section(title, (Paragraph(text),), asked.name)
-    blocks: tuple[Block, ...] = progress(asked, source.pieces)
+    blocks: tuple[Block, ...] = summary + progress(asked, source.pieces)
     try:
         if asked.experiment in MEASURED:
             blocks += MEASURED[asked.experiment](asked)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -158,21 +157,6 @@ def read_source(root: str | Path) -> Source:
             f"finished downstream run.{detail}"
         )
     return Source(root, (), pieces, tuple(runs), tuple(problems))
-
-
-def read_table(path: Path) -> list[dict[str, str]]:
-    """Read the rows of a measurement.
-
-    Raises:
-        RecordError: there is no such file, or it cannot be read.
-    """
-    try:
-        with open(path, newline="", encoding="utf-8") as file:
-            return list(csv.DictReader(file))
-    except FileNotFoundError:
-        raise RecordError(f"{path.parent.name} has no {path.name}, although it is finished.") from None
-    except (OSError, UnicodeDecodeError, csv.Error) as reason:
-        raise RecordError(f"{path} cannot be read: {reason}.") from None
 
 
 def number(row: Mapping[str, str], column: str) -> float | None:
