@@ -21,9 +21,11 @@ from crptpro.experiments.job import main
 from crptpro.experiments.pieces import (
     KINDS,
     DatasetPiece,
+    ExploredPiece,
     FinetunedPiece,
     Piece,
     PretrainedPiece,
+    RunPiece,
     UntrainedPiece,
     settings,
 )
@@ -99,6 +101,21 @@ def toy_dataset(store: Store, domain: str = "pendulum") -> DatasetPiece:
     return piece
 
 
+def test_a_finished_piece_keeps_nothing_that_only_continues_it(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def leave_all(piece: Piece, store: Store, job: JobSettings) -> None:
+        for name in ("checkpoints", "replay", "agent"):
+            (store.path(piece) / name).mkdir()
+
+    monkeypatch.setattr(building, "make", leave_all)
+    run = RunPiece("pendulum_swingup", None, 0)
+    explored = ExploredPiece("apt-s", 0, ("pendulum",))
+    for piece, kept in ((run, {"agent"}), (explored, {"agent", "replay"})):
+        build(piece, store, JOB)
+        assert {path.name for path in store.path(piece).iterdir() if path.is_dir()} == kept
+
+
 def test_a_piece_is_made_described_and_marked_as_done(store: Store, numbers: list[int]) -> None:
     piece = Number(3)
     assert not store.is_done(piece)
@@ -107,7 +124,7 @@ def test_a_piece_is_made_described_and_marked_as_done(store: Store, numbers: lis
     assert store.described(piece.key) == piece
     done = read_json(store.path(piece) / DONE)
     assert done["seconds"] == store.seconds(piece) >= 0
-    assert done["job"] == {"device": "cpu", "threads": 2, "workers": 1}
+    assert done["job"] == {"device": "cpu", "threads": 2, "workers": 1, "plugins": []}
     assert {"versions", "hardware", "git_revision"} <= set(done)
     assert torch.get_num_threads() == 2
 

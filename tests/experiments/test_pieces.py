@@ -75,7 +75,8 @@ def test_settings_do_not_depend_on_the_order_they_are_named_in() -> None:
 
 def test_every_kind_of_piece_comes_back_from_its_description() -> None:
     pieces = all_pieces()
-    assert {piece.kind for piece in pieces.values()} == set(KINDS)
+    own = {kind for kind, piece in KINDS.items() if piece.__module__.startswith("crptpro.")}
+    assert {piece.kind for piece in pieces.values()} == own
     for key, piece in pieces.items():
         back = piece_from_json(json.loads(json.dumps(piece.to_json())))
         assert back == piece

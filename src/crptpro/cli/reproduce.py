@@ -26,7 +26,7 @@ class Reproduce:
     the same command continues. At the end `crptpro report ROOT` makes tables and figures of it.
     """
 
-    experiments: Positional[tuple[str, ...]]
+    experiments: Annotated[Positional[tuple[str, ...]], tyro.conf.arg(metavar="EXPERIMENT [EXPERIMENT ...]")]
     """which, e.g. `seen`, or several, or `all`"""
     scale: Literal["tiny", "small", "paper"]
     """tiny shows in minutes that everything runs; small fits two CPU cores; paper has the paper's numbers"""
@@ -51,12 +51,11 @@ class Reproduce:
     launcher: Literal["local", "slurm", "ray", "inline"] = "local"
     """local: processes here; slurm, ray: a cluster whose nodes share ROOT; inline: in this process, one at a time"""
     jobs: int | None = None
-    """most pieces at a time (default: one per core or GPU; on a cluster 16). Each needs memory: a run at paper scale
-    several GB"""
+    """most pieces at a time, each with its own memory (default: one per core or GPU; on a cluster 16)"""
     cores_per_job: int | None = None
     """cores of each job (default: this machine's divided by jobs; on a cluster 1, beside a GPU 4)"""
     jobs_per_gpu: int = 1
-    """local, ray: jobs that share a GPU"""
+    """local, ray: how many jobs share a GPU"""
     attempts: int = 3
     """jobs that may try a piece before it counts as failed; each continues where the one before was lost"""
     partition: str | None = None

@@ -223,9 +223,7 @@ def test_slurm_is_asked_for_what_a_job_needs_and_goes_on_after_its_time_was_up(
     assert second["threads"] == "2"
 
 
-def test_an_exclusive_piece_asks_slurm_for_a_node_of_its_own(
-    store: Store, slurm: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_exclusive_piece_asks_slurm_for_a_node_of_its_own(store: Store, slurm: Path) -> None:
     (slurm.parent / "bin" / "sbatch").write_text(SBATCH.replace("setsid", "true"))
     launcher = slurm_launcher()
     launcher.start(Work(str(store.root), "timing", SETTINGS), is_exclusive=True)
@@ -233,6 +231,20 @@ def test_an_exclusive_piece_asks_slurm_for_a_node_of_its_own(
     scripts = [path.read_text() for path in sorted(slurm.glob("*.sh"))]
     assert ["#SBATCH --exclusive\n" in script for script in scripts] == [True, False]
     assert not any("gpus" in script for script in scripts)
+
+
+def test_a_slurm_job_is_asked_to_write_a_checkpoint_before_it_is_cancelled(store: Store, slurm: Path) -> None:
+    programs = slurm.parent / "bin"
+    (programs / "sbatch").write_text(SBATCH.replace("setsid", "true"))
+    (programs / "scancel").write_text('#!/bin/bash\necho "$*" >> "$FAKE_SLURM/cancelled"\n')
+    (programs / "scancel").chmod(0o755)
+    job = slurm_launcher().start(Work(str(store.root), "p", SETTINGS), is_exclusive=False)
+    [number] = [path.stem for path in slurm.glob("*.sh")]
+    job.stop()
+    asked = [f"--state=PENDING {number}", f"--signal=TERM {number}"]
+    assert (slurm / "cancelled").read_text().splitlines() == asked
+    job.stop()
+    assert (slurm / "cancelled").read_text().splitlines() == [*asked, number]
 
 
 def test_what_sbatch_refuses_is_said_in_a_line(store: Store, slurm: Path) -> None:

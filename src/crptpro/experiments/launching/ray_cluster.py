@@ -53,7 +53,8 @@ class RayLauncher:
     checkpoints on the disk that the nodes share.
 
     Args:
-        address: of the cluster's head; ``None`` for ``RAY_ADDRESS``, a cluster that runs on this machine, or a new one.
+        address: of the cluster's head; ``None`` for ``RAY_ADDRESS``, a cluster that runs on this machine, or a new one;
+            ``"local"`` for a new one in any case.
         gpus_per_job: a whole number or a fraction of one.
 
     Raises:
