@@ -198,6 +198,6 @@ def test_the_probe_covers_every_encoder_seen_and_unseen_domains() -> None:
 
 
 def test_an_unknown_experiment_is_refused_with_the_nearest_name() -> None:
-    assert get_experiment("seen").title == "Seen domains"
+    assert get_experiment("seen").title == "Tasks of seen domains"
     with pytest.raises(UnknownNameError, match=r"'sean'.*'seen'.*probe"):
         get_experiment("sean")
