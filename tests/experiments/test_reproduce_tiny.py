@@ -18,32 +18,40 @@ pytestmark = [pytest.mark.gl, pytest.mark.slow, pytest.mark.timeout(1_200)]
 
 Asked = dict[str, tuple[str, ...]]
 
-# Episodes of manipulation are a quarter as long as the others', so evaluations are.
-GROUP_B = ("--groups", "B", "--tasks", "reach_duplo")
+PENDULUM = ("--tasks", "pendulum_swingup")
+GROUP_D = ("--groups", "D", *PENDULUM)
 FEW = ("--methods", "crptpro", "random-encoder")
 ROOTS: dict[str, Asked] = {
-    "every method": {"seen": GROUP_B, "finetune": GROUP_B},
+    "every method": {"seen": GROUP_D, "finetune": GROUP_D},
     "prototypical methods": {
-        "ablation": GROUP_B,
-        "sensitivity": (*GROUP_B, "--methods", "crptpro"),
-        "prototypes": GROUP_B,
-        "stability": GROUP_B,
-        "coverage": GROUP_B,
-        "visualize": GROUP_B,
+        "ablation": GROUP_D,
+        "sensitivity": (*GROUP_D, "--methods", "crptpro"),
+        "prototypes": GROUP_D,
+        "stability": GROUP_D,
+        "coverage": GROUP_D,
+        "visualize": GROUP_D,
     },
     "few methods": {
-        "unseen": ("--groups", "A", "--tasks", "reach_duplo", *FEW),
-        "colors": ("--groups", "C", "--tasks", "reach_duplo", *FEW),
-        "efficiency": ("--groups", "B", "--methods", "crptpro", "proto-rl-c", "apt-s"),
-        "probe": ("--groups", "B", "--tasks", "pendulum_swingup", *FEW),
+        "unseen": ("--groups", "A", *PENDULUM, *FEW),
+        "colors": ("--groups", "C", *PENDULUM, *FEW),
+        "efficiency": ("--groups", "D", "--methods", "crptpro", "proto-rl-c", "apt-s"),
+        "probe": (*GROUP_D, *FEW),
     },
 }
+SHORT_EPISODES = Path(__file__).with_name("short_episodes.py")
 
 
 def crptpro(*arguments: object) -> str:
     """Run the command; return what it printed, failures with what it said."""
     done = subprocess.run(
-        [sys.executable, "-c", "from crptpro.cli import main; main()", *map(str, arguments)],
+        [
+            sys.executable,
+            "-c",
+            "from crptpro.cli import main; main()",
+            "--plugin",
+            str(SHORT_EPISODES),
+            *map(str, arguments),
+        ],
         capture_output=True,
         text=True,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
