@@ -14,6 +14,7 @@ from crptpro import pretrained
 from crptpro.cards import read_json, write_json
 from crptpro.data.collection import DomainCollection
 from crptpro.directory_lock import DirectoryLock
+from crptpro.downstream_config import DownstreamConfig
 from crptpro.errors import RecordError
 from crptpro.experiments import building
 from crptpro.experiments.building import DESCRIPTION, DONE, JobSettings, Store, build, new_loss
@@ -276,3 +277,16 @@ def test_a_stage_that_refuses_leaves_the_piece_open(store: Store) -> None:
     with pytest.raises(ValueError, match="sparkle"):
         build(piece, store, JOB)
     assert not store.is_done(piece)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_job_of_one_core_neither_evaluates_nor_draws_in_others(
+    store: Store, threads: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[DownstreamConfig] = []
+    monkeypatch.setattr("crptpro.training.train_downstream", lambda *_, config, **__: seen.append(config))
+    encoder = UntrainedPiece("random-encoder", 0)
+    build(encoder, store, JOB)
+    build(RunPiece("pendulum_swingup", encoder, 0), store, JobSettings(threads=threads))
+    (config,) = seen
+    assert (config.eval_workers, config.render_ahead) == ((0, False) if threads == 1 else (None, None))

@@ -216,7 +216,9 @@ def _(piece: ExploredPiece, store: Store, job: JobSettings) -> None:
 
     loss = new_loss(piece)
     run_dir = store.path(piece)
-    config = ActiveConfig(**dict(piece.explore), seed=piece.seed, device=job.device)
+    # A job of one core does one thing at a time: another job has the other cores.
+    ahead: dict[str, Any] = {"render_ahead": False} if job.threads == 1 else {}
+    config = ActiveConfig(**dict(piece.explore), **ahead, seed=piece.seed, device=job.device)
     with RunLogger(run_dir, config=_record(piece)) as records:
         result = pretrain_active(loss, piece.domains, config=config, run_dir=run_dir, logger=records)
         hands_over = exploration_defaults(loss).transfers_actor
@@ -258,7 +260,9 @@ def _(piece: RunPiece, store: Store, job: JobSettings) -> None:
     algorithm = "drq" if piece.encoder is None else asked.get("algorithm")
     base = {"drq": drq_settings, "skill-ddpg": skill_ddpg_settings}.get(str(algorithm), DownstreamConfig)
     seed = derive_seed(piece.seed, "task", piece.task)
-    config = base(**asked, seed=seed, colors=piece.colors, device=job.device)
+    # As above; neither changes a number.
+    alone: dict[str, Any] = {"eval_workers": 0, "render_ahead": False} if job.threads == 1 else {}
+    config = base(**asked, **alone, seed=seed, colors=piece.colors, device=job.device)
     run_dir = store.path(piece)
     pretrained = None if piece.encoder is None else load_pretrained(store.encoder(piece.encoder))
     with RunLogger(run_dir, config={"task": piece.task, **asdict(config)}) as records:
