@@ -151,7 +151,7 @@ TINY = Scale(
     ),
     seeds=1,
     alphas=(5e-2,),
-    capacities=(60, 130),
+    capacities=(130,),  # the data is there
     probe_samples=60,
     probe_transitions=1_100,  # three episodes; one has 500 decisions
     timing_updates=2,
