@@ -18,7 +18,6 @@ from crptpro.downstream_config import DownstreamConfig
 from crptpro.errors import RecordError
 from crptpro.experiments import building
 from crptpro.experiments.building import DESCRIPTION, DONE, JobSettings, Store, build, new_loss
-from crptpro.experiments.job import main
 from crptpro.experiments.pieces import (
     KINDS,
     DatasetPiece,
@@ -202,22 +201,6 @@ def test_a_kind_that_nothing_makes_is_refused(store: Store) -> None:
 
     with pytest.raises(RecordError, match="Nothing makes"):
         build(Riddle(), store, JOB)
-
-
-@pytest.mark.usefixtures("quiet_again")
-def test_a_job_makes_a_described_piece(store: Store, numbers: list[int]) -> None:
-    store.describe(Number(4))
-    main([str(store.root), Number(4).key, "--settings.threads", "1"])
-    assert numbers == [4]
-    assert store.is_done(Number(4))
-
-
-@pytest.mark.usefixtures("quiet_again")
-def test_a_job_for_an_unknown_key_says_so(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stopped:
-        main([str(store.root), "number-1-x"])
-    assert stopped.value.code == 1
-    assert "number-1-x" in capsys.readouterr().err
 
 
 def test_an_untrained_encoder_depends_on_its_seed(store: Store) -> None:

@@ -12,8 +12,8 @@ from crptpro.experiments.analyses import PRETRAINED
 from crptpro.experiments.building import Store
 from crptpro.experiments.catalogue import EXPERIMENTS, get_experiment
 from crptpro.experiments.goals import Goal, Request, encoder
-from crptpro.experiments.measurements import CoveragePiece, EmbeddingsPiece, TimingPiece
-from crptpro.experiments.pieces import EncoderPiece, ExploredPiece, PretrainedPiece, ProbePiece, RunPiece
+from crptpro.experiments.measurements import CoveragePiece, EmbeddingsPiece, ProbePiece, TimingPiece
+from crptpro.experiments.pieces import EncoderPiece, ExploredPiece, PretrainedPiece, RunPiece
 from crptpro.experiments.plan import make_plan
 from crptpro.experiments.scales import PAPER, SMALL, TINY
 

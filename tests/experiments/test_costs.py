@@ -11,13 +11,13 @@ from crptpro.experiments.building import DONE, Store
 from crptpro.experiments.costs import corrections, estimate, wall_seconds
 from crptpro.experiments.goals import Request
 from crptpro.experiments.matrix import seen
+from crptpro.experiments.measurements import ProbePiece
 from crptpro.experiments.piece_costs import core_seconds, stored_bytes, working_bytes
 from crptpro.experiments.pieces import (
     DatasetPiece,
     ExploredPiece,
     Piece,
     PretrainedPiece,
-    ProbePiece,
     RunPiece,
     UntrainedPiece,
     settings,

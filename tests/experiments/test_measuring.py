@@ -22,6 +22,7 @@ from crptpro.experiments.goals import dataset, encoder
 from crptpro.experiments.measurements import (
     CoveragePiece,
     EmbeddingsPiece,
+    ProbePiece,
     PrototypesPiece,
     TimingPiece,
 )
@@ -30,7 +31,6 @@ from crptpro.experiments.pieces import (
     ExploredPiece,
     Piece,
     PretrainedPiece,
-    ProbePiece,
     UntrainedPiece,
     settings,
 )

@@ -8,14 +8,13 @@ import pytest
 from crptpro.errors import RecordError
 from crptpro.experiments.catalogue import EXPERIMENTS
 from crptpro.experiments.goals import Request
-from crptpro.experiments.measurements import TimingPiece
+from crptpro.experiments.measurements import ProbePiece, TimingPiece
 from crptpro.experiments.pieces import (
     KINDS,
     DatasetPiece,
     FinetunedPiece,
     Piece,
     PretrainedPiece,
-    ProbePiece,
     RunPiece,
     UntrainedPiece,
     piece_from_json,

@@ -11,7 +11,7 @@ from crptpro.errors import RecordError
 from crptpro.experiments.building import Store
 from crptpro.experiments.goals import Goal, Request
 from crptpro.experiments.matrix import seen
-from crptpro.experiments.requests import read_request, read_requests, request_path, write_request
+from crptpro.experiments.requests import AskedGoal, read_request, request_path, write_request
 from crptpro.experiments.scales import TINY
 
 
@@ -22,12 +22,16 @@ def ask(store: Store, **part: object) -> list[Goal]:
     return goals
 
 
+def described(goal: AskedGoal, store: Store) -> Goal:
+    return Goal(goal.label, store.described(goal.key), goal.place)
+
+
 def test_goals_are_read_back_with_their_pieces(tmp_path: Path) -> None:
     store = Store(tmp_path)
     goals = ask(store, methods=("crptpro", "drq"), seeds=(0, 1))
-    [asked] = read_requests(tmp_path)
+    asked = read_request(request_path(tmp_path, "seen", "tiny"))
     assert (asked.experiment, asked.scale) == ("seen", "tiny")
-    assert [goal.goal(store) for goal in asked.goals] == goals
+    assert [described(goal, store) for goal in asked.goals] == goals
     assert asked.request == {
         "methods": ["crptpro", "drq"], "groups": ["A"], "tasks": ["walker_run"], "encoder_seeds": [0], "seeds": [0, 1],
         "colors": "reversed_background",
@@ -40,7 +44,7 @@ def test_what_was_asked_for_before_is_kept(tmp_path: Path) -> None:
     after = ask(store, methods=("drq", "atc"))
     asked = read_request(request_path(tmp_path, "seen", "tiny"))
     crptpro = [goal for goal in before if goal.label == "crptpro"]
-    assert [goal.goal(store) for goal in asked.goals] == [*after, *crptpro]
+    assert [described(goal, store) for goal in asked.goals] == [*after, *crptpro]
     assert asked.request["methods"] == ["drq", "atc"]
     assert [path.name for path in (tmp_path / "experiments").iterdir()] == ["seen-tiny.json"]
 
@@ -58,7 +62,9 @@ def test_a_place_with_several_values_is_read_back(tmp_path: Path) -> None:
     request = Request(TINY)
     goal = Goal("x", seen(request)[0].piece, (("domains", ("walker", "hopper")), ("seed", 0)))
     write_request(store, "probe", request, [goal])
-    assert read_requests(tmp_path)[0].goals[0].goal(store) == goal
+    assert [
+        described(asked, store) for asked in read_request(request_path(tmp_path, "probe", "tiny")).goals
+    ] == [goal]
 
 
 def test_a_damaged_file_is_refused_by_name(tmp_path: Path) -> None:

@@ -14,10 +14,10 @@ from crptpro.data.collection import DomainCollection
 from crptpro.errors import RecordError
 from crptpro.experiments.building import DONE, JobSettings, Store, build
 from crptpro.experiments.goals import RANDOM_ENCODER, Goal, Request
+from crptpro.experiments.measurements import ProbePiece
 from crptpro.experiments.pieces import (
     DatasetPiece,
     PretrainedPiece,
-    ProbePiece,
     RunPiece,
     UntrainedPiece,
     piece_from_json,

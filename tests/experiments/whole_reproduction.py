@@ -12,7 +12,8 @@ from fake_reproduction import Reproduction, pictures, write_table
 from crptpro.cards import write_json
 from crptpro.experiments.goals import Goal, Request, encoder
 from crptpro.experiments.matrix import ablation, colors, finetune, seen, sensitivity, unseen
-from crptpro.experiments.pieces import PretrainedPiece, ProbePiece, RunPiece, settings
+from crptpro.experiments.measurements import ProbePiece
+from crptpro.experiments.pieces import PretrainedPiece, RunPiece, settings
 from crptpro.experiments.published import EFFICIENCY
 from crptpro.experiments.scales import SMALL
 from crptpro.training.video import write_video

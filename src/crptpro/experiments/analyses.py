@@ -21,8 +21,14 @@ from crptpro.experiments.goals import (
     is_single_domain,
 )
 from crptpro.experiments.matrix import NO_DISPERSION, VARIANTS
-from crptpro.experiments.measurements import CoveragePiece, EmbeddingsPiece, PrototypesPiece, TimingPiece
-from crptpro.experiments.pieces import EncoderPiece, ExploredPiece, ProbePiece, settings
+from crptpro.experiments.measurements import (
+    CoveragePiece,
+    EmbeddingsPiece,
+    ProbePiece,
+    PrototypesPiece,
+    TimingPiece,
+)
+from crptpro.experiments.pieces import EncoderPiece, ExploredPiece, settings
 from crptpro.experiments.scales import PAPER, Scale
 
 SINGLE_DOMAIN = {"A": "walker", "B": "pendulum", "C": "finger", "D": "walker"}

@@ -1,12 +1,14 @@
-"""How much training an encoder's description amounts to."""
+"""What a description amounts to: how much training, with which settings."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from crptpro.active_config import ActiveConfig
-from crptpro.experiments.pieces import EncoderPiece, ExploredPiece, FinetunedPiece, PretrainedPiece
+from crptpro.downstream_config import DownstreamConfig, drq_settings, skill_ddpg_settings
+from crptpro.experiments.pieces import EncoderPiece, ExploredPiece, FinetunedPiece, PretrainedPiece, RunPiece
 from crptpro.objectives import ExplorationDefaults, get_method
+from crptpro.seeding import derive_seed
 from crptpro.training.action_repeat import action_repeat_of
 from crptpro.training.explore.plan import Plan, make_plan, resolve
 
@@ -47,3 +49,17 @@ def exploration_plan(encoder: ExploredPiece) -> Plan:
     """Return when an exploring encoder's agents decide, and which decisions come with updates."""
     config = exploration_config(encoder)
     return make_plan(config, [action_repeat_of(domain, config.action_repeat) for domain in encoder.domains])
+
+
+def run_config(piece: RunPiece, **job: Any) -> DownstreamConfig:
+    """Return a downstream run's settings on top of its algorithm's.
+
+    Args:
+        piece: the run.
+        **job: settings that are no part of the piece: where and how it runs.
+    """
+    asked = dict(piece.config)
+    algorithm = "drq" if piece.encoder is None else asked.get("algorithm")
+    base = {"drq": drq_settings, "skill-ddpg": skill_ddpg_settings}.get(str(algorithm), DownstreamConfig)
+    seed = derive_seed(piece.seed, "task", piece.task)
+    return base(**asked, **job, seed=seed, colors=piece.colors)

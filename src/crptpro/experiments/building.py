@@ -250,19 +250,14 @@ def _(piece: FinetunedPiece, store: Store, job: JobSettings) -> None:
 
 @register
 def _(piece: RunPiece, store: Store, job: JobSettings) -> None:
-    from crptpro.downstream_config import DownstreamConfig, drq_settings, skill_ddpg_settings
+    from crptpro.experiments.budgets import run_config
     from crptpro.loggers import RunLogger
     from crptpro.pretrained import load_pretrained
-    from crptpro.seeding import derive_seed
     from crptpro.training import train_downstream
 
-    asked = dict(piece.config)
-    algorithm = "drq" if piece.encoder is None else asked.get("algorithm")
-    base = {"drq": drq_settings, "skill-ddpg": skill_ddpg_settings}.get(str(algorithm), DownstreamConfig)
-    seed = derive_seed(piece.seed, "task", piece.task)
     # As above; neither changes a number.
     alone: dict[str, Any] = {"eval_workers": 0, "render_ahead": False} if job.threads == 1 else {}
-    config = base(**asked, **alone, seed=seed, colors=piece.colors, device=job.device)
+    config = run_config(piece, device=job.device, **alone)
     run_dir = store.path(piece)
     pretrained = None if piece.encoder is None else load_pretrained(store.encoder(piece.encoder))
     with RunLogger(run_dir, config={"task": piece.task, **asdict(config)}) as records:

@@ -1,9 +1,10 @@
-"""Pieces that measure what others have made: cost, prototypes, coverage of data, principal components."""
+"""Pieces that measure what others have made: states told by features, costs, prototypes, coverage, components."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from crptpro.colors import Colors
 from crptpro.experiments.pieces import DatasetPiece, EncoderPiece, ExploredPiece, Piece
 
 
@@ -49,6 +50,35 @@ class TimingPiece(Piece):
             )
             for encoder in self.encoders
         )
+
+
+@dataclass(frozen=True)
+class ProbePiece(Piece):
+    """The state probe of one encoder on one domain, as ``probe.csv``.
+
+    Args:
+        encoder: whose features are read.
+        dataset: with the states; held-out episodes are a part of it.
+        colors: in which the same states are drawn.
+        samples: drawn from the dataset.
+        seed: of the draw.
+        at_updates: which of the encoder's snapshots is read; ``None`` for the finished encoder.
+    """
+
+    kind = "probe"
+    encoder: EncoderPiece
+    dataset: DatasetPiece
+    colors: Colors = "normal"
+    samples: int = 2_000
+    seed: int = 0
+    at_updates: int | None = None
+
+    @property
+    def title(self) -> str:
+        """Encoder's method, when, domain and colours."""
+        colors = "" if self.colors == "normal" else f" {self.colors}"
+        when = "" if self.at_updates is None else f" at {self.at_updates}"
+        return f"{self.encoder.method} seed {self.encoder.seed}{when} on {self.dataset.domain}{colors}"
 
 
 @dataclass(frozen=True)

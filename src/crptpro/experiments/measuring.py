@@ -15,8 +15,14 @@ from crptpro.data import FrameDataset, StoredReplay
 from crptpro.errors import RecordError
 from crptpro.experiments import probing, timing
 from crptpro.experiments.building import JobSettings, Store, register
-from crptpro.experiments.measurements import CoveragePiece, EmbeddingsPiece, PrototypesPiece, TimingPiece
-from crptpro.experiments.pieces import EncoderPiece, ExploredPiece, ProbePiece
+from crptpro.experiments.measurements import (
+    CoveragePiece,
+    EmbeddingsPiece,
+    ProbePiece,
+    PrototypesPiece,
+    TimingPiece,
+)
+from crptpro.experiments.pieces import EncoderPiece, ExploredPiece
 from crptpro.experiments.row_files import read_rows, write_rows
 from crptpro.objectives.metrics import prototype_metrics
 from crptpro.pretrained import Pretrained, load_pretrained

@@ -14,8 +14,7 @@ import torch
 
 from crptpro.data.layout import estimate_bytes
 from crptpro.domains import get_domain
-from crptpro.downstream_config import DownstreamConfig, drq_settings, skill_ddpg_settings
-from crptpro.experiments.budgets import exploration_config, exploration_plan
+from crptpro.experiments.budgets import exploration_config, exploration_plan, run_config
 from crptpro.experiments.measurements import TimingPiece
 from crptpro.experiments.pieces import (
     DatasetPiece,
@@ -167,7 +166,7 @@ def _(piece: ExploredPiece) -> int:
 
 @register_seconds
 def _(piece: RunPiece) -> float:
-    config = _run_config(piece)
+    config = run_config(piece)
     repeat = action_repeat_of(piece.task, config.action_repeat)
     row_s = DRQ_ROW_S if config.algorithm == "drq" else AGENT_ROW_S
     episode = get_domain(piece.task).episode_env_steps or USUAL_EPISODE_ENV_STEPS
@@ -178,13 +177,13 @@ def _(piece: RunPiece) -> float:
 
 @register_stored
 def _(piece: RunPiece) -> int:
-    config = _run_config(piece)
+    config = run_config(piece)
     return OTHER_BYTES + NUMBER_BYTES * _actor_and_critic(config.bottleneck_dim, config.hidden_dim)[0]
 
 
 @register_working
 def _(piece: RunPiece) -> int:
-    config = _run_config(piece)
+    config = run_config(piece)
     kept = config.replay_capacity or _replay_capacity(piece.encoder)
     repeat = action_repeat_of(piece.task, config.action_repeat)
     slack = 2 * (config.checkpoint_interval_env_steps // repeat) + SLACK_FRAMES
@@ -203,13 +202,6 @@ def _exploring_s(piece: ExploredPiece) -> float:
     """A decision of an explorer, with its share of the agent's updates."""
     interval = exploration_plan(piece).agent_update_interval
     return ACT_S + EXPLORER_ROW_S * _batch_size(piece.method, piece.explore) / interval
-
-
-def _run_config(piece: RunPiece) -> DownstreamConfig:
-    asked = dict(piece.config)
-    algorithm = "drq" if piece.encoder is None else str(asked.get("algorithm"))
-    base = {"drq": drq_settings, "skill-ddpg": skill_ddpg_settings}.get(algorithm, DownstreamConfig)
-    return base(**asked)
 
 
 def _replay_capacity(encoder: EncoderPiece | None) -> int:

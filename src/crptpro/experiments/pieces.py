@@ -12,6 +12,7 @@ import dataclasses
 import hashlib
 import json
 import re
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -37,7 +38,7 @@ def settings(**values: Any) -> Settings:
     return tuple(sorted(values.items()))
 
 
-class Piece:
+class Piece(ABC):
     """Base of every piece; subclasses are frozen dataclasses."""
 
     kind: ClassVar[str] = ""
@@ -52,9 +53,9 @@ class Piece:
             KINDS[cls.kind] = cls
 
     @property
+    @abstractmethod
     def title(self) -> str:
         """A few words for a person, without the numbers that the key hashes."""
-        raise NotImplementedError
 
     @property
     def needs(self) -> tuple[Piece, ...]:
@@ -274,32 +275,3 @@ class RunPiece(Piece):
         encoder = "drq" if self.encoder is None else f"{self.encoder.method} encoder {self.encoder.seed}"
         colors = "" if self.colors == "normal" else f" {self.colors}"
         return f"{self.task}{colors} {encoder} seed {self.seed}"
-
-
-@dataclass(frozen=True)
-class ProbePiece(Piece):
-    """The state probe of one encoder on one domain, as ``probe.csv``.
-
-    Args:
-        encoder: whose features are read.
-        dataset: with the states; held-out episodes are a part of it.
-        colors: in which the same states are drawn.
-        samples: drawn from the dataset.
-        seed: of the draw.
-        at_updates: which of the encoder's snapshots is read; ``None`` for the finished encoder.
-    """
-
-    kind = "probe"
-    encoder: EncoderPiece
-    dataset: DatasetPiece
-    colors: Colors = "normal"
-    samples: int = 2_000
-    seed: int = 0
-    at_updates: int | None = None
-
-    @property
-    def title(self) -> str:
-        """Encoder's method, when, domain and colours."""
-        colors = "" if self.colors == "normal" else f" {self.colors}"
-        when = "" if self.at_updates is None else f" at {self.at_updates}"
-        return f"{self.encoder.method} seed {self.encoder.seed}{when} on {self.dataset.domain}{colors}"

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from crptpro.experiments.costs import Cost
-from crptpro.experiments.launching.scheduler import Failure, duration
+from crptpro.experiments.durations import duration
+from crptpro.experiments.launching.scheduler import Failure
 from crptpro.experiments.pieces import Piece
 from crptpro.experiments.plan import Plan
 

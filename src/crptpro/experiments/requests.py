@@ -30,18 +30,10 @@ class AskedGoal:
     key: str
     place: Settings = ()
 
-    def goal(self, store: Store) -> Goal:
-        """Return the goal with its piece.
-
-        Raises:
-            RecordError: if the store has no such piece.
-        """
-        return Goal(self.label, store.described(self.key), self.place)
-
 
 @dataclass(frozen=True)
-class Asked:
-    """An experiment at one scale, with everything that was ever asked of it.
+class Record:
+    """What the file of an experiment at one scale holds: everything that was ever asked of it.
 
     Args:
         experiment: its name.
@@ -61,7 +53,7 @@ def request_path(root: Path, experiment: str, scale: str) -> Path:
     return root / EXPERIMENTS_DIRECTORY / f"{experiment}-{scale}.json"
 
 
-def write_request(store: Store, experiment: str, request: Request, goals: Iterable[Goal]) -> Asked:
+def write_request(store: Store, experiment: str, request: Request, goals: Iterable[Goal]) -> Record:
     """Write down what is asked for, without losing what was asked for before; every goal's piece is described.
 
     Args:
@@ -80,7 +72,7 @@ def write_request(store: Store, experiment: str, request: Request, goals: Iterab
     path = request_path(store.root, experiment, request.scale.name)
     before = read_request(path).goals if path.exists() else ()
     merged = dict.fromkeys([*new, *before])
-    asked = Asked(experiment, request.scale.name, _plain(request), tuple(merged))
+    asked = Record(experiment, request.scale.name, _plain(request), tuple(merged))
     content = {
         "experiment": asked.experiment,
         "scale": asked.scale,
@@ -91,7 +83,7 @@ def write_request(store: Store, experiment: str, request: Request, goals: Iterab
     return asked
 
 
-def read_request(path: Path) -> Asked:
+def read_request(path: Path) -> Record:
     """Read what was asked for.
 
     Raises:
@@ -100,16 +92,11 @@ def read_request(path: Path) -> Asked:
     content = read_json(path, error=RecordError)
     try:
         goals = tuple(AskedGoal(g["label"], g["key"], _settings(g["place"])) for g in content["goals"])
-        return Asked(content["experiment"], content["scale"], content["request"], goals)
+        return Record(content["experiment"], content["scale"], content["request"], goals)
     except (KeyError, TypeError) as reason:
         raise RecordError(
             f"{path} does not say what was asked for ({reason!r}); remove it and ask again."
         ) from reason
-
-
-def read_requests(root: Path) -> list[Asked]:
-    """Read all of a reproduction, by name."""
-    return [read_request(path) for path in sorted((root / EXPERIMENTS_DIRECTORY).glob("*.json"))]
 
 
 def _plain(request: Request) -> dict[str, Any]:

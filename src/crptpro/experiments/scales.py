@@ -108,6 +108,9 @@ SMALL = Scale(
 )
 """A fifth of the data, 6 % of the updates, 4 % of the env steps, a quarter of the batch: a day on two CPU cores."""
 
+_TINY_EXPLORER = settings(
+    env_steps=120, random_agent_steps=8, hidden_dim=16, queue_size=32, checkpoint_interval_env_steps=60
+)
 TINY = Scale(
     "tiny",
     transitions=130,  # an episode of manipulation has 125
@@ -120,20 +123,8 @@ TINY = Scale(
         "becl": settings(hidden_dim=16),
     },
     explore=_explorers(
-        settings(
-            env_steps=120,
-            random_agent_steps=8,
-            hidden_dim=16,
-            queue_size=32,
-            checkpoint_interval_env_steps=60,
-        ),
-        settings(
-            env_steps=120,
-            random_agent_steps=8,
-            hidden_dim=16,
-            queue_size=32,
-            checkpoint_interval_env_steps=60,
-        ),
+        _TINY_EXPLORER,
+        _TINY_EXPLORER,
         interval=2,
     ),
     finetune_updates=dict.fromkeys(FINETUNE_UPDATES, 2),

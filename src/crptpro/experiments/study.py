@@ -13,11 +13,12 @@ from typing import Any, Literal
 
 from crptpro.domains import GROUPS, get_domain
 from crptpro.experiments import goals
+from crptpro.experiments.analyses import SINGLE_DOMAIN, UNSEEN_DOMAINS
 from crptpro.experiments.goals import RANDOM_ENCODER, Goal, Request, dataset, runs
+from crptpro.experiments.measurements import ProbePiece
 from crptpro.experiments.pieces import (
     EncoderPiece,
     PretrainedPiece,
-    ProbePiece,
     UntrainedPiece,
     settings,
 )
@@ -33,9 +34,6 @@ SNAPSHOTS = (500, 1_000, 2_000, 3_000, 5_000, 10_000, 20_000)
 """Updates after which the encoders of the temperatures are probed, besides at their end."""
 FACTOR_SNAPSHOTS = (1_000,)
 """Likewise those of the factors."""
-UNSEEN_DOMAINS = {"A": "finger", "B": "walker", "C": "walker", "D": "finger"}
-LEARNED_DOMAINS = {"A": "walker", "B": "cartpole", "C": "finger", "D": "hopper"}
-"""The domain of each group whose task is learned on the encoders."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +181,7 @@ def _probes(
     """
     group = place["group"]
     found: list[Goal] = []
-    for domain in (*GROUPS[group], UNSEEN_DOMAINS[group]):
+    for domain in (*GROUPS[group], UNSEEN_DOMAINS[group][0]):
         data = dataset(scale, domain, piece.seed, transitions=scale.probe_transitions)
         probe = ProbePiece(piece, data, samples=scale.probe_samples, at_updates=at_updates)
         found.append(Goal(label, probe, settings(**place, domain=get_domain(domain).name)))
@@ -192,7 +190,7 @@ def _probes(
 
 def _learned(request: Request, label: str, piece: PretrainedPiece, place: dict[str, Any]) -> list[Goal]:
     """One task of the group on the finished encoder, one run unless more seeds are asked for."""
-    task = get_domain(LEARNED_DOMAINS[place["group"]]).task
+    task = get_domain(SINGLE_DOMAIN[place["group"]]).task
     if request.tasks and task not in request.tasks:
         return []
     return runs(replace(request, seeds=request.seeds or (0,)), label, task, {piece.seed: piece}, **place)

@@ -8,6 +8,7 @@ from typing import Any
 from crptpro.cards import read_json
 from crptpro.data.incoming import dataset_path
 from crptpro.errors import CRPTproError, RecordError
+from crptpro.experiments.durations import duration
 from crptpro.experiments.pieces import piece_from_json
 from crptpro.experiments.records import Run
 from crptpro.experiments.report.blocks import Block, Cell, Fold, Table, cells, facts
@@ -48,19 +49,6 @@ def run_cards(runs: Iterable[Run]) -> tuple[Block, ...]:
         title = f"{run.method} on {run.task}, seed {run.seed}"
         found.append(Fold(title, (facts("Settings", values),)))
     return tuple(found)
-
-
-def duration(seconds: float) -> str:
-    """Return a time in words.
-
-    Examples:
-        >>> duration(42.0), duration(3_725.0), duration(90_061.0)
-        ('42 s', '1 h 02 min', '25 h 01 min')
-    """
-    if seconds < 60:
-        return f"{seconds:.0f} s"
-    hours, minutes = divmod(round(seconds / 60), 60)
-    return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min"
 
 
 def _card(piece: Made, pieces: Mapping[str, Made]) -> Fold:

@@ -13,8 +13,7 @@ from crptpro.cards import read_json
 from crptpro.errors import RecordError
 from crptpro.experiments.building import DESCRIPTION, DONE, PIECES
 from crptpro.experiments.records import Run, find_runs
-
-EXPERIMENTS = "experiments"
+from crptpro.experiments.requests import EXPERIMENTS_DIRECTORY, read_request
 
 
 @dataclass(frozen=True)
@@ -136,11 +135,11 @@ def read_source(root: str | Path) -> Source:
     problems: list[str] = []
     pieces = _pieces(root, problems)
     asked = []
-    for path in sorted((root / EXPERIMENTS).glob("*.json")):
+    for path in sorted((root / EXPERIMENTS_DIRECTORY).glob("*.json")):
         try:
             asked.append(_asked(root, path, pieces))
-        except (RecordError, KeyError, TypeError, AttributeError, ValueError) as reason:
-            problems.append(f"{path} is no request of an experiment ({type(reason).__name__}: {reason}).")
+        except RecordError as reason:
+            problems.append(str(reason))
     if asked:
         return Source(root, tuple(asked), pieces, problems=tuple(problems))
     found = find_runs(root, unfinished=True)
@@ -153,8 +152,8 @@ def read_source(root: str | Path) -> Source:
     if not runs:
         detail = f" {problems[0]}" if problems else ""
         raise RecordError(
-            f"{root} holds nothing to report on: no experiment of `crptpro reproduce` ({EXPERIMENTS}/*.json) and no "
-            f"finished downstream run.{detail}"
+            f"{root} holds nothing to report on: no experiment of `crptpro reproduce` "
+            f"({EXPERIMENTS_DIRECTORY}/*.json) and no finished downstream run.{detail}"
         )
     return Source(root, (), pieces, tuple(runs), tuple(problems))
 
@@ -187,10 +186,9 @@ def _made(directory: Path) -> Made:
 
 
 def _asked(root: Path, path: Path, pieces: Mapping[str, Made]) -> Asked:
-    content = read_json(path, error=RecordError)
+    record = read_request(path)
     goals = []
-    for goal in content["goals"]:
-        key = str(goal["key"])
-        piece = pieces.get(key) or Made(key, root / PIECES / key, {}, None)
-        goals.append(Wanted(str(goal["label"]), dict(goal.get("place") or {}), piece))
-    return Asked(str(content["experiment"]), str(content["scale"]), tuple(goals))
+    for goal in record.goals:
+        piece = pieces.get(goal.key) or Made(goal.key, root / PIECES / goal.key, {}, None)
+        goals.append(Wanted(goal.label, dict(goal.place), piece))
+    return Asked(record.experiment, record.scale, tuple(goals))
