@@ -41,17 +41,17 @@ def learning_curves(placed: Sequence[Placed], name: str, bootstrap: Bootstrap) -
         label: [len(grouped[spot, label]) for spot in spots if grouped[spot, label]] for label in labels
     }
     named = {label: f"{label} ({_runs(counts[label])})" for label in labels}
-    by_steps, by_hours = [], []
+    by_env_steps, by_hours = [], []
     for spot in spots:
         here = {label: grouped[spot, label] for label in labels if grouped[spot, label]}
-        by_steps.append(_panel(spot, "env steps", here, look, named, bootstrap))
+        by_env_steps.append(_panel(spot, "env steps", here, look, named, bootstrap))
         by_hours.append(_panel(spot, "hours", here, look, named, bootstrap))
     band = f"{bootstrap.confidence:.0%} bootstrap intervals over runs where there are two or more"
     return [
         Figure(
             f"{name}-curves",
             f"Episode return along training: mean over runs (n per panel in the legend), {band}.",
-            drawing.lines(by_steps),
+            drawing.lines(by_env_steps),
         ),
         Figure(
             f"{name}-curves-time",

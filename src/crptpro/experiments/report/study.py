@@ -88,9 +88,8 @@ def _along(rows: Sequence[Row], name: str, of: str) -> list[Block]:
         for label in labels:
             own = [row for row in here if _value(row.goal) == label]
             places = sorted({_updates(row) for row in own})
-            means = [
-                np.mean([r.number("value") or np.nan for r in own if _updates(r) == at]) for at in places
-            ]
+            read = [[r.number("value") for r in own if _updates(r) == at] for at in places]
+            means = [np.mean([np.nan if value is None else value for value in part]) for part in read]
             encoders = len({_encoder(row) for row in own})
             curves.append(drawing.Line(f"{label} (n = {encoders})", look[label], places, means))
         untrained = [r.number("value") for r in rows if _factor(r.goal) == CONTROL and _column(r) == column]
