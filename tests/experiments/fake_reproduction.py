@@ -37,6 +37,10 @@ class Measurement(Piece):
     name: str
     seed: int = 0
 
+    @property
+    def title(self) -> str:
+        return self.name
+
     def to_json(self) -> dict[str, Any]:
         kind, _ = self.name.split(" ", 1)
         return {"kind": kind, "name": self.name, "seed": self.seed}

@@ -201,7 +201,7 @@ def test_a_damaged_request_and_a_damaged_piece_are_named(tmp_path: Path) -> None
     (tmp_path / "experiments" / "probe-small.json").write_text('{"experiment": "probe"}')
     page = page_of(tmp_path)
     said = words(blocks_of(page, "contents"))
-    assert "probe-small.json is no request of an experiment" in said
+    assert "probe-small.json does not say what was asked for" in said
     assert "done.json cannot be read as JSON" in said
     assert "Nothing is finished yet" in words(blocks_of(page, "seen-small"))
 
