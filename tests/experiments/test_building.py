@@ -17,7 +17,7 @@ from crptpro.directory_lock import DirectoryLock
 from crptpro.downstream_config import DownstreamConfig
 from crptpro.errors import RecordError
 from crptpro.experiments import building
-from crptpro.experiments.building import DESCRIPTION, DONE, JobSettings, Store, build, new_loss
+from crptpro.experiments.building import CLOCK, DESCRIPTION, DONE, JobSettings, Store, build, new_loss
 from crptpro.experiments.pieces import (
     KINDS,
     DatasetPiece,
@@ -240,8 +240,13 @@ def test_an_encoder_is_trained_recorded_and_goes_on_where_it_was_interrupted(
     before = read_rows(record)
     assert [row["updates"] for row in before] == ["2", "4"]
     assert not store.is_done(piece)
+    first = read_json(store.path(piece) / CLOCK)
     build(piece, store, JOB)
     assert read_rows(record) == before
+    done = read_json(store.path(piece) / DONE)
+    assert (first["attempts"], done["attempts"]) == (1, 2)
+    assert done["seconds"] == store.seconds(piece) > first["seconds"] > 0
+    assert not (store.path(piece) / CLOCK).exists()
     artifact = load_pretrained(store.encoder(piece))
     assert artifact.card["training"]["updates"] == 4
     assert read_json(store.path(piece) / "config.json")["config"]["piece"] == piece.to_json()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import logging
 import shutil
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -28,13 +27,14 @@ from crptpro.experiments.pieces import (
     UntrainedPiece,
     piece_from_json,
 )
+from crptpro.experiments.work_clock import WorkClock
 
 if TYPE_CHECKING:
     from torchrl.objectives import LossModule
 
 logger = logging.getLogger(__name__)
 
-PIECES, DESCRIPTION, DONE, LOG = "pieces", "piece.json", "done.json", "log.txt"
+PIECES, DESCRIPTION, CLOCK, DONE, LOG = "pieces", "piece.json", "clock.json", "done.json", "log.txt"
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Store:
         return (self.path(piece) / DONE).is_file()
 
     def seconds(self, piece: Piece) -> float:
-        """Wall clock of the attempt that finished a piece."""
+        """Wall clock of all attempts at a finished piece."""
         return float(read_json(self.path(piece) / DONE, error=RecordError)["seconds"])
 
     def dataset(self, piece: DatasetPiece) -> Path:
@@ -134,10 +134,11 @@ def build(piece: Piece, store: Store, job: JobSettings | None = None) -> None:
     store.describe(piece)
     directory = store.path(piece)
     with DirectoryLock(directory, error=RecordError, is_reentrant=True):
-        began = time.monotonic()
-        make(piece, store, job)
-        seconds = time.monotonic() - began
-        write_json(directory / DONE, {"seconds": seconds, "job": asdict(job), **provenance()})
+        with WorkClock(directory / CLOCK) as clock:
+            make(piece, store, job)
+        spent = {"seconds": clock.seconds, "attempts": clock.attempts}
+        write_json(directory / DONE, {**spent, "job": asdict(job), **provenance()})
+        clock.path.unlink(missing_ok=True)
         for name in piece.leftovers:  # gigabytes, of a downstream run
             shutil.rmtree(directory / name, ignore_errors=True)
 

@@ -207,10 +207,8 @@ class DownstreamRun:
         """
         at_once = self.parts.algorithm.explores_at_once
         if self.agent_steps < self.config.random_agent_steps and not at_once:
-            return (
-                torch.rand(self.env.env.action_spec.shape, generator=self.generators["random_actions"]) * 2
-                - 1
-            )
+            shape, generator = self.env.env.action_spec.shape, self.generators["random_actions"]
+            return 2 * torch.rand(shape, generator=generator) - 1
         action = self.parts.algorithm.explore(features).squeeze(0).float().cpu().clamp(-1, 1)
         if not torch.isfinite(action).all():
             raise not_finite(f"After update {self.updates} the policy of {self.task} acts {action.tolist()}")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from crptpro.cards import cpu_cores
 from crptpro.errors import CRPTproError
 from crptpro.experiments.building import JobSettings
+from crptpro.experiments.launching.gpus import visible_gpus
 from crptpro.experiments.launching.launchers import InlineLauncher, Launcher
 
 LauncherName = Literal["local", "slurm", "ray", "inline"]
@@ -70,7 +70,7 @@ def divide(
         usual = CLUSTER_GPU_CORES if device.startswith("cuda") else 1
         return Resources(jobs or CLUSTER_JOBS, cores_per_job or usual, jobs_per_gpu=jobs_per_gpu)
     cores = cpu_cores()
-    gpus = _gpus() if device == "cuda" else ()
+    gpus = _require_gpus() if device == "cuda" else ()
     if launcher == "inline":
         return Resources(1, cores_per_job or cores)
     if jobs is None:
@@ -78,20 +78,15 @@ def divide(
     return Resources(jobs, cores_per_job or max(1, cores // jobs), gpus, jobs_per_gpu)
 
 
-def _gpus() -> tuple[str, ...]:
+def _require_gpus() -> tuple[str, ...]:
     import torch
 
-    seen = os.environ.get("CUDA_VISIBLE_DEVICES")
-    gpus = (
-        [part.strip() for part in seen.split(",") if part.strip()]
-        if seen is not None
-        else list(map(str, range(torch.cuda.device_count())))
-    )
+    gpus = visible_gpus()
     if not gpus or not torch.cuda.device_count():
         raise CRPTproError(
             "--device cuda: this machine has no GPU that torch can use; --device cpu always works."
         )
-    return tuple(gpus)
+    return gpus
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from crptpro.errors import CRPTproError
+from crptpro.experiments.launching.gpus import visible_gpus
 from crptpro.experiments.launching.launchers import Outcome
 from crptpro.experiments.launching.work import THREAD_VARIABLES, Work
 
@@ -131,7 +132,7 @@ class LocalLauncher:
 
         self._jobs = [job for job in self._jobs if job.outcome is None]
         # submitit hides all GPUs from a job that asks it for none; the job itself brings them back.
-        seen = os.environ.get("CUDA_VISIBLE_DEVICES", _all_gpus())
+        seen = ",".join(visible_gpus())
         if self.gpus:
             seen = min(self.gpus, key=lambda gpu: sum(job.work.gpus == gpu for job in self._jobs))
         work = Work(work.root, work.key, work.settings, gpus=seen)
@@ -220,12 +221,6 @@ def _new_folder(work: Work) -> Path:
     parent = Path(work.root) / FOLDER
     parent.mkdir(parents=True, exist_ok=True)
     return Path(tempfile.mkdtemp(prefix=f"{work.key}-", dir=parent))
-
-
-def _all_gpus() -> str:
-    import torch
-
-    return ",".join(map(str, range(torch.cuda.device_count())))
 
 
 @contextlib.contextmanager

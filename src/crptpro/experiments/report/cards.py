@@ -55,7 +55,8 @@ def _card(piece: Made, pieces: Mapping[str, Made]) -> Fold:
     rows = [cells("state", piece.state)]
     if piece.done is not None:
         if isinstance(seconds := piece.done.get("seconds"), (int, float)):
-            rows.append(cells("wall clock of the last attempt", duration(seconds)))
+            attempts = piece.done.get("attempts", 1)
+            rows.append(cells(f"wall clock, {attempts} attempt{'s' * (attempts != 1)}", duration(seconds)))
         rows += [cells(f"job {name}", value) for name, value in _flat(piece.done.get("job", {}))]
         rows.append(cells("git revision", str(piece.done.get("git_revision", "unknown"))))
     for name, value in piece.description.items():

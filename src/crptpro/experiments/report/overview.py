@@ -48,9 +48,7 @@ def contents(source: Source) -> tuple[Block, ...]:
         done = Counter(piece.kind for piece in source.pieces.values() if piece.done is not None)
         seconds = [float(p.done.get("seconds", 0)) for p in source.pieces.values() if p.done is not None]
         told = ", ".join(f"{done[kind]} of {count} {kind}" for kind, count in kinds.items())
-        blocks.append(
-            Paragraph(f"Pieces finished: {told}; {sum(seconds) / 3600:.1f} h of work in their last attempts.")
-        )
+        blocks.append(Paragraph(f"Pieces finished: {told}; {sum(seconds) / 3600:.1f} h of work in all."))
     if source.runs:
         tasks = sorted({run.task for run in source.runs})
         methods = sorted({run.method for run in source.runs})

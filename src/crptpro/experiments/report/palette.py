@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from crptpro.experiments.goals import METHODS
-
 
 @dataclass(frozen=True)
 class Style:
@@ -37,7 +35,6 @@ _STYLES = {
     "random-encoder": Style("#858a91", "h", ":"),
     "random policy": Style("#858a91", ".", ":"),
 }
-assert set(METHODS) <= set(_STYLES)
 
 _VARIANTS = (
     ("o", "-"),
@@ -98,8 +95,8 @@ def in_order(labels: Iterable[str]) -> list[str]:
     order = list(_STYLES)
     unique = list(dict.fromkeys(labels))
 
-    def place(label: str) -> tuple[int, int]:
+    def place(label: str) -> tuple[int, bool, int]:
         base = base_method(label)
-        return (order.index(base) if base else len(order), unique.index(label))
+        return (order.index(base) if base else len(order), label != base, unique.index(label))
 
     return sorted(unique, key=place)

@@ -213,16 +213,16 @@ def warmup(index: int, updates: int) -> float:
     return 1.0 if index >= updates else index / updates
 
 
-def warmup_cosine(index: int, warmup: int, updates: int) -> float:
+def warmup_cosine(index: int, warmup_updates: int, updates: int) -> float:
     """Factor on the learning rate at update ``index`` (from 0): linear from 0, then half a cosine to 0 (ATC).
 
     Examples:
         >>> [round(warmup_cosine(i, 2, 6), 2) for i in range(6)]
         [0.0, 0.5, 1.0, 0.85, 0.5, 0.15]
     """
-    if index < warmup:
-        return index / warmup
-    progress = (index - warmup) / max(updates - warmup, 1)
+    if index < warmup_updates:
+        return index / warmup_updates
+    progress = (index - warmup_updates) / max(updates - warmup_updates, 1)
     return (1 + math.cos(math.pi * min(progress, 1.0))) / 2
 
 
