@@ -67,9 +67,17 @@ def test_a_place_with_several_values_is_read_back(tmp_path: Path) -> None:
     ] == [goal]
 
 
-def test_a_damaged_file_is_refused_by_name(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"experiment": "seen"},
+        {"goals": ["x"]},
+        {"goals": [{"label": "x", "key": "y", "place": None}]},
+    ],
+)
+def test_a_damaged_file_is_refused_by_name(tmp_path: Path, content: dict[str, object]) -> None:
     path = request_path(tmp_path, "seen", "tiny")
     path.parent.mkdir()
-    path.write_text(json.dumps({"experiment": "seen"}))
+    path.write_text(json.dumps(content))
     with pytest.raises(RecordError, match=r"seen-tiny\.json does not say what was asked for"):
         ask(Store(tmp_path))

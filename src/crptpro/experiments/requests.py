@@ -93,7 +93,7 @@ def read_request(path: Path) -> Record:
     try:
         goals = tuple(AskedGoal(g["label"], g["key"], _settings(g["place"])) for g in content["goals"])
         return Record(content["experiment"], content["scale"], content["request"], goals)
-    except (KeyError, TypeError) as reason:
+    except (KeyError, TypeError, AttributeError) as reason:
         raise RecordError(
             f"{path} does not say what was asked for ({reason!r}); remove it and ask again."
         ) from reason
