@@ -8,6 +8,8 @@ from crptpro.downstream_config import DownstreamConfig, SkillDDPGSettings, drq_s
 
 
 @pytest.mark.parametrize(("make", "message"), [
+    (lambda: DownstreamConfig(channels_last="last"), r"`channels_last` must be 'auto', 'on' or 'off', got 'last'"),
+    (lambda: DownstreamConfig(cuda_graph="maybe"), r"`cuda_graph` must be 'auto', 'on' or 'off', got 'maybe'"),
     (lambda: DownstreamConfig(algorithm="drq"), r"`intrinsic_reward_coef` is 0\.2, but drq .* drq_settings\(\)"),
     (lambda: SkillDDPGSettings(n_step=0), r"`skill_ddpg\.n_step` must be at least 1, got 0"),
     (lambda: SkillDDPGSettings(noise_clip=-1.0), r"`skill_ddpg\.noise_clip` must not be negative, got -1\.0"),

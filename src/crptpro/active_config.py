@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from crptpro.quality import Quality
+from crptpro.switches import Switch, check_switch
 
 
 @dataclass(frozen=True)
@@ -108,6 +109,8 @@ class ActiveConfig(ExplorationSettings):
     """seeds agents, environments, exploration, sampling and shifts"""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """arithmetic of the convolutions and big matrix products"""
+    channels_last: Switch = "auto"
+    """memory layout of the encoder's convolutions; changes rounding only (auto: on)"""
     device: str = "cpu"
     """where networks live"""
     render_ahead: bool | None = None
@@ -120,6 +123,7 @@ class ActiveConfig(ExplorationSettings):
             ValueError: naming the setting, its value and what is allowed.
         """
         super().__post_init__()
+        check_switch("channels_last", self.channels_last)
         for name in ("batch_size", "log_interval", "patience_updates"):
             _require(self, name, "at least 1", lambda value: value >= 1)
         _require(self, "learning_rate", "positive", lambda value: value > 0)

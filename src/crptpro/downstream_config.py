@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from crptpro.colors import Colors
 from crptpro.quality import Quality
+from crptpro.switches import Switch, check_switch
 
 Algorithm = Literal["rad-sac", "drq", "skill-ddpg"]
 
@@ -191,9 +192,11 @@ class DownstreamConfig(SACSettings):
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it. Deviation: the released code
     computes in fp32 throughout, which `fp32` gives"""
-    compile: Literal["auto", "on", "off"] = "auto"
+    channels_last: Switch = "auto"
+    """memory layout of the encoder's convolutions, which changes rounding only; `auto` is on"""
+    compile: Switch = "auto"
     """compile the learner's losses with torch.compile, which changes rounding only; `auto` is off"""
-    cuda_graph: Literal["auto", "on", "off"] = "auto"
+    cuda_graph: Switch = "auto"
     """on a GPU, record the learner's updates and replay them, the action noise drawn there; `auto` is off"""
     eval_workers: int | None = None
     """processes that evaluate on the CPU while training goes on, 0.5 GB of memory each, at most one per episode; 0
@@ -214,6 +217,8 @@ class DownstreamConfig(SACSettings):
         super().__post_init__()
         if self.eval_workers is not None and self.eval_workers < 0:
             raise ValueError(f"`eval_workers` must not be negative, got {self.eval_workers}.")
+        for name in ("channels_last", "compile", "cuda_graph"):
+            check_switch(name, getattr(self, name))
         for name in ("compile", "cuda_graph"):
             if self.algorithm == "skill-ddpg" and getattr(self, name) == "on":
                 raise ValueError(f"`{name}` is 'on', which skill-ddpg does not have; leave it out.")

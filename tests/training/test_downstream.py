@@ -252,6 +252,8 @@ def test_what_auto_became_must_agree_when_a_run_is_continued(
         train(tmp_path, features="reencode")
     with pytest.raises(CheckpointError, match="compile was 'absent', now 'on'"):
         train(tmp_path, features="dense", compile="on")
+    with pytest.raises(CheckpointError, match="channels_last was 'absent', now 'off'"):
+        train(tmp_path, features="dense", channels_last="off")
     assert train(tmp_path, features="dense", compile="off").env_steps == 120
 
 

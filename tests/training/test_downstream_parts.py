@@ -111,3 +111,13 @@ def test_the_switches_reach_the_learner_and_are_off_on_a_cpu_unless_asked_for(tm
     assert parts_of(small_pretrained(), tmp_path / "on", compile="on").learner.compiled.is_on
     with pytest.raises(ValueError, match="`cuda_graph` 'on' needs a CUDA device"):
         parts_of(small_pretrained(), tmp_path / "graph", cuda_graph="on")
+
+
+@pytest.mark.parametrize(("channels_last", "found"), [("auto", True), ("off", False)])
+def test_the_layout_is_the_runs_and_the_artifact_keeps_its_own(
+    tmp_path: Path, channels_last: str, found: bool
+) -> None:
+    pretrained = small_pretrained()
+    parts = parts_of(pretrained, tmp_path, channels_last=channels_last)
+    assert parts.encoder.channels_last is found
+    assert pretrained.encoder.channels_last

@@ -12,6 +12,7 @@ from pretrain_world import SETTINGS, make_dataset, make_datasets, make_loss, sam
 from torchrl.objectives import LossModule
 
 from crptpro.errors import CheckpointError, PretrainedError
+from crptpro.modules import PixelEncoder, is_channels_last
 from crptpro.objectives import MethodDefaults, registry
 from crptpro.pretrained import encoder_snapshots, finetune, load_pretrained, save_pretrained, snapshot_path
 from crptpro.training import pretrain
@@ -183,3 +184,37 @@ def test_a_run_that_broke_off_keeps_the_same_encoders(tmp_path: Path) -> None:
 def test_an_update_that_is_never_reached_is_refused(done: int) -> None:
     with pytest.raises(ValueError, match=f"`at_updates` must lie in 1 to `updates`, here 4, got {done}"):
         run(make_loss(), 4, at_updates={done: save_pretrained})
+
+
+def test_the_layout_changes_rounding_only_is_recorded_and_is_left_as_it_was(tmp_path: Path) -> None:
+    last, usual = make_loss(), make_loss()
+    run(last, 6)
+    run(usual, 6, channels_last="off", run_dir=tmp_path)
+    for one, two in zip(last.parameters(), usual.parameters()):
+        torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-4)
+    assert (last.training_record["channels_last"], usual.training_record["channels_last"]) == (True, False)
+    assert is_channels_last(usual)
+    assert (
+        "channels_last" not in last.training_record["settings"]
+    )  # runs from before the switch can be continued
+    with pytest.raises(CheckpointError, match="channels_last was False, now 'absent'"):
+        run(make_loss(), 8, run_dir=tmp_path)
+    assert run(make_loss(), 8, run_dir=tmp_path, channels_last="off").resumed_from == 6
+
+
+def test_the_layout_is_in_force_while_a_loss_is_trained(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[bool] = []
+    convolve = PixelEncoder._convolve
+
+    def watch(self: PixelEncoder, images: torch.Tensor, parameters: Any) -> torch.Tensor:
+        seen.append(convolve(self, images, parameters).is_contiguous(memory_format=torch.channels_last))
+        return convolve(self, images, parameters)
+
+    monkeypatch.setattr(PixelEncoder, "_convolve", watch)
+    run(make_loss(), 1)
+    run(make_loss(), 1, channels_last="off")
+    half = len(seen) // 2
+    assert all(seen[:half])
+    assert not any(seen[half:])
+    with pytest.raises(ValueError, match="`channels_last` must be 'auto', 'on' or 'off', got 'yes'"):
+        run(make_loss(), 1, channels_last="yes")

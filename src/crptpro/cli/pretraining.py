@@ -15,6 +15,7 @@ from crptpro.cli.request import Logging, explored_domains, image_format
 from crptpro.errors import CRPTproError
 from crptpro.loggers import RunLogger
 from crptpro.seeding import seed_everything
+from crptpro.switches import Switch
 
 if TYPE_CHECKING:
     from torch import nn
@@ -39,9 +40,11 @@ class PretrainingOptions:
     """seeds initialisation, sampling and shifts"""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
     """arithmetic of the convolutions and big matrix products"""
-    compile: Literal["auto", "on", "off"] = "auto"
+    channels_last: Switch = "auto"
+    """memory layout of the convolutions; changes rounding only (auto: on)"""
+    compile: Switch = "auto"
     """compile the loss with torch.compile; changes rounding only (auto: off)"""
-    cuda_graph: Literal["auto", "on", "off"] = "auto"
+    cuda_graph: Switch = "auto"
     """on a GPU, record the update once and replay it (auto: off)"""
     device: str = "cpu"
     """where to train"""
@@ -55,7 +58,7 @@ class PretrainingOptions:
     def training_arguments(self) -> dict[str, Any]:
         """Return the keywords that `pretrain` and `finetune` share."""
         names = (
-            "batch_size", "learning_rate", "seed", "precision", "compile", "cuda_graph", "device",
+            "batch_size", "learning_rate", "seed", "precision", "channels_last", "compile", "cuda_graph", "device",
             "checkpoint_interval", "log_interval",
         )  # fmt: skip
         return {name: getattr(self, name) for name in names} | {"run_dir": self.out}
@@ -131,6 +134,7 @@ class Pretrain(PretrainingOptions):
             log_interval=self.log_interval,
             seed=self.seed,
             precision=self.precision,
+            channels_last=self.channels_last,
             device=self.device,
         )
         require_explorable(loss, domains, config)

@@ -5,6 +5,7 @@ from crptpro.modules.contrast_heads import AnchorHead, SkillHead
 from crptpro.modules.deterministic_actor import DeterministicActor, FixedSkillActor
 from crptpro.modules.encoder import PixelEncoder
 from crptpro.modules.heads import Predictor, Projector, Prototypes
+from crptpro.modules.layout import is_channels_last, resolve_channels_last, set_channels_last
 from crptpro.modules.pixel_critic import PixelCritic
 from crptpro.modules.placement import usable_device
 from crptpro.modules.precision import resolve_precision, set_compute_dtype
@@ -21,7 +22,10 @@ __all__ = [
     "SkillHead",
     "SquashedGaussianActor",
     "TwinCritic",
+    "is_channels_last",
+    "resolve_channels_last",
     "resolve_precision",
+    "set_channels_last",
     "set_compute_dtype",
     "usable_device",
 ]

@@ -26,8 +26,7 @@ class PixelEncoder(nn.Module):
     Numerics. In float32 the network sees ``pixels * pixel_scale - pixel_offset``. In bfloat16 it sees the raw
     0..255 values, which bfloat16 holds exactly, and the scale is folded into the first kernel; an offset of
     0.5 (with scale 1/255) is exact too. Parameters stay float32 in both, and each chunk of the batch
-    accumulates its weight gradient in float32. Memory layout (channels last) and chunking change rounding
-    only.
+    accumulates its weight gradient in float32. Memory layout and chunking change rounding only.
 
     Args:
         in_channels: colour channels times stacked frames (3 x 3).
@@ -46,6 +45,8 @@ class PixelEncoder(nn.Module):
             dtype.
         micro_batch: chunk length on CPU, where smaller chunks stay in cache and go to different cores; other
             devices take the whole batch.
+        channels_last: whether convolutions compute with the channels of a pixel beside each other in memory, or in
+            PyTorch's usual layout.
 
     Raises:
         ValueError: lists of unequal length, an image too small for the convolutions, or an unknown ``init``.
@@ -103,6 +104,7 @@ class PixelEncoder(nn.Module):
         self.init: WeightInit = init
         self.compute_dtype: torch.dtype = torch.float32
         self.micro_batch: int = 64
+        self.channels_last: bool = True
         self.reset_parameters()
 
     @torch.no_grad()
@@ -168,7 +170,7 @@ class PixelEncoder(nn.Module):
             x = images.to(parameters[0].dtype) * self.pixel_scale
             if self.pixel_offset:
                 x = x - self.pixel_offset
-        x = x.contiguous(memory_format=torch.channels_last)
+        x = x.contiguous(memory_format=torch.channels_last if self.channels_last else torch.contiguous_format)
         for index, (weight, bias) in enumerate(zip(parameters[::2], parameters[1::2])):
             if low:
                 weight = weight * self.pixel_scale if index == 0 else weight

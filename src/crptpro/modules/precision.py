@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from crptpro.modules.networks_within import networks_within
 
 Precision = Literal["auto", "fp32", "bf16"]
 
@@ -70,7 +71,7 @@ def set_compute_dtype(module: _Module, dtype: torch.dtype) -> _Module:
     """
     if dtype not in COMPUTE_DTYPES:
         raise ValueError(f"compute dtype must be torch.float32 or torch.bfloat16, got {dtype}.")
-    for network in _all_modules(module, set()):
+    for network in networks_within(module):
         if hasattr(network, "compute_dtype"):
             cast(Any, network).compute_dtype = dtype
     return module
@@ -95,18 +96,6 @@ def linear_in(inputs: Tensor, weight: Tensor, bias: Tensor | None, compute_dtype
         return F.linear(inputs.to(weight.dtype), weight, bias)
     product = F.linear(inputs.to(compute_dtype), weight.to(compute_dtype)).to(weight.dtype)
     return product if bias is None else product + bias
-
-
-def _all_modules(module: nn.Module, seen: set[int]) -> Iterator[nn.Module]:
-    for child in module.modules():
-        if id(child) in seen:
-            continue
-        seen.add(id(child))
-        yield child
-        # LossModule.convert_to_functional hides networks in the instance dictionary.
-        for value in list(vars(child).values()):
-            if isinstance(value, nn.Module):
-                yield from _all_modules(value, seen)
 
 
 def _multiplies_bf16(device: torch.device) -> bool:

@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from crptpro.errors import CompileError
-from crptpro.training.compiled import Switch, check_switch
+from crptpro.switches import Switch, check_switch
 
 Outputs = dict[str, Tensor]
 

@@ -4,30 +4,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import torch
 
 from crptpro.errors import CompileError
 from crptpro.modules.chunks import chunks_uncompiled
+from crptpro.switches import Switch, check_switch
 
 _LOG = logging.getLogger(__name__)
 
-Switch = Literal["auto", "on", "off"]
 R = TypeVar("R")
 
 #: Packages whose exceptions say that compiling failed and not what was compiled.
 _COMPILERS = ("torch._dynamo", "torch._inductor", "torch._functorch", "triton")
-
-
-def check_switch(name: str, value: str) -> None:
-    """Refuse anything but ``"auto"``, ``"on"`` and ``"off"``.
-
-    Raises:
-        ValueError: naming the setting and its value.
-    """
-    if value not in ("auto", "on", "off"):
-        raise ValueError(f"`{name}` must be 'auto', 'on' or 'off', got {value!r}.")
 
 
 def resolve_compile(compile: Switch) -> bool:

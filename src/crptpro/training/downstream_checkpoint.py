@@ -22,7 +22,8 @@ STREAMS = ("train", "episodes", "eval")
 COUNTERS = ("agent_steps", "updates", "episodes", "last_eval", "next_eval", "next_checkpoint")
 
 FREE_TO_CHANGE = (
-    "env_steps", "device", "features", "precision", "compile", "cuda_graph", "eval_workers", "render_ahead",
+    "env_steps", "device", "features", "precision", "channels_last", "compile", "cuda_graph", "eval_workers",
+    "render_ahead",
 )  # fmt: skip
 """Settings that a run may be continued with other values of: budgets may grow, machines differ. What `auto` became
 is compared instead of what was asked."""
@@ -50,6 +51,8 @@ def fingerprint(run: DownstreamRun) -> dict[str, Any]:
     compiled = getattr(run.parts.learner, "compiled", None)
     if compiled is not None and compiled.is_on:
         resolved["compile"] = "on"
+    if not run.parts.encoder.channels_last:
+        resolved["channels_last"] = "off"
     if getattr(run.parts.learner, "generator", None) is not None:
         resolved["action noise"] = "drawn on the device"
     return {"task": run.task, **settings, **resolved, "pretrained": run.pretrained_identity}

@@ -16,7 +16,13 @@ from torchrl.envs import EnvBase
 
 from crptpro.data import FrameReplay
 from crptpro.downstream_config import DownstreamConfig
-from crptpro.modules import PixelEncoder, resolve_precision, set_compute_dtype
+from crptpro.modules import (
+    PixelEncoder,
+    resolve_channels_last,
+    resolve_precision,
+    set_channels_last,
+    set_compute_dtype,
+)
 from crptpro.pretrained import Pretrained
 from crptpro.training.actor_transfer import transferred_actor
 from crptpro.training.agent import PixelAgent
@@ -129,6 +135,7 @@ def build_parts(
     for module in (encoder, projector, prototypes):
         if module is not None:
             set_compute_dtype(module.requires_grad_(False).eval().to(config.device), dtype)
+    set_channels_last(encoder, resolve_channels_last(config.channels_last))
 
     action_dim = env.action_spec.shape[-1]
     algorithm = make_algorithm(

@@ -5,7 +5,10 @@ from __future__ import annotations
 import logging
 import signal
 import threading
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from crptpro.training.checkpoint import CheckpointDir
 
 logger = logging.getLogger(__name__)
 
@@ -50,3 +53,8 @@ class StopRequest:
         self.signal = number
         if self._announcement:
             logger.warning(self._announcement)
+
+
+def what_is_kept(checkpoints: CheckpointDir | None) -> str:
+    """Return what a run that is stopped leaves behind, for its message."""
+    return "nothing is kept without run_dir" if checkpoints is None else "a checkpoint was written"

@@ -9,6 +9,7 @@ import torch
 from active_world import explore, make_loss, toy_env
 
 from crptpro.errors import CheckpointError, CRPTproError, NonFiniteError
+from crptpro.modules import is_channels_last
 from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training.explore.member import Member
 from crptpro.training.explore.run import ActiveRun
@@ -39,6 +40,13 @@ def test_it_spends_its_budget_and_says_so_in_env_steps_and_encoder_updates(tmp_p
     assert loss.training_record["env_steps"] == 240
     assert loss.training_record["updates"] == 50
     assert [facts["agent_steps"] for facts in loss.training_record["datasets"]] == [60, 60]
+
+
+def test_the_layout_is_the_runs_and_is_recorded() -> None:
+    loss, _ = explore(None, channels_last="off")
+    usual, _ = explore(None)
+    assert (loss.training_record["channels_last"], usual.training_record["channels_last"]) == (False, True)
+    assert is_channels_last(loss)
 
 
 @pytest.mark.parametrize("count", [2, 3, 4])
@@ -187,6 +195,8 @@ def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:
     explore(tmp_path)
     with pytest.raises(CheckpointError, match="encoder_update_interval was 2, now 3"):
         explore(tmp_path, encoder_update_interval=3)
+    with pytest.raises(CheckpointError, match="channels_last was 'absent', now False"):
+        explore(tmp_path, channels_last="off")
     with pytest.raises(CheckpointError, match="already holds a run"):
         explore(tmp_path, resume=False)
 

@@ -23,7 +23,14 @@ from crptpro.domains import Domain
 from crptpro.envs import make_env
 from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
-from crptpro.modules import resolve_precision, set_compute_dtype, usable_device
+from crptpro.modules import (
+    is_channels_last,
+    resolve_channels_last,
+    resolve_precision,
+    set_channels_last,
+    set_compute_dtype,
+    usable_device,
+)
 from crptpro.objectives import exploration_defaults, get_method, method_defaults, methods
 from crptpro.seeding import derive_seed
 from crptpro.training.checkpoint import CheckpointDir
@@ -112,6 +119,8 @@ def pretrain_active(
     with contextlib.ExitStack() as stack:
         stack.callback(set_compute_dtype, loss, torch.float32)
         set_compute_dtype(loss, dtype)
+        stack.callback(set_channels_last, loss, True)
+        set_channels_last(loss, resolve_channels_last(config.channels_last))
         stack.enter_context(torch.random.fork_rng(devices=cuda))
         require_explorable(loss, domains, config)
         torch.manual_seed(derive_seed(config.seed, "active", "loss"))
@@ -152,6 +161,7 @@ def pretrain_active(
             updates=run.updates,
             seconds=run.seconds,
             precision=run.precision,
+            channels_last=is_channels_last(loss),
             device=str(device),
             env_steps=run.env_steps,
             settings={key: value for key, value in run.fingerprint.items() if key != "loss"},

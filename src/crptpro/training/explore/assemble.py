@@ -17,6 +17,7 @@ from crptpro.active_config import ActiveConfig
 from crptpro.domains import Domain, get_domain
 from crptpro.envs import make_env
 from crptpro.loggers import RunLogger
+from crptpro.modules import is_channels_last
 from crptpro.objectives import ExplorationDefaults, MethodDefaults
 from crptpro.seeding import derive_seed
 from crptpro.training.action_repeat import action_repeat_of
@@ -36,8 +37,9 @@ from crptpro.transforms.prototype_reward import warn_if_mostly_zero
 
 logger = logging.getLogger(__name__)
 
-FREE_TO_CHANGE = ("device", "precision", "render_ahead")
-"""Settings that a run may be continued with other values of; what `precision` became is compared instead."""
+FREE_TO_CHANGE = ("device", "precision", "channels_last", "render_ahead")
+"""Settings that a run may be continued with other values of; what `precision` and `channels_last` became is compared
+instead."""
 
 
 def assemble(
@@ -191,6 +193,8 @@ def fingerprint(
     settings = dataclasses.asdict(config)
     for name in FREE_TO_CHANGE:
         settings.pop(name)
+    if not is_channels_last(loss):  # only then: runs from before this switch can be continued
+        settings["channels_last"] = False
     return {
         "domains": domains,
         **settings,

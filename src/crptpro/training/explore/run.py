@@ -26,7 +26,7 @@ from crptpro.training.finite import not_finite, require_finite_parameters
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.progress import PretrainProgress
 from crptpro.training.pretrain.window import Window, cosine_threshold, memory_row, num_prototypes
-from crptpro.training.stop_request import StopRequest
+from crptpro.training.stop_request import StopRequest, what_is_kept
 
 logger = logging.getLogger(__name__)
 
@@ -120,14 +120,9 @@ class ActiveRun:
                     self.save()
                     next_checkpoint = self._next_checkpoint()
                     if stop.signal is not None and self.decisions < total:
-                        kept = (
-                            "a checkpoint was written"
-                            if self.checkpoints
-                            else "nothing is kept without run_dir"
-                        )
                         logger.warning(
                             "Stopped at %s of %s env steps; %s.",
-                            f"{self.env_steps:,}", f"{self.plan.env_steps:,}", kept,
+                            f"{self.env_steps:,}", f"{self.plan.env_steps:,}", what_is_kept(self.checkpoints),
                         )  # fmt: skip
                         stop.leave()
 
@@ -281,9 +276,8 @@ class ActiveRun:
         """Continue from a checkpoint; without one, clear the record for a fresh start."""
         if state is None:
             if self.checkpoints is not None and self.records is not None:
-                for (
-                    stream
-                ) in checkpoint.STREAMS:  # rows of an attempt that was killed before its first checkpoint
+                # Rows of an attempt that was killed before its first checkpoint.
+                for stream in checkpoint.STREAMS:
                     self.records.truncate_to(stream, "env_steps", -1)
             return
         checkpoint.restore(self, state)

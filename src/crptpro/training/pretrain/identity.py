@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from crptpro.modules import is_channels_last
 from crptpro.objectives import method_defaults
 from crptpro.training.fingerprint import describe_loss
 from crptpro.training.pretrain.learner import Learner
@@ -33,6 +34,8 @@ def identity_of(
     defaults = learner.defaults
     # Only where used: older runs can be continued.
     switches: dict[str, Any] = {"compile": True} if learner.compiled.is_on else {}
+    if not is_channels_last(learner.loss):
+        switches["channels_last"] = False
     if draws_on_device:
         switches["batches"] = "drawn on the device"
     usual = 0 if defaults.schedule == "constant" else method_defaults(learner.loss).warmup_updates

@@ -14,12 +14,19 @@ from torchrl.objectives import LossModule
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
-from crptpro.modules import resolve_precision, set_compute_dtype, usable_device
+from crptpro.modules import (
+    resolve_channels_last,
+    resolve_precision,
+    set_channels_last,
+    set_compute_dtype,
+    usable_device,
+)
 from crptpro.modules.precision import Precision
 from crptpro.objectives import method_defaults
 from crptpro.seeding import derive_seed
+from crptpro.switches import Switch
 from crptpro.training.captured import resolve_cuda_graph
-from crptpro.training.compiled import Compiled, Switch, resolve_compile
+from crptpro.training.compiled import Compiled, resolve_compile
 from crptpro.training.pretrain.device_batches import DeviceBatches
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.result import PretrainResult
@@ -47,6 +54,7 @@ def pretrain(
     seed: int = 0,
     augment: Augment = "random_shift",
     precision: Precision = "auto",
+    channels_last: Switch = "auto",
     compile: Switch = "auto",
     cuda_graph: Switch = "auto",
     device: str | torch.device = "cpu",
@@ -89,6 +97,8 @@ def pretrain(
             the same images, shifted once more (copies for ``"none"`` and a function).
         precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (bf16 where the hardware multiplies it natively).
             Deviation: the released code computes in fp32 throughout, which ``"fp32"`` gives.
+        channels_last: ``"on"``, ``"off"`` or ``"auto"`` (on): the memory layout of the convolutions. Changes rounding
+            only.
         compile: ``"on"``, ``"off"`` or ``"auto"`` (off): compile the loss with ``torch.compile``. Changes
             rounding only. On a CPU the convolutions stay as they are.
         cuda_graph: ``"on"``, ``"off"`` or ``"auto"`` (off): on a GPU, record the whole update and replay it. An
@@ -146,6 +156,7 @@ def pretrain(
         raise ValueError(f"`encoder_tau` must be in [0, 1], got {encoder_tau}.")
     device = usable_device(device)
     dtype = resolve_precision(precision, device)
+    is_channels_last = resolve_channels_last(channels_last)
     compiled = Compiled(is_on=resolve_compile(compile))
     captures = resolve_cuda_graph(cuda_graph, device)
     cuda = [device.index or 0] if device.type == "cuda" else []
@@ -153,6 +164,8 @@ def pretrain(
     with contextlib.ExitStack() as stack:
         stack.callback(set_compute_dtype, loss, torch.float32)
         set_compute_dtype(loss, dtype)
+        stack.callback(set_channels_last, loss, True)
+        set_channels_last(loss, is_channels_last)
         stack.enter_context(torch.random.fork_rng(devices=cuda))
         torch.manual_seed(derive_seed(seed, "pretrain", "loss"))
         sources = open_sources(datasets, seed=seed, device=device)

@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule
 from crptpro.cards import provenance, require_disk
 from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
+from crptpro.modules import is_channels_last
 from crptpro.seeding import global_rng_state, set_global_rng_state
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.collapse import CollapseMonitor
@@ -25,7 +26,7 @@ from crptpro.training.pretrain.progress import PretrainProgress
 from crptpro.training.pretrain.result import PretrainResult, metrics_of, training_record
 from crptpro.training.pretrain.sources import Augmenter, Source, keys_read
 from crptpro.training.pretrain.window import Window, cosine_threshold, memory_row, num_prototypes
-from crptpro.training.stop_request import StopRequest
+from crptpro.training.stop_request import StopRequest, what_is_kept
 
 _LOG = logging.getLogger(__name__)
 
@@ -143,9 +144,7 @@ class PretrainRun:
                 if self.done == total or stop.signal is not None or self._checkpoint_is_due():
                     self.save()
                 if stop.signal is not None:
-                    kept = (
-                        "a checkpoint was written" if self.checkpoints else "nothing is kept without run_dir"
-                    )
+                    kept = what_is_kept(self.checkpoints)
                     _LOG.warning("Stopped at update %d of %d; %s.", self.done, total, kept)
                     stop.leave()
         return self._finish()
@@ -278,6 +277,7 @@ class PretrainRun:
             updates=self.done,
             seconds=seconds,
             precision=self.precision,
+            channels_last=is_channels_last(self.loss),
             compile=self.learner.compiled.is_on,
             cuda_graph=self.learner.captured is not None,
             device=str(self.device),
