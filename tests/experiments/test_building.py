@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -258,6 +259,30 @@ def test_an_encoder_is_trained_recorded_and_goes_on_where_it_was_interrupted(
     on = load_pretrained(store.encoder(finetuned))
     assert on.label == "crptpro-finetune"
     assert on.card["training"]["started_from"] == artifact.identity()
+
+
+def test_an_encoder_of_which_only_the_records_were_kept_is_made_again_with_the_same_numbers(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    piece = PretrainedPiece("crptpro", 0, (toy_dataset(store),), updates=4, loss=LOSS,
+                            training=settings(batch_size=4, log_interval=2))  # fmt: skip
+    build(piece, store, JOB)
+    directory = store.path(piece)
+    rows, identity = read_rows(directory / "pretrain.csv"), load_pretrained(store.encoder(piece)).identity()
+    shutil.rmtree(store.encoder(piece))
+    assert not store.is_done(piece)
+    with monkeypatch.context() as patch:
+        patch.setattr(pretrained, "save_pretrained", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            build(piece, store, JOB)
+    assert not store.is_recorded(piece)  # the old record is not taken for the new encoder's
+    build(piece, store, JOB)
+    assert load_pretrained(store.encoder(piece)).identity() == identity
+    ignored = {"unix_time_s", "updates_per_s", "resident_bytes"}
+    again = read_rows(directory / "pretrain.csv")
+    assert [{k: v for k, v in row.items() if k not in ignored} for row in again] == [
+        {k: v for k, v in row.items() if k not in ignored} for row in rows
+    ]
 
 
 def test_a_stage_that_refuses_leaves_the_piece_open(store: Store) -> None:

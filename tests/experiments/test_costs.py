@@ -34,6 +34,8 @@ RUN = RunPiece("walker_run", ENCODER, 0, config=settings(env_steps=20_000, batch
 def finish(store: Store, piece: Piece, seconds: float, device: str = "cpu") -> None:
     store.describe(piece)
     write_json(store.path(piece) / DONE, {"seconds": seconds, "job": {"device": device}})
+    for path in store.outputs(piece):
+        path.mkdir()
 
 
 @pytest.mark.parametrize(("piece", "seconds"), [

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,12 @@ def store(tmp_path: Path) -> Store:
 
 
 def finish(piece: Piece, store: Store) -> None:
+    record(piece, store)
+    for path in store.outputs(piece):
+        path.mkdir()
+
+
+def record(piece: Piece, store: Store) -> None:
     write_json(store.path(piece) / DONE, {"seconds": 1.0})
 
 
@@ -62,3 +69,38 @@ def test_what_an_unfinished_piece_needs_is_asked_for_even_if_a_finished_one_need
     finish(base, store)
     missing = make_plan([goal], store).missing
     assert [piece.key for piece in missing if piece.kind == "dataset"] == [goal.encoder.dataset.key]  # type: ignore[attr-defined]
+
+
+def test_of_a_finished_goal_the_records_are_enough(store: Store) -> None:
+    goal = finetuned_run()
+    record(goal.encoder, store)  # type: ignore[attr-defined]
+    record(goal, store)
+    assert make_plan([goal.encoder, goal], store).missing == ()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("is_goal_too", [True, False])
+def test_what_an_unfinished_piece_reads_is_made_again_where_only_its_records_were_kept(
+    store: Store, is_goal_too: bool
+) -> None:
+    goal = finetuned_run()
+    encoder = goal.encoder  # type: ignore[attr-defined]
+    record(encoder, store)
+    record(encoder.base, store)
+    finish(encoder.dataset, store)
+    goals = [encoder, goal] if is_goal_too else [goal]
+    plan = make_plan(goals, store)
+    assert [piece.kind for piece in plan.missing] == ["dataset", "dataset", "encoder", "finetuned", "run"]
+    for place, piece in enumerate(plan.pieces):
+        assert piece.key in plan.done or set(piece.needs) <= set(plan.pieces[:place])
+    store.encoder(encoder).mkdir()
+    assert make_plan(goals, store).missing == (goal,)
+
+
+def test_an_encoder_whose_snapshots_were_removed_is_made_again(store: Store) -> None:
+    base = finetuned_run().encoder.base  # type: ignore[attr-defined]
+    kept = replace(base, snapshots=(2,))
+    finish(kept, store)
+    assert store.is_done(kept)
+    store.encoder(kept, 2).rmdir()
+    assert not store.is_done(kept)
+    assert store.is_recorded(kept)

@@ -72,9 +72,22 @@ class Store:
         """What the jobs that made a piece said."""
         return self.path(piece) / LOG
 
-    def is_done(self, piece: Piece) -> bool:
-        """Whether a piece is finished."""
+    def is_recorded(self, piece: Piece) -> bool:
+        """Whether a piece has been finished; what it was made for may have been removed since, its records stay."""
         return (self.path(piece) / DONE).is_file()
+
+    def is_done(self, piece: Piece) -> bool:
+        """Whether a piece is finished and what others read of it is there."""
+        return self.is_recorded(piece) and all(path.exists() for path in self.outputs(piece))
+
+    def outputs(self, piece: Piece) -> list[Path]:
+        """What others read of a piece besides its records: gigabytes that may be removed when they have."""
+        if isinstance(piece, DatasetPiece):
+            return [self.dataset(piece)]
+        if not isinstance(piece, EncoderPiece):
+            return []
+        snapshots = piece.snapshots if isinstance(piece, PretrainedPiece) else ()
+        return [self.encoder(piece, at_updates) for at_updates in (None, *snapshots)]
 
     def seconds(self, piece: Piece) -> float:
         """Wall clock of all attempts at a finished piece."""
@@ -134,6 +147,8 @@ def build(piece: Piece, store: Store, job: JobSettings | None = None) -> None:
     store.describe(piece)
     directory = store.path(piece)
     with DirectoryLock(directory, error=RecordError, is_reentrant=True):
+        # Where records alone were kept, they are made again too.
+        (directory / DONE).unlink(missing_ok=True)
         with WorkClock(directory / CLOCK) as clock:
             make(piece, store, job)
         spent = {"seconds": clock.seconds, "attempts": clock.attempts}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from crptpro.experiments.building import Store
@@ -30,7 +30,8 @@ class Plan:
 def make_plan(goals: Iterable[Piece], store: Store) -> Plan:
     """Collect pieces and, recursively, what they need.
 
-    What only a finished piece needed is left out: nobody asks for the data of an encoder that is there.
+    What only a finished piece needed is left out: nobody asks for the data of an encoder that is there. A goal is
+    finished if its records are there; what an unfinished piece reads must be there itself, or it is made again.
 
     Args:
         goals: pieces that are wanted.
@@ -39,16 +40,18 @@ def make_plan(goals: Iterable[Piece], store: Store) -> Plan:
     ordered: dict[str, Piece] = {}
     done: set[str] = set()
 
-    def visit(piece: Piece) -> None:
-        if piece.key in ordered:
+    def visit(piece: Piece, is_done: Callable[[Piece], bool]) -> None:
+        if piece.key in ordered and (piece.key not in done or is_done(piece)):
             return
-        if store.is_done(piece):
+        ordered.pop(piece.key, None)  # a goal of which only records are there, and now somebody needs more
+        if is_done(piece):
             done.add(piece.key)
         else:
+            done.discard(piece.key)
             for needed in piece.needs:
-                visit(needed)
+                visit(needed, store.is_done)
         ordered[piece.key] = piece
 
     for goal in goals:
-        visit(goal)
+        visit(goal, store.is_recorded)
     return Plan(tuple(ordered.values()), frozenset(done))
