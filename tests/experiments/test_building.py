@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -269,7 +268,7 @@ def test_an_encoder_of_which_only_the_records_were_kept_is_made_again_with_the_s
     build(piece, store, JOB)
     directory = store.path(piece)
     rows, identity = read_rows(directory / "pretrain.csv"), load_pretrained(store.encoder(piece)).identity()
-    shutil.rmtree(store.encoder(piece))
+    (store.encoder(piece) / "weights.safetensors").unlink()
     assert not store.is_done(piece)
     with monkeypatch.context() as patch:
         patch.setattr(pretrained, "save_pretrained", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
@@ -283,6 +282,20 @@ def test_an_encoder_of_which_only_the_records_were_kept_is_made_again_with_the_s
     assert [{k: v for k, v in row.items() if k not in ignored} for row in again] == [
         {k: v for k, v in row.items() if k not in ignored} for row in rows
     ]
+
+
+def test_a_dataset_of_which_only_the_records_were_kept_is_collected_again(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    piece = toy_dataset(store)
+    for path in store.dataset(piece).rglob("*.memmap"):
+        path.unlink()
+    found: list[bool] = []
+    monkeypatch.setattr(
+        building, "make", lambda piece, store, job: found.append(store.dataset(piece).exists())
+    )
+    build(piece, store, JOB)
+    assert found == [False]  # nothing that a collection could take for its own
 
 
 def test_a_stage_that_refuses_leaves_the_piece_open(store: Store) -> None:

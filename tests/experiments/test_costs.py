@@ -35,7 +35,8 @@ def finish(store: Store, piece: Piece, seconds: float, device: str = "cpu") -> N
     store.describe(piece)
     write_json(store.path(piece) / DONE, {"seconds": seconds, "job": {"device": device}})
     for path in store.outputs(piece):
-        path.mkdir()
+        path.parent.mkdir(parents=True)
+        path.touch()
 
 
 @pytest.mark.parametrize(("piece", "seconds"), [

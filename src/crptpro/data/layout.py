@@ -18,6 +18,7 @@ CARD_FILE = "card.json"
 JOURNAL_FILE = "journal.jsonl"
 COLLECTION_FILE = "collection.json"
 FRAMES, TRANSITIONS = "frames", "transitions"
+PIXELS_FILE = f"{FRAMES}/pixels.memmap"
 
 #: What a card says about its pixels: their type and range, unscaled.
 PIXELS = "uint8 0..255"

@@ -13,7 +13,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 import crptpro.experiments.measurements  # noqa: F401 - makes its kinds of pieces known
+from crptpro.artifact import WEIGHTS_FILE
 from crptpro.cards import cpu_cores, provenance, read_json, write_json
+from crptpro.data.layout import PIXELS_FILE
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import RecordError
 from crptpro.experiments.pieces import (
@@ -78,10 +80,21 @@ class Store:
 
     def is_done(self, piece: Piece) -> bool:
         """Whether a piece is finished and what others read of it is there."""
-        return self.is_recorded(piece) and all(path.exists() for path in self.outputs(piece))
+        return self.is_recorded(piece) and all(path.is_file() for path in self.outputs(piece))
 
     def outputs(self, piece: Piece) -> list[Path]:
-        """What others read of a piece besides its records: gigabytes that may be removed when they have."""
+        """Files that others read of a piece besides its records: gigabytes that may be removed when they have."""
+        # Not the directories: cards lie in them, which belong to the records.
+        file = PIXELS_FILE if isinstance(piece, DatasetPiece) else WEIGHTS_FILE
+        return [directory / file for directory in self._output_directories(piece)]
+
+    def forget(self, piece: Piece) -> None:
+        """Remove the mark that a piece is finished, and what is left of its outputs."""
+        (self.path(piece) / DONE).unlink(missing_ok=True)
+        for directory in self._output_directories(piece):
+            shutil.rmtree(directory, ignore_errors=True)
+
+    def _output_directories(self, piece: Piece) -> list[Path]:
         if isinstance(piece, DatasetPiece):
             return [self.dataset(piece)]
         if not isinstance(piece, EncoderPiece):
@@ -147,8 +160,8 @@ def build(piece: Piece, store: Store, job: JobSettings | None = None) -> None:
     store.describe(piece)
     directory = store.path(piece)
     with DirectoryLock(directory, error=RecordError, is_reentrant=True):
-        # Where records alone were kept, they are made again too.
-        (directory / DONE).unlink(missing_ok=True)
+        if store.is_recorded(piece):  # and no more than that: the records are made again too
+            store.forget(piece)
         with WorkClock(directory / CLOCK) as clock:
             make(piece, store, job)
         spent = {"seconds": clock.seconds, "attempts": clock.attempts}

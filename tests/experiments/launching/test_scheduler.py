@@ -67,7 +67,8 @@ class FakeLauncher:
             write_json(job.work.log.parent / DONE, {"seconds": 1.0})
             store = Store(Path(job.work.root))
             for path in store.outputs(store.described(job.work.key)):
-                path.mkdir()
+                path.parent.mkdir(parents=True)
+                path.touch()
 
     def close(self) -> None:
         pass
