@@ -166,6 +166,7 @@ def time_pretraining(settings: Settings, datasets: dict[str, FrameDataset]) -> d
         "TF32": make(precision="fp32", tf32=True),
         "bf16": make(),
         "bf16, recorded": make(captures=True),
+        "bf16, recorded, usual layout": make(captures=True, channels_last=False),
     }
     if settings.compile:
         candidates["bf16, compiled"] = make(compiles=True)

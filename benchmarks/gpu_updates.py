@@ -18,6 +18,7 @@ from crptpro.modules import (
     SquashedGaussianActor,
     TwinCritic,
     resolve_precision,
+    set_channels_last,
     set_compute_dtype,
 )
 from crptpro.modules.precision import Precision
@@ -39,6 +40,7 @@ class DevicePretrainUpdates:
         precision: ``"fp32"`` or ``"bf16"``.
         compiles: whether loss and gathering are compiled.
         captures: whether both are recorded as CUDA graphs.
+        channels_last: whether the convolutions compute with channels last.
         tf32: let float32 factors be rounded to TF32.
     """
 
@@ -51,13 +53,14 @@ class DevicePretrainUpdates:
         precision: Precision = "bf16",
         compiles: bool = False,
         captures: bool = False,
+        channels_last: bool = True,
         tf32: bool = False,
     ) -> None:
         first = next(iter(datasets.values()))
         frames = first.frames.get("pixels")
         dtype = resolve_precision(precision, frames.device)
         self.loss = fresh_loss(image_size=frames.shape[-1], prototypes=prototypes).to(frames.device).train()
-        set_compute_dtype(self.loss, dtype)
+        set_channels_last(set_compute_dtype(self.loss, dtype), channels_last)
         compiled = Compiled(is_on=compiles)
         self.batches = DeviceBatches(
             datasets,

@@ -54,7 +54,7 @@ def main(settings: Settings) -> dict[str, Any]:
     shape = (settings.batch_size, 9, settings.image_size, settings.image_size)
     pixels = torch.randint(0, 256, shape, dtype=torch.uint8, generator=generator).to(device)
     results: dict[str, Any] = {}
-    for precision in precisions():
+    for precision in precisions(device):
         for work, call in (("forward", encode), ("forward and backward", differentiate)):
             candidates: dict[str, Callable[[], None]] = {}
             for layout, is_last in LAYOUTS.items():

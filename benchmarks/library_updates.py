@@ -30,9 +30,9 @@ ACTION_DIM = 6
 STREAMS = ("replay", "shift", "bonus", "policy", "random_actions")
 
 
-def precisions() -> list[Precision]:
-    """Return fp32, the reference, and bf16 if that is what ``"auto"`` picks on this machine."""
-    return ["fp32"] if resolve_precision("auto", "cpu") == torch.float32 else ["fp32", "bf16"]
+def precisions(device: torch.device | str = "cpu") -> list[Precision]:
+    """Return fp32, the reference, and bf16 if that is what ``"auto"`` picks on a device."""
+    return ["fp32"] if resolve_precision("auto", device) == torch.float32 else ["fp32", "bf16"]
 
 
 def fresh_loss(*, image_size: int = 84, prototypes: int = 512, seed: int = 0) -> ProtoLoss:

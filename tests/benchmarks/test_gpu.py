@@ -22,7 +22,9 @@ def test_every_section_runs_prints_and_is_written(tmp_path: Path, capsys: pytest
     assert written["settings"]["tiny"] is True
     assert set(written["results"]) == {"parity", "pretrain", "sustained", "downstream", "profile"}
     assert [check["passed"] for check in results["parity"]] == [True, True, True]
-    assert set(results["pretrain"]["timings"]) == {"fp32", "TF32", "bf16", "bf16, recorded"}
+    assert set(results["pretrain"]["timings"]) == {
+        "fp32", "TF32", "bf16", "bf16, recorded", "bf16, recorded, usual layout",
+    }  # fmt: skip
     assert results["sustained"]["projected_s"] > 0
     printed = capsys.readouterr().out
     for words in ("pre-training, recorded", "50,000 of", "250,000 of", "All kernels:"):

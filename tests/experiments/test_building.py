@@ -288,6 +288,7 @@ def test_a_dataset_of_which_only_the_records_were_kept_is_collected_again(
     store: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     piece = toy_dataset(store)
+    assert store.is_done(piece)
     for path in store.dataset(piece).rglob("*.memmap"):
         path.unlink()
     found: list[bool] = []

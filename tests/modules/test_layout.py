@@ -5,7 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from crptpro.modules import PixelEncoder, is_channels_last, resolve_channels_last, set_channels_last
+from crptpro.modules import (
+    PixelEncoder,
+    computing,
+    is_channels_last,
+    resolve_channels_last,
+    set_channels_last,
+)
 from crptpro.objectives import ProtoLoss
 
 SIZES = {"channels": (4, 4), "strides": (2, 1), "image_size": 16}
@@ -54,3 +60,16 @@ def test_networks_that_a_loss_hides_are_reached() -> None:
     encoders = [module for module in vars(loss).values() if isinstance(module, PixelEncoder)]
     assert not any(encoder.channels_last for encoder in encoders)
     assert is_channels_last(set_channels_last(loss, True))
+
+
+def test_computing_ends_with_fp32_and_channels_last_whatever_happened_inside() -> None:
+    encoder = PixelEncoder(3, **SIZES)
+
+    def break_off() -> None:
+        with computing(encoder, torch.bfloat16, channels_last=False):
+            assert (encoder.compute_dtype, encoder.channels_last) == (torch.bfloat16, False)
+            raise RuntimeError("inside")
+
+    with pytest.raises(RuntimeError, match="inside"):
+        break_off()
+    assert (encoder.compute_dtype, encoder.channels_last) == (torch.float32, True)

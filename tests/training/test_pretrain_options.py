@@ -194,9 +194,8 @@ def test_the_layout_changes_rounding_only_is_recorded_and_is_left_as_it_was(tmp_
         torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-4)
     assert (last.training_record["channels_last"], usual.training_record["channels_last"]) == (True, False)
     assert is_channels_last(usual)
-    assert (
-        "channels_last" not in last.training_record["settings"]
-    )  # runs from before the switch can be continued
+    # Runs from before the switch can be continued.
+    assert "channels_last" not in last.training_record["settings"]
     with pytest.raises(CheckpointError, match="channels_last was False, now 'absent'"):
         run(make_loss(), 8, run_dir=tmp_path)
     assert run(make_loss(), 8, run_dir=tmp_path, channels_last="off").resumed_from == 6

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from crptpro.experiments.building import Store
@@ -11,7 +11,7 @@ from crptpro.experiments.pieces import Piece
 
 @dataclass(frozen=True)
 class Plan:
-    """Pieces without repeats, each after all that it needs.
+    """Pieces without repeats, finished ones first, each of the others after all that it needs.
 
     Args:
         pieces: all, finished or not.
@@ -37,21 +37,22 @@ def make_plan(goals: Iterable[Piece], store: Store) -> Plan:
         goals: pieces that are wanted.
         store: where finished ones are found.
     """
-    ordered: dict[str, Piece] = {}
-    done: set[str] = set()
+    there: dict[str, Piece] = {}
+    missing: dict[str, Piece] = {}
 
-    def visit(piece: Piece, is_done: Callable[[Piece], bool]) -> None:
-        if piece.key in ordered and (piece.key not in done or is_done(piece)):
-            return
-        ordered.pop(piece.key, None)  # a goal of which only records are there, and now somebody needs more
-        if is_done(piece):
-            done.add(piece.key)
-        else:
-            done.discard(piece.key)
+    def require(piece: Piece) -> None:
+        """Ask for a piece that somebody reads."""
+        if store.is_done(piece):
+            there[piece.key] = piece
+        elif piece.key not in missing:
             for needed in piece.needs:
-                visit(needed, store.is_done)
-        ordered[piece.key] = piece
+                require(needed)
+            missing[piece.key] = piece
 
     for goal in goals:
-        visit(goal, store.is_recorded)
-    return Plan(tuple(ordered.values()), frozenset(done))
+        if store.is_recorded(goal):
+            there[goal.key] = goal
+        else:
+            require(goal)
+    done = {key: piece for key, piece in there.items() if key not in missing}
+    return Plan((*done.values(), *missing.values()), frozenset(done))

@@ -6,6 +6,7 @@ from crptpro.modules.deterministic_actor import DeterministicActor, FixedSkillAc
 from crptpro.modules.encoder import PixelEncoder
 from crptpro.modules.heads import Predictor, Projector, Prototypes
 from crptpro.modules.layout import is_channels_last, resolve_channels_last, set_channels_last
+from crptpro.modules.numerics import computing
 from crptpro.modules.pixel_critic import PixelCritic
 from crptpro.modules.placement import usable_device
 from crptpro.modules.precision import resolve_precision, set_compute_dtype
@@ -22,6 +23,7 @@ __all__ = [
     "SkillHead",
     "SquashedGaussianActor",
     "TwinCritic",
+    "computing",
     "is_channels_last",
     "resolve_channels_last",
     "resolve_precision",

@@ -24,11 +24,10 @@ from crptpro.envs import make_env
 from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
 from crptpro.modules import (
+    computing,
     is_channels_last,
     resolve_channels_last,
     resolve_precision,
-    set_channels_last,
-    set_compute_dtype,
     usable_device,
 )
 from crptpro.objectives import exploration_defaults, get_method, method_defaults, methods
@@ -117,10 +116,8 @@ def pretrain_active(
     cuda = [device.index or 0] if device.type == "cuda" else []
     loss.to(device).train()
     with contextlib.ExitStack() as stack:
-        stack.callback(set_compute_dtype, loss, torch.float32)
-        set_compute_dtype(loss, dtype)
-        stack.callback(set_channels_last, loss, True)
-        set_channels_last(loss, resolve_channels_last(config.channels_last))
+        channels_last = resolve_channels_last(config.channels_last)
+        stack.enter_context(computing(loss, dtype, channels_last=channels_last))
         stack.enter_context(torch.random.fork_rng(devices=cuda))
         require_explorable(loss, domains, config)
         torch.manual_seed(derive_seed(config.seed, "active", "loss"))

@@ -15,10 +15,9 @@ from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
 from crptpro.modules import (
+    computing,
     resolve_channels_last,
     resolve_precision,
-    set_channels_last,
-    set_compute_dtype,
     usable_device,
 )
 from crptpro.modules.precision import Precision
@@ -156,16 +155,13 @@ def pretrain(
         raise ValueError(f"`encoder_tau` must be in [0, 1], got {encoder_tau}.")
     device = usable_device(device)
     dtype = resolve_precision(precision, device)
-    is_channels_last = resolve_channels_last(channels_last)
+    puts_channels_last = resolve_channels_last(channels_last)
     compiled = Compiled(is_on=resolve_compile(compile))
     captures = resolve_cuda_graph(cuda_graph, device)
     cuda = [device.index or 0] if device.type == "cuda" else []
     loss.to(device).train()
     with contextlib.ExitStack() as stack:
-        stack.callback(set_compute_dtype, loss, torch.float32)
-        set_compute_dtype(loss, dtype)
-        stack.callback(set_channels_last, loss, True)
-        set_channels_last(loss, is_channels_last)
+        stack.enter_context(computing(loss, dtype, channels_last=puts_channels_last))
         stack.enter_context(torch.random.fork_rng(devices=cuda))
         torch.manual_seed(derive_seed(seed, "pretrain", "loss"))
         sources = open_sources(datasets, seed=seed, device=device)
