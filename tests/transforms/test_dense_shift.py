@@ -53,10 +53,11 @@ def test_dense_features_equal_shift_then_encode_for_every_shift(changes, weights
     assert greatest_error(encoder, pixels) <= 1e-6
 
 
+@pytest.mark.parametrize("channels_last", [True, False])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-6), (torch.bfloat16, 2**-8)])
-def test_the_default_encoder_gives_all_81_shifts_at_full_size(dtype, tolerance):
+def test_the_default_encoder_gives_all_81_shifts_at_full_size(dtype, tolerance, channels_last):
     encoder = PixelEncoder()
-    encoder.compute_dtype = dtype
+    encoder.compute_dtype, encoder.channels_last = dtype, channels_last
     pixels = torch.randint(0, 256, (9, 84, 84), dtype=torch.uint8)
     assert greatest_error(encoder, pixels) <= tolerance
 
