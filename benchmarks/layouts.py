@@ -1,4 +1,4 @@
-"""The encoder's convolutions in both memory layouts: forward alone, and forward and backward.
+"""The encoder in both memory layouts, and with ReLU in a pass of its own: forward alone, and forward and backward.
 
 ``python -m benchmarks.layouts`` needs neither simulator nor data. It is what the switch ``channels_last`` decides with
 ``"auto"``; the rest of an update does not know the layout.
@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import torch
 import tyro
@@ -21,13 +22,14 @@ from benchmarks.measure import save, side_by_side, table
 from crptpro.console import run_main
 from crptpro.modules import (
     PixelEncoder,
+    convolutions,
     resolve_precision,
     set_channels_last,
     set_compute_dtype,
     usable_device,
 )
 
-LAYOUTS = {"channels last": True, "usual": False}
+WAYS = {"channels last": True, "usual": False, "channels last, ReLU apart": True}
 
 
 @dataclass(frozen=True)
@@ -57,10 +59,11 @@ def main(settings: Settings) -> dict[str, Any]:
     for precision in precisions(device):
         for work, call in (("forward", encode), ("forward and backward", differentiate)):
             candidates: dict[str, Callable[[], None]] = {}
-            for layout, is_last in LAYOUTS.items():
+            for way, is_last in WAYS.items():
                 encoder = set_channels_last(PixelEncoder(image_size=settings.image_size).to(device), is_last)
                 set_compute_dtype(encoder, resolve_precision(precision, device))
-                candidates[layout] = functools.partial(call, encoder, pixels)
+                one = functools.partial(call, encoder, pixels)
+                candidates[way] = functools.partial(relu_apart, one) if way.endswith("apart") else one
             timings = side_by_side(candidates, rounds=settings.rounds, device=device)
             results[f"{precision}, {work}"] = timings
             print(
@@ -81,6 +84,12 @@ def differentiate(encoder: PixelEncoder, pixels: torch.Tensor) -> None:
     encoder.zero_grad(set_to_none=True)
     features = encoder(pixels)
     features.backward(torch.ones_like(features))
+
+
+def relu_apart(call: Callable[[], None]) -> None:
+    """Call with every ReLU as an operation of its own, as it always is in fp32 and on a GPU."""
+    with mock.patch.object(convolutions, "_can_fuse", return_value=False):
+        call()
 
 
 if __name__ == "__main__":

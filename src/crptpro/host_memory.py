@@ -20,8 +20,8 @@ _STAND_IN = {torch.bfloat16: torch.int16}
 SMALLEST_BLOCK = 2**23
 """Bytes below which the C library keeps and reuses what is freed."""
 
-KEPT_BLOCKS = 8
-"""Blocks that are remembered: two images, each with a second view, of this batch and the one before."""
+KEPT_BLOCKS = 16
+"""Blocks that are remembered: two images, each with a second view, and the features of all, of two batches."""
 
 KEPT_BYTES = 2**29
 """Size of all of them: a single large sample must not hold its memory for ever."""

@@ -49,6 +49,19 @@ def test_outputs_and_gradients_are_those_of_the_whole_batch(threads: int) -> Non
     )
 
 
+@pytest.mark.parametrize("is_recording", [True, False])
+def test_the_whole_lies_contiguous_whatever_the_layout_of_the_parts(is_recording: bool) -> None:
+    images = torch.arange(7 * 2 * 3 * 5, dtype=torch.float32).view(7, 2, 3, 5)
+    scale = torch.ones(()).requires_grad_(is_recording)
+    found = apply_to_chunks(
+        lambda chunk, parameters: (chunk * parameters[0]).contiguous(memory_format=torch.channels_last),
+        images.split(3),
+        [scale],
+    )
+    assert found.is_contiguous()
+    assert torch.equal(found, images)
+
+
 def test_the_number_of_threads_changes_no_bit_of_the_encoder() -> None:
     torch.manual_seed(0)
     encoder = PixelEncoder(3, channels=(8, 8), strides=(2, 1), image_size=21)

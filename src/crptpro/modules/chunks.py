@@ -18,9 +18,10 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
+from crptpro.host_memory import empty_batch
 from crptpro.modules.lone_threads import lone_threads
+from crptpro.modules.watching import is_watched
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -34,7 +35,7 @@ _is_passed_by = False
 def apply_to_chunks(
     function: ChunkFunction, chunks: Sequence[Tensor], parameters: Sequence[Tensor]
 ) -> Tensor:
-    """Return ``torch.cat([function(chunk, parameters) for chunk in chunks])``, computed side by side.
+    """Return ``torch.cat([function(chunk, parameters) for chunk in chunks])``, computed side by side, contiguous.
 
     The gradient of every parameter is the sum over the chunks in their order, whatever the number of threads. There is
     no second derivative. Where somebody watches or changes the operations themselves (autocast, compiling, tracing,
@@ -70,11 +71,13 @@ def chunks_uncompiled() -> Iterator[None]:
 
 
 def _apply(function: ChunkFunction, chunks: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
-    if _is_watched():
-        return torch.cat([function(chunk, parameters) for chunk in chunks])
+    if is_watched():
+        return torch.cat([function(chunk, parameters) for chunk in chunks]).contiguous()
     if torch.is_grad_enabled() and any(parameter.requires_grad for parameter in parameters):
         return _Chunks.apply(function, chunks, *parameters)
-    return torch.cat(map_side_by_side(lambda chunk: function(chunk, parameters), chunks))
+    whole = _Whole(chunks)
+    map_side_by_side(lambda index: whole.set(index, function(chunks[index], parameters)), range(len(chunks)))
+    return whole.get()
 
 
 @torch.compiler.disable(reason="threads that compute side by side are nothing a compiler could see")
@@ -101,16 +104,6 @@ def map_side_by_side(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
     return list(_pool(threads).map(in_thread, items))
 
 
-def _is_watched() -> bool:
-    return (
-        torch.compiler.is_compiling()
-        or torch.jit.is_tracing()
-        or torch.is_autocast_enabled("cpu")
-        or is_in_torch_dispatch_mode()
-        or torch._C._are_functorch_transforms_active()
-    )
-
-
 def split_among_threads(work: Callable[[slice], None], count: int, *, smallest: int = 64) -> None:
     """Call ``work`` with the parts of ``range(count)``, one per thread, side by side.
 
@@ -124,6 +117,30 @@ def split_among_threads(work: Callable[[slice], None], count: int, *, smallest: 
     map_side_by_side(work, [slice(first, last) for first, last in itertools.pairwise(bounds)])
 
 
+class _Whole:
+    """The outputs of all chunks in one tensor; each is copied there by its own thread, while it is in cache.
+
+    Rows follow each other in memory whatever the layout of the outputs.
+    """
+
+    def __init__(self, chunks: Sequence[Tensor]) -> None:
+        self._first_rows = [0, *itertools.accumulate(chunk.shape[0] for chunk in chunks)]
+        self._lock = threading.Lock()
+        self._rows: Tensor | None = None
+
+    def set(self, index: int, output: Tensor) -> None:
+        with self._lock:
+            if self._rows is None:
+                shape = (self._first_rows[-1], *output.shape[1:])
+                is_on_cpu = output.device.type == "cpu"
+                self._rows = empty_batch(shape, output.dtype) if is_on_cpu else output.new_empty(shape)
+        self._rows[self._first_rows[index] : self._first_rows[index + 1]] = output
+
+    def get(self) -> Tensor:
+        assert self._rows is not None
+        return self._rows
+
+
 class _Chunks(torch.autograd.Function):
     """Keeps one graph per chunk, so that the backward pass can go through them side by side too."""
 
@@ -131,20 +148,23 @@ class _Chunks(torch.autograd.Function):
     def forward(ctx: Any, function: ChunkFunction, chunks: Sequence[Tensor], *parameters: Tensor) -> Tensor:
         needs = [parameter.requires_grad for parameter in parameters]
 
-        def record(chunk: Tensor) -> tuple[list[Tensor], Tensor]:
+        whole = _Whole(chunks)
+
+        def record(index: int) -> tuple[list[Tensor], Tensor]:
             with torch.enable_grad():
                 leaves = [p.detach().requires_grad_(need) for p, need in zip(parameters, needs)]
-                output = function(chunk, leaves)
+                output = function(chunks[index], leaves)
+            whole.set(index, output.detach())
             return [leaf for leaf in leaves if leaf.requires_grad], output
 
-        graphs = map_side_by_side(record, chunks)
+        graphs = map_side_by_side(record, range(len(chunks)))
         ctx.needs = needs
         # On a saved tensor and not on the context: autograd frees those after the backward pass, while the context
         # lives as long as anybody holds the loss.
         carrier: Any = torch.empty(0)
         carrier.graphs = graphs
         ctx.save_for_backward(carrier)
-        return torch.cat([output.detach() for _, output in graphs])
+        return whole.get()
 
     @staticmethod
     @once_differentiable

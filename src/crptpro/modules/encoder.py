@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from crptpro.modules.chunks import apply_to_chunks
+from crptpro.modules.convolutions import conv_relu_stack
 from crptpro.modules.initialisation import WeightInit, init_weights_, require_weight_init
 
 KERNEL_SIZE = 3
@@ -146,7 +146,8 @@ class PixelEncoder(nn.Module):
             pixels: ``[*, in_channels, H, W]``, uint8 or floating, values 0..255.
 
         Returns:
-            ``[*, C, h, w]`` in ``compute_dtype``.
+            ``[*, C, h, w]`` in ``compute_dtype``; contiguous where the batch took several chunks, else in the layout of
+            the convolutions.
         """
         lead = pixels.shape[:-3]
         images = pixels.reshape(-1, *pixels.shape[-3:])
@@ -171,12 +172,12 @@ class PixelEncoder(nn.Module):
             if self.pixel_offset:
                 x = x - self.pixel_offset
         x = x.contiguous(memory_format=torch.channels_last if self.channels_last else torch.contiguous_format)
-        for index, (weight, bias) in enumerate(zip(parameters[::2], parameters[1::2])):
-            if low:
-                weight = weight * self.pixel_scale if index == 0 else weight
-                weight, bias = weight.to(self.compute_dtype), bias.to(self.compute_dtype)
-            x = F.relu(F.conv2d(x, weight, bias, stride=self.strides[index]), inplace=True)
-        return x
+        weights, biases = list(parameters[::2]), list(parameters[1::2])
+        if low:
+            weights[0] = weights[0] * self.pixel_scale
+            weights = [weight.to(self.compute_dtype) for weight in weights]
+            biases = [bias.to(self.compute_dtype) for bias in biases]
+        return conv_relu_stack(x, weights, biases, self.strides)
 
     def extra_repr(self) -> str:
         """Show the shapes that matter when reading a printed model."""
