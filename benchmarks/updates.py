@@ -110,8 +110,8 @@ def main(settings: Settings) -> dict[str, Any]:
             if name in settings.only:
                 print(f"\n## {name}\n", flush=True)
                 results[name] = section()
-    path = save("updates", settings, results, out=settings.out)
-    print(f"\n{path}")
+                # At once: what has been measured must not be lost with a section for which memory is too small.
+                print(f"\n{save('updates', settings, results, out=settings.out)}")
     return results
 
 

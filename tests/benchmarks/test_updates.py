@@ -15,7 +15,7 @@ from benchmarks.plain_store import StackedStore
 from benchmarks.synthetic import write_dataset
 from benchmarks.updates import Settings, main
 
-from benchmarks import library_updates
+from benchmarks import library_updates, updates
 from crptpro.data import FrameDataset
 from crptpro.errors import CRPTproError
 from crptpro.objectives import method_defaults
@@ -77,6 +77,18 @@ def checkout(tmp_path: Path) -> Path:
     for name, content in PEER_FILES.items():
         (path / name).write_text(content)
     return path
+
+
+def test_what_was_measured_is_kept_when_a_later_section_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise CRPTproError("too little memory")
+
+    monkeypatch.setattr(updates, "measure_agent_step", fail)
+    with pytest.raises(CRPTproError, match="too little memory"):
+        main(dataclasses.replace(TINY, only=("downstream", "agent-step"), out=tmp_path))
+    assert set(json.loads((tmp_path / "updates.json").read_text())["results"]) == {"downstream"}
 
 
 def test_every_section_without_a_simulator_prints_a_table_and_lands_in_the_json(
