@@ -73,8 +73,8 @@ def test_a_compiled_encoder_leaves_its_chunks_to_their_threads(monkeypatch: pyte
     compile = torch.compile
     monkeypatch.setattr(torch, "compile", lambda f, **options: compile(f, backend="aot_eager", **options))
     seen: list[bool] = []
-    watched = chunks._is_watched
-    monkeypatch.setattr(chunks, "_is_watched", lambda: seen.append(watched()) or seen[-1])
+    watched = chunks.is_watched
+    monkeypatch.setattr(chunks, "is_watched", lambda: seen.append(watched()) or seen[-1])
     encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=12)
     encoder.micro_batch = 2
     pixels = torch.randint(0, 256, (6, 3, 12, 12), dtype=torch.uint8)
