@@ -39,6 +39,18 @@ def test_default_encoder_has_39200_features_and_30368_parameters() -> None:
     assert encoder(pixels(2, 9, 84)).shape == (2, 39_200)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_a_parameter_or_a_pixel_that_is_not_a_number_is_seen_in_the_features(dtype: torch.dtype) -> None:
+    encoder = small()
+    encoder.compute_dtype = dtype
+    images = pixels().float()
+    images[0, 0, 0, 0] = float("nan")
+    assert encoder(images)[0].isnan().any()
+    with torch.no_grad():
+        encoder.conv_layers[0].weight.view(-1)[0] = float("nan")
+    assert encoder(pixels()).isnan().any(dim=1).all()
+
+
 @pytest.mark.parametrize("offset", [0.0, 0.5])
 def test_float32_features_and_gradients_equal_plain_convolutions(offset: float) -> None:
     encoder = small(pixel_offset=offset)

@@ -23,24 +23,31 @@ GROUPS = 1
 
 
 def conv_relu_stack(
-    images: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], strides: Sequence[int]
+    images: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    strides: Sequence[int],
+    *,
+    largest: float | None = None,
 ) -> Tensor:
     """Return ``relu(conv(... relu(conv(images))))``, un-padded.
 
     In bfloat16 on a CPU every convolution rounds after its ReLU instead of before, which gives the same bits. There is
     no second derivative then, and images receive no gradient; where they need one, or somebody watches the operations
-    (:func:`~crptpro.modules.watching.is_watched`), the operations are PyTorch's usual ones.
+    (:func:`~crptpro.modules.watching.is_watched`), the operations are PyTorch's usual ones. So they are where a NaN
+    could arise, which the library's ReLU turns into zero.
 
     Args:
         images: ``[n, C_0, H, W]`` in the dtype of the weights; the result has its memory layout.
         weights: of each convolution, ``[C_i, C_(i-1), k, k]``.
         biases: of each convolution, ``[C_i]``.
         strides: of each convolution.
+        largest: what no absolute value of the images exceeds, NaN included; None where that is not known.
 
     Returns:
         ``[n, C, h, w]``, in the dtype of the images.
     """
-    if _can_fuse(images):
+    if largest is not None and _can_fuse(images) and _stays_finite(weights, biases, largest):
         maps: Tensor = _FusedStack.apply(images, tuple(strides), *weights, *biases)
         return maps
     for weight, bias, stride in zip(weights, biases, strides):
@@ -58,6 +65,15 @@ def _can_fuse(images: Tensor) -> bool:
         and torch.backends.mkldnn.enabled
         and _library_fuses()
     )
+
+
+@torch.no_grad()
+def _stays_finite(weights: Sequence[Tensor], biases: Sequence[Tensor], largest: float) -> bool:
+    """Whether no map can overflow, by the sum of absolute values; false with NaN or infinity in a parameter."""
+    bound = torch.tensor(largest)
+    for weight, bias in zip(weights, biases):
+        bound = bound * weight.float().abs().sum((1, 2, 3)).max() + bias.float().abs().max()
+    return bool(bound < torch.finfo(torch.bfloat16).max)
 
 
 @functools.cache

@@ -177,7 +177,8 @@ class PixelEncoder(nn.Module):
             weights[0] = weights[0] * self.pixel_scale
             weights = [weight.to(self.compute_dtype) for weight in weights]
             biases = [bias.to(self.compute_dtype) for bias in biases]
-        return conv_relu_stack(x, weights, biases, self.strides)
+        largest = max(255.0, self.pixel_offset / self.pixel_scale) if images.dtype == torch.uint8 else None
+        return conv_relu_stack(x, weights, biases, self.strides, largest=largest)
 
     def extra_repr(self) -> str:
         """Show the shapes that matter when reading a printed model."""
