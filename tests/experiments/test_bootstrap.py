@@ -70,3 +70,11 @@ def test_one_run_per_encoder_on_one_task_is_the_plain_bootstrap() -> None:
     places = [5, 25, 50, 75, 95]
     one, other = (np.percentile(scores[i].mean(axis=1), places) for i in (by_encoder, by_run))
     np.testing.assert_allclose(one, other, atol=0.26)  # means come in steps of a quarter
+
+
+def test_rows_of_the_same_runs_are_redrawn_alike() -> None:
+    encoders, names = [["a", "a", "b"], ["a", "a", "b"], ["a", "a", "b"]], ["rst", "rst", "uvw"]
+    first, again, other = encoder_indices(encoders, runs=names, replicates=500, rng=np.random.default_rng(0))
+    assert (first == again).all()
+    assert (first != other).any()  # other runs of the same encoders
+    assert ((first == 2) == (other == 2)).all()

@@ -10,6 +10,7 @@ from crptpro.experiments.estimates import (
     estimate_curve,
     estimate_improvement,
     estimate_profile,
+    estimate_relative,
 )
 from crptpro.experiments.intervals import Bootstrap
 from crptpro.experiments.statistics import iqm, mean, median
@@ -194,3 +195,44 @@ def test_two_thousand_replicates_of_the_papers_table_take_well_below_a_second(ag
         estimate(scores, aggregate, encoders=encoders)
         spent.append(time.process_time() - start)
     assert min(spent) < 0.5
+
+
+def test_a_run_that_stands_in_two_rows_counts_once_and_leaves_the_interval_as_wide_as_it_is() -> None:
+    scores, names = np.array([0.1, 0.3, 0.5, 0.9]), tuple("abcd")
+    once = estimate({"walker_run": scores}, mean)
+    twice = estimate(
+        {"A walker_run": scores, "D walker_run": scores},
+        mean,
+        runs={"A walker_run": names, "D walker_run": names},
+    )
+    assert twice.value == once.value
+    assert twice.basis.runs == once.basis.runs == 4
+    assert once.interval is not None
+    assert twice.interval == pytest.approx(once.interval, abs=0.02)
+    apart = estimate({"A walker_run": scores, "D walker_run": scores}, mean)
+    assert apart.basis.runs == 8
+    assert apart.interval is not None
+    assert apart.interval[1] - apart.interval[0] < 0.8 * (once.interval[1] - once.interval[0])
+
+
+def test_a_ratio_knows_that_its_denominator_was_measured_too() -> None:
+    scores = {"walker_run": [40.0, 45.0, 55.0, 60.0], "hopper_hop": [10.0, 14.0, 16.0, 20.0]}
+    drq = {"walker_run": [60.0, 140.0, 100.0], "hopper_hop": [20.0, 40.0]}
+    found = estimate_relative(scores, drq)
+    assert found.value == pytest.approx((50 / 100 + 15 / 30) / 2)
+    exact = estimate({task: np.array(own) / np.mean(drq[task]) for task, own in scores.items()}, mean)
+    assert found.value == pytest.approx(exact.value)
+    assert found.interval is not None
+    assert exact.interval is not None
+    assert found.interval[0] < exact.interval[0]
+    assert found.interval[1] > exact.interval[1]
+    assert found.basis.runs == 8 + 5
+    with pytest.raises(ValueError, match="reference scored 0 or less on hopper_hop"):
+        estimate_relative(scores, {**drq, "hopper_hop": [0.0, 30.0]})
+    with pytest.raises(ValueError, match="Only one of the methods has runs on hopper_hop"):
+        estimate_relative(scores, {"walker_run": [1.0, 2.0]})
+
+
+def test_names_must_be_told_of_every_run() -> None:
+    with pytest.raises(ValueError, match="walker_run has 2 runs, and names are told of 1"):
+        estimate({"walker_run": [1.0, 2.0]}, runs={"walker_run": ("a",)})

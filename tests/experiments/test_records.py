@@ -8,7 +8,7 @@ import pytest
 
 from crptpro.downstream_config import DownstreamConfig
 from crptpro.errors import RecordError
-from crptpro.experiments.records import find_runs, read_run, tidy_rows
+from crptpro.experiments.records import find_runs, read_run
 from crptpro.loggers import RunLogger
 
 IDENTITY = "crptpro:" + "a" * 64
@@ -169,15 +169,3 @@ def test_a_run_that_trains_its_encoder_has_none_of_its_own_to_share(tmp_path: Pa
     run = read_run(write_run(tmp_path / "run", method="drq", algorithm="drq", encoder=None))
     assert run.trains_encoder
     assert run.encoder is None
-
-
-def test_tidy_rows_have_one_episode_each_with_whose_it_is(tmp_path: Path) -> None:
-    write_run(tmp_path / "a", method="atc", seed=2)
-    write_run(tmp_path / "b")
-    rows = tidy_rows(find_runs(tmp_path))
-    assert len(rows) == 12
-    assert rows[0] == rows[0] | {
-        "method": "atc", "task": "walker_run", "run_seed": 2, "encoder": IDENTITY, "env_steps": 0, "episode": 0,
-        "episode_return": 0.0,
-    }  # fmt: skip
-    assert [row["method"] for row in rows] == ["atc"] * 6 + ["crptpro"] * 6

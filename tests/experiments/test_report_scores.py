@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from report_reading import blocks_of, cell, page_of, table_in, tables_in, words
 
 from crptpro.experiments.goals import Goal, Request
 from crptpro.experiments.matrix import colors, seen, sensitivity
+from crptpro.experiments.pieces import settings
 from crptpro.experiments.records import read_run
 from crptpro.experiments.report.blocks import Figure
 from crptpro.experiments.report.learning import active_seconds, common_curve
@@ -77,6 +79,9 @@ def test_aggregates_are_those_of_the_runs_beside_the_papers_on_the_same_rows(blo
     # the middle half of 100/807, 200/807, 4 times 100/485, 300/807, 400/807, sorted
     assert cell(table, "IQM / DrQ", "crptpro").text == f"{(3 * 100 / 485 + 200 / 807) / 4:.3f}"
     assert cell(table, "mean / DrQ here", "crptpro").text == f"{(250 / 500 + 100 / 200) / 2:.3f}"
+    assert (cell(table, "mean / DrQ here", "drq").text, cell(table, "mean / DrQ here", "drq").beside) == (
+        "1", "by definition",
+    )  # fmt: skip
     assert (
         cell(table, "mean / DrQ", "atc").beside
         == f"[{(50 / 807 + 60 / 485) / 2:.3f}, {(50 / 807 + 60 / 485) / 2:.3f}]"
@@ -99,6 +104,7 @@ def test_improvement_compares_every_pair_of_runs(blocks: tuple) -> None:
     assert cell(table, "P(crptpro > other)", "atc").text == "1.00"
     assert cell(table, "P(crptpro > other)", "drq").text == "0.00"
     assert cell(table, "runs of both", "atc").text == "16"
+    assert cell(table, "interval over", "atc").text == "encoders"
 
 
 def test_every_figure_says_how_many_runs_it_shows(blocks: tuple) -> None:
@@ -180,6 +186,57 @@ def test_a_sensitivity_study_is_one_table_and_one_figure_for_what_varies(tmp_pat
     assert list(line.get_ydata()) == pytest.approx([0.2, 0.2, 0.2, 1.0, 0.2])  # 0, 0.0005, 0.005, 0.05, 0.5
     ticks = [tick.get_text() for tick in figures["sensitivity-small-b"].drawing.axes[0].get_xticklabels()]
     assert ticks == ["5000", "20000"]
+
+
+def test_two_methods_of_one_base_have_a_line_each(tmp_path: Path) -> None:
+    made = Reproduction(tmp_path)
+    goals = sensitivity(Request(SMALL, tasks=("walker_run",), methods=("crptpro",), seeds=(0, 1)))
+    mine = [
+        Goal(goal.label.replace("crptpro", "crptpro-mine"), replace(goal.piece, seed=9 + i), goal.place)  # type: ignore[type-var]
+        for i, goal in enumerate(goals)
+    ]
+    made.ask("sensitivity", [*goals, *mine])
+    for goal in (*goals, *mine):
+        if not made.store.is_done(goal.piece):
+            made.run(goal, 97)
+    blocks = blocks_of(page_of(tmp_path), "sensitivity-small")
+    figures = {block.name: block for block in blocks if isinstance(block, Figure)}
+    assert len(figures["sensitivity-small-alpha"].drawing.axes[0].get_lines()) == 2
+
+
+def test_a_run_that_was_asked_for_under_other_seeds_counts_once(tmp_path: Path) -> None:
+    made = Reproduction(tmp_path)
+    goals = seen(Request(SMALL, groups=("A",), tasks=("walker_run",), methods=("drq",), seeds=(0, 1)))
+    before = [replace(goal, place=settings(**{**dict(goal.place), "encoder_seed": 1})) for goal in goals]
+    made.ask("seen", [*goals, *before])
+    for goal, score in zip(goals, (100, 137)):
+        made.run(goal, score)
+    found = cell(table_in(blocks_of(page_of(tmp_path), "seen-small"), FINAL), "drq", "A", "walker_run")
+    assert found.beside == "n = 2"
+
+
+def test_encoders_fine_tuned_from_one_base_are_one_draw_of_its_pre_training(tmp_path: Path) -> None:
+    made = Reproduction(tmp_path)
+    tasks = ("cheetah_run", "walker_run")
+    request = Request(
+        SMALL, groups=("A",), tasks=tasks, methods=("crptpro-finetune",), encoder_seeds=(0, 1), seeds=(0, 1)
+    )
+    goals = seen(request)
+    made.ask("seen", goals)
+    for i, goal in enumerate(goals):
+        made.run(goal, 100 + 10 * i)
+    table = table_in(blocks_of(page_of(tmp_path), "seen-small"), "where runs share encoders")
+    assert cell(table, "encoders", "crptpro-finetune").text == "2"
+
+
+def test_what_has_begun_has_said_or_timed_something(tmp_path: Path) -> None:
+    made = Reproduction(tmp_path)
+    goals = seen(Request(SMALL, groups=("A",), tasks=("walker_run",), methods=("drq",), seeds=(0, 1, 2)))
+    made.ask("seen", goals)
+    made.store.log(goals[0].piece).write_text("Learning.")
+    made.run(goals[2], 100)
+    missing = table_in(blocks_of(page_of(tmp_path), "seen-small"), "Not finished")
+    assert [row[2].text for row in missing.rows] == ["begun, not finished", "not begun"]
 
 
 def test_time_leaves_out_the_pause_of_a_run_that_was_continued(tmp_path: Path) -> None:

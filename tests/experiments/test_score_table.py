@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import logging
+from copy import copy
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from crptpro.experiments.estimates import estimate
 from crptpro.experiments.records import Episode, Run
-from crptpro.experiments.score_table import score_tables, shared_tasks
+from crptpro.experiments.score_table import score_tables
 
 
 def run(
@@ -65,8 +66,21 @@ def test_an_encoder_that_is_not_recorded_leaves_intervals_over_runs_only(
     np.testing.assert_array_equal(table.scores["walker_run"], [1.0, 2.0])
 
 
-def test_tasks_that_a_method_lacks_are_named_and_left_out(caplog: pytest.LogCaptureFixture) -> None:
-    runs = [run("crptpro", t, 1.0) for t in ("walker_run", "hopper_hop")] + [run("atc", "walker_run", 1.0)]
-    with caplog.at_level(logging.WARNING):
-        assert shared_tasks(score_tables(runs)) == ["walker_run"]
-    assert "hopper_hop is left out of comparisons: no run of atc" in caplog.text
+def test_a_run_that_stands_in_two_rows_is_one_run_with_one_encoder() -> None:
+    runs = [run("drq", "walker_run", s, encoder=None, trains_encoder=True) for s in (1.0, 2.0, 3.0)]
+    twice = [*runs, *map(copy, runs)]
+    groups = {id(r): group for r, group in zip(twice, "AAADDD")}
+    table = score_tables(twice, key=lambda r: groups[id(r)])["drq"]
+    assert table.count == 3
+    assert not table.shares_encoders
+
+
+@pytest.mark.parametrize(
+    ("encoders", "shares"),
+    [("aabb", True), ("abcd", False), ("aaaa", False), ("abbb", True)],
+)
+def test_encoders_are_shared_where_there_are_fewer_of_them_than_runs_and_more_than_one(
+    encoders: str, shares: bool
+) -> None:
+    runs = [run("atc", "walker_run", float(i), encoder=name) for i, name in enumerate(encoders)]
+    assert score_tables(runs)["atc"].shares_encoders is shares

@@ -11,6 +11,9 @@ three independent draws of the method and not thirty-six. A replicate redraws th
 share them, and then, for each of its places, a downstream run of the encoder drawn (Davison & Hinkley, Bootstrap
 Methods and their Application, 1997, section 3.8, both stages with replacement). The intervals are wider wherever
 encoders differ. With few of them even these are too narrow: three encoders have but ten different resamples.
+
+**Runs in two rows.** A run that needs no group (DrQ, an encoder of the task's own domain) stands in the row of its task
+in every group. It is one draw and not two: rows of the same runs are redrawn alike, on either level.
 """
 
 from __future__ import annotations
@@ -38,7 +41,11 @@ def run_indices(counts: Sequence[int], *, replicates: int, rng: np.random.Genera
 
 
 def encoder_indices(
-    encoders: Sequence[Sequence[str]], *, replicates: int, rng: np.random.Generator
+    encoders: Sequence[Sequence[str]],
+    *,
+    replicates: int,
+    rng: np.random.Generator,
+    runs: Sequence[Sequence[str]] | None = None,
 ) -> list[Indices]:
     """Draw encoders with replacement, jointly for the tasks that share them, and then runs of those drawn.
 
@@ -50,6 +57,7 @@ def encoder_indices(
         encoders: per task, the encoder of each of its runs.
         replicates: how many resamples, ``B``.
         rng: where chance comes from.
+        runs: per task, what each run is called; tasks with the same runs are redrawn alike. All different if ``None``.
 
     Returns:
         One ``[B, R_t]`` of indices into its runs per task.
@@ -66,17 +74,23 @@ def encoder_indices(
     for stratum in dict.fromkeys(strata):
         most = max(len(names) for names, s in zip(own, strata) if s == stratum)
         ranks[stratum] = rng.random((replicates, most))
-    drawn = []
-    for labels, names, stratum in zip(encoders, own, strata):
+    drawn: list[Indices] = []
+    earlier: dict[tuple, Indices] = {}
+    for task, (labels, names, stratum) in enumerate(zip(encoders, own, strata)):
+        same = (tuple(labels), tuple(runs[task]) if runs is not None else task)
+        if same in earlier:
+            drawn.append(earlier[same])
+            continue
         places = np.array([names.index(label) for label in labels])  # (R,) position of a run's encoder
         counts = np.bincount(places, minlength=len(names))
-        # runs[e, i] is the i-th run of encoder e; what is beyond counts[e] is never drawn.
-        runs = np.zeros((len(names), counts.max()), dtype=np.int64)
+        # of_encoder[e, i] is the i-th run of encoder e; what is beyond counts[e] is never drawn.
+        of_encoder = np.zeros((len(names), counts.max()), dtype=np.int64)
         for encoder in range(len(names)):
-            runs[encoder, : counts[encoder]] = np.flatnonzero(places == encoder)
+            of_encoder[encoder, : counts[encoder]] = np.flatnonzero(places == encoder)
         chosen = (ranks[stratum][:, : len(names)] * len(names)).astype(np.int64)[:, places]  # (B, R)
         nth = (rng.random(chosen.shape) * counts[chosen]).astype(np.int64)
-        drawn.append(runs[chosen, nth])
+        drawn.append(of_encoder[chosen, nth])
+        earlier[same] = drawn[-1]
     return drawn
 
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crptpro.experiments.bootstrap import encoder_indices, run_indices
 from crptpro.experiments.intervals import Basis, Bootstrap, CurveEstimate, Estimate
+from crptpro.experiments.samples import Encoders, Runs, Sample, Scores
 from crptpro.experiments.statistics import (
     Aggregate,
     Array,
@@ -19,15 +17,13 @@ from crptpro.experiments.statistics import (
     probability_of_improvement,
 )
 
-Scores = Mapping[Any, ArrayLike]
-Encoders = Mapping[Any, Sequence[str]]
-
 
 def estimate(
     scores: Scores,
     aggregate: Aggregate = iqm,
     *,
     encoders: Encoders | None = None,
+    runs: Runs | None = None,
     bootstrap: Bootstrap | None = None,
 ) -> Estimate:
     """Aggregate runs of several tasks to one number with an interval.
@@ -37,6 +33,8 @@ def estimate(
         aggregate: of :mod:`crptpro.experiments.statistics`, e.g. ``mean``, ``median``, ``optimality_gap``.
         encoders: task to the encoder of each run. If given, the interval redraws encoders first;
             :mod:`crptpro.experiments.bootstrap` says when that is right.
+        runs: task to what each run is called; one that stands under several tasks counts once, and is redrawn with all
+            its places. All are different if ``None``.
         bootstrap: how the interval is made.
 
     Returns:
@@ -54,9 +52,55 @@ def estimate(
         512 [no interval] (1 task, 1 run, no interval: a single run on walker_run)
     """
     how = bootstrap or Bootstrap()
-    sample = _Sample.of(scores, encoders)
+    sample = Sample.of(scores, encoders, runs)
     value, ends = _interval([sample], lambda parts: aggregate(parts[0]), how)
     return _scalar(value, ends, _basis([sample], how))
+
+
+def estimate_relative(
+    scores: Scores,
+    references: Scores,
+    *,
+    runs: Runs | None = None,
+    reference_runs: Runs | None = None,
+    bootstrap: Bootstrap | None = None,
+) -> Estimate:
+    """Estimate the mean over tasks of the ratio of two methods' mean scores.
+
+    The reference was measured too: its runs are redrawn with the others, so that what is not known of it widens the
+    interval.
+
+    Args:
+        scores: task to one score per run.
+        references: the same for the reference; numbers of runs may differ.
+        runs: as of :func:`estimate`, for ``scores``.
+        reference_runs: the same for ``references``.
+        bootstrap: how the interval is made.
+
+    Returns:
+        The estimate; the interval is over runs.
+
+    Raises:
+        ValueError: as of :func:`estimate`, tasks that only one method has (named), or a run of the reference with a
+            score of 0 or less: no ratio.
+
+    Examples:
+        >>> print(f"{estimate_relative({'walker_run': [50.0, 70.0]}, {'walker_run': [100.0, 140.0]}):.2f}")
+        0.50 [0.36, 0.70]
+    """
+    _require_same_tasks(scores, references)
+    wrong = [str(task) for task, values in references.items() if np.min(np.asarray(values)) <= 0]
+    if wrong:
+        raise ValueError(f"A run of the reference scored 0 or less on {', '.join(sorted(wrong))}: no ratio.")
+    how = bootstrap or Bootstrap()
+    samples = [Sample.of(scores, None, runs), Sample.of(references, None, reference_runs)]
+
+    def ratio(parts: list[list[Array]]) -> Array:
+        each = [own.mean(axis=-1) / other.mean(axis=-1) for own, other in zip(*parts)]
+        return np.mean(np.stack(each), axis=0)
+
+    value, ends = _interval(samples, ratio, how)
+    return _scalar(value, ends, _basis(samples, how))
 
 
 def estimate_improvement(
@@ -65,6 +109,8 @@ def estimate_improvement(
     *,
     encoders: Encoders | None = None,
     other_encoders: Encoders | None = None,
+    runs: Runs | None = None,
+    other_runs: Runs | None = None,
     bootstrap: Bootstrap | None = None,
 ) -> Estimate:
     """Estimate how probably a run of one method beats one of another on the same task.
@@ -77,6 +123,8 @@ def estimate_improvement(
         others: the same for the other; numbers of runs may differ.
         encoders: as of :func:`estimate`, for ``scores``.
         other_encoders: the same for ``others``.
+        runs: as of :func:`estimate`, for ``scores``.
+        other_runs: the same for ``others``.
         bootstrap: how the interval is made.
 
     Returns:
@@ -85,15 +133,13 @@ def estimate_improvement(
     Raises:
         ValueError: as of :func:`estimate`, tasks that only one method has (named), or encoders of one only.
     """
-    if set(scores) != set(others):
-        odd = ", ".join(sorted(str(task) for task in set(scores) ^ set(others)))
-        raise ValueError(f"Only one of the methods has runs on {odd}; compare them on the tasks they share.")
+    _require_same_tasks(scores, others)
     if (encoders is None) != (other_encoders is None):
         raise ValueError(
             "Tell the encoders of both methods or of none: one interval cannot mix the two levels."
         )
     how = bootstrap or Bootstrap()
-    samples = [_Sample.of(scores, encoders), _Sample.of(others, other_encoders)]
+    samples = [Sample.of(scores, encoders, runs), Sample.of(others, other_encoders, other_runs)]
     value, ends = _interval(samples, lambda parts: probability_of_improvement(parts[0], parts[1]), how)
     return _scalar(value, ends, _basis(samples, how))
 
@@ -103,6 +149,7 @@ def estimate_profile(
     thresholds: ArrayLike,
     *,
     encoders: Encoders | None = None,
+    runs: Runs | None = None,
     bootstrap: Bootstrap | None = None,
 ) -> CurveEstimate:
     """Estimate which fraction of runs scores above each threshold, with pointwise intervals.
@@ -111,13 +158,14 @@ def estimate_profile(
         scores: task to one score per run ``[R_t]``, normalised so that a threshold means the same on all.
         thresholds: ``[K]``.
         encoders: as of :func:`estimate`.
+        runs: as of :func:`estimate`.
         bootstrap: how the intervals are made.
 
     Raises:
         ValueError: as of :func:`estimate`.
     """
     how = bootstrap or Bootstrap()
-    sample = _Sample.of(scores, encoders)
+    sample = Sample.of(scores, encoders, runs)
     value, ends = _interval([sample], lambda parts: performance_profile(parts[0], thresholds), how)
     return _curve(thresholds, value, ends, _basis([sample], how))
 
@@ -143,70 +191,19 @@ def estimate_curve(
         ValueError: as of :func:`estimate`, or a curve of another length.
     """
     how = bootstrap or Bootstrap()
-    sample = _Sample.of(scores, encoders, points=len(np.asarray(env_steps)))
+    sample = Sample.of(scores, encoders, None, points=len(np.asarray(env_steps)))
     value, ends = _interval([sample], lambda parts: aggregate(parts[0]), how)
     return _curve(env_steps, value, ends, _basis([sample], how))
 
 
-@dataclass(frozen=True)
-class _Sample:
-    """The runs of one method, checked, tasks in an order that does not depend on the caller's."""
-
-    tasks: list[Hashable]
-    scores: list[Array]  # (R_t,) or (K, R_t)
-    encoders: list[tuple[str, ...]] | None
-
-    @classmethod
-    def of(cls, scores: Scores, encoders: Encoders | None, points: int | None = None) -> _Sample:
-        if not scores:
-            raise ValueError("There are no tasks to estimate from.")
-        tasks = sorted(scores, key=str)
-        arrays = [_checked(task, scores[task], points) for task in tasks]
-        if encoders is None:
-            return cls(tasks, arrays, None)
-        for task, array in zip(tasks, arrays):
-            told = len(encoders.get(task, ()))
-            if told != array.shape[-1]:
-                raise ValueError(f"{task} has {array.shape[-1]} runs, and encoders are told of {told}.")
-        return cls(tasks, arrays, [tuple(encoders[task]) for task in tasks])
-
-    def why_no_interval(self) -> str:
-        kind = "run" if self.encoders is None else "encoder"
-        draws = [array.shape[-1] for array in self.scores]
-        if self.encoders is not None:
-            draws = [len(set(labels)) for labels in self.encoders]
-        single = [str(task) for task, count in zip(self.tasks, draws) if count < 2]
-        return f"no interval: a single {kind} on {', '.join(single)}" if single else ""
-
-    def redrawn(self, replicates: int, rng: np.random.Generator) -> list[Array]:
-        """Return one ``[B, R_t]`` or ``[B, K, R_t]`` per task."""
-        if self.encoders is None:
-            counts = [array.shape[-1] for array in self.scores]
-            indices = run_indices(counts, replicates=replicates, rng=rng)
-        else:
-            indices = encoder_indices(self.encoders, replicates=replicates, rng=rng)
-        return [np.moveaxis(array[..., index], -2, 0) for array, index in zip(self.scores, indices)]
-
-
-def _checked(task: Hashable, scores: ArrayLike, points: int | None) -> Array:
-    array = np.asarray(scores, dtype=np.float64)
-    wanted = 1 if points is None else 2
-    if array.ndim != wanted or not len(array) or (points is not None and array.shape[1] != points):
-        shape = "[runs]" if points is None else f"[runs, {points}]"
-        raise ValueError(
-            f"The scores of {task} must be {shape} with one run at least, got shape {array.shape}."
-        )
-    wrong = np.argwhere(~np.isfinite(array))
-    if len(wrong):
-        raise ValueError(
-            f"Run {int(wrong[0][0])} of {task} has the score {array[tuple(wrong[0])]}. A run that diverged has no "
-            "score: leave it out and say so."
-        )
-    return array.T if points is not None else array
+def _require_same_tasks(scores: Scores, others: Scores) -> None:
+    if set(scores) != set(others):
+        odd = ", ".join(sorted(str(task) for task in set(scores) ^ set(others)))
+        raise ValueError(f"Only one of the methods has runs on {odd}; compare them on the tasks they share.")
 
 
 def _interval(
-    samples: list[_Sample], aggregate: Callable[[list[list[Array]]], Array], how: Bootstrap
+    samples: list[Sample], aggregate: Callable[[list[list[Array]]], Array], how: Bootstrap
 ) -> tuple[Array, Array | None]:
     """Return the aggregate of the runs, and the ends of its interval ``[2, ...]`` if there is one."""
     value = aggregate([sample.scores for sample in samples])
@@ -218,12 +215,12 @@ def _interval(
     return value, np.percentile(replicates, [tail, 100 - tail], axis=0)
 
 
-def _basis(samples: list[_Sample], how: Bootstrap) -> Basis:
+def _basis(samples: list[Sample], how: Bootstrap) -> Basis:
     labels = [label for s in samples if s.encoders is not None for task in s.encoders for label in task]
     is_told = samples[0].encoders is not None
     return Basis(
         tasks=len(samples[0].tasks),
-        runs=sum(array.shape[-1] for sample in samples for array in sample.scores),
+        runs=sum(sample.count for sample in samples),
         encoders=len(set(labels)) if is_told else None,
         level="encoders" if is_told else "runs",
         confidence=how.confidence,

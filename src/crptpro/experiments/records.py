@@ -8,7 +8,7 @@ import logging
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -152,28 +152,6 @@ def read_run(directory: str | Path) -> Run:
     trains_encoder = settings.get("algorithm") == "drq"
     encoder = None if trains_encoder else _encoder_identity(directory, outer)
     return Run(directory, method, task, seed, encoder, trains_encoder, env_steps, episodes, config)
-
-
-def tidy_rows(runs: Iterable[Run]) -> list[dict[str, Any]]:
-    """Lay runs out as one row per episode, each with its run's method, task, seed and encoder.
-
-    Args:
-        runs: as found.
-
-    Returns:
-        Rows with the columns ``method, task, run_seed, encoder`` and those of :class:`Episode`.
-    """
-    return [
-        {
-            "method": run.method,
-            "task": run.task,
-            "run_seed": run.seed,
-            "encoder": run.encoder,
-            **asdict(episode),
-        }
-        for run in runs
-        for episode in run.episodes
-    ]
 
 
 def _candidates(roots: Iterable[str | Path]) -> list[Path]:

@@ -23,10 +23,27 @@ class ScoreTable:
         scores: task (or whatever the runs were keyed by) to one score per run ``[R]``.
         encoders: the same keys to the encoder of each run; ``None`` if one is not known, and then only intervals over
             runs can be had. A run that trains its encoder counts as having its own.
+        runs: the same keys to what each run is called; one that stands under two keys has one name.
     """
 
     scores: Mapping[Any, Array]
     encoders: Mapping[Any, tuple[str, ...]] | None
+    runs: Mapping[Any, tuple[str, ...]]
+
+    @property
+    def count(self) -> int:
+        """Number of different runs."""
+        return len({name for names in self.runs.values() for name in names})
+
+    @property
+    def shares_encoders(self) -> bool:
+        """Whether an interval over encoders can be had and differs from one over runs.
+
+        It needs two encoders on every task, and is the same where every run has an encoder that no other has.
+        """
+        if self.encoders is None or any(len(set(labels)) < 2 for labels in self.encoders.values()):
+            return False
+        return len({label for labels in self.encoders.values() for label in labels}) < self.count
 
     def only(self, tasks: Iterable[Hashable]) -> ScoreTable:
         """Return the part on some of the tasks.
@@ -36,7 +53,8 @@ class ScoreTable:
         """
         kept = list(tasks)
         encoders = None if self.encoders is None else {task: self.encoders[task] for task in kept}
-        return ScoreTable({task: self.scores[task] for task in kept}, encoders)
+        runs = {task: self.runs[task] for task in kept}
+        return ScoreTable({task: self.scores[task] for task in kept}, encoders, runs)
 
 
 def score_tables(
@@ -61,24 +79,9 @@ def score_tables(
     return {method: _table(method, by_key, score) for method, by_key in sorted(by_method.items())}
 
 
-def shared_tasks(tables: Mapping[str, ScoreTable]) -> list[Any]:
-    """Return the tasks on which every method has runs, and name the others in a warning.
-
-    Aggregates over different tasks do not compare.
-
-    Args:
-        tables: method to table.
-    """
-    everywhere = sorted({task for table in tables.values() for task in table.scores}, key=str)
-    lacking = {t: [m for m, table in tables.items() if t not in table.scores] for t in everywhere}
-    for task, methods in lacking.items():
-        if methods:
-            logger.warning("%s is left out of comparisons: no run of %s.", task, ", ".join(methods))
-    return [task for task in everywhere if not lacking[task]]
-
-
 def _table(method: str, by_key: Mapping[Hashable, list[Run]], score: Callable[[Run], float]) -> ScoreTable:
     scores = {key: np.array([score(run) for run in runs]) for key, runs in by_key.items()}
+    names = {key: tuple(str(run.directory) for run in runs) for key, runs in by_key.items()}
     unknown = [
         run for runs in by_key.values() for run in runs if run.encoder is None and not run.trains_encoder
     ]
@@ -87,8 +90,8 @@ def _table(method: str, by_key: Mapping[Hashable, list[Run]], score: Callable[[R
             "The encoder of %d run(s) of %s is not recorded, the first in %s: intervals over runs only.",
             len(unknown), method, unknown[0].directory,
         )  # fmt: skip
-        return ScoreTable(scores, None)
+        return ScoreTable(scores, None, names)
     encoders = {
         key: tuple(run.encoder or f"own:{run.directory}" for run in runs) for key, runs in by_key.items()
     }
-    return ScoreTable(scores, encoders)
+    return ScoreTable(scores, encoders, names)

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from crptpro.experiments.estimates import estimate, estimate_improvement, estimate_profile
+from crptpro.experiments.estimates import (
+    estimate,
+    estimate_improvement,
+    estimate_profile,
+    estimate_relative,
+)
 from crptpro.experiments.intervals import Bootstrap, Estimate
 from crptpro.experiments.published import EXPERT_SCORES
 from crptpro.experiments.report import drawing
@@ -16,6 +22,7 @@ from crptpro.experiments.report.runs import Placed, Spot, published, tables_of
 from crptpro.experiments.score_table import ScoreTable
 from crptpro.experiments.statistics import expert_normalized, iqm, mean, median, optimality_gap
 
+DRQ = "drq"
 REFERENCE = "crptpro"
 """The method that others are compared with."""
 
@@ -57,32 +64,32 @@ def aggregates(placed: Sequence[Placed], name: str, bootstrap: Bootstrap) -> lis
 
 def _normalized(table: ScoreTable) -> ScoreTable:
     experts = {spot: EXPERT_SCORES[spot.task] for spot in table.scores}
-    return ScoreTable(expert_normalized(table.scores, experts), table.encoders)
+    return ScoreTable(expert_normalized(table.scores, experts), table.encoders, table.runs)
 
 
 def _tables(tables: Mapping[str, ScoreTable], shared: Sequence[Spot], bootstrap: Bootstrap) -> list[Block]:
     normalizable = [spot for spot in shared if spot.task in EXPERT_SCORES]
-    here = _experts_here(tables, shared)
+    here = _measures_against_drq(tables)
     how = f"{bootstrap.replicates:,} stratified bootstrap replicates, seed {bootstrap.seed}"
     rows = []
     for label, table in tables.items():
-        row: list[str | Cell] = [label, *_counts(table)]
-        row.append(
-            _with_interval(
-                estimate(table.scores, mean, bootstrap=bootstrap), ".0f", _paper_mean(shared, label)
-            )
-        )
+        row: list[str | Cell] = [label, str(len(table.scores)), str(table.count)]
+        found = estimate(table.scores, mean, runs=table.runs, bootstrap=bootstrap)
+        row.append(_with_interval(found, ".0f", _paper_mean(shared, label)))
         row += _normalized_cells(table, normalizable, label, bootstrap, None)
         if here:
-            own = estimate(expert_normalized(table.scores, here), mean, bootstrap=bootstrap)
-            row.append(_with_interval(own, ".3f"))
+            row.append(
+                _against_drq(table, tables[DRQ], bootstrap) if label != DRQ else Cell("1", "by definition")
+            )
         rows.append(cells(*row))
     columns = ["method", "rows", "runs", "mean score", *(_NORMALIZED if normalizable else ())]
     columns += ["mean / DrQ here"] * bool(here)
     caption = (
         f"Over the {len(shared)} row(s) that all methods share; {bootstrap.confidence:.0%} intervals over runs, {how}. "
-        "Normalised scores are divided by the paper's DrQ."
+        "A run that stands in several rows counts once. Normalised scores are divided by the paper's DrQ."
     )
+    if here:
+        caption += " DrQ here has few runs itself: they are redrawn with the others', so that the intervals know of it."
     blocks: list[Block] = [Table(caption, tuple(columns), tuple(rows))]
     if len(normalizable) < len(shared):
         blocks.append(
@@ -104,13 +111,12 @@ def _normalized_cells(
 ) -> list[Cell]:
     if not spots:
         return []
-    scores = _normalized(table.only(spots)).scores
+    own = _normalized(table.only(spots))
     found = []
     for aggregate in (mean, iqm, median, optimality_gap):
         paper = _paper_normalized(spots, label) if aggregate is mean and encoders is None else ""
-        found.append(
-            _with_interval(estimate(scores, aggregate, encoders=encoders, bootstrap=bootstrap), ".3f", paper)
-        )
+        made = estimate(own.scores, aggregate, encoders=encoders, runs=own.runs, bootstrap=bootstrap)
+        found.append(_with_interval(made, ".3f", paper))
     return found
 
 
@@ -122,13 +128,10 @@ def _over_encoders(
         return []
     rows = []
     for label, table in tables.items():
-        told = table.only(spots).encoders
-        if told is None or any(len(set(encoders)) < 2 for encoders in told.values()):
+        own = table.only(spots)
+        told = own.encoders
+        if told is None or not own.shares_encoders:
             continue
-        if all(len(set(encoders)) == len(encoders) for encoders in told.values()):
-            own = {encoder for encoders in told.values() for encoder in encoders}
-            if len(own) == sum(len(encoders) for encoders in told.values()):
-                continue  # every run has an encoder that no other has: the same as over runs
         count = len({encoder for encoders in told.values() for encoder in encoders})
         rows.append(cells(label, str(count), *_normalized_cells(table, spots, label, bootstrap, told)))
     if not rows:
@@ -151,18 +154,35 @@ def _improvement(tables: Mapping[str, ScoreTable], name: str, bootstrap: Bootstr
     for label, table in tables.items():
         if label == REFERENCE:
             continue
-        found = estimate_improvement(ours.scores, table.scores, bootstrap=bootstrap)
-        rows.append(cells(label, str(found.basis.runs), _with_interval(found, ".2f")))
+        level: dict[str, Any] = {}
+        if _has_encoders(ours, table):
+            level = {"encoders": ours.encoders, "other_encoders": table.encoders}
+        found = estimate_improvement(
+            ours.scores, table.scores, runs=ours.runs, other_runs=table.runs, bootstrap=bootstrap, **level
+        )
+        rows.append(cells(label, str(found.basis.runs), found.basis.level, _with_interval(found, ".2f")))
         drawn.append((label, look[label], found.value, found.interval))
     caption = (
-        f"Probability that a run of {REFERENCE} scores higher than one of the other method on the same task."
+        f"Probability that a run of {REFERENCE} scores higher than one of the other method on the same task; "
+        f"{bootstrap.confidence:.0%} intervals, over encoders where both methods have two or more on every row and "
+        "one of them shares some among its runs, else over runs."
     )
     picture = drawing.intervals(drawn, f"P({REFERENCE} > other); 0.5: no difference", 0.5)
     runs = _runs(tables)
     return [
-        Table(caption, ("other method", "runs of both", f"P({REFERENCE} > other)"), tuple(rows)),
+        Table(
+            caption,
+            ("other method", "runs of both", "interval over", f"P({REFERENCE} > other)"),
+            tuple(rows),
+        ),
         Figure(f"{name}-improvement", f"{caption} {runs} runs in all.", picture),
     ]
+
+
+def _has_encoders(*tables: ScoreTable) -> bool:
+    """Whether an interval over the encoders of all of these can be had, and differs from one over runs."""
+    told = [labels for table in tables for labels in (table.encoders or {"": ()}).values()]
+    return all(len(set(labels)) > 1 for labels in told) and any(table.shares_encoders for table in tables)
 
 
 def _profiles(tables: Mapping[str, ScoreTable], name: str, bootstrap: Bootstrap) -> Figure:
@@ -171,26 +191,32 @@ def _profiles(tables: Mapping[str, ScoreTable], name: str, bootstrap: Bootstrap)
     look = styles(tables)
     curves = []
     for label, table in tables.items():
-        found = estimate_profile(table.scores, thresholds, bootstrap=bootstrap)
-        runs = found.basis.runs
+        encoders = table.encoders if table.shares_encoders else None
+        found = estimate_profile(
+            table.scores, thresholds, encoders=encoders, runs=table.runs, bootstrap=bootstrap
+        )
+        count = f"n = {found.basis.runs}" + (f" on {found.basis.encoders} encoders" if encoders else "")
         curves.append(
-            drawing.Line(f"{label} (n = {runs})", look[label], found.x, found.values, found.low, found.high)
+            drawing.Line(f"{label} ({count})", look[label], found.x, found.values, found.low, found.high)
         )
     panel = drawing.Panel("", "score / the paper's DrQ", "fraction of runs above it", curves)
-    caption = f"Performance profiles with {bootstrap.confidence:.0%} intervals over runs; n counts runs of all rows."
+    caption = (
+        f"Performance profiles with {bootstrap.confidence:.0%} intervals, over encoders where the legend counts them, "
+        "else over runs; n counts runs of all rows."
+    )
     return Figure(f"{name}-profiles", caption, drawing.lines([panel]))
 
 
-def _experts_here(tables: Mapping[str, ScoreTable], shared: Sequence[Spot]) -> dict[Spot, float]:
-    """DrQ's mean as measured here, if it was, and is above 0 on every row."""
-    if "drq" not in tables:
-        return {}
-    means = {spot: float(np.mean(tables["drq"].scores[spot])) for spot in shared}
-    return means if all(value > 0 for value in means.values()) else {}
+def _measures_against_drq(tables: Mapping[str, ScoreTable]) -> bool:
+    """Whether DrQ was measured here, and every one of its runs has a score to divide by."""
+    return DRQ in tables and all(float(np.min(scores)) > 0 for scores in tables[DRQ].scores.values())
 
 
-def _counts(table: ScoreTable) -> list[str]:
-    return [str(len(table.scores)), str(sum(len(scores) for scores in table.scores.values()))]
+def _against_drq(table: ScoreTable, drq: ScoreTable, bootstrap: Bootstrap) -> Cell:
+    found = estimate_relative(
+        table.scores, drq.scores, runs=table.runs, reference_runs=drq.runs, bootstrap=bootstrap
+    )
+    return _with_interval(found, ".3f")
 
 
 def _paper_mean(spots: Sequence[Spot], label: str) -> str:
@@ -212,4 +238,4 @@ def _with_interval(found: Estimate, spec: str, paper: str = "") -> Cell:
 
 
 def _runs(tables: Mapping[str, ScoreTable]) -> int:
-    return sum(len(scores) for table in tables.values() for scores in table.scores.values())
+    return sum(table.count for table in tables.values())

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from crptpro.errors import RecordError
+from crptpro.experiments.pieces import piece_from_json
 from crptpro.experiments.published import COLORS, SEEN, UNSEEN, Score
 from crptpro.experiments.records import Run, read_run
 from crptpro.experiments.report.palette import in_order
@@ -61,6 +62,7 @@ def placed_runs(asked: Asked) -> tuple[list[Placed], list[str]]:
         The runs, and a sentence for each that is finished and cannot be read.
     """
     found, problems = [], []
+    seen = set()
     for goal in asked.finished:
         if goal.piece.kind != "run":
             continue
@@ -74,8 +76,21 @@ def placed_runs(asked: Asked) -> tuple[list[Placed], list[str]]:
         place = goal.place
         spot = Spot(str(place.get("group", "")), run.task, str(place.get("colors", "normal")))
         varied = (str(place.get("varied", "")), str(place.get("value", "")))
-        found.append(Placed(goal.label, spot, run, varied))
+        same = (goal.label, spot, varied, goal.piece.key)
+        if same not in seen:  # asked for twice, under other seeds
+            seen.add(same)
+            found.append(Placed(goal.label, spot, _on_base(run, goal.piece.description), varied))
     return found, problems
+
+
+def _on_base(run: Run, description: Mapping[str, Any]) -> Run:
+    """Let runs on encoders that were fine-tuned from one base share it: it is their one draw of a pre-training."""
+    encoder = description.get("encoder") or {}
+    if encoder.get("kind") != "finetuned":
+        return run
+    while encoder.get("kind") == "finetuned":
+        encoder = encoder["base"]
+    return dataclasses.replace(run, encoder=f"base:{piece_from_json(encoder).key}")
 
 
 def unplaced_runs(runs: Iterable[Run]) -> list[Placed]:

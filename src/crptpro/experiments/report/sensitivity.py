@@ -9,7 +9,7 @@ from crptpro.experiments.intervals import Bootstrap, Estimate
 from crptpro.experiments.published import EXPERT_SCORES
 from crptpro.experiments.report import drawing
 from crptpro.experiments.report.blocks import Block, Figure
-from crptpro.experiments.report.palette import base_method, styles
+from crptpro.experiments.report.palette import styles
 from crptpro.experiments.report.runs import Placed, tables_of
 from crptpro.experiments.statistics import expert_normalized, mean
 
@@ -29,12 +29,12 @@ def sensitivity(placed: Sequence[Placed], name: str, bootstrap: Bootstrap) -> li
         part = [p for p in placed if p.varied[0] == varied and p.spot.task in EXPERT_SCORES]
         if not part:
             continue
-        methods = list(dict.fromkeys(base_method(p.label) or p.label for p in part))
+        methods = list(dict.fromkeys(_method(p) for p in part))
         look, curves = styles(methods), []
         values = sorted({p.varied[1] for p in part}, key=_size)
         for method in methods:
             points = []
-            own = [p for p in part if (base_method(p.label) or p.label) == method]
+            own = [p for p in part if _method(p) == method]
             for value in values:
                 here = [p for p in own if p.varied[1] == value]
                 if here:
@@ -55,6 +55,11 @@ def sensitivity(placed: Sequence[Placed], name: str, bootstrap: Bootstrap) -> li
         )
         blocks.append(Figure(f"{name}-{varied}", caption, drawing.lines([panel])))
     return blocks
+
+
+def _method(placed: Placed) -> str:
+    """What is before the value in a label, as ``"crptpro, alpha 0.05"``."""
+    return placed.label.split(f", {placed.varied[0]} ")[0]
 
 
 def _estimate(placed: Sequence[Placed], bootstrap: Bootstrap) -> Estimate:
