@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import psutil
@@ -15,6 +16,8 @@ import pytest
 from command import Call, refused
 
 import crptpro
+from crptpro.experiments.catalogue import EXPERIMENTS
+from crptpro.experiments.goals import Goal, Request
 
 MAIN = "from crptpro.cli import main; main()"
 FAKE_EXPERIMENT = Path(__file__).parents[1] / "experiments" / "launching" / "fake_experiment.py"
@@ -100,10 +103,20 @@ def test_a_plan_that_the_disk_cannot_hold_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_colours_are_reversed_by_background_or_image(call: Call, tmp_path: Path) -> None:
-    part = ("--methods", "random-encoder", "--tasks", "cheetah_run", "--scale", "tiny")
+def test_colours_are_reversed_by_background_or_image(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual, asked = EXPERIMENTS["colors"], []
+
+    def goals(request: Request) -> list[Goal]:
+        asked.append({goal.piece.colors for goal in usual.goals(request)})  # type: ignore[attr-defined]
+        return usual.goals(request)
+
+    monkeypatch.setitem(EXPERIMENTS, "colors", replace(usual, goals=goals))
+    part = ("--methods", "random-encoder", "--scale", "tiny")
     for by in ("background", "image"):
         assert call("reproduce", "colors", *part, "--colors-by", by, "--dry-run", "--out", tmp_path)[0] == 0
+    assert asked == [{"reversed_background"}, {"reversed_image"}]
 
 
 # --- an experiment that takes seconds -----------------------------------------------------------------------------

@@ -9,13 +9,14 @@ import pytest
 
 from crptpro.errors import UnknownNameError
 from crptpro.experiments.analyses import PRETRAINED
-from crptpro.experiments.building import Store
+from crptpro.experiments.budgets import budget
 from crptpro.experiments.catalogue import EXPERIMENTS, get_experiment
 from crptpro.experiments.goals import Goal, Request, encoder
 from crptpro.experiments.measurements import CoveragePiece, EmbeddingsPiece, ProbePiece, TimingPiece
 from crptpro.experiments.pieces import EncoderPiece, ExploredPiece, PretrainedPiece, RunPiece
 from crptpro.experiments.plan import make_plan
 from crptpro.experiments.scales import PAPER, SMALL, TINY
+from crptpro.experiments.store import Store
 
 ENCODERS = ("encoder", "explored", "finetuned", "untrained")
 
@@ -142,17 +143,19 @@ def test_efficiency_adds_the_encoders_of_single_domain_methods_up() -> None:
     shared = found["proto-rl-c", 3]
     assert isinstance(shared, TimingPiece)
     assert [piece.domain_names for piece in shared.encoders] == [("cheetah", "walker", "quadruped")]
-    assert shared.paper_decisions == 3 * 33_334
+    assert budget(shared.paper[0]).decisions == 3 * 33_334
+    assert shared.paper == shared.encoders
     crptpro = found["crptpro", 2]
     assert isinstance(crptpro, TimingPiece)
-    assert (crptpro.paper_updates, crptpro.paper_decisions) == (50_000, 0)
+    assert budget(crptpro.paper[0]) == (50_000, 0)
 
 
 def test_a_timing_of_a_small_scale_knows_the_papers_budget() -> None:
     request = Request(SMALL, methods=("crptpro",))
     for goal in EXPERIMENTS["efficiency"].goals(request):
         assert isinstance(goal.piece, TimingPiece)
-        assert goal.piece.paper_updates == 50_000
+        assert budget(goal.piece.paper[0]).updates == 50_000
+        assert goal.piece.paper_timed == 7
         assert goal.piece.encoders[0].updates == 3_000  # type: ignore[attr-defined]
 
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -11,6 +12,7 @@ from crptpro.experiments.goals import (
     FINETUNE,
     METHODS,
     RANDOM_ENCODER,
+    Goal,
     Request,
     dataset,
     encoder,
@@ -31,6 +33,7 @@ from crptpro.experiments.pieces import (
 )
 from crptpro.experiments.published import EFFICIENCY, EfficiencyRow
 from crptpro.experiments.scales import PAPER, SMALL, TINY, get_scale
+from crptpro.objectives import ATCLoss, ExplorationDefaults, MethodDefaults, register_method, registry
 
 A = ("cheetah", "walker", "quadruped")
 
@@ -131,7 +134,63 @@ def test_every_encoder_has_every_downstream_seed() -> None:
 def test_a_system_without_encoder_has_as_many_different_runs() -> None:
     request = Request(PAPER, encoder_seeds=(0, 7), seeds=(0, 3))
     goals = runs(request, DRQ, "walker_run", {0: None, 7: None})
-    assert [goal.piece.seed for goal in goals] == [0, 3, 4, 7]  # type: ignore[attr-defined]
+    assert [goal.piece.seed for goal in goals] == [0, 3, 7_000, 7_003]  # type: ignore[attr-defined]
+
+
+def test_a_run_without_encoder_does_not_depend_on_what_else_is_asked_for() -> None:
+    def asked(encoder_seeds: tuple[int, ...], seeds: tuple[int, ...]) -> set[Goal]:
+        request = Request(PAPER, encoder_seeds=encoder_seeds, seeds=seeds)
+        return set(runs(request, DRQ, "walker_run", dict.fromkeys(encoder_seeds)))
+
+    whole = asked((0, 1), (0, 1))
+    assert len(whole) == len({goal.piece for goal in whole}) == 4
+    assert asked((0,), (0, 1)) | asked((1,), (0, 1)) == whole
+    assert asked((0, 1), (0,)) < whole
+
+
+def test_a_domains_name_stands_for_its_task() -> None:
+    assert Request(PAPER, tasks=("walker", "walker_run", "quadruped_walk", "hopper")).tasks == (
+        "walker_run", "quadruped_walk", "hopper_hop",
+    )  # fmt: skip
+
+
+def test_a_users_method_is_another_piece_when_it_is_registered_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
+
+    def key(**options: Any) -> str:
+        register_method("mine", ATCLoss, MethodDefaults(lr=options.pop("lr", 1e-3)), **options)
+        return encoder(SMALL, "mine", A, 0).key
+
+    first = key()
+    assert key() == first
+    changed = [key(lr=3e-2), key(loss_options={"latent_dim": 64}), key(encoder_options={"pixel_offset": 0.5})]
+    assert len({first, *changed}) == 4
+    piece = encoder(SMALL, "atc", A, 0)
+    assert isinstance(piece, PretrainedPiece)
+    assert piece.definition == ""
+
+
+@pytest.mark.parametrize("is_single", [False, True])
+@pytest.mark.parametrize("each", [1, 3])
+def test_an_explorer_that_a_scale_does_not_name_has_its_budget(
+    monkeypatch: pytest.MonkeyPatch, is_single: bool, each: int
+) -> None:
+    monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
+    exploration = ExplorationDefaults(is_single_domain=is_single, encoder_updates_each=each)
+    register_method("mine", ATCLoss, exploration=exploration)
+    domains, known = (A[:1], "proto-rl-s") if is_single else (A, "proto-rl-c")
+    mine, usual = budget(encoder(SMALL, "mine", domains, 0)), budget(encoder(SMALL, known, domains, 0))
+    assert mine.decisions == usual.decisions == pytest.approx(20_000, rel=0.01)
+    assert mine.updates == pytest.approx(usual.updates, rel=0.01)
+
+
+def test_a_variant_of_a_method_takes_the_scales_options_of_its_loss() -> None:
+    piece = encoder(SMALL, "released-code", A, 0)
+    assert isinstance(piece, PretrainedPiece)
+    assert dict(piece.loss) == {"num_prototypes": 128}
+    assert encoder(PAPER, "released-code", A, 0).loss == ()  # type: ignore[attr-defined]
 
 
 def test_downstream_seeds_are_the_scales_unless_given() -> None:
@@ -143,11 +202,15 @@ def test_downstream_seeds_are_the_scales_unless_given() -> None:
     ("make", "error", "message"),
     [
         (lambda: Request(PAPER, methods=("crtpro",)), UnknownNameError, "crptpro"),
+        (lambda: Request(PAPER, methods=("crptpro-fine",)), UnknownNameError, "crptpro-finetune"),
+        (lambda: Request(PAPER, methods=("foo",)), UnknownNameError, "becl, crptpro, crptpro-finetune, drq"),
         (lambda: Request(PAPER, groups=("E",)), UnknownNameError, "'E'; choose from A, B, C, D"),
         (lambda: Request(PAPER, tasks=("walker_rum",)), UnknownNameError, "walker_run"),
         (lambda: get_scale("huge"), UnknownNameError, "'huge'; choose tiny, small, paper"),
         (lambda: Request(PAPER, encoder_seeds=()), CRPTproError, "`encoder_seeds`"),
         (lambda: Request(PAPER, seeds=(1, 1)), CRPTproError, r"`seeds`.*\(1, 1\)"),
+        (lambda: Request(PAPER, seeds=(1_000,)), CRPTproError, "`seeds`.*from 0 to 999, got"),
+        (lambda: Request(PAPER, encoder_seeds=(-1,)), CRPTproError, "`encoder_seeds`.*from 0 to 999, got"),
     ],
 )
 def test_a_request_that_nobody_can_meet_is_refused(

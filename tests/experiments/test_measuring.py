@@ -17,7 +17,7 @@ from crptpro.cards import read_json
 from crptpro.data import StoredReplay
 from crptpro.errors import RecordError
 from crptpro.experiments.budgets import budget
-from crptpro.experiments.building import JobSettings, Store, build
+from crptpro.experiments.building import JobSettings, build
 from crptpro.experiments.goals import dataset, encoder
 from crptpro.experiments.measurements import (
     CoveragePiece,
@@ -38,6 +38,7 @@ from crptpro.experiments.plan import make_plan
 from crptpro.experiments.probing import COLUMNS as PROBE_COLUMNS
 from crptpro.experiments.row_files import read_rows
 from crptpro.experiments.scales import TINY
+from crptpro.experiments.store import Store
 from crptpro.experiments.timing import COLUMNS as TIMING_COLUMNS
 from crptpro.pretrained import load_pretrained
 
@@ -77,13 +78,29 @@ def make(piece: Piece, store: Store) -> Path:
     return store.path(piece)
 
 
+def timing_of(*encoders: EncoderPiece, paper_timed: int = 1) -> TimingPiece:
+    """The timing of encoders whose paper has batches of six."""
+
+    def at_paper(piece: EncoderPiece) -> EncoderPiece:
+        if isinstance(piece, PretrainedPiece):
+            return replace(piece, updates=7_200, training=settings(batch_size=6), datasets=())
+        assert isinstance(piece, ExploredPiece)
+        return replace(piece, explore=settings(**{**dict(piece.explore), "batch_size": 6, "env_steps": 240}))
+
+    paper = tuple(at_paper(piece) for piece in encoders)
+    return TimingPiece(encoders, paper, TINY.timing_updates, paper_timed=paper_timed)
+
+
 def timed(store: Store, *encoders: EncoderPiece) -> dict[str, str]:
-    piece = TimingPiece(encoders, TINY.timing_updates, paper_updates=7_200, paper_decisions=36)
+    piece = timing_of(*encoders)
     (row,) = read_rows(make(piece, store) / "timing.csv")
     assert tuple(row) == TIMING_COLUMNS
     assert row["method"] == encoders[0].method
     assert float(row["seconds"]) > 0
-    assert float(row["paper_projected_hours"]) == pytest.approx(2 * float(row["seconds_per_update"]))
+    at_paper = sum(budget(paper).updates for paper in piece.paper)
+    assert int(row["paper_updates"]) == at_paper
+    hours = float(row["paper_seconds_per_update"]) * at_paper / 3600
+    assert float(row["paper_projected_hours"]) == pytest.approx(hours)
     updates, decisions = (sum(part) for part in zip(*map(budget, encoders)))
     assert (row["budget_updates"], row["budget_decisions"]) == (str(updates), str(decisions))
     assert (row["threads"], row["device"]) == ("1", "cpu")
@@ -103,6 +120,14 @@ def test_training_on_datasets_is_timed_without_their_collection(store: Store) ->
     ).exists()  # nothing of the timing stays, and the encoder was not asked for
 
 
+def test_the_papers_hours_are_left_open_unless_its_updates_are_timed(store: Store) -> None:
+    (row,) = read_rows(make(timing_of(trained(), paper_timed=0), store) / "timing.csv")
+    assert row["paper_projected_hours"] == row["paper_seconds_per_update"] == ""
+    alike = TimingPiece((trained(),), (trained(),), TINY.timing_updates)
+    (row,) = read_rows(make(alike, store) / "timing.csv")
+    assert row["paper_projected_hours"] == row["projected_hours"]
+
+
 def test_exploring_is_timed_with_its_decisions_past_the_random_ones(store: Store) -> None:
     row = timed(store, explorer("proto-rl-c", *DOMAINS))
     assert (row["domains"], row["encoder_updates"], row["decisions"]) == ("2", "10", "20")
@@ -120,7 +145,7 @@ def test_encoders_of_single_domains_are_timed_one_by_one(store: Store) -> None:
     encoders = tuple(explorer("apt-s", domain) for domain in DOMAINS)
     row = timed(store, *encoders)
     assert (row["domains"], row["encoder_updates"]) == ("2", "10")
-    each = [timed_part(store, piece) for piece in TimingPiece(encoders, TINY.timing_updates, 7_200, 36).parts]
+    each = [timed_part(store, piece) for piece in timing_of(*encoders).parts]
     assert float(row["seconds"]) == pytest.approx(sum(each))
 
 

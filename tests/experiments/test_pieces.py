@@ -112,7 +112,7 @@ def test_an_encoder_knows_the_domains_of_its_last_training() -> None:
 
 
 def test_a_timing_needs_the_data_of_its_encoder_and_not_the_encoder() -> None:
-    timing = TimingPiece((ENCODER,), updates=10, paper_updates=100, paper_decisions=0)
+    timing = TimingPiece((ENCODER,), (ENCODER,), updates=10)
     assert timing.is_exclusive
     assert not ENCODER.is_exclusive
     assert timing.needs == (WALKER,)
@@ -120,9 +120,16 @@ def test_a_timing_needs_the_data_of_its_encoder_and_not_the_encoder() -> None:
 
 def test_a_timing_of_several_encoders_needs_that_of_each() -> None:
     one, two = replace(ENCODER, method="apt-s"), replace(ENCODER, method="apt-s", seed=1)
-    both = TimingPiece((one, two), updates=10, paper_updates=200, paper_decisions=40)
-    alone = [TimingPiece((piece,), 10, paper_updates=100, paper_decisions=20) for piece in (one, two)]
-    assert list(both.needs) == alone
+    whole = [replace(piece, updates=100) for piece in (one, two)]
+    both = TimingPiece((one, two), tuple(whole), updates=10, threads=2)
+    assert list(both.needs) == [
+        TimingPiece((piece,), (paper,), 10, threads=2) for piece, paper in zip((one, two), whole)
+    ]
+
+
+def test_a_timing_on_another_device_or_of_more_threads_is_another() -> None:
+    timing = TimingPiece((ENCODER,), (ENCODER,), updates=10)
+    assert len({timing.key, replace(timing, device="cuda").key, replace(timing, threads=2).key}) == 3
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from crptpro.errors import RecordError
-from crptpro.experiments.building import Store
 from crptpro.experiments.goals import Goal, Request
 from crptpro.experiments.matrix import seen
 from crptpro.experiments.requests import AskedGoal, read_request, request_path, write_request
 from crptpro.experiments.scales import TINY
+from crptpro.experiments.store import Store
 
 
 def ask(store: Store, **part: object) -> list[Goal]:
@@ -34,7 +34,7 @@ def test_goals_are_read_back_with_their_pieces(tmp_path: Path) -> None:
     assert [described(goal, store) for goal in asked.goals] == goals
     assert asked.request == {
         "methods": ["crptpro", "drq"], "groups": ["A"], "tasks": ["walker_run"], "encoder_seeds": [0], "seeds": [0, 1],
-        "colors": "reversed_background",
+        "colors": "reversed_background", "device": "cpu", "threads": 1,
     }  # fmt: skip
 
 

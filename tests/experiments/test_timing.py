@@ -11,10 +11,11 @@ from torch import nn
 
 from crptpro.errors import RecordError
 from crptpro.experiments import timing
-from crptpro.experiments.building import JobSettings, Store
+from crptpro.experiments.building import JobSettings
 from crptpro.experiments.measurements import TimingPiece
 from crptpro.experiments.pieces import PretrainedPiece, UntrainedPiece
 from crptpro.experiments.row_files import write_rows
+from crptpro.experiments.store import Store
 from crptpro.experiments.timing import WINDOWS, UpdateClock, time_training, timing_row
 
 
@@ -58,11 +59,12 @@ def test_what_has_no_training_of_its_own_is_refused(tmp_path: Path) -> None:
 def test_encoders_of_single_domains_cost_the_sum_of_theirs(tmp_path: Path) -> None:
     store = Store(tmp_path)
     encoders = tuple(PretrainedPiece("apt-s", seed, (), updates=10) for seed in (0, 1))
-    piece = TimingPiece(encoders, updates=5, paper_updates=200, paper_decisions=800)
+    piece = TimingPiece(encoders, encoders, updates=5)
     row: dict[str, Any] = {
         "method": "apt-s", "domains": 1, "encoder_updates": 5, "decisions": 10, "seconds": 20.0,
         "seconds_per_update": 4.0, "seconds_per_decision": 2.0, "budget_updates": 900, "budget_decisions": 1800,
-        "projected_hours": 1.0, "paper_updates": 100, "paper_decisions": 400, "paper_projected_hours": 0.5,
+        "projected_hours": 1.0, "paper_updates": 100, "paper_decisions": 400, "paper_seconds_per_update": 18.0,
+        "paper_projected_hours": 0.5,
         "collection_seconds": "", "threads": 1, "device": "cpu",
     }  # fmt: skip
     other = {**row, "seconds": 30.0, "seconds_per_update": 8.0, "projected_hours": 2.0}
@@ -73,6 +75,11 @@ def test_encoders_of_single_domains_cost_the_sum_of_theirs(tmp_path: Path) -> No
         "method": "apt-s", "domains": "2", "encoder_updates": "10", "decisions": "20", "seconds": "50.0",
         "seconds_per_update": "6.0", "seconds_per_decision": "3.0", "budget_updates": "1800",
         "budget_decisions": "3600", "projected_hours": "3.0", "paper_updates": "200", "paper_decisions": "800",
-        "paper_projected_hours": "1.0", "collection_seconds": "", "threads": "1", "device": "cpu",
+        "paper_seconds_per_update": "18.0", "paper_projected_hours": "1.0", "collection_seconds": "",
+        "threads": "1", "device": "cpu",
     }  # fmt: skip
     assert set(found) == set(timing.COLUMNS)
+    write_rows(
+        store.path(piece.parts[1]) / "timing.csv", timing.COLUMNS, [{**other, "paper_projected_hours": ""}]
+    )
+    assert timing_row(piece, store, JobSettings())["paper_projected_hours"] == ""

@@ -73,12 +73,12 @@ class Reproduce:
         """Print the plan, make what is missing, list what failed."""
         from crptpro.cards import require_disk
         from crptpro.errors import CRPTproError
-        from crptpro.experiments.building import Store
         from crptpro.experiments.costs import estimate
         from crptpro.experiments.launching import divide, run_pieces
         from crptpro.experiments.plan import make_plan
         from crptpro.experiments.plan_text import failures_text, plan_text
         from crptpro.experiments.requests import write_request
+        from crptpro.experiments.store import Store
         from crptpro.modules import usable_device
         from crptpro.plugins import loaded_plugins
 
@@ -93,7 +93,7 @@ class Reproduce:
             cores_per_job=self.cores_per_job,
             jobs_per_gpu=self.jobs_per_gpu,
         )
-        request = self._request()
+        request = self._request(resources)
         wanted = {name: self._goals(name, request) for name in _names(self.experiments)}
         store = Store(self.out)
         plan = make_plan([goal.piece for goals in wanted.values() for goal in goals], store)
@@ -120,7 +120,7 @@ class Reproduce:
                 raise SystemExit(1)
         print(f"\nAll of it is there. Tables and figures: crptpro report {self.out}", flush=True)
 
-    def _request(self) -> Request:
+    def _request(self, resources: Resources) -> Request:
         from crptpro.experiments.goals import Request
         from crptpro.experiments.scales import get_scale
 
@@ -132,6 +132,8 @@ class Reproduce:
             encoder_seeds=self.encoder_seeds,
             seeds=self.seeds or None,
             colors="reversed_image" if self.colors_by == "image" else "reversed_background",
+            device=self.device,
+            threads=resources.cores_per_job,
         )
 
     def _goals(self, name: str, request: Request) -> list[Goal]:

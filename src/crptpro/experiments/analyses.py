@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 from crptpro.colors import Colors
 from crptpro.domains import GROUPS, get_domain
-from crptpro.experiments.budgets import Budget, budget
 from crptpro.experiments.goals import (
     DRQ,
     FINETUNE,
@@ -51,14 +50,21 @@ def efficiency(request: Request) -> list[Goal]:
         for method in _methods(request, PRETRAINED):
             for count in range(1, len(GROUPS[group]) + 1):
                 domains = GROUPS[group][:count]
-                whole = _total(_encoders(PAPER, method, domains, seed))
                 piece = TimingPiece(
                     encoders=_encoders(request.scale, method, domains, seed),
+                    paper=_encoders(PAPER, method, domains, seed),
                     updates=request.scale.timing_updates,
-                    paper_updates=whole.updates,
-                    paper_decisions=whole.decisions,
+                    paper_timed=request.scale.paper_timing_updates,
+                    device=request.device,
+                    threads=request.threads,
                 )
-                place = settings(group=group, domains=count, encoder_seed=seed)
+                place = settings(
+                    group=group,
+                    domains=count,
+                    encoder_seed=seed,
+                    device=request.device,
+                    threads=request.threads,
+                )
                 goals.append(Goal(method, piece, place))
     return goals
 
@@ -192,11 +198,6 @@ def _encoders(scale: Scale, method: str, domains: tuple[str, ...], seed: int) ->
     """One encoder of all domains, or one for each."""
     sets = [(domain,) for domain in domains] if is_single_domain(method) else [domains]
     return tuple(encoder(scale, method, each, seed) for each in sets)
-
-
-def _total(encoders: tuple[EncoderPiece, ...]) -> Budget:
-    each = [budget(piece) for piece in encoders]
-    return Budget(sum(one.updates for one in each), sum(one.decisions for one in each))
 
 
 def _goal(label: str, piece: object, group: str, seed: int, domains: tuple[str, ...]) -> Goal:

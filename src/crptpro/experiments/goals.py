@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import inspect
+import json
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,13 +25,16 @@ from crptpro.experiments.pieces import (
     settings,
 )
 from crptpro.experiments.scales import Scale
-from crptpro.objectives import Method, get_method
+from crptpro.objectives import Method, get_method, methods
 
 FINETUNE, DRQ, RANDOM_ENCODER = "crptpro-finetune", "drq", "random-encoder"
 METHODS = (
     "crptpro", FINETUNE, "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-s", "becl", DRQ, RANDOM_ENCODER,
 )  # fmt: skip
 """Every system of the comparison, in the order of tables."""
+
+SEEDS = 1_000
+"""Seeds of a level lie below this number, so that DrQ's runs, which have both levels in one, are all different."""
 
 
 @dataclass(frozen=True)
@@ -55,10 +60,12 @@ class Request:
         scale: every budget.
         methods: systems, by name; the experiment's own if empty.
         groups: letters of :data:`crptpro.domains.GROUPS`; the experiment's own if empty.
-        tasks: by name; the experiment's own if empty.
+        tasks: by name, or a domain's, which stands for its task; the experiment's own if empty.
         encoder_seeds: the first seed level: collection, exploration and pre-training.
         seeds: the second: downstream runs on each encoder; ``None`` for as many as the scale has.
         colors: what "other colours" are, where an experiment has them (decision A22).
+        device: of networks; only what measures time depends on it, and on ``threads``.
+        threads: of torch, in each job.
     """
 
     scale: Scale
@@ -68,25 +75,31 @@ class Request:
     encoder_seeds: tuple[int, ...] = (0,)
     seeds: tuple[int, ...] | None = None
     colors: Colors = "reversed_background"
+    device: str = "cpu"
+    threads: int = 1
 
     def __post_init__(self) -> None:
         """Refuse names that nobody knows.
 
         Raises:
             UnknownNameError: for a method, a group or a task.
-            CRPTproError: for a repeated or missing seed.
+            CRPTproError: for a repeated or missing seed, or one outside [0, :data:`SEEDS`).
         """
         for method in self.methods:
-            if method not in METHODS:
-                get_method(method)
+            if method not in (FINETUNE, DRQ, RANDOM_ENCODER):
+                _require_method(method)
         for group in self.groups:
             if group not in GROUPS:
                 raise UnknownNameError(f"There is no group {group!r}; choose from {', '.join(GROUPS)}.")
-        for task in self.tasks:
-            get_domain(task)
+        # A domain's name stands for its task: a run called "walker" would be another piece than "walker_run".
+        named = [(task, get_domain(task)) for task in self.tasks]
+        tasks = (domain.task if task == domain.name else task for task, domain in named)
+        object.__setattr__(self, "tasks", tuple(dict.fromkeys(tasks)))
         for name, given in (("encoder_seeds", self.encoder_seeds), ("seeds", self.downstream_seeds)):
             if not given or len(set(given)) != len(given):
                 raise CRPTproError(f"`{name}` must be one or several different numbers, got {given}.")
+            if not all(0 <= seed < SEEDS for seed in given):
+                raise CRPTproError(f"`{name}` must be numbers from 0 to {SEEDS - 1}, got {given}.")
 
     @property
     def downstream_seeds(self) -> tuple[int, ...]:
@@ -96,6 +109,16 @@ class Request:
     def chosen(self, usual: Iterable[str]) -> tuple[str, ...]:
         """Return the methods asked for, or the experiment's usual ones."""
         return self.methods or tuple(usual)
+
+
+def _require_method(name: str) -> None:
+    """Refuse an unknown name, with the nearest of all that a comparison accepts."""
+    try:
+        get_method(name)
+    except UnknownNameError:
+        known = sorted({*methods(presets=True), *METHODS})
+        nearest = difflib.get_close_matches(name, known, n=3, cutoff=0.4) or known
+        raise UnknownNameError(f"There is no method {name!r}. Did you mean {', '.join(nearest)}?") from None
 
 
 def explores(method: str) -> bool:
@@ -142,17 +165,28 @@ def encoder(
     if method == RANDOM_ENCODER:
         return UntrainedPiece(method, seed)
     registered = get_method(method)
-    options = _departures(registered, {**dict(scale.loss.get(method, ())), **dict(loss)})
+    options = _departures(registered, {**dict(scale.loss_options(registered)), **dict(loss)})
+    definition = (
+        "" if registered.is_builtin else json.dumps(registered.describe(), sort_keys=True, default=repr)
+    )
     batch = {} if scale.batch_size is None else {"batch_size": scale.batch_size}
     if registered.exploration is None:
         datasets = tuple(dataset(scale, name, seed, transitions=transitions) for name in names)
         return PretrainedPiece(
-            method, seed, datasets=datasets, updates=scale.updates, training=settings(**batch), loss=options
+            method,
+            seed,
+            datasets=datasets,
+            updates=scale.updates,
+            training=settings(**batch),
+            loss=options,
+            definition=definition,
         )
-    explore = {**dict(scale.explore.get(method, ())), **batch}
+    explore = {**dict(scale.exploration(registered)), **batch}
     if scale.quality != "exact":
         explore["quality"] = scale.quality
-    return ExploredPiece(method, seed, domains=names, explore=settings(**explore), loss=options)
+    return ExploredPiece(
+        method, seed, domains=names, explore=settings(**explore), loss=options, definition=definition
+    )
 
 
 def _departures(method: Method, options: dict[str, Any]) -> Settings:
@@ -208,13 +242,13 @@ def runs(
     """Return the runs of one cell: every downstream seed on the encoder of every encoder seed.
 
     Where there is no encoder to share (DrQ), the encoder seeds count as further seeds of the run, so that every
-    system has as many runs.
+    system has as many runs. Which run a place has depends on its two seeds alone, and not on what else is asked for.
     """
     where = settings(task=task, **place)
     goals = []
-    for number, (seed, piece) in enumerate(encoders.items()):
+    for seed, piece in encoders.items():
         for own in request.downstream_seeds:
-            shift = 0 if piece is not None else number * (max(request.downstream_seeds) + 1)
+            shift = 0 if piece is not None else seed * SEEDS
             goal = run(request.scale, task, piece, own + shift)
             goals.append(Goal(label, goal, settings(encoder_seed=seed, seed=own, **dict(where))))
     return goals

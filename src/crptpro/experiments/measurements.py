@@ -12,25 +12,33 @@ from crptpro.experiments.pieces import DatasetPiece, EncoderPiece, ExploredPiece
 class TimingPiece(Piece):
     """What training encoders costs, measured on a short part of it, as ``timing.csv``.
 
+    The device and the threads are a part of what is measured, other than in pieces that come out the same on any.
+
     Args:
         encoders: one, or, of a method that has an encoder per domain, several whose costs add up. They need not be
             made.
+        paper: the same, trained as the paper trains them: with its batches, budgets and intervals.
         updates: encoder updates that are timed at least, after as many to warm up.
-        paper_updates: encoder updates at the scale of the paper, over all encoders.
-        paper_decisions: decisions of exploring agents, likewise.
+        paper_timed: the same of ``paper``'s, on the data of ``encoders``; 0 leaves the hours of the paper's budget
+            open, unless both are trained alike.
+        device: of networks.
+        threads: of torch.
     """
 
     kind = "timing"
     is_exclusive = True
     encoders: tuple[EncoderPiece, ...]
+    paper: tuple[EncoderPiece, ...]
     updates: int
-    paper_updates: int
-    paper_decisions: int
+    paper_timed: int = 0
+    device: str = "cpu"
+    threads: int = 1
 
     @property
     def title(self) -> str:
-        """Method and domains."""
-        return f"{self.encoders[0].method} {'+'.join(d for e in self.encoders for d in e.domain_names)}"
+        """Method, domains and device."""
+        domains = "+".join(d for e in self.encoders for d in e.domain_names)
+        return f"{self.encoders[0].method} {domains} {self.device} {self.threads}"
 
     @property
     def needs(self) -> tuple[Piece, ...]:
@@ -40,15 +48,9 @@ class TimingPiece(Piece):
     @property
     def parts(self) -> tuple[TimingPiece, ...]:
         """The same for each encoder alone."""
-        count = len(self.encoders)
         return tuple(
-            replace(
-                self,
-                encoders=(encoder,),
-                paper_updates=self.paper_updates // count,
-                paper_decisions=self.paper_decisions // count,
-            )
-            for encoder in self.encoders
+            replace(self, encoders=(encoder,), paper=(whole,))
+            for encoder, whole in zip(self.encoders, self.paper, strict=True)
         )
 
 

@@ -122,8 +122,14 @@ def _(piece: ExploredPiece) -> float:
 def _(piece: TimingPiece) -> float:
     if len(piece.encoders) > 1:
         return 1.0  # a sum
-    [encoder] = piece.encoders
-    updates = 2 * piece.updates
+    spent = _timing_s(piece.encoders[0], piece.updates)
+    if piece.paper_timed and piece.paper != piece.encoders:
+        spent += _timing_s(piece.paper[0], piece.paper_timed)
+    return spent
+
+
+def _timing_s(encoder: EncoderPiece, timed: int) -> float:
+    updates = 2 * timed
     if not isinstance(encoder, ExploredPiece):
         batch = _batch_size(encoder.method, getattr(encoder, "training", ()))
         return START_S + updates * batch * ENCODER_ROW_S

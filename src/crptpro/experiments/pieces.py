@@ -174,6 +174,7 @@ class PretrainedPiece(EncoderPiece):
         loss: options of the method's loss.
         encoder: options of :class:`crptpro.modules.PixelEncoder`, besides the method's.
         snapshots: updates after which the encoder is kept too, in ``<piece>/encoder_at_<updates>``.
+        definition: what a user's own method was registered with, as JSON; empty for those of the library.
     """
 
     kind = "encoder"
@@ -183,6 +184,7 @@ class PretrainedPiece(EncoderPiece):
     loss: Settings = ()
     encoder: Settings = ()
     snapshots: tuple[int, ...] = ()
+    definition: str = ""
 
     @property
     def domain_names(self) -> tuple[str, ...]:
@@ -203,12 +205,14 @@ class ExploredPiece(EncoderPiece):
         domains: which take turns.
         explore: settings of :class:`crptpro.training.ActiveConfig`.
         loss: options of the method's loss.
+        definition: what a user's own method was registered with, as JSON; empty for those of the library.
     """
 
     kind = "explored"
     domains: tuple[str, ...]
     explore: Settings = ()
     loss: Settings = ()
+    definition: str = ""
 
     @property
     def domain_names(self) -> tuple[str, ...]:

@@ -9,9 +9,9 @@ from typing import Any
 
 from crptpro.cards import read_json, write_json
 from crptpro.errors import RecordError
-from crptpro.experiments.building import Store
 from crptpro.experiments.goals import Goal, Request
 from crptpro.experiments.pieces import Settings, settings
+from crptpro.experiments.store import Store
 
 EXPERIMENTS_DIRECTORY = "experiments"
 
@@ -107,6 +107,8 @@ def _plain(request: Request) -> dict[str, Any]:
         "encoder_seeds": list(request.encoder_seeds),
         "seeds": list(request.downstream_seeds),
         "colors": request.colors,
+        "device": request.device,
+        "threads": request.threads,
     }
 
 

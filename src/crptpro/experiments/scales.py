@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from crptpro.errors import UnknownNameError
 from crptpro.experiments.pieces import Settings, settings
 from crptpro.experiments.published import FINETUNE_UPDATES
+from crptpro.objectives import Method, get_method
 from crptpro.quality import Quality
 
 
@@ -21,8 +22,9 @@ class Scale:
         quality: render quality of everything.
         updates: encoder updates on datasets, over all domains.
         batch_size: transitions per pre-training update; ``None`` for the method's own.
-        loss: options of a method's loss, by method.
-        explore: settings of active pre-training, by method; budgets and schedules are in here.
+        loss: options of a method's loss, by method; a variant of a method, which has its loss, takes them too.
+        explore: settings of active pre-training, by method; budgets and schedules are in here. An exploring method
+            that is not named takes Proto-RL's, with the encoder updates that it makes every time.
         finetune_updates: encoder updates of fine-tuning, by domain; others take the largest.
         run: settings of every downstream run.
         drq: settings of DrQ's, besides ``run``.
@@ -33,6 +35,7 @@ class Scale:
         probe_transitions: of the dataset that is probed, which needs several episodes; ``None`` for the one that
             methods are trained on.
         timing_updates: encoder updates that ``efficiency`` times, after as many to warm up.
+        paper_timing_updates: the same with the paper's batches and decisions; 0 for none.
         coverage_samples: observations of a coverage estimate.
         embedded_samples: observations of each source in ``visualize``.
     """
@@ -53,8 +56,22 @@ class Scale:
     probe_samples: int = 4_000
     probe_transitions: int | None = None
     timing_updates: int = 100
+    paper_timing_updates: int = 0
     coverage_samples: int = 1_024
     embedded_samples: int = 125
+
+    def loss_options(self, method: Method) -> Settings:
+        """Options of a method's loss."""
+        same = [name for name in self.loss if get_method(name).loss_class is method.loss_class]
+        return self.loss.get(method.name if method.name in self.loss else next(iter(same), ""), ())
+
+    def exploration(self, method: Method) -> Settings:
+        """Settings of a method's active pre-training."""
+        if method.name in self.explore or method.exploration is None or not self.explore:
+            return self.explore.get(method.name, ())
+        usual = dict(self.explore["proto-rl-s" if method.exploration.is_single_domain else "proto-rl-c"])
+        usual["encoder_update_interval"] *= method.exploration.encoder_updates_each
+        return settings(**usual)
 
     def finetuning_updates(self, domain: str) -> int:
         """Encoder updates of fine-tuning on a domain."""
@@ -65,11 +82,16 @@ def _explorers(group: Settings, single: Settings, interval: int) -> dict[str, Se
     """Budgets of the (C) and of the (S) methods, with one encoder update per `interval` decisions on average."""
     methods = {name: dict(group) for name in ("proto-rl-c", "apt-c", "becl")}
     methods |= {name: dict(single) for name in ("proto-rl-s", "apt-s")}
-    each = {"becl": 3}  # updates every time
     return {
-        name: settings(encoder_update_interval=interval * each.get(name, 1), **values)
+        name: settings(encoder_update_interval=interval * _updates_each(name), **values)
         for name, values in methods.items()
     }
+
+
+def _updates_each(method: str) -> int:
+    exploration = get_method(method).exploration
+    assert exploration is not None
+    return exploration.encoder_updates_each
 
 
 def _prototypes(**options: int) -> dict[str, Settings]:
@@ -104,6 +126,7 @@ SMALL = Scale(
     capacities=(5_000, 20_000),
     probe_samples=2_000,
     timing_updates=25,
+    paper_timing_updates=7,  # as many rows
     coverage_samples=512,
 )
 """A fifth of the data, 6 % of the updates, 4 % of the env steps, a quarter of the batch: a day on two CPU cores."""

@@ -13,21 +13,22 @@ from torchrl.objectives import LossModule
 
 from crptpro.errors import RecordError
 from crptpro.experiments.budgets import budget, exploration_config, exploration_plan
-from crptpro.experiments.building import JobSettings, Store, new_loss
+from crptpro.experiments.building import JobSettings, new_loss
 from crptpro.experiments.measurements import TimingPiece
 from crptpro.experiments.pieces import DatasetPiece, EncoderPiece, ExploredPiece, PretrainedPiece
 from crptpro.experiments.row_files import read_rows
+from crptpro.experiments.store import Store
 from crptpro.training import pretrain, pretrain_active
 
 COLUMNS = (
     "method", "domains", "encoder_updates", "decisions", "seconds", "seconds_per_update", "seconds_per_decision",
     "budget_updates", "budget_decisions", "projected_hours", "paper_updates", "paper_decisions",
-    "paper_projected_hours", "collection_seconds", "threads", "device",
+    "paper_seconds_per_update", "paper_projected_hours", "collection_seconds", "threads", "device",
 )  # fmt: skip
 """Of ``timing.csv``, which has one row: what was timed; what that makes per encoder update (the decisions and the
-agents' updates that go with it included) and per decision; the whole pre-training at the scale of the request and of
-the paper, without the random decisions before the first update; and the collection of the datasets, which is not part
-of the other times."""
+agents' updates that go with it included) and per decision; the whole pre-training at the scale of the request, and at
+that of the paper by updates with the paper's batches and decisions (empty if those were not timed), both without the
+random decisions before the first update; and the collection of the datasets, which is not part of the other times."""
 
 WINDOWS = 5
 """Parts whose median duration counts, so that one hiccup of the machine does not."""
@@ -109,6 +110,7 @@ def time_training(encoder: EncoderPiece, store: Store, job: JobSettings, *, upda
     Raises:
         RecordError: for an encoder that is not trained on datasets or by exploring.
     """
+    torch.set_num_threads(job.threads)
     if isinstance(encoder, PretrainedPiece):
         return _time_datasets(encoder, store, job, updates)
     if isinstance(encoder, ExploredPiece):
@@ -157,9 +159,11 @@ def timing_row(piece: TimingPiece, store: Store, job: JobSettings) -> dict[str, 
     """Return the row of a timing, by :data:`COLUMNS`; of several encoders, the sum over theirs."""
     if len(piece.encoders) > 1:
         return _sum([read_rows(store.path(part) / "timing.csv")[0] for part in piece.parts])
-    (encoder,) = piece.encoders
+    (encoder,), (paper,) = piece.encoders, piece.paper
+    job = dataclasses.replace(job, device=piece.device, threads=piece.threads)
     timed = time_training(encoder, store, job, updates=piece.updates)
-    whole = budget(encoder)
+    whole, at_paper = budget(encoder), budget(paper)
+    per_paper_update = _time_paper(piece, timed, store, job)
     data = [store.seconds(needed) for needed in piece.needs if isinstance(needed, DatasetPiece)]
     return {
         "method": encoder.method,
@@ -172,13 +176,30 @@ def timing_row(piece: TimingPiece, store: Store, job: JobSettings) -> dict[str, 
         "budget_updates": whole.updates,
         "budget_decisions": whole.decisions,
         "projected_hours": timed.seconds_per_update * whole.updates / 3600,
-        "paper_updates": piece.paper_updates,
-        "paper_decisions": piece.paper_decisions,
-        "paper_projected_hours": timed.seconds_per_update * piece.paper_updates / 3600,
+        "paper_updates": at_paper.updates,
+        "paper_decisions": at_paper.decisions,
+        "paper_seconds_per_update": "" if per_paper_update is None else per_paper_update,
+        "paper_projected_hours": ""
+        if per_paper_update is None
+        else per_paper_update * at_paper.updates / 3600,
         "collection_seconds": sum(data) if data else "",
         "threads": job.threads,
         "device": job.device,
     }
+
+
+def _time_paper(piece: TimingPiece, timed: Timed, store: Store, job: JobSettings) -> float | None:
+    """Return the seconds per encoder update with the paper's batches; ``None`` if they are not asked for."""
+    (encoder,), (paper,) = piece.encoders, piece.paper
+    if encoder == paper:
+        return timed.seconds_per_update
+    if not piece.paper_timed:
+        return None
+    if isinstance(encoder, PretrainedPiece) and isinstance(paper, PretrainedPiece):
+        paper = dataclasses.replace(
+            paper, datasets=encoder.datasets
+        )  # what is in them does not change the time
+    return time_training(paper, store, job, updates=piece.paper_timed).seconds_per_update
 
 
 def _sum(rows: list[dict[str, str]]) -> dict[str, Any]:
@@ -192,15 +213,20 @@ def _sum(rows: list[dict[str, str]]) -> dict[str, Any]:
         )
     }  # fmt: skip
     measured: dict[str, Any] = {
-        name: sum(float(row[name]) for row in rows)
-        for name in ("seconds", "projected_hours", "paper_projected_hours")
+        name: sum(float(row[name]) for row in rows) for name in ("seconds", "projected_hours")
     }
+    at_paper: dict[str, float | str] = {"paper_seconds_per_update": "", "paper_projected_hours": ""}
+    if all(row["paper_projected_hours"] for row in rows):
+        hours = sum(float(row["paper_projected_hours"]) for row in rows)
+        at_paper["paper_projected_hours"] = hours
+        at_paper["paper_seconds_per_update"] = 3600 * hours / counted["paper_updates"]
     data = [float(row["collection_seconds"]) for row in rows if row["collection_seconds"]]
     per_update = 3600 * measured["projected_hours"] / counted["budget_updates"]
     return {
         **same,
         **counted,
         **measured,
+        **at_paper,
         "seconds_per_update": per_update,
         "seconds_per_decision": _per_decision(per_update, counted["encoder_updates"], counted["decisions"]),
         "collection_seconds": sum(data) if data else "",

@@ -8,7 +8,7 @@ from crptpro.objectives.atc import ATCLoss
 from crptpro.objectives.becl import BeCLLoss
 from crptpro.objectives.exploration import ExplorationDefaults
 from crptpro.objectives.proto import ProtoLoss
-from crptpro.objectives.registry import MethodDefaults, register_method
+from crptpro.objectives.registry import MethodDefaults, mark_builtin, register_method
 from crptpro.objectives.simclr import SimCLRLoss
 
 # The first method of a class is what a loss of that class built by hand is trained like.
@@ -80,3 +80,4 @@ register_method(
         random_agent_steps=2_000,
     ),
 )
+mark_builtin()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import inspect
 from dataclasses import dataclass, field
@@ -78,6 +79,23 @@ class Method:
     exploration: ExplorationDefaults | None = None
     """How it explores while it pre-trains; None for a method trained on random datasets."""
 
+    is_builtin: bool = False
+    """Comes with the library, whose revision says what it is."""
+
+    def describe(self) -> dict[str, Any]:
+        """Return all that was registered as plain values: what a record needs to tell two methods of one name apart.
+
+        The code of the loss is not part of it, only its class's name.
+        """
+        return {
+            "loss_class": f"{self.loss_class.__module__}.{self.loss_class.__qualname__}",
+            "defaults": dataclasses.asdict(self.defaults),
+            "loss_options": self.loss_options,
+            "encoder_options": self.encoder_options,
+            "replay_capacity": self.replay_capacity,
+            "exploration": None if self.exploration is None else dataclasses.asdict(self.exploration),
+        }
+
     def build_encoder(self, in_channels: int = 9, image_size: int = 84, **options: Any) -> PixelEncoder:
         """Build a fresh encoder of the kind that the method trains.
 
@@ -110,6 +128,12 @@ class Method:
 
 
 _METHODS: dict[str, Method] = {}
+
+
+def mark_builtin() -> None:
+    """Call every method that is registered so far the library's own."""
+    for name, method in _METHODS.items():
+        _METHODS[name] = dataclasses.replace(method, is_builtin=True)
 
 
 def register_method(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -20,24 +21,38 @@ Timings = Mapping[tuple[str, int], Sequence[Row]]
 def efficiency(asked: Asked) -> tuple[Block, ...]:
     """Hours and encoder updates of pre-training, by number of domains, beside the paper's on a P100."""
     rows, blocks = rows_of(asked, "timing")
+    by_place: dict[str, list[Row]] = {}
+    for row in rows:
+        where = f"{row['device'] or 'device not recorded'}, {row['threads'] or '?'} thread(s)"
+        by_place.setdefault(where, []).append(row)
+    for where, part in sorted(by_place.items()):
+        name = (
+            asked.name
+            if len(by_place) == 1
+            else f"{asked.name}-{re.sub(r'[^a-z0-9]+', '-', where).strip('-')}"
+        )
+        blocks += _timed_on(where, part, name)
+    return tuple(blocks)
+
+
+def _timed_on(where: str, rows: Sequence[Row], name: str) -> list[Block]:
     found: dict[tuple[str, int], list[Row]] = {}
     for row in rows:
         found.setdefault((row["method"], int(row.number("domains") or 0)), []).append(row)
-    if not found:
-        return tuple(blocks)
     methods, counts = in_order(method for method, _ in found), sorted({count for _, count in found})
-    blocks += [_table(found, methods, counts), *_figures(asked.name, found, methods, counts)]
-    where = sorted(
-        {f"{row['device'] or 'device not recorded'}, {row['threads'] or '?'} thread(s)" for row in rows}
-    )
     text = (
-        f"Timed on {'; '.join(where)} (hardware below). Hours are those of pre-training proper: environments that "
-        "explore are part of it, the collection of random datasets, which is done once for all, has its own column."
+        f"Timed on {where} (hardware below). Hours are those of pre-training proper: environments that explore are "
+        "part of it, the collection of random datasets, which is done once for all, has its own column. Hours of the "
+        "paper's budget follow updates with the paper's batches and decisions, which were timed for themselves."
     )
-    return (*blocks, Paragraph(text, "note"))
+    return [
+        _table(found, methods, counts, where),
+        *_figures(name, found, methods, counts),
+        Paragraph(text, "note"),
+    ]
 
 
-def _table(found: Timings, methods: Sequence[str], counts: Sequence[int]) -> Table:
+def _table(found: Timings, methods: Sequence[str], counts: Sequence[int], where: str) -> Table:
     lines = []
     for method in methods:
         for count in counts:
@@ -68,8 +83,8 @@ def _table(found: Timings, methods: Sequence[str], counts: Sequence[int]) -> Tab
         "hours at this scale", "hours of collection", "encoder updates, paper's budget", "hours, paper's budget",
     )  # fmt: skip
     caption = (
-        "Pre-training by number of domains: some updates timed here (n timings), projected to whole budgets; the "
-        "paper's hours are those of an NVIDIA Tesla P100."
+        f"Pre-training by number of domains on {where}: some updates timed here (n timings), projected to whole "
+        "budgets; the paper's hours are those of an NVIDIA Tesla P100."
     )
     return Table(caption, columns, tuple(lines), labels=2)
 
@@ -87,8 +102,9 @@ def _figures(name: str, found: Timings, methods: Sequence[str], counts: Sequence
         _domains(count): [_mean(found, m, count, "paper_updates") for m in methods] for count in counts
     }
     caption = f"Hours of pre-training with the paper's budget for {_domains(most)}; {timings} timings of all counts."
+    was_timed = any(hour is not None for hour in hours[f"projected here, {_domains(most)}"])
     return [
-        Figure(f"{name}-hours", caption, drawing.bars(methods, hours, "hours")),
+        *([Figure(f"{name}-hours", caption, drawing.bars(methods, hours, "hours"))] if was_timed else []),
         Figure(
             f"{name}-updates",
             "Encoder updates of the paper's budget by number of domains.",
