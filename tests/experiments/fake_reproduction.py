@@ -15,10 +15,10 @@ from toy_world import ToyEnv, fixed_length
 from crptpro.cards import write_json
 from crptpro.data.collect_worker import EpisodeRoller
 from crptpro.data.collection import DomainCollection
-from crptpro.experiments.building import DONE, Store
 from crptpro.experiments.goals import Goal
 from crptpro.experiments.pieces import EncoderPiece, Piece, PretrainedPiece, RunPiece
 from crptpro.experiments.records import Episode
+from crptpro.experiments.store import DONE, Store
 
 START_S = 1_795_000_000.0
 MADE = {
@@ -111,6 +111,9 @@ class Reproduction:
         self.root, self.store = root, Store(root)
 
     def ask(self, experiment: str, goals: Iterable[Goal], scale: str = "small") -> None:
+        goals = list(goals)
+        for goal in goals:
+            self.store.describe(goal.piece)
         listed = [{"label": g.label, "key": g.piece.key, "place": dict(g.place)} for g in goals]
         content = {"experiment": experiment, "scale": scale, "request": {}, "goals": listed}
         write_json(self.root / "experiments" / f"{experiment}-{scale}.json", content)

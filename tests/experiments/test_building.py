@@ -17,7 +17,7 @@ from crptpro.directory_lock import DirectoryLock
 from crptpro.downstream_config import DownstreamConfig
 from crptpro.errors import RecordError
 from crptpro.experiments import building
-from crptpro.experiments.building import CLOCK, DESCRIPTION, DONE, JobSettings, Store, build, new_loss
+from crptpro.experiments.building import JobSettings, build, new_loss
 from crptpro.experiments.pieces import (
     KINDS,
     DatasetPiece,
@@ -30,6 +30,7 @@ from crptpro.experiments.pieces import (
     settings,
 )
 from crptpro.experiments.row_files import read_rows
+from crptpro.experiments.store import CLOCK, DESCRIPTION, DONE, Store
 from crptpro.pretrained import load_pretrained
 
 LOSS = settings(num_prototypes=8, latent_dim=4, hidden_dim=8)

@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from crptpro.cards import write_json
-from crptpro.experiments.building import DONE, Store
 from crptpro.experiments.costs import corrections, estimate, wall_seconds
 from crptpro.experiments.goals import Request
 from crptpro.experiments.matrix import seen
@@ -25,6 +24,7 @@ from crptpro.experiments.pieces import (
 from crptpro.experiments.plan import Plan, make_plan
 from crptpro.experiments.plan_text import plan_text
 from crptpro.experiments.scales import SCALES
+from crptpro.experiments.store import DONE, Store
 
 WALKER = DatasetPiece("walker", 1_000, 0)
 ENCODER = PretrainedPiece("crptpro", 0, (WALKER,), updates=100)

@@ -13,12 +13,13 @@ from toy_world import collection_request, random_episode
 from crptpro.cards import write_json
 from crptpro.data import FrameReplay
 from crptpro.data.collection import DomainCollection
-from crptpro.experiments.building import DONE, JobSettings, Store, build
+from crptpro.experiments.building import JobSettings, build
 from crptpro.experiments.goals import encoder
 from crptpro.experiments.measurements import CoveragePiece
 from crptpro.experiments.pieces import DatasetPiece, ExploredPiece, UntrainedPiece
 from crptpro.experiments.row_files import read_rows
 from crptpro.experiments.scales import TINY
+from crptpro.experiments.store import DONE, Store
 from crptpro.pretrained import load_pretrained, save_pretrained
 
 SIZE = 84

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from crptpro.cards import write_json
-from crptpro.experiments.building import DONE, Store
 from crptpro.experiments.goals import Request, encoder_for_task, run
 from crptpro.experiments.matrix import seen
 from crptpro.experiments.pieces import Piece
 from crptpro.experiments.plan import make_plan
 from crptpro.experiments.scales import TINY
+from crptpro.experiments.store import DONE, Store
 
 A = ("cheetah", "walker", "quadruped")
 

@@ -18,9 +18,9 @@ from crptpro import cli
 from crptpro.envs import factory
 from crptpro.envs.episode_limit import EpisodeLimit
 from crptpro.envs.own_env import with_transform
-from crptpro.experiments.building import Store
 from crptpro.experiments.catalogue import EXPERIMENTS
 from crptpro.experiments.goals import METHODS
+from crptpro.experiments.store import Store
 
 pytestmark = [pytest.mark.gl, pytest.mark.slow, pytest.mark.timeout(1_200)]
 

@@ -12,7 +12,7 @@ from crptpro.cards import write_json
 from crptpro.data.collect_worker import EpisodeRoller
 from crptpro.data.collection import DomainCollection
 from crptpro.errors import RecordError
-from crptpro.experiments.building import DONE, JobSettings, Store, build
+from crptpro.experiments.building import JobSettings, build
 from crptpro.experiments.goals import RANDOM_ENCODER, Goal, Request
 from crptpro.experiments.measurements import ProbePiece
 from crptpro.experiments.pieces import (
@@ -24,6 +24,7 @@ from crptpro.experiments.pieces import (
 )
 from crptpro.experiments.plan import make_plan
 from crptpro.experiments.scales import PAPER, SMALL, TINY
+from crptpro.experiments.store import DONE, Store
 from crptpro.experiments.study import factors, factors_of, study, temperatures
 from crptpro.pretrained import load_pretrained
 

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from crptpro.experiments.building import DONE, Store
 from crptpro.experiments.piece_costs import core_seconds, stored_bytes, working_bytes
 from crptpro.experiments.plan import Plan
+from crptpro.experiments.store import DONE, Store
 
 SHORTEST_S = 60.0
 """Estimate up to which a finished piece says nothing about a longer one."""

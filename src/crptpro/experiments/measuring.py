@@ -14,7 +14,7 @@ from crptpro.cards import write_json
 from crptpro.data import FrameDataset, StoredReplay
 from crptpro.errors import RecordError
 from crptpro.experiments import probing, timing
-from crptpro.experiments.building import JobSettings, Store, register
+from crptpro.experiments.building import JobSettings, register
 from crptpro.experiments.measurements import (
     CoveragePiece,
     EmbeddingsPiece,
@@ -24,6 +24,7 @@ from crptpro.experiments.measurements import (
 )
 from crptpro.experiments.pieces import EncoderPiece, ExploredPiece
 from crptpro.experiments.row_files import read_rows, write_rows
+from crptpro.experiments.store import Store
 from crptpro.objectives.metrics import prototype_metrics
 from crptpro.pretrained import Pretrained, load_pretrained
 from crptpro.seeding import derive_seed

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from crptpro.experiments.building import Store
 from crptpro.experiments.pieces import Piece
+from crptpro.experiments.store import Store
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import crptpro
-from crptpro.experiments.building import Store
+from crptpro.experiments.store import Store
 
 collect_ignore = ["fake_experiment.py", "conftest.py"]
 """A plugin changes the catalogue of whoever imports it, be it only to look for doctests."""

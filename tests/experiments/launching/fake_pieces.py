@@ -10,9 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from crptpro.errors import RecordError
-from crptpro.experiments.building import JobSettings, Store, register
+from crptpro.experiments.building import JobSettings, register
 from crptpro.experiments.pieces import Piece
 from crptpro.experiments.plan import Plan, make_plan
+from crptpro.experiments.store import Store
 from crptpro.training.stop_request import StopRequest
 
 PLUGIN = str(Path(__file__).resolve())

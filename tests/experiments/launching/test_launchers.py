@@ -17,7 +17,7 @@ from fake_pieces import PLUGIN, FakePiece, attempts, counted, plan_of
 
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import CRPTproError
-from crptpro.experiments.building import JobSettings, Store
+from crptpro.experiments.building import JobSettings
 from crptpro.experiments.launching import (
     InlineLauncher,
     Launcher,
@@ -31,6 +31,7 @@ from crptpro.experiments.launching import (
 )
 from crptpro.experiments.launching.choice import slurm_parameters
 from crptpro.experiments.launching.submitted import FOLDER, LocalLauncher, SlurmLauncher
+from crptpro.experiments.store import Store
 
 SETTINGS = JobSettings(plugins=(PLUGIN,))
 
@@ -299,6 +300,8 @@ def test_jobs_share_the_gpus_that_this_process_sees(monkeypatch: pytest.MonkeyPa
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
     assert divide("local", device="cuda").gpus == ("0", "1")
     assert divide("local", device="cuda:1", jobs=2).gpus == ()
+    assert divide("local", device="cuda:1") == Resources(1, 16)
+    assert divide("local", device="cuda:1", jobs_per_gpu=4) == Resources(4, 4, (), 4)
 
 
 def test_without_a_gpu_cuda_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

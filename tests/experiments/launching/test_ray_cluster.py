@@ -10,9 +10,10 @@ import pytest
 from fake_pieces import PLUGIN, FakePiece, attempts, counted, plan_of
 
 from crptpro.errors import CRPTproError
-from crptpro.experiments.building import JobSettings, Store
+from crptpro.experiments.building import JobSettings
 from crptpro.experiments.launching import Work, run_pieces
 from crptpro.experiments.launching.ray_cluster import RayLauncher
+from crptpro.experiments.store import Store
 
 pytestmark = pytest.mark.slow
 

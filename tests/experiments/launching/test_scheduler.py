@@ -11,9 +11,10 @@ import pytest
 from fake_pieces import ExclusivePiece, FakePiece, plan_of
 
 from crptpro.cards import write_json
-from crptpro.experiments.building import DONE, JobSettings, Store
+from crptpro.experiments.building import JobSettings
 from crptpro.experiments.launching import Failure, Outcome, Work, run_pieces
 from crptpro.experiments.pieces import DatasetPiece
+from crptpro.experiments.store import DONE, Store
 
 LOST = Outcome("the job was lost (killed)")
 REFUSED = Outcome("it will never do", is_final=True)

@@ -50,8 +50,9 @@ def divide(
 ) -> Resources:
     """Fill in what the user left open.
 
-    On one machine there is a job per core, or, with ``device="cuda"``, per GPU times ``jobs_per_gpu``; the cores are
-    divided among them. On a cluster there are 16 jobs, with a core each, or four beside a GPU.
+    On one machine there is a job per core, or, with ``device="cuda"``, per GPU times ``jobs_per_gpu``; with
+    ``device="cuda:1"`` there are ``jobs_per_gpu`` on that GPU alone. The cores are divided among them. On a cluster
+    there are 16 jobs, with a core each, or four beside a GPU.
 
     Args:
         launcher: where jobs run; ``inline`` makes one piece at a time.
@@ -74,7 +75,8 @@ def divide(
     if launcher == "inline":
         return Resources(1, cores_per_job or cores)
     if jobs is None:
-        jobs = len(gpus) * jobs_per_gpu if gpus else max(1, cores // (cores_per_job or 1))
+        used = len(gpus) if device == "cuda" else int(device.startswith("cuda"))
+        jobs = used * jobs_per_gpu if used else max(1, cores // (cores_per_job or 1))
     return Resources(jobs, cores_per_job or max(1, cores // jobs), gpus, jobs_per_gpu)
 
 

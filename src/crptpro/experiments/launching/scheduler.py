@@ -16,12 +16,13 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from crptpro.experiments.building import JobSettings, Store
+from crptpro.experiments.building import JobSettings
 from crptpro.experiments.durations import duration
 from crptpro.experiments.launching.launchers import Job, Launcher, Outcome
 from crptpro.experiments.launching.work import Work
 from crptpro.experiments.pieces import DatasetPiece, Piece
 from crptpro.experiments.plan import Plan
+from crptpro.experiments.store import Store
 from crptpro.training.stop_request import StopRequest
 
 logger = logging.getLogger(__name__)

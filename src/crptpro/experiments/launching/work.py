@@ -16,7 +16,8 @@ from pathlib import Path
 from crptpro.console import configure_logging, is_expected
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import CRPTproError, RecordError, RenderingError
-from crptpro.experiments.building import LOG, PIECES, JobSettings, Store, build
+from crptpro.experiments.building import JobSettings, build
+from crptpro.experiments.store import LOG, PIECES, Store
 from crptpro.plugins import load_plugin
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")

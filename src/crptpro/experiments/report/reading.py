@@ -11,9 +11,9 @@ from typing import Any
 
 from crptpro.cards import read_json
 from crptpro.errors import RecordError
-from crptpro.experiments.building import DESCRIPTION, DONE, PIECES
 from crptpro.experiments.records import Run, find_runs
 from crptpro.experiments.requests import EXPERIMENTS_DIRECTORY, read_request
+from crptpro.experiments.store import CLOCK, DESCRIPTION, DONE, LOG, PIECES
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,9 @@ class Made:
         """How far it is, in words."""
         if self.done is not None:
             return "finished"
-        return "begun, not finished" if self.directory.is_dir() else "not begun"
+        # A request describes all of its pieces, so that a directory alone says nothing.
+        is_begun = any((self.directory / name).exists() for name in (CLOCK, LOG))
+        return "begun, not finished" if is_begun else "not begun"
 
 
 @dataclass(frozen=True)
