@@ -49,7 +49,6 @@ class Panel:
         y: of the vertical one.
         lines: curves.
         marks: heights of dashed lines, with what they say.
-        is_log: logarithmic vertical axis.
         ticks: names of the places 0, 1, ... of the horizontal axis, instead of numbers.
     """
 
@@ -58,7 +57,6 @@ class Panel:
     y: str
     lines: Sequence[Line]
     marks: Mapping[str, float] = field(default_factory=dict)
-    is_log: bool = False
     ticks: Sequence[str] = ()
 
 
@@ -106,8 +104,6 @@ def lines(panels: Sequence[Panel], *, columns: int = 3) -> Any:
             axis.set(xlabel=panel.x, ylabel=panel.y, title=panel.title)
             if panel.ticks:
                 axis.set_xticks(range(len(panel.ticks)), panel.ticks)
-            if panel.is_log:
-                axis.set_yscale("log")
             largest = max((float(np.max(line.x)) for line in panel.lines if np.size(line.x)), default=0)
             if largest >= 10_000:
                 axis.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")

@@ -155,10 +155,16 @@ def _budgets(scale: Scale) -> dict[str, str]:
         "random transitions per domain": f"{scale.transitions:,}",
         "encoder updates on datasets": f"{scale.updates:,}",
         "pre-training batch": f"{scale.batch_size}" if scale.batch_size else "512, or the method's own",
+        "prototypes": str(dict(scale.loss.get("crptpro", ())).get("num_prototypes", 512)),
         "env steps of exploration (C)": f"{explore.get('env_steps', 200_000):,}",
+        "decisions per encoder update (C)": str(explore.get("encoder_update_interval", 2)),
         "downstream env steps": f"{run.get('env_steps', ENV_STEPS):,}",
         "DrQ's env steps": f"{drq.get('env_steps', DRQ_ENV_STEPS):,}",
         "downstream batch": f"{run.get('batch_size', 512)}",
+        "downstream learning rate": f"{run.get('learning_rate', 1e-4):g}",
+        "downstream replay": f"{run['replay_capacity']:,}"
+        if "replay_capacity" in run
+        else "40,000 (Proto-RL 100,000)",
         "downstream seeds per encoder": "not printed (at least 6 evaluations)"
         if is_paper
         else f"{scale.seeds}",
