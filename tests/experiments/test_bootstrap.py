@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from crptpro.experiments.bootstrap import encoder_indices, run_indices
+from crptpro.experiments.bootstrap import COVERAGE, encoder_indices, run_indices
 
 
 def rng() -> np.random.Generator:
@@ -78,3 +78,13 @@ def test_rows_of_the_same_runs_are_redrawn_alike() -> None:
     assert (first == again).all()
     assert (first != other).any()  # other runs of the same encoders
     assert ((first == 2) == (other == 2)).all()
+
+
+@pytest.mark.parametrize("count", COVERAGE)
+def test_intervals_of_few_runs_hold_the_truth_as_seldom_as_the_report_says(count: int) -> None:
+    generator = rng()
+    samples = generator.normal(size=(2_000, count))
+    drawn = generator.integers(0, count, size=(400, 2_000, count))
+    means = np.take_along_axis(samples[None], drawn, axis=-1).mean(axis=-1)
+    low, high = np.percentile(means, [2.5, 97.5], axis=0)
+    assert np.mean((low <= 0) & (high >= 0)) == pytest.approx(COVERAGE[count], abs=0.03)

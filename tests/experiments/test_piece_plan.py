@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from crptpro.cards import write_json
-from crptpro.experiments.goals import Request, encoder_for_task, run
+from crptpro.experiments.goals import Request, dataset, encoder, encoder_for_task, run
 from crptpro.experiments.matrix import seen
-from crptpro.experiments.pieces import Piece
+from crptpro.experiments.measurements import CoveragePiece
+from crptpro.experiments.pieces import ExploredPiece, Piece
 from crptpro.experiments.plan import make_plan
 from crptpro.experiments.scales import TINY
 from crptpro.experiments.store import DONE, Store
@@ -108,3 +109,18 @@ def test_an_encoder_whose_snapshots_were_removed_is_made_again(store: Store) -> 
     shutil.rmtree(store.encoder(kept, 2))
     assert not store.is_done(kept)
     assert store.is_recorded(kept)
+
+
+def test_an_explorer_whose_replays_were_removed_explores_again_for_those_that_read_them(store: Store) -> None:
+    explorer = encoder(TINY, "proto-rl-c", A, 0)
+    judge = encoder(TINY, "crptpro", A, 0)
+    data = tuple(dataset(TINY, domain, 0) for domain in A)
+    for piece in (explorer, judge, *data):
+        finish(piece, store)
+    assert isinstance(explorer, ExploredPiece)
+    reader, learner = CoveragePiece(explorer, data, judge), run(TINY, "walker_run", explorer, 0)
+    assert make_plan([learner], store).missing == (learner,)
+    assert make_plan([learner, reader], store).missing == (learner, explorer, reader)
+    for domain in A:
+        (store.path(explorer) / "replay" / domain).mkdir(parents=True)
+    assert make_plan([learner, reader], store).missing == (learner, reader)

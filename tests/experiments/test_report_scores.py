@@ -88,6 +88,11 @@ def test_aggregates_are_those_of_the_runs_beside_the_papers_on_the_same_rows(blo
     )
 
 
+def test_intervals_of_few_runs_are_called_too_narrow(blocks: tuple) -> None:
+    assert "Rows have as few as 4 run(s)" in words(blocks)
+    assert "2: 51%" in words(blocks)
+
+
 def test_intervals_over_encoders_stand_where_runs_share_several(blocks: tuple, tmp_path: Path) -> None:
     table = table_in(blocks, "where runs share encoders")
     assert [row[0].text for row in table.rows] == ["crptpro", "atc"]

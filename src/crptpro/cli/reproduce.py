@@ -122,6 +122,7 @@ class Reproduce:
 
     def _request(self, resources: Resources) -> Request:
         from crptpro.experiments.goals import Request
+        from crptpro.experiments.launching import threads_alone
         from crptpro.experiments.scales import get_scale
 
         return Request(
@@ -133,7 +134,7 @@ class Reproduce:
             seeds=self.seeds or None,
             colors="reversed_image" if self.colors_by == "image" else "reversed_background",
             device=self.device,
-            threads=resources.cores_per_job,
+            threads=threads_alone(self.launcher, resources),
         )
 
     def _goals(self, name: str, request: Request) -> list[Goal]:

@@ -25,6 +25,11 @@ from numpy.typing import NDArray
 
 Indices = NDArray[np.int64]
 
+ENOUGH_DRAWS = 10
+COVERAGE = {2: 0.51, 3: 0.74, 4: 0.79, 5: 0.83, 6: 0.86, 8: 0.89, 10: 0.90}
+"""How often a 95 % percentile interval of the mean of so many draws of a normal law holds its mean: an interval of two
+runs is their range, whatever it is called."""
+
 
 def run_indices(counts: Sequence[int], *, replicates: int, rng: np.random.Generator) -> list[Indices]:
     """Draw runs with replacement within every task.

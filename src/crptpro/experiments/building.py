@@ -68,7 +68,7 @@ def build(piece: Piece, store: Store, job: JobSettings | None = None) -> None:
         _remove_leftovers(piece, store)  # of a job that was killed before it came to that
         return
     for needed in piece.needs:
-        if not store.is_done(needed):
+        if not store.is_done(needed, for_piece=piece):
             raise RecordError(f"{piece.key} needs {needed.key}, which is not finished in {store.root}.")
     job = job or JobSettings(threads=cpu_cores())
     torch.set_num_threads(job.threads)

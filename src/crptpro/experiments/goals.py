@@ -65,7 +65,7 @@ class Request:
         seeds: the second: downstream runs on each encoder; ``None`` for as many as the scale has.
         colors: what "other colours" are, where an experiment has them (decision A22).
         device: of networks; only what measures time depends on it, and on ``threads``.
-        threads: of torch, in each job.
+        threads: of torch, in a job that is alone on its machine.
     """
 
     scale: Scale

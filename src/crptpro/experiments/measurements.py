@@ -118,6 +118,7 @@ class CoveragePiece(Piece):
     """
 
     kind = "coverage"
+    reads_replays = True
     explorer: ExploredPiece
     datasets: tuple[DatasetPiece, ...]
     encoder: EncoderPiece
@@ -144,6 +145,7 @@ class EmbeddingsPiece(Piece):
     """
 
     kind = "embeddings"
+    reads_replays = True
     encoder: EncoderPiece
     datasets: tuple[DatasetPiece, ...]
     explorer: ExploredPiece

@@ -44,6 +44,8 @@ class Piece(ABC):
     kind: ClassVar[str] = ""
     is_exclusive: ClassVar[bool] = False
     """Must be made alone on its machine: it measures time."""
+    reads_replays: ClassVar[bool] = False
+    """Reads what explorers saw, and not only the encoders that they trained."""
     leftovers: ClassVar[tuple[str, ...]] = ()
     """Directories that only an unfinished piece needs; they are removed when it is finished."""
 

@@ -40,13 +40,13 @@ def make_plan(goals: Iterable[Piece], store: Store) -> Plan:
     there: dict[str, Piece] = {}
     missing: dict[str, Piece] = {}
 
-    def require(piece: Piece) -> None:
+    def require(piece: Piece, reader: Piece | None = None) -> None:
         """Ask for a piece that somebody reads."""
-        if store.is_done(piece):
+        if store.is_done(piece, for_piece=reader):
             there[piece.key] = piece
         elif piece.key not in missing:
             for needed in piece.needs:
-                require(needed)
+                require(needed, piece)
             missing[piece.key] = piece
 
     for goal in goals:

@@ -11,7 +11,15 @@ from crptpro.artifact import WEIGHTS_FILE
 from crptpro.cards import read_json, write_json
 from crptpro.data.layout import PIXELS_FILE
 from crptpro.errors import RecordError
-from crptpro.experiments.pieces import DatasetPiece, EncoderPiece, Piece, PretrainedPiece, piece_from_json
+from crptpro.experiments.pieces import (
+    DatasetPiece,
+    EncoderPiece,
+    ExploredPiece,
+    Piece,
+    PretrainedPiece,
+    piece_from_json,
+)
+from crptpro.training.explore.replays import DIRECTORY as REPLAYS
 
 PIECES, DESCRIPTION, CLOCK, DONE, LOG = "pieces", "piece.json", "clock.json", "done.json", "log.txt"
 
@@ -38,8 +46,12 @@ class Store:
         """Whether a piece has been finished; what it was made for may have been removed since, its records stay."""
         return (self.path(piece) / DONE).is_file()
 
-    def is_done(self, piece: Piece) -> bool:
-        """Whether a piece is finished and what others read of it is there."""
+    def is_done(self, piece: Piece, *, for_piece: Piece | None = None) -> bool:
+        """Whether a piece is finished and what others read of it is there, or what a certain other piece reads."""
+        if for_piece is not None and for_piece.reads_replays and isinstance(piece, ExploredPiece):
+            domains = [self.path(piece) / REPLAYS / domain for domain in piece.domains]
+            if not all(directory.is_dir() for directory in domains):
+                return False
         return self.is_recorded(piece) and all(path.is_file() for path in self.outputs(piece))
 
     def outputs(self, piece: Piece) -> list[Path]:

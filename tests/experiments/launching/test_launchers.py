@@ -28,6 +28,7 @@ from crptpro.experiments.launching import (
     divide,
     make_launcher,
     run_pieces,
+    threads_alone,
 )
 from crptpro.experiments.launching.choice import slurm_parameters
 from crptpro.experiments.launching.submitted import FOLDER, LocalLauncher, SlurmLauncher
@@ -302,6 +303,11 @@ def test_jobs_share_the_gpus_that_this_process_sees(monkeypatch: pytest.MonkeyPa
     assert divide("local", device="cuda:1", jobs=2).gpus == ()
     assert divide("local", device="cuda:1") == Resources(1, 16)
     assert divide("local", device="cuda:1", jobs_per_gpu=4) == Resources(4, 4, (), 4)
+
+
+def test_a_piece_that_is_alone_has_the_threads_of_all_jobs_of_one_machine() -> None:
+    assert threads_alone("local", Resources(3, 2)) == 6
+    assert threads_alone("slurm", Resources(3, 2)) == 2
 
 
 def test_without_a_gpu_cuda_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,8 @@ from fake_pieces import ExclusivePiece, FakePiece, plan_of
 from crptpro.cards import write_json
 from crptpro.experiments.building import JobSettings
 from crptpro.experiments.launching import Failure, Outcome, Work, run_pieces
-from crptpro.experiments.pieces import DatasetPiece
+from crptpro.experiments.measurements import CoveragePiece
+from crptpro.experiments.pieces import DatasetPiece, ExploredPiece, PretrainedPiece
 from crptpro.experiments.store import DONE, Store
 
 LOST = Outcome("the job was lost (killed)")
@@ -117,6 +118,32 @@ def test_a_finished_piece_and_what_only_it_needed_are_left_alone(store: Store) -
     launcher = FakeLauncher()
     run(store, launcher, FakePiece("run", (encoder,)))
     assert launcher.events == ["run starts", "run ends"]
+
+
+def test_an_explorer_without_its_replays_is_no_finished_piece_to_the_job_that_explores_again(
+    store: Store,
+) -> None:
+    data = (DatasetPiece("walker", 10, 0),)
+    explorer, judge = (
+        ExploredPiece("proto-rl-c", 0, ("walker",)),
+        PretrainedPiece("crptpro", 0, data, updates=1),
+    )
+    for piece in (*data, explorer, judge):
+        store.describe(piece)
+        write_json(store.path(piece) / DONE, {"seconds": 1.0})
+        for path in store.outputs(piece):
+            path.parent.mkdir(parents=True)
+            path.touch()
+
+    done_at_start = []
+
+    class Watching(FakeLauncher):
+        def start(self, work: Work, *, is_exclusive: bool) -> FakeJob:
+            done_at_start.append(store.is_done(explorer))
+            return super().start(work, is_exclusive=is_exclusive)
+
+    run(store, Watching(), CoveragePiece(explorer, data, judge))
+    assert done_at_start == [False, True]  # the explorer is made again, then what reads it
 
 
 def test_a_lost_job_is_started_again(store: Store, caplog: pytest.LogCaptureFixture) -> None:

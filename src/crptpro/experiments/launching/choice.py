@@ -40,6 +40,11 @@ class Resources:
         return JobSettings(device=device, threads=cores, workers=cores, plugins=plugins)
 
 
+def threads_alone(launcher: LauncherName, resources: Resources) -> int:
+    """Threads of a piece that has its machine to itself: on one machine, those of all jobs."""
+    return resources.cores_per_job * (resources.jobs if launcher in ("local", "inline") else 1)
+
+
 def divide(
     launcher: LauncherName,
     *,

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from crptpro.experiments.bootstrap import COVERAGE, ENOUGH_DRAWS
 from crptpro.experiments.estimates import (
     estimate,
     estimate_improvement,
@@ -100,7 +101,17 @@ def _tables(tables: Mapping[str, ScoreTable], shared: Sequence[Spot], bootstrap:
                 "note",
             )
         )
-    return blocks + _over_encoders(tables, normalizable, bootstrap, how)
+    blocks += _over_encoders(tables, normalizable, bootstrap, how)
+    fewest = min(len(scores) for table in tables.values() for scores in table.scores.values())
+    if fewest < ENOUGH_DRAWS:
+        held = "; ".join(f"{count}: {share:.0%}" for count, share in COVERAGE.items())
+        text = (
+            f"Rows have as few as {fewest} run(s), and bootstrap intervals of few draws are too narrow: one of two is "
+            "their range. Where runs follow a normal law, 95% intervals of a single row's mean hold the truth, by "
+            f"number of runs, {held}. The same holds for encoders."
+        )
+        blocks.append(Paragraph(text, "warning"))
+    return blocks
 
 
 _NORMALIZED = ("mean / DrQ", "IQM / DrQ", "median / DrQ", "optimality gap")

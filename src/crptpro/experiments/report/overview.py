@@ -18,7 +18,7 @@ SHORTCOMINGS = (
     "learn late look worse here than they are.",
     "The prototype loss first stays near ln M, for over a thousand updates at batch 512; an encoder of few updates may "
     "not have left that plateau.",
-    "Few runs: an interval over two or three of them is wide, and none can be had from one.",
+    "Few runs: an interval over two or three of them is too narrow to be believed, and none can be had from one.",
     "A smaller batch, replay or dataset changes the method and not only its budget.",
 )
 """What no run below the paper's scale shows."""
