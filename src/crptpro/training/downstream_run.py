@@ -288,8 +288,10 @@ class DownstreamRun:
         """
         state = checkpoints.load_latest()
         if state is None:
-            for stream in STREAMS:  # rows of an attempt that was killed before its first checkpoint
-                self.records.truncate_to(stream, "env_steps", -1)
+            # Rows of an attempt that was killed before its first checkpoint; elsewhere they may be another run's.
+            if self.records.writes_into(self.run_dir):
+                for stream in STREAMS:
+                    self.records.truncate_to(stream, "env_steps", -1)
             return
         downstream_checkpoint.restore(self, state)
         if self.env_steps >= self.config.env_steps:
