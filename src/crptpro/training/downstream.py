@@ -20,6 +20,8 @@ from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
 from crptpro.training.action_repeat import action_repeat_of
 from crptpro.training.agent import PixelAgent
 from crptpro.training.checkpoint import CheckpointDir
+from crptpro.training.downstream_checkpoint import require_continuable
+from crptpro.training.downstream_replay import remove_replay
 from crptpro.training.downstream_run import DownstreamRun, EnvFactory
 
 
@@ -94,11 +96,22 @@ def train_downstream(
             raise CheckpointError(
                 f"{directory} already holds a run. Choose another directory, or continue it (resume=True)."
             )
+        state = None if run_dir is None else checkpoints.load_latest()
+        if state is None:
+            remove_replay(directory)
+        else:
+            require_continuable(
+                state,
+                task=task,
+                pretrained=None if config.algorithm == "drq" else artifact.identity(),
+                config=config,
+                run_dir=directory,
+            )
         run = DownstreamRun(
             task, artifact, directory, config, records, progress=progress, env_factory=env_factory
         )
         stack.callback(run.close)
-        run.resume(checkpoints)
+        run.resume(state)
         run.train(checkpoints if run_dir is not None else None)
         agent_path = run.save_agent() if run_dir is not None else None
         return DownstreamResult(run.agent(), records.rows("eval"), agent_path, run.env_steps)

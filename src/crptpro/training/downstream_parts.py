@@ -29,6 +29,7 @@ from crptpro.training.agent import PixelAgent
 from crptpro.training.captured import resolve_cuda_graph
 from crptpro.training.compiled import Compiled, resolve_compile
 from crptpro.training.downstream_algorithms import DownstreamAlgorithm, Learner, make_algorithm
+from crptpro.training.downstream_replay import make_replay
 from crptpro.training.frozen_features import FrozenFeatures, dense_slots
 from crptpro.training.trained_features import TrainedFeatures
 from crptpro.transforms import PrototypeReward, choose_feature_mode
@@ -149,7 +150,7 @@ def build_parts(
         captures=resolve_cuda_graph(config.cuda_graph, config.device),
     )
     set_compute_dtype(algorithm.learner.loss, dtype)
-    replay = _build_replay(env, config, generators["replay"], run_dir)
+    replay = make_replay(env, config, generators["replay"], run_dir)
     shifts: dict[str, Any] = {
         "pad": config.shift_pad,
         "generator": generators["shift"],
@@ -190,25 +191,6 @@ def build_parts(
         reads_projections=keeps_projections,
     )
     return Parts(encoder, algorithm, replay, features, bonus, mode)
-
-
-def _build_replay(
-    env: EnvBase, config: DownstreamConfig, generator: torch.Generator, run_dir: Path
-) -> FrameReplay:
-    _, height, width = env.observation_spec["pixels"].shape
-    # A checkpoint holds cursors, not frames: whatever it refers to must outlive the next one, and the one after
-    # that while it is being written.
-    slack = 2 * (config.checkpoint_interval_env_steps // config.resolved_action_repeat) + 2_000
-    replay = FrameReplay(
-        config.resolved_replay_capacity,
-        frame_shape=(3, height, width),
-        action_dim=env.action_spec.shape[-1],
-        path=run_dir / "replay",
-        slack=slack,
-        frame_stack=env.observation_spec["pixels"].shape[0] // 3,
-    )
-    replay.set_rng(generator)
-    return replay
 
 
 def _choose_features(

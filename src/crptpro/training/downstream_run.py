@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -280,13 +280,12 @@ class DownstreamRun:
         require_finite_parameters(self.parts.learner.loss, self.updates)
         checkpoints.save(downstream_checkpoint.state_of(self), counter=self.agent_steps)
 
-    def resume(self, checkpoints: CheckpointDir) -> None:
-        """Continue from the newest checkpoint, if there is one.
+    def resume(self, state: Mapping[str, Any] | None) -> None:
+        """Continue from a checkpoint's state; without one, clear the record for a fresh start.
 
         Raises:
-            CheckpointError: if it belongs to a run with other settings.
+            CheckpointError: if it belongs to a run that was built in another way.
         """
-        state = checkpoints.load_latest()
         if state is None:
             # Rows of an attempt that was killed before its first checkpoint; elsewhere they may be another run's.
             if self.records.writes_into(self.run_dir):
