@@ -21,6 +21,7 @@ from crptpro.training.action_repeat import action_repeat_of
 from crptpro.training.agent import PixelAgent
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.downstream_checkpoint import require_continuable
+from crptpro.training.downstream_checkpoint import resume as resume_run
 from crptpro.training.downstream_replay import remove_replay
 from crptpro.training.downstream_run import DownstreamRun, EnvFactory
 
@@ -108,10 +109,17 @@ def train_downstream(
                 run_dir=directory,
             )
         run = DownstreamRun(
-            task, artifact, directory, config, records, progress=progress, env_factory=env_factory
+            task,
+            artifact,
+            directory,
+            config,
+            records,
+            progress=progress,
+            env_factory=env_factory,
+            state=state,
         )
         stack.callback(run.close)
-        run.resume(state)
+        resume_run(run, state, progress=progress)
         run.train(checkpoints if run_dir is not None else None)
         agent_path = run.save_agent() if run_dir is not None else None
         return DownstreamResult(run.agent(), records.rows("eval"), agent_path, run.env_steps)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,10 +13,13 @@ import torch
 from crptpro.downstream_config import DownstreamConfig, SkillDDPGSettings
 from crptpro.errors import CheckpointError
 from crptpro.seeding import global_rng_state, set_global_rng_state
+from crptpro.training.downstream_replay import DIRECTORY, has_replay
 from crptpro.training.fingerprint import require_same
 
 if TYPE_CHECKING:
     from crptpro.training.downstream_run import DownstreamRun
+
+logger = logging.getLogger(__name__)
 
 STREAMS = ("train", "episodes", "eval")
 """Streams of the record that a resumed run cuts back to its checkpoint."""
@@ -77,6 +81,20 @@ def require_continuable(
             "or choose another run directory."
         )
 
+    if not is_complete(state, config) and not has_replay(run_dir):
+        raise CheckpointError(
+            f"{run_dir} has done {done:,} of {config.env_steps:,} env steps; to go on it needs its frames, and "
+            f"{run_dir / DIRECTORY} is gone. Put it back, or start in another run directory."
+        )
+
+
+def is_complete(state: Mapping[str, Any], config: DownstreamConfig) -> bool:
+    """Whether nothing is left of the budget, nor to be evaluated: such a run is only read."""
+    done = env_steps_of(state, config)
+    is_pending = state.get("evaluation", {}).get("pending") is not None
+    is_evaluated = state["counters"]["last_eval"] == done and not is_pending
+    return done >= config.env_steps and is_evaluated
+
 
 def env_steps_of(state: Mapping[str, Any], config: DownstreamConfig) -> int:
     """Return the simulator steps that a checkpoint's run had taken."""
@@ -116,8 +134,35 @@ def state_of(run: DownstreamRun) -> dict[str, Any]:
     }
 
 
+def resume(run: DownstreamRun, state: Mapping[str, Any] | None, *, progress: bool) -> None:
+    """Continue from a checkpoint's state; without one, clear the record for a fresh start.
+
+    Args:
+        run: built with the same state.
+        state: from :func:`state_of`.
+        progress: show a bar while observations are encoded again.
+
+    Raises:
+        CheckpointError: if it belongs to a run that was built in another way, or frames that it needs are gone.
+    """
+    if state is None:
+        # Rows of an attempt that was killed before its first checkpoint; elsewhere they may be another run's.
+        if run.records.writes_into(run.run_dir):
+            for stream in STREAMS:
+                run.records.truncate_to(stream, "env_steps", -1)
+        return
+    restore(run, state)
+    if run.env_steps >= run.config.env_steps:
+        logger.info("%s: already at %s env steps", run.task, f"{run.env_steps:,}")
+        return
+    logger.info("%s: continuing from %s env steps", run.task, f"{run.env_steps:,}")
+    run.parts.features.rebuild(progress=progress)
+
+
 def restore(run: DownstreamRun, state: Mapping[str, Any]) -> None:
     """Put a run where :func:`state_of` saw it; dense feature maps are rebuilt by the caller.
+
+    A complete run gets no replay back.
 
     Raises:
         CheckpointError: if the state belongs to a run that was built in another way; nothing has changed then.
@@ -125,7 +170,7 @@ def restore(run: DownstreamRun, state: Mapping[str, Any]) -> None:
     require_same({**CAME_LATER, **state["fingerprint"]}, fingerprint(run), run.run_dir)
     for name, value in state["counters"].items():
         setattr(run, name, value)
-    run.parts.load_state_dict(state)
+    run.parts.load_state_dict(state, with_replay=not is_complete(state, run.config))
     for name, generator in run.generators.items():
         generator.set_state(state["generators"][name])
     set_global_rng_state(state["global_rng"])

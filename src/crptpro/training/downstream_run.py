@@ -24,7 +24,6 @@ from crptpro.seeding import derive_seed, seed_everything
 from crptpro.training import downstream_checkpoint
 from crptpro.training.agent import PixelAgent, save_agent
 from crptpro.training.checkpoint import CheckpointDir
-from crptpro.training.downstream_checkpoint import STREAMS
 from crptpro.training.downstream_evaluation import DownstreamEvaluation
 from crptpro.training.downstream_parts import Parts, build_parts
 from crptpro.training.env_thread import EnvThread, runs_ahead
@@ -48,6 +47,7 @@ class DownstreamRun:
         records: where metrics go.
         progress: show bars.
         env_factory: makes the environments.
+        state: of the checkpoint that this run will continue from, if any.
     """
 
     def __init__(
@@ -60,6 +60,7 @@ class DownstreamRun:
         *,
         progress: bool,
         env_factory: EnvFactory,
+        state: Mapping[str, Any] | None = None,
     ) -> None:
         self.task, self.config, self.run_dir, self.progress = task, config, run_dir, progress
         seed_everything(derive_seed(config.seed, "downstream"))
@@ -99,6 +100,7 @@ class DownstreamRun:
                 self.generators,
                 run_dir,
                 reserved_bytes=self.evaluation.workers * WORKER_BYTES,
+                state=state,
             )
         except BaseException:
             self.env.close()  # no run, nobody else to free the render context
@@ -279,22 +281,3 @@ class DownstreamRun:
         self.check_finite()
         require_finite_parameters(self.parts.learner.loss, self.updates)
         checkpoints.save(downstream_checkpoint.state_of(self), counter=self.agent_steps)
-
-    def resume(self, state: Mapping[str, Any] | None) -> None:
-        """Continue from a checkpoint's state; without one, clear the record for a fresh start.
-
-        Raises:
-            CheckpointError: if it belongs to a run that was built in another way.
-        """
-        if state is None:
-            # Rows of an attempt that was killed before its first checkpoint; elsewhere they may be another run's.
-            if self.records.writes_into(self.run_dir):
-                for stream in STREAMS:
-                    self.records.truncate_to(stream, "env_steps", -1)
-            return
-        downstream_checkpoint.restore(self, state)
-        if self.env_steps >= self.config.env_steps:
-            logger.info("%s: already at %s env steps", self.task, f"{self.env_steps:,}")
-            return
-        logger.info("%s: continuing from %s env steps", self.task, f"{self.env_steps:,}")
-        self.parts.features.rebuild(progress=self.progress)
