@@ -30,7 +30,7 @@ from crptpro.training.agent import PixelAgent
 from crptpro.training.captured import resolve_cuda_graph
 from crptpro.training.compiled import Compiled, resolve_compile
 from crptpro.training.downstream_algorithms import DownstreamAlgorithm, Learner, make_algorithm
-from crptpro.training.downstream_bonus import build_bonus
+from crptpro.training.downstream_bonus import build_bonus, require_queue
 from crptpro.training.downstream_checkpoint import is_complete
 from crptpro.training.downstream_replay import empty_replay, make_replay
 from crptpro.training.frozen_features import FrozenFeatures, dense_slots
@@ -138,11 +138,13 @@ def build_parts(
 
     Raises:
         CheckpointError: if dense maps were kept and do not fit the memory now.
-        PretrainedError: if the artifact was made for other images than the environment's.
+        PretrainedError: if the artifact was made for other images than the environment's, or brings a queue of
+            another length than is asked for.
         DiskSpaceError: if the replay's frames do not fit the disk.
     """
     channels, image_size, _ = env.observation_spec["pixels"].shape
     pretrained.require(image_size=image_size, frame_stack=channels // 3)
+    require_queue(pretrained, config)
     dtype = resolve_precision(config.precision, config.device)
     networks = (pretrained.encoder, pretrained.projector, pretrained.prototypes)
     encoder, projector, prototypes = copy.deepcopy(networks)
