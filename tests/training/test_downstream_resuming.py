@@ -8,9 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 from test_downstream import small_pretrained, train
+from torchrl.envs import CatFrames, EnvBase, TransformedEnv
+from toy_world import ToyEnv
 
 from crptpro.errors import CheckpointError
 from crptpro.training import downstream_parts
+from crptpro.training.downstream_run import DownstreamRun
 from crptpro.transforms import dense_shift_geometry
 
 
@@ -106,3 +109,34 @@ def test_a_finished_run_is_found_again_without_memory_for_its_maps(
     first = train(tmp_path, **KEPT)
     monkeypatch.setattr(downstream_parts, "free_bytes", lambda device: 0)
     assert train(tmp_path, **KEPT).evaluations == first.evaluations
+
+
+def test_an_episode_that_outgrows_the_slack_is_announced_once_and_the_setting_is_named_when_it_is_too_late(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("crptpro.training.downstream_replay.SPARE_FRAMES", 0)  # leaves 2 * 20 / 2 frames
+    kill_at = [60 + 15]
+
+    def long_episodes(
+        task: str, *, seed: int, image_size: int, frame_stack: int, **settings: object
+    ) -> EnvBase:
+        env = ToyEnv(lambda _: 60, seed=seed, image_size=image_size)
+        return TransformedEnv(env, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
+
+    def act(run: DownstreamRun, features: torch.Tensor) -> torch.Tensor:
+        if run.agent_steps == kill_at[0]:
+            raise KeyboardInterrupt
+        return run.acts(features)
+
+    monkeypatch.setattr(DownstreamRun, "acts", DownstreamRun.act, raising=False)
+    monkeypatch.setattr(DownstreamRun, "act", act)
+    settings = {"env_factory": long_episodes, "env_steps": 360, "eval_interval_env_steps": 1_000}
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, **settings)
+    assert "since the last checkpoint" not in caplog.text
+    kill_at[0] = 2 * 60 + 50
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, **settings)
+    assert caplog.text.count("frames since the last checkpoint, the replay can spare 20") == 1
+    with pytest.raises(CheckpointError, match=r"slack of 20.*`checkpoint_interval_env_steps`"):
+        train(tmp_path, **settings)

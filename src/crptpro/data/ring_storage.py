@@ -262,13 +262,13 @@ class RingStorage(TensorStorage):
         number = self._storage.get("number")
         lost = int((number[needed % self.rows] != needed + 1).sum())
         if lost:
-            since, why = (
-                int(number.max()) - cursors.frames,
-                "the files were removed or replaced; put them back.",
-            )
+            since = int(number.max()) - cursors.frames
+            why = "the files were removed or replaced; put them back."
             if since > self.slack:
-                why = f"{since} frames were written after it, with a slack of {self.slack}; begin again with a larger one "
-                why += "(a run has it from `checkpoint_interval_env_steps`), or use a newer checkpoint."
+                why = (
+                    f"{since} frames were written after it, with a slack of {self.slack}; begin again with a "
+                )
+                why += "larger one (a run has it from `checkpoint_interval_env_steps`), or use a newer checkpoint."
             raise CheckpointError(f"{lost} rows that the checkpoint of {self.path} needs are gone: {why}")
 
     def _empty(self) -> None:

@@ -171,6 +171,7 @@ def restore(run: DownstreamRun, state: Mapping[str, Any]) -> None:
     for name, value in state["counters"].items():
         setattr(run, name, value)
     run.parts.load_state_dict(state, with_replay=not is_complete(state, run.config))
+    run.slack.saved()
     for name, generator in run.generators.items():
         generator.set_state(state["generators"][name])
     set_global_rng_state(state["global_rng"])

@@ -26,6 +26,7 @@ from crptpro.training.agent import PixelAgent, save_agent
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.downstream_evaluation import DownstreamEvaluation
 from crptpro.training.downstream_parts import Parts, build_parts
+from crptpro.training.downstream_replay import SlackWatch
 from crptpro.training.env_thread import EnvThread, runs_ahead
 from crptpro.training.evaluation_pool import WORKER_BYTES
 from crptpro.training.finite import not_finite, require_finite_parameters
@@ -107,6 +108,7 @@ class DownstreamRun:
             raise
         # What an encoder that is trained here began as tells nothing about the agent.
         self.pretrained_identity = None if self.parts.algorithm.trains_encoder else pretrained.identity()
+        self.slack = SlackWatch(self.parts.replay)
         self.agent_steps = self.updates = self.episodes = 0
         self.last_eval = -1
         self.next_eval, self.next_checkpoint = 0, config.checkpoint_interval_env_steps
@@ -188,6 +190,7 @@ class DownstreamRun:
                 following["truncated"],
                 following["pixels"][-3:],
             )
+            self.slack.check()
             features = parts.features.observe(following["pixels"], slot)
             episode_return += following["reward"].item()
             agent_steps, self.agent_steps = agent_steps + 1, self.agent_steps + 1
@@ -281,3 +284,4 @@ class DownstreamRun:
         self.check_finite()
         require_finite_parameters(self.parts.learner.loss, self.updates)
         checkpoints.save(downstream_checkpoint.state_of(self), counter=self.agent_steps)
+        self.slack.saved()
