@@ -78,7 +78,8 @@ def train_downstream(
         CRPTproError: if the device cannot be used.
         PretrainedError: if the artifact does not fit, e.g. another image size, or actor weights only; if there is none
             for a frozen encoder, or one for DrQ.
-        CheckpointError: if ``run_dir`` holds a run with other settings.
+        CheckpointError: if ``run_dir`` holds a run with other settings, or one that cannot go on: its replay is gone,
+            or the dense maps that it began with do not fit the memory. A finished run needs neither.
         NonFiniteError: if a loss became NaN or infinite; the last checkpoint is kept.
     """
     config = dataclasses.replace(config or DownstreamConfig(), **overrides)
