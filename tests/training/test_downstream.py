@@ -15,6 +15,7 @@ from crptpro.modules import PixelEncoder, Projector, Prototypes
 from crptpro.pretrained import Pretrained, random_pretrained
 from crptpro.training import DownstreamConfig, load_agent, train_downstream
 from crptpro.training.downstream import _replay_capacity
+from crptpro.training.downstream_run import DownstreamRun
 from crptpro.training.frozen_features import FrozenFeatures
 from crptpro.training.rad_sac_learner import RADSACLearner
 
@@ -77,17 +78,26 @@ def test_a_run_evaluates_at_every_interval_and_at_both_ends(tmp_path: Path) -> N
 
 
 def test_training_changes_the_actor_and_leaves_the_encoder_projector_and_prototypes_alone(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pretrained, untouched = small_pretrained(), small_pretrained()
-    first = train(tmp_path / "a", pretrained, env_steps=20)  # 10 decisions: no update yet
-    later = train(tmp_path / "b", small_pretrained())
-    before, after = first.policy.actor.state_dict(), later.policy.actor.state_dict()
+    runs: list[DownstreamRun] = []
+
+    def noted(*args: object, **options: object) -> DownstreamRun:
+        runs.append(DownstreamRun(*args, **options))  # type: ignore[arg-type]
+        return runs[-1]
+
+    monkeypatch.setattr("crptpro.training.downstream.DownstreamRun", noted)
+    train(tmp_path / "a", env_steps=20)  # 10 decisions: no update yet
+    train(tmp_path / "b")
+    first, later = runs
+    assert (first.updates, later.updates) == (0, 60 - 12)
+    before, after = (run.parts.agent().actor.state_dict() for run in runs)
     assert any(not torch.equal(before[k], after[k]) for k in before)
+    untouched, parts = small_pretrained(), later.parts
     for trained, reference in (
-        (later.policy.encoder, untouched.encoder),
-        (pretrained.projector, untouched.projector),
-        (pretrained.prototypes, untouched.prototypes),
+        (parts.encoder, untouched.encoder),
+        (parts.bonus.projector, untouched.projector),
+        (parts.bonus.prototypes, untouched.prototypes),
     ):
         for key, value in reference.state_dict().items():
             torch.testing.assert_close(trained.state_dict()[key], value, rtol=0, atol=0)

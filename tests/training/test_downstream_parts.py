@@ -10,6 +10,7 @@ import pytest
 import torch
 from test_downstream import SMALL, small_pretrained, toy_env
 
+from crptpro.errors import PretrainedError
 from crptpro.pretrained import Pretrained
 from crptpro.training import downstream_parts
 from crptpro.training.downstream_parts import Parts, build_parts
@@ -102,6 +103,19 @@ def test_projections_give_way_before_dense_maps_do_and_others_needs_are_set_apar
         found[reserved] = (parts.feature_mode, parts.features.keeps_projections)
         assert (parts.bonus.projector is None) is parts.features.keeps_projections
     assert list(found.values()) == [("dense", True), ("dense", False), ("reencode", False)]
+
+
+def test_a_queue_of_another_length_is_refused_with_both_ways_out_before_a_replay_is_made(
+    tmp_path: Path,
+) -> None:
+    pretrained = dataclasses.replace(small_pretrained(), queue=torch.randn(16, 4))
+    message = r"queue of 16 candidates, `queue_size` is 32.*queue_size=16.*reset_queue=True"
+    with pytest.raises(PretrainedError, match=message):
+        parts_of(pretrained, tmp_path, queue_size=32)
+    assert not any(tmp_path.iterdir())
+    assert torch.equal(parts_of(pretrained, tmp_path, queue_size=16).bonus.queue, pretrained.queue)
+    assert not parts_of(pretrained, tmp_path, queue_size=32, reset_queue=True).bonus.queue.any()
+    assert parts_of(pretrained, tmp_path, queue_size=32, intrinsic_reward_coef=0.0).bonus is None
 
 
 def test_the_switches_reach_the_learner_and_are_off_on_a_cpu_unless_asked_for(tmp_path: Path) -> None:

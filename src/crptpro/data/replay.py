@@ -139,6 +139,16 @@ class FrameReplay(ReplayBuffer):
         """Rows that sampled transitions and the newest observation lie in; at most ``frame_slots``."""
         return self._storage.window
 
+    @property
+    def slack(self) -> int:
+        """Frames that may be written after a checkpoint before it is worthless."""
+        return self._storage.slack
+
+    @property
+    def frames_written(self) -> int:
+        """Frames stored so far, those that were overwritten included."""
+        return self._storage.cursors.frames
+
     def numbers_at(self, slots: Tensor) -> Tensor:
         """Return how many frames were stored before those in ``slots``, int64 ``[B]``.
 

@@ -263,11 +263,13 @@ class RingStorage(TensorStorage):
         lost = int((number[needed % self.rows] != needed + 1).sum())
         if lost:
             since = int(number.max()) - cursors.frames
-            raise CheckpointError(
-                f"{lost} rows that the checkpoint of {self.path} needs are gone: {since} frames were "
-                f"written after it, with a slack of {self.slack}, or the files were replaced. Use a newer "
-                "checkpoint, or a larger slack."
-            )
+            why = "the files were removed or replaced; put them back."
+            if since > self.slack:
+                why = (
+                    f"{since} frames were written after it, with a slack of {self.slack}; begin again with a "
+                )
+                why += "larger one (a run has it from `checkpoint_interval_env_steps`), or use a newer checkpoint."
+            raise CheckpointError(f"{lost} rows that the checkpoint of {self.path} needs are gone: {why}")
 
     def _empty(self) -> None:
         self.cursors = RingCursors()

@@ -141,6 +141,10 @@ class RunLogger:
         self.record.keep_until(stream, counter, value)
         self._rewind(before)
 
+    def writes_into(self, directory: str | Path) -> bool:
+        """Whether the record lies in ``directory`` or below it: only then is all of it that directory's own."""
+        return self.run_dir.resolve().is_relative_to(Path(directory).resolve())
+
     def close(self) -> None:
         """Finish the mirrors and free the directory; every row is on disk already."""
         self._copy(lambda mirror: mirror.close())

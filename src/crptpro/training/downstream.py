@@ -20,6 +20,9 @@ from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
 from crptpro.training.action_repeat import action_repeat_of
 from crptpro.training.agent import PixelAgent
 from crptpro.training.checkpoint import CheckpointDir
+from crptpro.training.downstream_checkpoint import require_continuable
+from crptpro.training.downstream_checkpoint import resume as resume_run
+from crptpro.training.downstream_replay import remove_replay
 from crptpro.training.downstream_run import DownstreamRun, EnvFactory
 
 
@@ -75,7 +78,8 @@ def train_downstream(
         CRPTproError: if the device cannot be used.
         PretrainedError: if the artifact does not fit, e.g. another image size, or actor weights only; if there is none
             for a frozen encoder, or one for DrQ.
-        CheckpointError: if ``run_dir`` holds a run with other settings.
+        CheckpointError: if ``run_dir`` holds a run with other settings, or one that cannot go on: its replay is gone,
+            or the dense maps that it began with do not fit the memory. A finished run needs neither.
         NonFiniteError: if a loss became NaN or infinite; the last checkpoint is kept.
     """
     config = dataclasses.replace(config or DownstreamConfig(), **overrides)
@@ -94,11 +98,29 @@ def train_downstream(
             raise CheckpointError(
                 f"{directory} already holds a run. Choose another directory, or continue it (resume=True)."
             )
+        state = None if run_dir is None else checkpoints.load_latest()
+        if state is None:
+            remove_replay(directory)
+        else:
+            require_continuable(
+                state,
+                task=task,
+                pretrained=None if config.algorithm == "drq" else artifact.identity(),
+                config=config,
+                run_dir=directory,
+            )
         run = DownstreamRun(
-            task, artifact, directory, config, records, progress=progress, env_factory=env_factory
+            task,
+            artifact,
+            directory,
+            config,
+            records,
+            progress=progress,
+            env_factory=env_factory,
+            state=state,
         )
         stack.callback(run.close)
-        run.resume(checkpoints)
+        resume_run(run, state, progress=progress)
         run.train(checkpoints if run_dir is not None else None)
         agent_path = run.save_agent() if run_dir is not None else None
         return DownstreamResult(run.agent(), records.rows("eval"), agent_path, run.env_steps)

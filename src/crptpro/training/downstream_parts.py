@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import EnvBase
 
 from crptpro.data import FrameReplay
 from crptpro.downstream_config import DownstreamConfig
+from crptpro.errors import CheckpointError
 from crptpro.modules import (
     PixelEncoder,
     resolve_channels_last,
@@ -29,11 +30,14 @@ from crptpro.training.agent import PixelAgent
 from crptpro.training.captured import resolve_cuda_graph
 from crptpro.training.compiled import Compiled, resolve_compile
 from crptpro.training.downstream_algorithms import DownstreamAlgorithm, Learner, make_algorithm
+from crptpro.training.downstream_bonus import build_bonus, require_queue
+from crptpro.training.downstream_checkpoint import is_complete
+from crptpro.training.downstream_replay import empty_replay, make_replay
 from crptpro.training.frozen_features import FrozenFeatures, dense_slots
 from crptpro.training.trained_features import TrainedFeatures
 from crptpro.transforms import PrototypeReward, choose_feature_mode
 from crptpro.transforms.free_memory import free_bytes
-from crptpro.transforms.prototype_reward import warn_if_mostly_zero
+from crptpro.transforms.shift_cache import dense_cache_bytes
 
 logger = logging.getLogger(__name__)
 
@@ -91,12 +95,18 @@ class Parts:
             "replay": self.replay.state_dict(),
         }
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what :meth:`state_dict` returned; dense feature maps are rebuilt by the caller."""
+    def load_state_dict(self, state: Mapping[str, Any], *, with_replay: bool = True) -> None:
+        """Restore what :meth:`state_dict` returned; dense feature maps are rebuilt by the caller.
+
+        Args:
+            state: from :meth:`state_dict`.
+            with_replay: False leaves the replay as it is, for a run that is only read.
+        """
         self.learner.load_state_dict(state["learner"])
         if self.bonus is not None:
             self.bonus.load_state_dict(state["bonus"])
-        self.replay.load_state_dict(state["replay"])
+        if with_replay:
+            self.replay.load_state_dict(state["replay"])
 
 
 def build_parts(
@@ -108,6 +118,7 @@ def build_parts(
     run_dir: Path,
     *,
     reserved_bytes: int = 0,
+    state: Mapping[str, Any] | None = None,
 ) -> Parts:
     """Build networks, replay, features and bonus; encoder, projector and prototypes are copies, frozen ones.
 
@@ -122,13 +133,18 @@ def build_parts(
         generators: streams ``"replay"``, ``"shift"``, ``"bonus"`` and ``"policy"``.
         run_dir: the replay's frames go below it.
         reserved_bytes: of the CPU's memory, that others will need.
+        state: of the checkpoint that the run continues from, if any. Features are had as they were then; a run that
+            is complete is given neither frames nor room for maps.
 
     Raises:
-        PretrainedError: if the artifact was made for other images than the environment's.
+        CheckpointError: if dense maps were kept and do not fit the memory now.
+        PretrainedError: if the artifact was made for other images than the environment's, or brings a queue of
+            another length than is asked for.
         DiskSpaceError: if the replay's frames do not fit the disk.
     """
     channels, image_size, _ = env.observation_spec["pixels"].shape
     pretrained.require(image_size=image_size, frame_stack=channels // 3)
+    require_queue(pretrained, config)
     dtype = resolve_precision(config.precision, config.device)
     networks = (pretrained.encoder, pretrained.projector, pretrained.prototypes)
     encoder, projector, prototypes = copy.deepcopy(networks)
@@ -149,7 +165,8 @@ def build_parts(
         captures=resolve_cuda_graph(config.cuda_graph, config.device),
     )
     set_compute_dtype(algorithm.learner.loss, dtype)
-    replay = _build_replay(env, config, generators["replay"], run_dir)
+    complete = state is not None and is_complete(state, config)
+    replay = empty_replay(env) if complete else make_replay(env, config, generators["replay"], run_dir)
     shifts: dict[str, Any] = {
         "pad": config.shift_pad,
         "generator": generators["shift"],
@@ -168,9 +185,20 @@ def build_parts(
         and worth_keeping_projections(config)
     ):
         latent_dim = prototypes.get_parameter("weight").shape[1]
-    mode, keeps_projections = _choose_features(
-        config, encoder, slots, dtype, latent_dim=latent_dim, reserved_bytes=reserved_bytes
-    )
+    before: Mapping[str, Any] = {} if state is None else state["fingerprint"]
+    if before and before.get("projections") != "kept":
+        latent_dim = None
+    available = _available_bytes(config, reserved_bytes)
+    mode: Literal["dense", "reencode"]
+    if before and config.features == "auto":
+        # What there was room for when the run began: the other way rounds differently.
+        mode, keeps_projections = before["features"], latent_dim is not None
+        if mode == "dense" and not complete:
+            _require_room(config, encoder, slots, dtype, available, run_dir, latent_dim=latent_dim)
+    else:
+        mode, keeps_projections = _choose_features(
+            config, encoder, slots, dtype, available, latent_dim=latent_dim
+        )
     features = FrozenFeatures(
         encoder,
         replay,
@@ -181,7 +209,7 @@ def build_parts(
         discount=config.discount,
         **shifts,
     )
-    bonus = _build_bonus(
+    bonus = build_bonus(
         projector,
         prototypes,
         pretrained.queue,
@@ -192,23 +220,10 @@ def build_parts(
     return Parts(encoder, algorithm, replay, features, bonus, mode)
 
 
-def _build_replay(
-    env: EnvBase, config: DownstreamConfig, generator: torch.Generator, run_dir: Path
-) -> FrameReplay:
-    _, height, width = env.observation_spec["pixels"].shape
-    # A checkpoint holds cursors, not frames: whatever it refers to must outlive the next one, and the one after
-    # that while it is being written.
-    slack = 2 * (config.checkpoint_interval_env_steps // config.resolved_action_repeat) + 2_000
-    replay = FrameReplay(
-        config.resolved_replay_capacity,
-        frame_shape=(3, height, width),
-        action_dim=env.action_spec.shape[-1],
-        path=run_dir / "replay",
-        slack=slack,
-        frame_stack=env.observation_spec["pixels"].shape[0] // 3,
-    )
-    replay.set_rng(generator)
-    return replay
+def _available_bytes(config: DownstreamConfig, reserved_bytes: int) -> int:
+    """Free memory of the run's device, less what others will need of the CPU's."""
+    device = torch.device(config.device)
+    return max(0, free_bytes(device) - (reserved_bytes if device.type == "cpu" else 0))
 
 
 def _choose_features(
@@ -216,9 +231,9 @@ def _choose_features(
     encoder: PixelEncoder,
     slots: int,
     dtype: torch.dtype,
+    available: int,
     *,
     latent_dim: int | None,
-    reserved_bytes: int,
 ) -> tuple[Literal["dense", "reencode"], bool]:
     """Return how features are had, and whether projections are kept beside dense maps; says so.
 
@@ -227,11 +242,9 @@ def _choose_features(
         encoder: frozen.
         slots: observations.
         dtype: of the features.
+        available: bytes.
         latent_dim: length of the projections, if they are to be kept where there is room.
-        reserved_bytes: of the CPU's memory, that others will need.
     """
-    device = torch.device(config.device)
-    available = max(0, free_bytes(device) - (reserved_bytes if device.type == "cpu" else 0))
     choose = functools.partial(
         choose_feature_mode, config.features, encoder, slots, dtype, available, pad=config.shift_pad
     )
@@ -241,6 +254,29 @@ def _choose_features(
         mode, reason = choose()  # a tenth less
     logger.info("features: %s", reason)
     return mode, keeps_projections
+
+
+def _require_room(
+    config: DownstreamConfig,
+    encoder: PixelEncoder,
+    slots: int,
+    dtype: torch.dtype,
+    available: int,
+    run_dir: Path,
+    *,
+    latent_dim: int | None,
+) -> None:
+    """Refuse to go on where the dense maps that a run began with do not fit any more."""
+    needed = dense_cache_bytes(encoder, slots, dtype, pad=config.shift_pad, latent_dim=latent_dim)
+    size = f"{needed / 2**30:.1f} GiB for {slots} observations"
+    if needed > available:
+        kept = "dense maps and projections" if latent_dim else "dense maps"
+        raise CheckpointError(
+            f"{run_dir} began with {kept} of its observations, {size}, and {available / 2**30:.1f} GiB are free. "
+            "Free memory, or say features='dense' to try it all the same; encoding at every update would round "
+            "differently, so it takes another run directory."
+        )
+    logger.info("features: dense-shift cache, as the run began (%s)", size)
 
 
 def worth_keeping_projections(config: DownstreamConfig) -> bool:
@@ -254,30 +290,3 @@ def worth_keeping_projections(config: DownstreamConfig) -> bool:
 
 def _agent_steps(config: DownstreamConfig) -> int:
     return -(-config.env_steps // config.resolved_action_repeat)
-
-
-def _build_bonus(
-    projector: nn.Module | None,
-    prototypes: nn.Module | None,
-    queue: Tensor | None,
-    config: DownstreamConfig,
-    generator: torch.Generator,
-    *,
-    reads_projections: bool,
-) -> PrototypeReward | None:
-    if config.intrinsic_reward_coef == 0:
-        return None
-    if prototypes is None or projector is None:
-        logger.info("no exploration bonus: the artifact has no prototypes")
-        return None
-    warn_if_mostly_zero(len(prototypes.get_parameter("weight")), config.batch_size, config.knn_k)
-    return PrototypeReward(
-        None if reads_projections else projector,
-        prototypes,
-        in_keys="embedding" if reads_projections else "features",
-        intrinsic_reward_coef=config.intrinsic_reward_coef,
-        knn_k=config.knn_k,
-        queue_size=config.queue_size,
-        queue=None if config.reset_queue else queue,
-        generator=generator,
-    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,9 @@ from crptpro.seeding import derive_seed, seed_everything
 from crptpro.training import downstream_checkpoint
 from crptpro.training.agent import PixelAgent, save_agent
 from crptpro.training.checkpoint import CheckpointDir
-from crptpro.training.downstream_checkpoint import STREAMS
 from crptpro.training.downstream_evaluation import DownstreamEvaluation
 from crptpro.training.downstream_parts import Parts, build_parts
+from crptpro.training.downstream_replay import SlackWatch
 from crptpro.training.env_thread import EnvThread, runs_ahead
 from crptpro.training.evaluation_pool import WORKER_BYTES
 from crptpro.training.finite import not_finite, require_finite_parameters
@@ -48,6 +48,7 @@ class DownstreamRun:
         records: where metrics go.
         progress: show bars.
         env_factory: makes the environments.
+        state: of the checkpoint that this run will continue from, if any.
     """
 
     def __init__(
@@ -60,6 +61,7 @@ class DownstreamRun:
         *,
         progress: bool,
         env_factory: EnvFactory,
+        state: Mapping[str, Any] | None = None,
     ) -> None:
         self.task, self.config, self.run_dir, self.progress = task, config, run_dir, progress
         seed_everything(derive_seed(config.seed, "downstream"))
@@ -99,12 +101,14 @@ class DownstreamRun:
                 self.generators,
                 run_dir,
                 reserved_bytes=self.evaluation.workers * WORKER_BYTES,
+                state=state,
             )
         except BaseException:
             self.env.close()  # no run, nobody else to free the render context
             raise
         # What an encoder that is trained here began as tells nothing about the agent.
         self.pretrained_identity = None if self.parts.algorithm.trains_encoder else pretrained.identity()
+        self.slack = SlackWatch(self.parts.replay)
         self.agent_steps = self.updates = self.episodes = 0
         self.last_eval = -1
         self.next_eval, self.next_checkpoint = 0, config.checkpoint_interval_env_steps
@@ -186,6 +190,7 @@ class DownstreamRun:
                 following["truncated"],
                 following["pixels"][-3:],
             )
+            self.slack.check()
             features = parts.features.observe(following["pixels"], slot)
             episode_return += following["reward"].item()
             agent_steps, self.agent_steps = agent_steps + 1, self.agent_steps + 1
@@ -279,21 +284,4 @@ class DownstreamRun:
         self.check_finite()
         require_finite_parameters(self.parts.learner.loss, self.updates)
         checkpoints.save(downstream_checkpoint.state_of(self), counter=self.agent_steps)
-
-    def resume(self, checkpoints: CheckpointDir) -> None:
-        """Continue from the newest checkpoint, if there is one.
-
-        Raises:
-            CheckpointError: if it belongs to a run with other settings.
-        """
-        state = checkpoints.load_latest()
-        if state is None:
-            for stream in STREAMS:  # rows of an attempt that was killed before its first checkpoint
-                self.records.truncate_to(stream, "env_steps", -1)
-            return
-        downstream_checkpoint.restore(self, state)
-        if self.env_steps >= self.config.env_steps:
-            logger.info("%s: already at %s env steps", self.task, f"{self.env_steps:,}")
-            return
-        logger.info("%s: continuing from %s env steps", self.task, f"{self.env_steps:,}")
-        self.parts.features.rebuild(progress=self.progress)
+        self.slack.saved()

@@ -232,12 +232,11 @@ def choose_feature_mode(
     if mode not in ("auto", "dense"):
         raise ValueError(f"mode must be 'auto', 'dense' or 'reencode', got {mode!r}.")
     try:
-        values = dense_shift_geometry(encoder, pad).values
+        needed = dense_cache_bytes(encoder, slots, dtype, pad=pad, latent_dim=latent_dim)
     except ValueError as error:
         if mode == "dense":
             raise
         return "reencode", f"re-encoding at every update: {error}"
-    needed = slots * (values * dtype.itemsize + (latent_dim or 0) * 4 * (2 * pad + 1) ** 2)
     available = free_bytes(torch.device(device)) if available_bytes is None else available_bytes
     size = f"{needed / 2**30:.1f} GiB for {slots} observations, {available / 2**30:.1f} GiB free"
     if mode == "dense":
@@ -250,6 +249,18 @@ def choose_feature_mode(
             f"re-encoding at every update: too little memory for the dense-shift cache ({size})",
         )
     return "dense", f"dense-shift cache ({size})"
+
+
+def dense_cache_bytes(
+    encoder: nn.Module, slots: int, dtype: torch.dtype, *, pad: int = 4, latent_dim: int | None = None
+) -> int:
+    """Return the memory of a full :class:`DenseShiftCache` in bytes; see :func:`choose_feature_mode`.
+
+    Raises:
+        ValueError: an encoder that is not of the form.
+    """
+    values = dense_shift_geometry(encoder, pad).values
+    return slots * (values * dtype.itemsize + (latent_dim or 0) * 4 * (2 * pad + 1) ** 2)
 
 
 @torch.no_grad()

@@ -275,8 +275,8 @@ class ActiveRun:
     def resume(self, state: Mapping[str, Any] | None) -> None:
         """Continue from a checkpoint; without one, clear the record for a fresh start."""
         if state is None:
-            if self.checkpoints is not None and self.records is not None:
-                # Rows of an attempt that was killed before its first checkpoint.
+            # Rows of an attempt that was killed before its first checkpoint; elsewhere they may be another run's.
+            if self.records is not None and self.records.writes_into(self.run_dir):
                 for stream in checkpoint.STREAMS:
                     self.records.truncate_to(stream, "env_steps", -1)
             return

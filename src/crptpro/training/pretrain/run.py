@@ -115,7 +115,8 @@ class PretrainRun:
             self._load(state)
             return
         if self.checkpoints is not None:
-            if self.logger is not None:  # rows of an attempt that was killed before its first checkpoint
+            # Rows of an attempt that was killed before its first checkpoint; elsewhere they may be another run's.
+            if self.logger is not None and self.logger.writes_into(self.checkpoints.path.parent):
                 self.logger.truncate_to(STREAM, "updates", -1)
             size = sum(p.numel() * p.element_size() for p in self.loss.parameters())
             # Weights, targets and two Adam moments; two checkpoints kept while a third is written.
