@@ -298,6 +298,18 @@ def test_modules_that_contain_themselves_are_refused(tmp_path: Path) -> None:
     )
 
 
+def test_few_bytes_that_refer_to_something_long_again_and_again_are_refused(tmp_path: Path) -> None:
+    pairs = b"\x80\x02ccollections\nOrderedDict\nq\x00](" + b"K\x01K\x01\x86" * 100_000 + b"e\x85q\x01"
+    text = b"X" + (1_000_000).to_bytes(4, "little") + b"a" * 1_000_000
+    for pickled, message in (
+        (pairs + b"h\x00h\x01R0" * 500 + b".", "its dicts or tensors have no end"),
+        (b"\x80\x04" + text + b"q\x00(" + b"h\x00h\x00\x93" * 500 + b"l.", "an endless name"),
+    ):
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        assert message in str(refused(zip_file(tmp_path / "zip.pt", pickled), tmp_path))
+        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kilobytes
+
+
 @pytest.mark.parametrize("place", ["_parameters", "_buffers", "_modules", "attributes"])
 def test_modules_that_share_one_big_dict_are_refused(place: str, tmp_path: Path) -> None:
     """Nothing in such a file is large or deep: a few megabytes would keep the reader busy for hours."""
