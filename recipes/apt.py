@@ -5,9 +5,9 @@
 
 The paper says what APT is made of, its author's code is for Atari only, and so the numbers are those of the two where
 they speak and of Proto-RL where they do not: temperature 0.07 and Adam 1e-4 from forhaoliu/mini_apt, the reward from
-rll-research/url_benchmark. The exploring agent is SAC with DrQ's two views of each image. Disk: 2.2 GB per domain that
-is explored and 1.3 GB per task. Killed at any moment, the same command continues. Ends with one eval.csv per task
-under OUT, a row per episode.
+rll-research/url_benchmark. The exploring agent is SAC with DrQ's two views of each image. Disk: 0.8 GB per domain of a
+group that is explored, 2.4 GB for a domain alone, and 1.3 GB per task. Killed at any moment, the same command
+continues. Ends with one eval.csv per task under OUT, a row per episode.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ class Config:
     """APT's hyper-parameters."""
 
     variant: Literal["c", "s"] = "c"
-    """c: one encoder for a group, 200,000 env steps over all its domains and 50,000 encoder updates; s: one encoder for
-    one domain, 500,000 env steps and 125,000 encoder updates"""
+    """c: one encoder for a group, 200,000 env steps over all its domains and 48,501 encoder updates; s: one encoder for
+    one domain, 500,000 env steps and 124,500 encoder updates"""
     group: Literal["A", "B", "C", "D"] = "A"
     """of c: A cheetah walker quadruped, B cartpole pendulum manipulation, C manipulation hopper finger, D walker
     pendulum hopper"""

@@ -5,8 +5,8 @@
 
 CRPTpro's comparison states ATC's budget (50,000 updates on the random data) and nothing else; loss, learning rate and
 schedule are those of astooke/rlpyt: 1,000 updates of warm-up, then a cosine to 0, gradients clipped at norm 10. Disk:
-2.1 GB per domain and 1.3 GB per task. Killed at any moment, the same command continues. Ends with one eval.csv per
-task under OUT, a row per episode.
+2.1 GB per domain and 1.3 GB per task. Killed at any moment, the same command continues; another seed needs another
+--out, as its random data are others. Ends with one eval.csv per task under OUT, a row per episode.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@
     python recipes/crptpro.py --group A --pretrained random-encoder    # the control: the same without pre-training
 
 Every default is the paper's number. Disk: 2.1 GB per domain and 1.3 GB per task. Memory: 4 GB, or 20 GB where the
-features of all random shifts are kept. Killed at any moment, the same command continues. Ends with one eval.csv per
-task under OUT, a row per episode.
+features of all random shifts are kept. Killed at any moment, the same command continues; another seed needs another
+--out, as its random data are others. Ends with one eval.csv per task under OUT, a row per episode.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
     python recipes/drq.py                                      # every task of the paper at paper scale; needs a GPU
     python recipes/drq.py --tasks walker_run reach_duplo --device cuda --seed 1
 
-Every default is the number of the paper's comparison or, where the paper is silent, of denisyarats/drq. Disk: 2.2 GB
-per task. Killed at any moment, the same command continues. Ends with one eval.csv per task under OUT, a row per
-episode, written by the very loop that trains on pre-trained encoders.
+Every default is the number of the paper's comparison or, where the paper is silent, of denisyarats/drq. Disk: a replay
+of 2.3 GB per task. Killed at any moment, the same command continues. Ends with one eval.csv per task under OUT, a row
+per episode, written by the very loop that trains on pre-trained encoders.
 """
 
 from __future__ import annotations

@@ -4,7 +4,8 @@
 
 The paper's budgets from the group A encoder: pendulum 2,000 updates, manipulation 2,000, cartpole 3,000,
 cheetah 1,000, walker 500. The encoder gets better on that domain and worse on the others. Optimiser state starts
-afresh; target networks are kept. Disk: 2.1 GB for the domain's random data and 1.3 GB for the task.
+afresh; target networks are kept. Disk: 2.1 GB for the domain's random data and 1.3 GB for the task. Another seed needs
+another --out, as its random data are others.
 """
 
 from __future__ import annotations

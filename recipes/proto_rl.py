@@ -5,8 +5,9 @@
     python recipes/proto_rl.py --group A --intr-loss-coef 5e-3 --out runs/proto_rl_intr    # ablation: with dispersion
 
 Numbers of denisyarats/proto, and of CRPTpro's comparison with it. The exploring actor of Proto-RL(S) goes on in its own
-domain's tasks. Disk: 2.2 GB per domain that is explored and 2.2 GB per task. Killed at any moment, the same command
-continues. Ends with one eval.csv per task under OUT, a row per episode.
+domain's tasks. Disk: 0.8 GB per domain of a group that is explored, 2.4 GB for a domain alone, and a replay of 2.3 GB
+per task. Killed at any moment, the same command continues. Ends with one eval.csv per task under OUT, a row per
+episode.
 """
 
 from __future__ import annotations
@@ -39,8 +40,8 @@ class Config:
     """Proto-RL's hyper-parameters."""
 
     variant: Literal["c", "s"] = "c"
-    """c: one encoder for a group, 200,000 env steps over all its domains and 50,000 encoder updates; s: one encoder for
-    one domain, 500,000 env steps and 125,000 encoder updates"""
+    """c: one encoder for a group, 200,000 env steps over all its domains and 48,501 encoder updates; s: one encoder for
+    one domain, 500,000 env steps and 124,500 encoder updates"""
     group: Literal["A", "B", "C", "D"] = "A"
     """of c: A cheetah walker quadruped, B cartpole pendulum manipulation, C manipulation hopper finger, D walker
     pendulum hopper"""

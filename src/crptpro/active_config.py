@@ -24,7 +24,8 @@ class ExplorationSettings:
     env_steps: int | None = None
     """budget in simulator steps (default: the method's)"""
     steps_budget: Literal["total", "per_domain"] = "total"
-    """whether the budget is shared by all domains or each has it"""
+    """total: all domains share the budget; per_domain: the domain of the largest action repeat has all of it, and every
+    other one as many decisions"""
     reward: str | None = None
     """what exploration is paid with: prototype, particle, skill-contrast, or one of your own (default: the method's)"""
     agent: str | None = None
@@ -108,7 +109,8 @@ class ActiveConfig(ExplorationSettings):
     seed: int = 0
     """seeds agents, environments, exploration, sampling and shifts"""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
-    """arithmetic of the convolutions and big matrix products"""
+    """arithmetic of the convolutions and big matrix products; `auto` is bf16 where the hardware has it. Deviation: the
+    released code computes in fp32 throughout, which `fp32` gives"""
     channels_last: Switch = "auto"
     """memory layout of the encoder's convolutions; changes rounding only (auto: on)"""
     device: str = "cpu"

@@ -34,15 +34,36 @@ def seed_everything(seed: int) -> None:
 
 
 def global_rng_state() -> dict[str, Any]:
-    """Return torch's global generator states (CPU, and CUDA where in use) as tensors."""
-    state: dict[str, Any] = {"torch": torch.get_rng_state()}
+    """Return the states of Python's, NumPy's and torch's global generators (CPU, and CUDA where in use).
+
+    Torch's are tensors, the others plain numbers and texts: a checkpoint holds them.
+    """
+    state: dict[str, Any] = {
+        "python": random.getstate(),
+        "numpy": _plain(np.random.get_state(legacy=False)),  # noqa: NPY002 - the one that worlds draw from
+        "torch": torch.get_rng_state(),
+    }
     if torch.cuda.is_initialized():  # asking an unused GPU would take its memory
         state["cuda"] = torch.cuda.get_rng_state_all()
     return state
 
 
 def set_global_rng_state(state: dict[str, Any]) -> None:
-    """Restore what :func:`global_rng_state` returned, on as many GPUs as there are."""
+    """Restore what :func:`global_rng_state` returned, on as many GPUs as there are.
+
+    Generators that the state does not name, as those of earlier versions name torch's only, are left as they are.
+    """
+    if "python" in state:
+        random.setstate(state["python"])
+    if "numpy" in state:
+        np.random.set_state(state["numpy"])  # noqa: NPY002
     torch.set_rng_state(state["torch"].cpu())
     for device in range(min(len(state.get("cuda", ())), torch.cuda.device_count())):
         torch.cuda.set_rng_state(state["cuda"][device].cpu(), device)
+
+
+def _plain(value: Any) -> Any:
+    """Turn the arrays in NumPy's state into lists, which NumPy takes back as they are."""
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    return value.tolist() if isinstance(value, np.ndarray) else value

@@ -13,11 +13,12 @@ from crptpro.data.collection import DomainCollection
 
 SIZE = 16
 TASK = FIXED.task
-SMALL = (
+SMALL_DRQ = (
     "--env-steps", 60, "--random-agent-steps", 12, "--batch-size", 4, "--replay-capacity", 20,
     "--eval-episodes", 1, "--eval-interval-env-steps", 20, "--checkpoint-interval-env-steps", 20,
-    "--log-interval-env-steps", 10, "--queue-size", 512, "--precision", "fp32", "--hidden-dim", 32,
+    "--log-interval-env-steps", 10, "--precision", "fp32", "--hidden-dim", 32,
 )  # fmt: skip
+SMALL = (*SMALL_DRQ, "--queue-size", 512)
 
 Call = Callable[..., tuple[int, str, str]]
 

@@ -17,6 +17,7 @@ from crptpro.objectives import (
     SimCLRLoss,
     get_method,
     method_defaults,
+    method_name_of,
     methods,
     register_method,
 )
@@ -77,6 +78,17 @@ def test_a_users_method_is_registered_and_found_by_name_and_class() -> None:
     assert method_defaults(Derived(small_encoder())) is defaults
     with pytest.raises(ValueError, match="'own' is already registered for OwnLoss"):
         register_method("own", ProtoLoss)
+
+
+def test_a_loss_built_by_hand_is_named_by_the_first_registered_method_of_its_very_class() -> None:
+    register_method("ablation", ProtoLoss, loss_options={"intr_loss_coef": 0.0})
+    assert method_name_of(proto()) == "crptpro"
+    assert method_name_of(get_method("ablation").build(small_encoder(), num_prototypes=8)) == "ablation"
+
+    class Derived(ProtoLoss):
+        pass
+
+    assert method_name_of(Derived(small_encoder(), num_prototypes=8)) == "Derived"
 
 
 def test_an_unregistered_loss_gets_generic_defaults_and_no_target_rate_without_targets() -> None:

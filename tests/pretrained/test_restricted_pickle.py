@@ -23,7 +23,12 @@ from crptpro.errors import PretrainedError
 from crptpro.pretrained import import_snapshot, load_pretrained
 from crptpro.pretrained.importing.convert import to_pretrained
 from crptpro.pretrained.importing.layouts import recognise
-from crptpro.pretrained.importing.restricted_pickle import Foreign, RestrictedUnpickler
+from crptpro.pretrained.importing.restricted_pickle import (
+    Foreign,
+    RestrictedUnpickler,
+    StorageRecord,
+    TensorRecord,
+)
 from crptpro.pretrained.importing.torch_file import TorchFile
 
 MARK = "this_file_must_not_appear"
@@ -291,6 +296,39 @@ def test_modules_that_contain_themselves_are_refused(tmp_path: Path) -> None:
     assert "no end" in str(
         refused(zip_file(tmp_path / "zip.pt", dumps({"agent": {"encoder": module}})), tmp_path)
     )
+
+
+def test_few_bytes_that_refer_to_something_long_again_and_again_are_refused(tmp_path: Path) -> None:
+    pairs = b"\x80\x02ccollections\nOrderedDict\nq\x00](" + b"K\x01K\x01\x86" * 100_000 + b"e\x85q\x01"
+    text = b"X" + (1_000_000).to_bytes(4, "little") + b"a" * 1_000_000
+    for pickled, message in (
+        (pairs + b"h\x00h\x01R0" * 500 + b".", "its dicts or tensors have no end"),
+        (b"\x80\x04" + text + b"q\x00(" + b"h\x00h\x00\x93" * 500 + b"l.", "an endless name"),
+    ):
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        assert message in str(refused(zip_file(tmp_path / "zip.pt", pickled), tmp_path))
+        assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000  # kilobytes
+
+
+@pytest.mark.parametrize("place", ["_parameters", "_buffers", "_modules", "attributes"])
+def test_modules_that_share_one_big_dict_are_refused(place: str, tmp_path: Path) -> None:
+    """Nothing in such a file is large or deep: a few megabytes would keep the reader busy for hours."""
+    many: dict[str, Any] = {str(index): None for index in range(110_000)}
+    state: dict[str, Any] = {"_parameters": {}, "_buffers": {}, "_modules": {}}
+    state = {**many, **state} if place == "attributes" else {**state, place: many}
+    modules = {f"n{index}": Calls(Named("torch.nn", "Linear"), more=(state,)) for index in range(1_000)}
+    root = {"_parameters": {}, "_buffers": {}, "_modules": modules}
+    nested = {"encoder": Calls(Named("torch.nn", "Sequential"), more=(root,))}
+    file = zip_file(tmp_path / "zip.pt", dumps({"agent": modules if place == "attributes" else nested}))
+    assert file.stat().st_size < 3_000_000
+    assert "no end" in str(refused(file, tmp_path))
+
+
+def test_state_dicts_that_are_one_big_dict_are_refused() -> None:
+    record = TensorRecord(StorageRecord("FloatStorage", "0", 1, 0, 1), 0, (1,), (1,))
+    shared = {str(index): record for index in range(110_000)}
+    with pytest.raises(PretrainedError, match="no end"):
+        recognise({f"n{index}": shared for index in range(1_000)})
 
 
 def test_archives_that_torch_does_not_write_are_refused(tmp_path: Path) -> None:

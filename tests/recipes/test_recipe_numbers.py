@@ -13,7 +13,7 @@ from recipe_process import RECIPES
 
 from crptpro.objectives import get_method
 from crptpro.training import ActiveConfig, SACSettings, drq_settings
-from crptpro.training.explore.plan import resolve
+from crptpro.training.explore.plan import make_plan, resolve
 
 
 def load(recipe: str) -> ModuleType:
@@ -72,3 +72,23 @@ def test_drq_has_the_numbers_of_the_library() -> None:
     assert drq_settings(**vars(recipe.DrQ())) == drq_settings()
     assert set(vars(recipe.DrQ())) <= {field.name for field in dataclasses.fields(drq_settings())}
     assert len(recipe.Config().tasks) == 8
+
+
+@pytest.mark.parametrize(
+    ("recipe", "method", "domains", "settings"),
+    [
+        ("apt", "apt-c", 3, {}),
+        ("apt", "apt-s", 1, {}),
+        ("proto_rl", "proto-rl-c", 3, {}),
+        ("proto_rl", "proto-rl-s", 1, {}),
+        ("becl", "becl", 3, {}),
+        ("becl", "becl", 3, {"encoder_updates_each": 1}),
+        ("becl", "apt-c", 3, {}),
+    ],
+)
+def test_a_recipe_names_as_many_encoder_updates_as_there_will_be(
+    recipe: str, method: str, domains: int, settings: dict[str, int]
+) -> None:
+    known = get_method(method)
+    plan = make_plan(resolve(ActiveConfig(**settings), known.exploration, known.defaults), [2] * domains)
+    assert f"{plan.encoder_updates:,}" in (RECIPES / f"{recipe}.py").read_text()

@@ -2,14 +2,22 @@ from __future__ import annotations
 
 import csv
 import os
+import random
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
+from test_downstream import EPISODE, SMALL, small_pretrained
+from torchrl.envs import CatFrames, EnvBase, TransformedEnv
+from toy_world import ToyEnv
 
-from crptpro.training import load_agent
+from crptpro.seeding import seed_everything
+from crptpro.training import load_agent, train_downstream
+from crptpro.training.downstream_run import DownstreamRun
 
 
 def record(path: Path) -> list[dict[str, str]]:
@@ -53,3 +61,46 @@ def test_killed_at_random_moments_it_completes_with_the_same_records_and_agent(
     for network, twin in ((agent.actor, expected.actor), (agent.encoder, expected.encoder)):
         for key, value in twin.state_dict().items():
             assert torch.equal(network.state_dict()[key], value), key
+
+
+class LuckyEnv(ToyEnv):
+    """Its rewards come from the global generators of Python and NumPy."""
+
+    def _step(self, tensordict: TensorDict) -> TensorDict:
+        found = super()._step(tensordict)
+        found["reward"] += random.random() + np.random.rand()  # noqa: NPY002 - what many worlds draw from
+        return found
+
+
+def lucky_env(task: str, *, seed: int, image_size: int, frame_stack: int, **settings: object) -> EnvBase:
+    env = LuckyEnv(lambda _: EPISODE, seed=seed, image_size=image_size)
+    return TransformedEnv(env, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
+
+
+def test_a_world_that_draws_from_pythons_and_numpys_generators_goes_on_with_the_same_numbers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Killed(BaseException):
+        pass
+
+    def train(run_dir: Path) -> None:
+        train_downstream(
+            "toy", small_pretrained(), run_dir=run_dir, config=SMALL, env_factory=lucky_env, progress=False
+        )
+
+    train(tmp_path / "whole")
+    original = DownstreamRun.run_episode
+
+    def dies(run: DownstreamRun, bar: object) -> None:
+        if run.episodes == 4:
+            raise Killed
+        original(run, bar)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(DownstreamRun, "run_episode", dies)
+        with pytest.raises(Killed):
+            train(tmp_path / "killed")
+    seed_everything(99)
+    train(tmp_path / "killed")
+    for name in ("eval.csv", "train.csv", "episodes.csv"):
+        assert record(tmp_path / "killed" / name) == record(tmp_path / "whole" / name), name

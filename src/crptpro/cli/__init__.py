@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from tyro.conf import Positional, subcommand
+from tyro.conf import Positional, arg, subcommand
 
 from crptpro.cards import cpu_cores
 from crptpro.cli.downstream import Downstream, DrQ
@@ -32,8 +32,8 @@ logger = logging.getLogger(__name__)
 class Doctor:
     """Check that this machine can run crptpro: render every domain, print versions, say what to fix."""
 
-    domains: tuple[str, ...] = ()
-    """only these domains (default: the paper's eight)"""
+    domains: Annotated[tuple[str, ...], arg(help_behavior_hint="(default: the paper's eight)")] = ()
+    """only these domains"""
 
     def run(self) -> None:
         """Print the report; exit status 1 unless a run would work."""
@@ -49,7 +49,7 @@ class Doctor:
 class Collect:
     """Let a uniform random policy fill one dataset per domain."""
 
-    domains: Positional[tuple[str, ...]]
+    domains: Annotated[Positional[tuple[str, ...]], arg(help_behavior_hint="(required)")]
     """domains, tasks, or group letters, e.g. `walker cartpole`, `A`, `gymnasium:HalfCheetah-v5`"""
     out: Path = Path("data")
     """one directory per domain is made below this one"""
@@ -57,8 +57,10 @@ class Collect:
     """transitions per domain (21 KB each)"""
     seed: int = 0
     """the same seed gives the same data whatever the number of workers"""
-    workers: int = field(default_factory=cpu_cores)
-    """collecting processes, shared by all domains (default: one per core)"""
+    workers: Annotated[
+        int, arg(help_behavior_hint=lambda cores: f"(default: one per core, {cores} here)")
+    ] = field(default_factory=cpu_cores)
+    """collecting processes, shared by all domains"""
     quality: Quality = "exact"
     """render quality; fast uses smaller shadow maps on software GL"""
     colors: Colors = "normal"

@@ -8,13 +8,19 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, Suppress, arg
 
 from crptpro.cli.request import Logging
 from crptpro.domains import get_domain
-from crptpro.downstream_config import DownstreamConfig, drq_settings, skill_ddpg_settings
+from crptpro.downstream_config import (
+    Algorithm,
+    DownstreamConfig,
+    SkillDDPGSettings,
+    drq_settings,
+    skill_ddpg_settings,
+)
 from crptpro.errors import CRPTproError
 
 logger = logging.getLogger(__name__)
@@ -76,6 +82,30 @@ class Downstream:
 
 
 @dataclass(frozen=True)
+class DrQConfig(DownstreamConfig):
+    """DrQ's settings, without options for what it has no use for: a pretrained encoder, a bonus, BeCL's agent."""
+
+    algorithm: Suppress[Algorithm] = "drq"
+    replay_capacity: int | None = None
+    """transitions kept; the oldest go first"""
+    random_agent_steps: int = 1_000
+    """decisions taken uniformly at random before the first update"""
+    transfer_actor: Suppress[bool | None] = None
+    initial_temperature: float = 0.1
+    """SAC's alpha at the start"""
+    actor_update_interval: int = 2
+    """updates between two actor and temperature steps"""
+    target_update_interval: int = 2
+    """updates between two target updates"""
+    intrinsic_reward_coef: Suppress[float] = 0.0
+    knn_k: Suppress[int] = 3
+    queue_size: Suppress[int] = 2_048
+    reset_queue: Suppress[bool] = False
+    features: Suppress[Literal["auto", "dense", "reencode"]] = "auto"
+    skill_ddpg: Suppress[SkillDDPGSettings] = field(default_factory=SkillDDPGSettings)
+
+
+@dataclass(frozen=True)
 class DrQ:
     """Train DrQ, SAC that learns its encoder along with the task: the reference without pre-training."""
 
@@ -83,7 +113,9 @@ class DrQ:
     """task to learn, e.g. walker_run, reach_duplo, gymnasium:HalfCheetah-v5"""
     out: Path
     """run directory: eval.csv, train.csv, checkpoints, and the agent in OUT/agent"""
-    config: Annotated[DownstreamConfig, arg(name="")] = field(default_factory=drq_settings)
+    config: Annotated[DrQConfig, arg(name="")] = field(
+        default_factory=lambda: DrQConfig(**vars(drq_settings()))
+    )
     """every number of the run"""
     logging: Logging = field(default_factory=Logging)
     """mirrors"""
@@ -93,13 +125,9 @@ class DrQ:
         from crptpro.modules import usable_device
         from crptpro.training import train_downstream
 
-        if self.config.algorithm != "drq":
-            raise CRPTproError(
-                f"{self.config.algorithm} learns on a frozen encoder: "
-                f"crptpro downstream {self.task} --pretrained ENCODER --algorithm {self.config.algorithm}."
-            )
         usable_device(self.config.device)
         get_domain(self.task)  # an unknown name is refused before the run directory is made
         with self.logging.open(self.out, self) as records:
-            result = train_downstream(self.task, None, run_dir=self.out, config=self.config, logger=records)
+            config = DownstreamConfig(**vars(self.config))
+            result = train_downstream(self.task, None, run_dir=self.out, config=config, logger=records)
         logger.info("agent: %s", result.agent_path)

@@ -21,7 +21,7 @@ class Import:
     out: Path
     """directory of the pretrained encoder to write"""
     layout: Literal["auto", "proto", "urlb", "atc"] = "auto"
-    """whose snapshot it must be (default: any)"""
+    """whose snapshot it must be; auto takes anyone's"""
 
     def run(self) -> None:
         """Read, convert and write."""

@@ -6,9 +6,9 @@ import dataclasses
 import logging
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from crptpro.active_config import ExplorationSettings
 from crptpro.cli.request import Logging, explored_domains, image_format
@@ -76,7 +76,7 @@ class PretrainingOptions:
 class Pretrain(PretrainingOptions):
     """Pre-train one encoder for several domains, one update per domain in turn: on datasets, or while exploring."""
 
-    sources: Positional[tuple[str, ...]]
+    sources: Annotated[Positional[tuple[str, ...]], arg(help_behavior_hint="(required)")]
     """dataset directories, e.g. data/walker data/cartpole; for exploring methods domains, tasks or group letters"""
     method: str = "crptpro"
     """a registered method: crptpro, atc (on datasets), proto-rl-c, proto-rl-s, apt-c, apt-s, becl (exploring), or one

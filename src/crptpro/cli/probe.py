@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from crptpro.cli.downstream import RANDOM_ENCODER
 from crptpro.cli.request import image_format
@@ -22,7 +22,7 @@ class Probe:
 
     encoder: Positional[str]
     """directory of a pretrained encoder, or `random-encoder` for the untrained control"""
-    datasets: Positional[tuple[Path, ...]]
+    datasets: Annotated[Positional[tuple[Path, ...]], arg(help_behavior_hint="(required)")]
     """datasets, e.g. data/walker data/finger; each is probed alone, seen in pre-training or not"""
     samples: int = 2_000
     """observations per dataset; time and memory grow with their square"""

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 if TYPE_CHECKING:
     from crptpro.experiments.goals import Goal, Request
     from crptpro.experiments.launching import Launcher, Resources
 
 ALL = "all"
+_ITS_OWN = arg(help_behavior_hint="(default: the experiment's)")
 
 
 @dataclass(frozen=True)
@@ -26,18 +26,23 @@ class Reproduce:
     the same command continues. At the end `crptpro report ROOT` makes tables and figures of it.
     """
 
-    experiments: Annotated[Positional[tuple[str, ...]], tyro.conf.arg(metavar="EXPERIMENT [EXPERIMENT ...]")]
+    experiments: Annotated[
+        Positional[tuple[str, ...]],
+        arg(metavar="EXPERIMENT [EXPERIMENT ...]", help_behavior_hint="(required)"),
+    ]
     """which, e.g. `seen`, or several, or `all`"""
     scale: Literal["tiny", "small", "paper"]
     """tiny shows in minutes that everything runs; small fits two CPU cores; paper has the paper's numbers"""
-    methods: tuple[str, ...] = ()
-    """only these systems, e.g. `crptpro drq random-encoder` (default: the experiment's)"""
-    groups: tuple[str, ...] = ()
-    """only these pre-training groups, of A B C D (default: the experiment's)"""
-    tasks: tuple[str, ...] = ()
-    """only these tasks, e.g. `walker_run` (default: the experiment's)"""
-    seeds: tuple[int, ...] = ()
-    """of downstream runs on each encoder (default: as many as the scale has, from 0)"""
+    methods: Annotated[tuple[str, ...], _ITS_OWN] = ()
+    """only these systems, e.g. `crptpro drq random-encoder`"""
+    groups: Annotated[tuple[str, ...], _ITS_OWN] = ()
+    """only these pre-training groups, of A B C D"""
+    tasks: Annotated[tuple[str, ...], _ITS_OWN] = ()
+    """only these tasks, e.g. `walker_run`"""
+    seeds: Annotated[
+        tuple[int, ...], arg(help_behavior_hint="(default: as many as the scale has, from 0)")
+    ] = ()
+    """of downstream runs on each encoder"""
     encoder_seeds: tuple[int, ...] = (0,)
     """of data and pre-training"""
     colors_by: Literal["background", "image"] = "background"
@@ -64,9 +69,9 @@ class Reproduce:
     """slurm: time limit of a job; one that reaches it is queued again and continues"""
     memory_gb: float = 16.0
     """slurm: memory of a job"""
-    sbatch: tuple[str, ...] = ()
+    sbatch: Annotated[tuple[str, ...], arg(help_behavior_hint="(default: none)")] = ()
     """slurm: further options as `key=value`, e.g. `account=robots qos=high`"""
-    ray_address: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None
+    ray_address: Annotated[str | None, arg(metavar="HOST:PORT")] = None
     """ray: head of the cluster (default: RAY_ADDRESS, or one on this machine)"""
 
     def run(self) -> None:

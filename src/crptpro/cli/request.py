@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from tyro.conf import arg
 
 from crptpro.domains import GROUPS, GYMNASIUM_PREFIX, PAPER_DOMAINS, TASKS, get_domain
 from crptpro.errors import CRPTproError, DatasetError, UnknownNameError
@@ -22,7 +24,7 @@ class Logging:
     """W&B project"""
     wandb_group: str | None = None
     """W&B group"""
-    wandb_tags: tuple[str, ...] = ()
+    wandb_tags: Annotated[tuple[str, ...], arg(help_behavior_hint="(default: none)")] = ()
     """W&B tags"""
     tensorboard: bool = False
     """also write TensorBoard event files"""

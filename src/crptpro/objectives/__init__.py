@@ -13,8 +13,10 @@ from crptpro.objectives.registry import (
     Method,
     MethodDefaults,
     exploration_defaults,
+    exploring_method,
     get_method,
     method_defaults,
+    method_name_of,
     methods,
     register_method,
 )
@@ -35,8 +37,10 @@ __all__ = [
     "SimCLRLoss",
     "SkillDDPGLoss",
     "exploration_defaults",
+    "exploring_method",
     "get_method",
     "method_defaults",
+    "method_name_of",
     "methods",
     "register_method",
 ]

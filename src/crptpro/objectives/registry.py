@@ -213,31 +213,58 @@ def method_defaults(loss: LossModule | type[LossModule]) -> MethodDefaults:
     A loss built by name has that method's defaults. A user's own, unregistered loss gets the generic ones,
     with ``encoder_tau`` None if it has no target networks.
     """
-    named = _METHODS.get(getattr(loss, "method_name", None) or "")
-    loss_class = loss if isinstance(loss, type) else type(loss)
-    if named is not None and issubclass(loss_class, named.loss_class):
+    named = _named(loss)
+    if named is not None:
         return named.defaults
+    loss_class = loss if isinstance(loss, type) else type(loss)
     for base in loss_class.__mro__:
-        for method in _METHODS.values():
-            if method.loss_class is base and not method.is_preset:
-                return method.defaults
+        for method in _methods_of(base):
+            return method.defaults
     if isinstance(loss, type):
         return MethodDefaults()
     has_targets = any(name.startswith("target_") for name, _ in loss.named_children())
     return MethodDefaults() if has_targets else MethodDefaults(encoder_tau=None)
 
 
-def exploration_defaults(loss: LossModule) -> ExplorationDefaults:
-    """How active pre-training of a loss explores.
+def method_name_of(loss: LossModule) -> str:
+    """Name a loss: the method that built it; built by hand, the first one of its very class, or else the class."""
+    name = getattr(loss, "method_name", None)
+    if name is not None:
+        return name
+    return next((method.name for method in _methods_of(type(loss))), type(loss).__name__)
 
-    As the method that built it does; built by hand, as the first method of its class, or the nearest base class, that
-    explores. The generic defaults otherwise.
+
+def exploring_method(loss: LossModule | type[LossModule]) -> Method | None:
+    """Return the method that active pre-training of a loss explores as, None for the generic way.
+
+    The method that built it, if that explores; otherwise the first method of its class, or the nearest base class,
+    that does.
     """
-    named = _METHODS.get(getattr(loss, "method_name", None) or "")
-    if named is not None and isinstance(loss, named.loss_class) and named.exploration is not None:
-        return named.exploration
-    for base in type(loss).__mro__:
-        for method in _METHODS.values():
-            if method.loss_class is base and not method.is_preset and method.exploration is not None:
-                return method.exploration
-    return ExplorationDefaults()
+    named = _named(loss)
+    if named is not None and named.exploration is not None:
+        return named
+    loss_class = loss if isinstance(loss, type) else type(loss)
+    for base in loss_class.__mro__:
+        for method in _methods_of(base):
+            if method.exploration is not None:
+                return method
+    return None
+
+
+def exploration_defaults(loss: LossModule) -> ExplorationDefaults:
+    """How active pre-training of a loss explores: as :func:`exploring_method` does."""
+    method = exploring_method(loss)
+    found = None if method is None else method.exploration
+    return ExplorationDefaults() if found is None else found
+
+
+def _named(loss: LossModule | type[LossModule]) -> Method | None:
+    """Return the method whose name a loss bears, unless it is of another class."""
+    method = _METHODS.get(getattr(loss, "method_name", None) or "")
+    loss_class = loss if isinstance(loss, type) else type(loss)
+    return method if method is not None and issubclass(loss_class, method.loss_class) else None
+
+
+def _methods_of(loss_class: type) -> list[Method]:
+    """List the methods of a very class, without presets, in the order in which they were registered."""
+    return [m for m in _METHODS.values() if m.loss_class is loss_class and not m.is_preset]

@@ -16,7 +16,7 @@ from torchrl.objectives import LossModule
 from crptpro.artifact import CARD_FILE, write_artifact
 from crptpro.cards import provenance, read_json
 from crptpro.errors import DiskSpaceError, PretrainedError
-from crptpro.objectives import get_method, methods
+from crptpro.objectives import method_name_of
 from crptpro.pretrained.bundle import ACTOR, FORMAT, QUEUE, REST, ROLES, TARGET_ROLES, VERSION, Pretrained
 from crptpro.pretrained.networks import target_state, unwrap
 
@@ -106,12 +106,8 @@ def save_pretrained(
 
 def describe_loss(loss: LossModule) -> dict[str, Any]:
     """Return what the card says of a loss: method, class, options, training."""
-    name = getattr(loss, "method_name", None)
-    if name is None:
-        exact = [m for m in methods() if get_method(m).loss_class is type(loss)]
-        name = exact[0] if exact else type(loss).__name__
     return {
-        "method": name,
+        "method": method_name_of(loss),
         "loss": {
             "class": f"{type(loss).__module__}.{type(loss).__qualname__}",
             "config": _loss_options(loss),

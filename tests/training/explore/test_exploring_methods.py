@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
-from active_world import explore, make_loss
+from active_world import SIZE, explore, make_loss
 
 from crptpro.errors import CRPTproError, DatasetError, UnknownNameError
-from crptpro.objectives import AveragedSACLoss, RADSACLoss, SkillDDPGLoss
+from crptpro.modules import PixelEncoder
+from crptpro.objectives import (
+    AveragedSACLoss,
+    MethodDefaults,
+    ProtoLoss,
+    RADSACLoss,
+    SkillDDPGLoss,
+    get_method,
+    register_method,
+)
+from crptpro.objectives import registry as registry_module
+from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training import register_intrinsic_reward
+from crptpro.training.explore import active
 from crptpro.training.explore.run import ActiveRun
 from crptpro.transforms import ParticleReward, PrototypeReward, SkillContrastReward
 
@@ -163,3 +177,54 @@ def test_an_encoder_without_the_methods_pixel_scaling_is_announced(caplog: pytes
     loss.encoder.config["pixel_offset"] = 0.0
     explore(None, loss=loss, env_steps=60)
     assert "becl wants an encoder with pixel_offset 0.5, this one has 0.0" in caplog.text
+
+
+def proto_by_hand() -> ProtoLoss:
+    torch.manual_seed(0)
+    encoder = PixelEncoder(9, channels=(4, 4), strides=(2, 1), image_size=SIZE)
+    return ProtoLoss(encoder, num_prototypes=8, latent_dim=4, hidden_dim=8, intr_loss_coef=0.0)
+
+
+def test_the_artifact_of_a_loss_built_by_hand_bears_the_name_of_the_method_that_it_explored_as(
+    tmp_path: Path,
+) -> None:
+    loss, _ = explore(None, loss=proto_by_hand())
+    save_pretrained(loss, tmp_path / "encoder")
+    method = load_pretrained(tmp_path / "encoder").method
+    assert method == "proto-rl-c"
+    assert get_method(method).replay_capacity == 100_000
+
+
+def test_a_loss_of_a_derived_class_bears_no_methods_name() -> None:
+    class Derived(ProtoLoss):
+        pass
+
+    loss = proto_by_hand()
+    loss.__class__ = Derived
+    explore(None, loss=loss)
+    assert loss.method_name is None
+
+
+def test_a_loss_that_has_explored_finds_its_finished_run_again(tmp_path: Path) -> None:
+    loss, first = explore(tmp_path, loss=proto_by_hand())
+    _, again = explore(tmp_path, loss=loss)
+    assert again.resumed_from == first.updates
+
+
+def test_a_run_of_a_version_that_did_not_name_a_loss_built_by_hand_is_continued(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patched:
+        patched.setattr(active, "_name", lambda loss: None)
+        _, first = explore(tmp_path, loss=proto_by_hand())
+    _, again = explore(tmp_path, loss=proto_by_hand())
+    assert again.resumed_from == first.updates
+
+
+def test_a_method_registered_later_has_no_say_on_the_encoder_of_a_loss_built_by_hand(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(registry_module, "_METHODS", dict(registry_module._METHODS))
+    register_method("ablation", ProtoLoss, MethodDefaults(), encoder_options={"pixel_offset": 0.5})
+    explore(None, loss=proto_by_hand(), env_steps=60)
+    assert "wants an encoder" not in caplog.text

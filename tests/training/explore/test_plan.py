@@ -55,6 +55,13 @@ def test_domains_of_different_repeats_share_a_budget_by_turns() -> None:
     assert [plan.env_steps_after(decisions) for decisions in range(5)] == [0, 2, 6, 7, 9]
 
 
+def test_a_budget_per_domain_is_that_of_the_largest_repeat_and_all_domains_decide_equally_often() -> None:
+    chosen = get_method("proto-rl-c")
+    config = ActiveConfig(env_steps=100, random_agent_steps=1, steps_budget="per_domain")
+    plan = make_plan(resolve(config, chosen.exploration, chosen.defaults), [2, 1])
+    assert [plan.agent_steps * repeat for repeat in plan.repeats] == [100, 50]
+
+
 def test_a_loss_built_by_hand_explores_like_the_method_of_its_class_and_an_unknown_one_generically() -> None:
     from active_world import make_loss
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import ItemsView
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +16,7 @@ Scalar = int | float | str | bool
 
 _MOST_MODULES = 10_000
 _MOST_TENSORS = 100_000
+_MOST_ENTRIES = 1_000_000
 _LONGEST_TEXT = 200
 _COUNTERS = {"_global_step": "agent_steps", "_global_episode": "episodes", "itr": "updates"}
 
@@ -31,6 +33,7 @@ class Contents:
         counters: ``agent_steps``, ``episodes`` or ``updates`` so far, as the snapshot counts them.
         others: names of what is neither network, tensor nor setting.
         agent_class: dotted name of the agent's class; None for state dicts.
+        entries: of dicts, looked at so far. Networks may share a dict, so that a small file has any number of them.
     """
 
     layout: Layout = URLB
@@ -40,6 +43,18 @@ class Contents:
     counters: dict[str, int] = field(default_factory=dict)
     others: list[str] = field(default_factory=list)
     agent_class: str | None = None
+    entries: int = 0
+
+    def look_at(self, table: dict[Any, Any]) -> ItemsView[Any, Any]:
+        """Return the entries of a dict, unless there have been too many.
+
+        Raises:
+            PretrainedError: in all that was looked at.
+        """
+        self.entries += len(table)
+        if self.entries > _MOST_ENTRIES:
+            raise PretrainedError("its networks have no end.")
+        return table.items()
 
 
 def recognise(root: Any) -> Contents:
@@ -83,7 +98,11 @@ def _collect(contents: Contents, name: str, value: Any) -> None:
     elif _is_module(value):
         contents.sections[name] = {}
         _flatten(contents, name, value)
-    elif isinstance(value, dict) and value and all(isinstance(v, TensorRecord) for v in value.values()):
+    elif (
+        isinstance(value, dict)
+        and value
+        and all(isinstance(v, TensorRecord) for _, v in contents.look_at(value))
+    ):
         contents.sections[name] = {key: v for key, v in value.items() if isinstance(key, str)}
     elif value is not None:
         contents.others.append(name)
@@ -106,28 +125,30 @@ def _flatten(contents: Contents, section: str, module: Foreign) -> None:
         if visited > _MOST_MODULES or len(prefix) > _LONGEST_TEXT:
             raise PretrainedError("its networks have no end.")
         for group in ("_parameters", "_buffers"):
-            for name, value in _entries(attributes, group).items():
+            for name, value in _entries(contents, attributes, group).items():
                 if isinstance(value, TensorRecord):
                     table[join(prefix, name)] = value
             if len(table) > _MOST_TENSORS:
                 raise PretrainedError("its networks have no end.")
-        for name, child in _entries(attributes, "_modules").items():
+        for name, child in _entries(contents, attributes, "_modules").items():
             if _is_module(child):
                 pending.append((join(prefix, name), child))
         if section == "encoder" and isinstance(attributes.get("stride"), tuple):
             contents.strides[join(section, prefix)] = _stride_of(attributes)
         elif not prefix:
-            for name, value in attributes.items():
+            for name, value in contents.look_at(attributes):
                 if isinstance(name, str) and _is_scalar(value) and name not in ("training", "dump_patches"):
                     contents.settings[join(section, name)] = value
 
 
-def _entries(attributes: dict[Any, Any], group: str) -> dict[str, Any]:
+def _entries(contents: Contents, attributes: dict[Any, Any], group: str) -> dict[str, Any]:
     found = attributes[group]
     if not isinstance(found, dict):
         return {}
     return {
-        k: v for k, v in found.items() if isinstance(k, str) and k.isprintable() and len(k) < _LONGEST_TEXT
+        k: v
+        for k, v in contents.look_at(found)
+        if isinstance(k, str) and k.isprintable() and len(k) < _LONGEST_TEXT
     }
 
 

@@ -13,6 +13,8 @@ _ORDERED_DICTS = ("collections.OrderedDict", "collections.defaultdict")
 _TENSOR_BUILDERS = ("torch._utils._rebuild_tensor_v2", "torch._utils._rebuild_tensor")
 _PARAMETER_BUILDERS = ("torch._utils._rebuild_parameter", "torch._utils._rebuild_parameter_with_state")
 _STORAGE_MODULES = ("torch", "torch.cuda")
+_LONGEST_NAME = 1_000
+_MOST_COPIED = 1_000_000
 
 # The machine in Python: the one in C offers no way to replace its instructions.
 _Machine: Any = pickle._Unpickler
@@ -85,9 +87,12 @@ class RestrictedUnpickler(_Machine):
         super().__init__(file)
         self.storages: dict[str, StorageRecord] = {}
         """Every block of numbers referred to, by its key."""
+        self._copied = 0
 
     def find_class(self, module: str, name: str) -> Name:
         """Return the name itself."""
+        if len(module) + len(name) > _LONGEST_NAME:  # joined anew each time that a few bytes refer to both
+            raise PretrainedError("it names something of an endless name.")
         return Name(f"{module}.{name}")
 
     def persistent_load(self, pid: Any) -> Any:
@@ -113,7 +118,17 @@ class RestrictedUnpickler(_Machine):
 
     def _reduce(self) -> None:
         arguments = self.stack.pop()
+        self._count_copies(self.stack[-1], arguments)
         self.stack[-1] = _build(self.stack[-1], arguments)
+
+    def _count_copies(self, named: Any, arguments: Any) -> None:
+        """Bound what dicts and tensors copy: a few bytes may refer to the same long list any number of times."""
+        if not isinstance(named, Name) or named.path not in (*_ORDERED_DICTS, *_TENSOR_BUILDERS):
+            return
+        parts = arguments[:4] if isinstance(arguments, tuple) else ()
+        self._copied += sum(len(part) for part in parts if isinstance(part, (list, tuple)))
+        if self._copied > _MOST_COPIED:
+            raise PretrainedError("its dicts or tensors have no end.")
 
     def _new_object(self) -> None:
         del self.stack[-1]  # arguments of __new__

@@ -30,7 +30,14 @@ from crptpro.modules import (
     resolve_precision,
     usable_device,
 )
-from crptpro.objectives import exploration_defaults, get_method, method_defaults, methods
+from crptpro.objectives import (
+    exploration_defaults,
+    exploring_method,
+    get_method,
+    method_defaults,
+    method_name_of,
+    methods,
+)
 from crptpro.seeding import derive_seed
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.explore.assemble import assemble, fingerprint
@@ -85,7 +92,8 @@ def pretrain_active(
     again from its seed and actions.
 
     Args:
-        loss: the objective with its networks; trained in place. Its ``training_record`` afterwards says how.
+        loss: the objective with its networks; trained in place. Its ``training_record`` afterwards says how. Built by
+            hand, it has the name of the method that it explores as from here on.
         domains: one or several, by domain or task name.
         run_dir: records (``pretrain.csv``, ``explore.csv``, ``episodes.csv``), replays and checkpoints; ``None`` keeps
             nothing but the result.
@@ -108,6 +116,7 @@ def pretrain_active(
     """
     config = dataclasses.replace(config or ActiveConfig(), **overrides)
     device = usable_device(config.device)
+    _name(loss)
     defaults, exploration = method_defaults(loss), exploration_defaults(loss)
     config = resolve(config, exploration, defaults)
     _warn_of_another_encoder(loss)
@@ -132,7 +141,8 @@ def pretrain_active(
         now = fingerprint(loss, list(named), config, defaults, dtype)
         finished = None
         if state is not None:
-            require_same(state["fingerprint"], now, directory)  # before environments and replays are made
+            # Before environments and replays are made.
+            require_same(_with_name(state["fingerprint"], loss), now, directory)
             finished = action_sizes(state) if state["is_finished"] else None
         else:
             shutil.rmtree(directory / DIRECTORY, ignore_errors=True)  # of an attempt without a checkpoint
@@ -183,11 +193,24 @@ def pretrain_active(
         )
 
 
+def _name(loss: LossModule) -> None:
+    """Let a loss built by hand bear the name of the method that it explores as: its artifact's, too."""
+    method = exploring_method(loss)
+    if getattr(loss, "method_name", None) is None and method is not None and method.loss_class is type(loss):
+        loss.method_name = method.name
+
+
+def _with_name(saved: dict[str, Any], loss: LossModule) -> dict[str, Any]:
+    """Complete the fingerprint of an earlier version, which did not name a loss built by hand."""
+    method = exploring_method(type(loss))
+    if method is None or method.loss_class is not type(loss):
+        return saved
+    return {**saved, "loss": {"method_name": method.name, **saved["loss"]}}
+
+
 def _warn_of_another_encoder(loss: LossModule) -> None:
     """A method's numbers belong to its own pixel scaling; a loss built by hand may have forgotten it."""
-    name = getattr(loss, "method_name", None) or next(
-        (name for name in methods() if get_method(name).loss_class is type(loss)), None
-    )
+    name = method_name_of(loss)
     config = getattr(getattr(loss, "encoder", None), "config", {})
     wanted = get_method(name).encoder_options if name in methods(presets=True) else {}
     for option, value in wanted.items():

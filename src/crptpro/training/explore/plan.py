@@ -84,7 +84,7 @@ class Plan:
 
 
 def make_plan(config: ActiveConfig, repeats: Sequence[int]) -> Plan:
-    """Spread a budget over domains.
+    """Spread a budget over domains, as equally many decisions in each: they take turns.
 
     Args:
         config: resolved.
