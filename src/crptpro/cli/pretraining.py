@@ -91,6 +91,8 @@ class Pretrain(PretrainingOptions):
     it)"""
     intr_loss_coef: float | None = None
     """weight of the prototype dispersion loss (default: the method's; crptpro 5e-3, proto-rl 0)"""
+    domain_schedule: Literal["cycle", "random", "mixed"] = "cycle"
+    """whose rows an update on datasets takes: one domain's after the other's, a random domain's, or all domains'"""
     explore: ExplorationSettings = field(default_factory=ExplorationSettings)
     """how a method explores that does"""
 
@@ -117,7 +119,14 @@ class Pretrain(PretrainingOptions):
         datasets = [Path(source) for source in self.sources]
         loss = self._build(method, *image_format(datasets))
         with self.logging.open(self.out, self) as records:
-            pretrain(loss, datasets, updates=self.updates, logger=records, **self.training_arguments())
+            pretrain(
+                loss,
+                datasets,
+                updates=self.updates,
+                domain_schedule=self.domain_schedule,
+                logger=records,
+                **self.training_arguments(),
+            )
             self.keep(loss, records)
 
     def _exploring(self, method: Method, exploration: ExplorationDefaults) -> None:
@@ -151,6 +160,7 @@ class Pretrain(PretrainingOptions):
         instead = {
             "checkpoint_interval": "use --explore.checkpoint-interval-env-steps",
             "compile": "leave it out",
+            "domain_schedule": "leave it out",
             "cuda_graph": "leave it out",
         }
         for option in dataclasses.fields(self):

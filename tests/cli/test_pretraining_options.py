@@ -1,0 +1,19 @@
+"""What the commands that pre-train may vary beside the paper's settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from command import SIZE, Call, refused, toy_dataset
+
+from crptpro.pretrained import load_pretrained
+
+
+def test_pretraining_takes_a_schedule_of_domains(call: Call, dataset: Path, tmp_path: Path) -> None:
+    other, out = toy_dataset(tmp_path / "data" / "other", SIZE), tmp_path / "out"
+    common = ("pretrain", dataset, other, "--out", out, "--updates", 2, "--domain-schedule", "mixed")
+    assert "got 1 and 2" in refused(call(*common, "--batch-size", 1))
+    assert call(*common, "--batch-size", 4)[0] == 0
+    assert load_pretrained(out / "encoder").card["training"]["settings"]["domain_schedule"] == "mixed"
+    line = refused(call("pretrain", "walker", "--method", "apt-s", "--out", out, *common[-2:]))
+    assert "--domain-schedule is for methods that learn from datasets; leave it out" in line
