@@ -36,6 +36,8 @@ def identity_of(
         switches["batches"] = "drawn on the device"
     if turns.schedule != "cycle":
         switches["domain_schedule"] = turns.schedule
+    if learner.moments_digest is not None:
+        switches["optimizer_state"] = f"kept {learner.moments_digest}"
     usual = 0 if defaults.schedule == "constant" else method_defaults(learner.loss).warmup_updates
     if defaults.warmup_updates != usual:
         switches["warmup_updates"] = defaults.warmup_updates

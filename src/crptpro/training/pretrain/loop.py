@@ -28,6 +28,7 @@ from crptpro.training.captured import resolve_cuda_graph
 from crptpro.training.compiled import Compiled, resolve_compile
 from crptpro.training.pretrain.device_batches import DeviceBatches
 from crptpro.training.pretrain.learner import Learner
+from crptpro.training.pretrain.moments import read_moments
 from crptpro.training.pretrain.result import PretrainResult
 from crptpro.training.pretrain.run import PretrainRun
 from crptpro.training.pretrain.sources import (
@@ -66,6 +67,7 @@ def pretrain(
     resume: bool = True,
     patience_updates: int = 5_000,
     at_updates: Mapping[int, Callable[[LossModule], Any]] | None = None,
+    optimizer_state_from: str | Path | None = None,
     progress: bool = True,
 ) -> PretrainResult:
     """Train a self-supervised loss on the datasets of several domains (CRPTpro, Sec. III; algorithm 1).
@@ -122,6 +124,9 @@ def pretrain(
             :func:`crptpro.pretrained.encoder_snapshots` gives it to keep the encoder at several points of one run. It
             must leave the loss as it is. A run that was killed calls it again if it does that update again, and an
             earlier call's updates are not done again.
+        optimizer_state_from: run directory of an earlier pre-training that left the loss's weights; a fresh start
+            goes on with Adam's moments from its newest checkpoint, at this run's learning rate. It is read again
+            when the run is continued, which then has its own. ``None``: a fresh Adam.
         progress: show a bar (never in log files).
 
     Returns:
@@ -129,7 +134,8 @@ def pretrain(
 
     Raises:
         CheckpointError: if ``run_dir`` holds a run with other settings (named), all its checkpoints are
-            damaged, or another process is running in it.
+            damaged, or another process is running in it; if ``optimizer_state_from`` has no checkpoint of a
+            pre-training, or one of other parameters or weights.
         NonFiniteError: naming update, domain and term; the last checkpoint is kept.
         DatasetError: if a dataset is unusable, shows other images than the encoder takes, or lacks an entry
             that the loss reads.
@@ -176,6 +182,7 @@ def pretrain(
         for source in sources:
             source.require_fit(getattr(loss, "encoder", None))
         require_schedule(domain_schedule, batch_size=settings["batch_size"], num_domains=len(sources))
+        moments = None if optimizer_state_from is None else read_moments(optimizer_state_from, loss)
         if run_dir is not None:
             stack.enter_context(DirectoryLock(run_dir, error=CheckpointError, is_reentrant=True))
             logger = logger or stack.enter_context(RunLogger(run_dir))
@@ -205,6 +212,7 @@ def pretrain(
                 compiled=compiled,
                 captures=captures,
                 inputs=None if batches is None else batches.batch,
+                moments=moments,
             ),
             settings={**settings, "seed": seed, "patience_updates": patience_updates},
             device=device,

@@ -16,7 +16,7 @@ from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
 from crptpro.modules import is_channels_last
 from crptpro.seeding import global_rng_state, set_global_rng_state
-from crptpro.training.checkpoint import CheckpointDir
+from crptpro.training.checkpoint import CHECKPOINTS, CheckpointDir
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.fingerprint import require_same
 from crptpro.training.pretrain.identity import identity_of
@@ -30,7 +30,6 @@ from crptpro.training.stop_request import StopRequest, what_is_kept
 _LOG = logging.getLogger(__name__)
 
 STREAM = "pretrain"
-CHECKPOINTS = "checkpoints"
 CHECKPOINT_SECONDS = 300.0
 
 
