@@ -190,6 +190,8 @@ class Finetune(PretrainingOptions):
     """dataset directory of the one domain"""
     updates: int = 2_000
     """encoder updates (the paper: pendulum 2,000, manipulation 2,000, cartpole 3,000, cheetah 1,000, walker 500)"""
+    optimizer_state_from: Path | None = None
+    """run directory of the pre-training, to go on with its Adam moments (default: a fresh Adam)"""
 
     def run(self) -> None:
         """Fine-tune, or continue, and write the artifact."""
@@ -204,6 +206,11 @@ class Finetune(PretrainingOptions):
         seed_everything(self.seed)
         with self.logging.open(self.out, self) as records:
             loss, _ = finetune(
-                pretrained, self.dataset, updates=self.updates, logger=records, **self.training_arguments()
+                pretrained,
+                self.dataset,
+                updates=self.updates,
+                optimizer_state_from=self.optimizer_state_from,
+                logger=records,
+                **self.training_arguments(),
             )
             self.keep(loss, records)
