@@ -91,6 +91,8 @@ class Pretrain(PretrainingOptions):
     it)"""
     intr_loss_coef: float | None = None
     """weight of the prototype dispersion loss (default: the method's; crptpro 5e-3, proto-rl 0)"""
+    domain_schedule: Literal["cycle", "random", "mixed"] = "cycle"
+    """whose rows an update on datasets takes: one domain's after the other's, a random domain's, or all domains'"""
     explore: ExplorationSettings = field(default_factory=ExplorationSettings)
     """how a method explores that does"""
 
@@ -117,7 +119,14 @@ class Pretrain(PretrainingOptions):
         datasets = [Path(source) for source in self.sources]
         loss = self._build(method, *image_format(datasets))
         with self.logging.open(self.out, self) as records:
-            pretrain(loss, datasets, updates=self.updates, logger=records, **self.training_arguments())
+            pretrain(
+                loss,
+                datasets,
+                updates=self.updates,
+                domain_schedule=self.domain_schedule,
+                logger=records,
+                **self.training_arguments(),
+            )
             self.keep(loss, records)
 
     def _exploring(self, method: Method, exploration: ExplorationDefaults) -> None:
@@ -151,6 +160,7 @@ class Pretrain(PretrainingOptions):
         instead = {
             "checkpoint_interval": "use --explore.checkpoint-interval-env-steps",
             "compile": "leave it out",
+            "domain_schedule": "leave it out",
             "cuda_graph": "leave it out",
         }
         for option in dataclasses.fields(self):
@@ -180,6 +190,8 @@ class Finetune(PretrainingOptions):
     """dataset directory of the one domain"""
     updates: int = 2_000
     """encoder updates (the paper: pendulum 2,000, manipulation 2,000, cartpole 3,000, cheetah 1,000, walker 500)"""
+    optimizer_state_from: Path | None = None
+    """run directory of the pre-training, to go on with its Adam moments (default: a fresh Adam)"""
 
     def run(self) -> None:
         """Fine-tune, or continue, and write the artifact."""
@@ -194,6 +206,11 @@ class Finetune(PretrainingOptions):
         seed_everything(self.seed)
         with self.logging.open(self.out, self) as records:
             loss, _ = finetune(
-                pretrained, self.dataset, updates=self.updates, logger=records, **self.training_arguments()
+                pretrained,
+                self.dataset,
+                updates=self.updates,
+                optimizer_state_from=self.optimizer_state_from,
+                logger=records,
+                **self.training_arguments(),
             )
             self.keep(loss, records)

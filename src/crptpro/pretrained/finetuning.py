@@ -17,18 +17,26 @@ from crptpro.pretrained.snapshots import IS_SNAPSHOT
 
 
 def finetune(
-    artifact: str | Path | Pretrained, datasets: Any, *, updates: int, **options: Any
+    artifact: str | Path | Pretrained,
+    datasets: Any,
+    *,
+    updates: int,
+    optimizer_state_from: str | Path | None = None,
+    **options: Any,
 ) -> tuple[Any, Any]:
     """Continue pre-training from an artifact, usually on one more domain.
 
-    The loss is rebuilt from the card; Adam starts afresh and the target networks are kept (the paper states
-    neither). The paper's budgets: pendulum 2,000 updates, manipulation 2,000, cartpole 3,000, cheetah 1,000,
-    walker 500.
+    The loss is rebuilt from the card; Adam starts afresh, unless ``optimizer_state_from`` says otherwise, and the
+    target networks are kept (the paper states neither). The paper's budgets: pendulum 2,000 updates, manipulation
+    2,000, cartpole 3,000, cheetah 1,000, walker 500.
 
     Args:
         artifact: directory, or loaded artifact.
         datasets: as of :func:`~crptpro.training.pretrain`: one dataset or several.
         updates: encoder updates of the fine-tuning.
+        optimizer_state_from: run directory of the pre-training that the artifact comes from, whose Adam moments the
+            fine-tuning goes on with; learning rate and every other setting are the fine-tuning's own. ``None``: a
+            fresh Adam.
         **options: further arguments of :func:`~crptpro.training.pretrain`.
 
     Returns:
@@ -36,13 +44,15 @@ def finetune(
 
     Raises:
         PretrainedError: if the artifact's method cannot be rebuilt.
+        CheckpointError: if ``optimizer_state_from`` has no checkpoint of a pre-training that ended with the
+            artifact's weights.
     """
     # Imported here: the training package imports this module for its downstream half.
     from crptpro.training.pretrain import pretrain
 
     pretrained = artifact if isinstance(artifact, Pretrained) else load_pretrained(artifact)
     loss = rebuild_loss(pretrained)
-    result = pretrain(loss, datasets, updates=updates, **options)
+    result = pretrain(loss, datasets, updates=updates, optimizer_state_from=optimizer_state_from, **options)
     return loss, result
 
 

@@ -22,6 +22,9 @@ import torch
 
 from crptpro.errors import CheckpointError, DiskSpaceError
 
+CHECKPOINTS = "checkpoints"
+"""Where a run keeps them, below its directory."""
+
 _LOG = logging.getLogger(__name__)
 _NAME = re.compile(r"checkpoint-(\d{12})-([0-9a-f]{64})\.pt")
 _PARTIAL = ".partial-checkpoint-"

@@ -15,6 +15,7 @@ from crptpro.objectives import MethodDefaults
 from crptpro.training.captured import CapturedCall, portable_state, prepare_optimizer
 from crptpro.training.compiled import Compiled
 from crptpro.training.finite import not_finite, require_finite_parameters
+from crptpro.training.pretrain.moments import Moments, digest_of, load_moments
 
 
 class Learner:
@@ -30,6 +31,7 @@ class Learner:
         captures: on a GPU, record the whole update as a CUDA graph and replay it. The learning rate of a
             schedule and the number of the update are tensors then, written before each replay.
         inputs: batches that the caller writes always into this one tensordict, where it ``captures``.
+        moments: of an earlier run's Adam, to go on with; by default it starts afresh.
     """
 
     def __init__(
@@ -43,6 +45,7 @@ class Learner:
         compiled: Compiled | None = None,
         captures: bool = False,
         inputs: TensorDictBase | None = None,
+        moments: Moments | None = None,
     ) -> None:
         self.loss = loss
         self.defaults = defaults
@@ -63,6 +66,9 @@ class Learner:
             weight_decay=defaults.weight_decay,
             fused=True,
         )
+        self.moments_digest = None if moments is None else digest_of(moments)
+        if moments is not None:
+            load_moments(self.optimizer, moments)
         self.updater = None if self.encoder_tau is None else _keep_targets(loss, self.encoder_tau)
         self.names: list[str] = []
         self._loss_count = 0

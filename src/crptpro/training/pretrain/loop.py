@@ -1,4 +1,4 @@
-"""The pre-training loop: cyclic over domains, logged, checkpointed, resumable at any moment."""
+"""The pre-training loop: over domains, logged, checkpointed, resumable at any moment."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ from crptpro.training.captured import resolve_cuda_graph
 from crptpro.training.compiled import Compiled, resolve_compile
 from crptpro.training.pretrain.device_batches import DeviceBatches
 from crptpro.training.pretrain.learner import Learner
+from crptpro.training.pretrain.moments import read_moments
 from crptpro.training.pretrain.result import PretrainResult
 from crptpro.training.pretrain.run import PretrainRun
 from crptpro.training.pretrain.sources import (
@@ -39,6 +40,7 @@ from crptpro.training.pretrain.sources import (
     open_sources,
     views_read,
 )
+from crptpro.training.pretrain.turns import DomainSchedule, Turns, require_schedule
 
 
 def pretrain(
@@ -50,6 +52,7 @@ def pretrain(
     learning_rate: float | None = None,
     warmup_updates: int | None = None,
     encoder_tau: float | None = None,
+    domain_schedule: DomainSchedule = "cycle",
     seed: int = 0,
     augment: Augment = "random_shift",
     precision: Precision = "auto",
@@ -64,15 +67,16 @@ def pretrain(
     resume: bool = True,
     patience_updates: int = 5_000,
     at_updates: Mapping[int, Callable[[LossModule], Any]] | None = None,
+    optimizer_state_from: str | Path | None = None,
     progress: bool = True,
 ) -> PretrainResult:
     """Train a self-supervised loss on the datasets of several domains (CRPTpro, Sec. III; algorithm 1).
 
-    Update u uses dataset u mod N only: one batch, one Adam step, one EMA step of the targets. Any
-    ``LossModule`` works that returns scalar ``loss_*`` terms for a batch with the entries of its ``in_keys``
-    (``pixels`` and ``("next", "pixels")`` in every dataset); a method ``before_update()``, if it has one, is
-    called before each forward. The loss is trained in place; its ``training_record`` afterwards says how, for
-    the artifact's card.
+    Update u (from 0) uses dataset u mod N only, unless ``domain_schedule`` says otherwise: one batch, one Adam step,
+    one EMA step of the targets. Any ``LossModule`` works that returns scalar ``loss_*`` terms for a batch with the
+    entries of its ``in_keys`` (``pixels`` and ``("next", "pixels")`` in every dataset); a method
+    ``before_update()``, if it has one, is called before each forward. The loss is trained in place; its
+    ``training_record`` afterwards says how, for the artifact's card.
 
     With ``run_dir`` the run can be killed at any moment: the same call with a newly built loss continues from
     the last checkpoint and, on the CPU with the same number of threads, gives the same weights as an
@@ -90,6 +94,11 @@ def pretrain(
         warmup_updates: updates over which the learning rate rises linearly from 0, before the method's schedule;
             default 0 (ATC 1,000).
         encoder_tau: EMA rate of the target networks; default 0.05.
+        domain_schedule: whose rows an update takes: ``"cycle"``: update u those of dataset u mod N; ``"random"``:
+            those of a dataset drawn uniformly for each update; ``"mixed"``: of every dataset, ``batch_size`` split as
+            evenly as possible (the first datasets get the remainder) and each part augmented by itself. The record
+            has no columns per domain then, the collapse is judged over the whole batch, and a GPU makes batches
+            without its fast way. Deviation: the paper takes one domain after the other, which ``"cycle"`` gives.
         seed: seeds sampling, shifts, and what the loss draws; torch's global generator is left as it was.
         augment: ``"random_shift"`` (4 pixels, replicated border; independent per image and per sample),
             ``"none"``, or a function of a batch and a generator. Entries that the loss names in ``views`` are
@@ -115,6 +124,9 @@ def pretrain(
             :func:`crptpro.pretrained.encoder_snapshots` gives it to keep the encoder at several points of one run. It
             must leave the loss as it is. A run that was killed calls it again if it does that update again, and an
             earlier call's updates are not done again.
+        optimizer_state_from: run directory of an earlier pre-training that left the loss's weights; a fresh start
+            goes on with Adam's moments from its newest checkpoint, at this run's learning rate. It is read again
+            when the run is continued, which then has its own. ``None``: a fresh Adam.
         progress: show a bar (never in log files).
 
     Returns:
@@ -122,10 +134,12 @@ def pretrain(
 
     Raises:
         CheckpointError: if ``run_dir`` holds a run with other settings (named), all its checkpoints are
-            damaged, or another process is running in it.
+            damaged, or another process is running in it; if ``optimizer_state_from`` has no checkpoint of a
+            pre-training, or one of other parameters or weights.
         NonFiniteError: naming update, domain and term; the last checkpoint is kept.
         DatasetError: if a dataset is unusable, shows other images than the encoder takes, or lacks an entry
             that the loss reads.
+        ValueError: naming an impossible setting, as fewer rows in a mixed batch than there are domains.
         CRPTproError: if the device cannot be used.
         CompileError: if compiling is asked for and fails, or an update cannot be recorded.
         DiskSpaceError: if the disk cannot hold the checkpoints.
@@ -167,16 +181,28 @@ def pretrain(
         sources = open_sources(datasets, seed=seed, device=device)
         for source in sources:
             source.require_fit(getattr(loss, "encoder", None))
+        require_schedule(domain_schedule, batch_size=settings["batch_size"], num_domains=len(sources))
+        moments = None if optimizer_state_from is None else read_moments(optimizer_state_from, loss)
         if run_dir is not None:
             stack.enter_context(DirectoryLock(run_dir, error=CheckpointError, is_reentrant=True))
             logger = logger or stack.enter_context(RunLogger(run_dir))
-        batches = _device_batches(
-            loss, sources, augment, settings["batch_size"], seed, compiled=compiled, captures=captures
-        )
+        batches = None
+        if domain_schedule != "mixed":
+            batches = _device_batches(
+                loss, sources, augment, settings["batch_size"], seed, compiled=compiled, captures=captures
+            )
         run = PretrainRun(
             loss,
-            sources,
-            Augmenter(augment, seed=seed, views=views_read(loss)),
+            Turns(
+                domain_schedule,
+                sources,
+                Augmenter(augment, seed=seed, views=views_read(loss)),
+                batches=batches,
+                keys=keys_read(loss),
+                batch_size=settings["batch_size"],
+                seed=seed,
+                device=device,
+            ),
             learner=Learner(
                 loss,
                 defaults,
@@ -186,8 +212,8 @@ def pretrain(
                 compiled=compiled,
                 captures=captures,
                 inputs=None if batches is None else batches.batch,
+                moments=moments,
             ),
-            batches=batches,
             settings={**settings, "seed": seed, "patience_updates": patience_updates},
             device=device,
             precision="bf16" if dtype == torch.bfloat16 else "fp32",

@@ -16,22 +16,20 @@ from crptpro.errors import CheckpointError
 from crptpro.loggers import RunLogger
 from crptpro.modules import is_channels_last
 from crptpro.seeding import global_rng_state, set_global_rng_state
-from crptpro.training.checkpoint import CheckpointDir
+from crptpro.training.checkpoint import CHECKPOINTS, CheckpointDir
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.fingerprint import require_same
-from crptpro.training.pretrain.device_batches import DeviceBatches
 from crptpro.training.pretrain.identity import identity_of
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.progress import PretrainProgress
 from crptpro.training.pretrain.result import PretrainResult, metrics_of, training_record
-from crptpro.training.pretrain.sources import Augmenter, Source, keys_read
+from crptpro.training.pretrain.turns import Turns
 from crptpro.training.pretrain.window import Window, cosine_threshold, memory_row, num_prototypes
 from crptpro.training.stop_request import StopRequest, what_is_kept
 
 _LOG = logging.getLogger(__name__)
 
 STREAM = "pretrain"
-CHECKPOINTS = "checkpoints"
 CHECKPOINT_SECONDS = 300.0
 
 
@@ -40,10 +38,8 @@ class PretrainRun:
 
     Args:
         loss: on ``device``, in its compute dtype.
-        sources: the datasets in cyclic order.
-        augmenter: applied to every batch.
+        turns: makes the batches, by the schedule of the domains.
         learner: does the updates.
-        batches: draws the batches where a GPU holds the frames; the augmenter draws them otherwise.
         settings: ``updates``, ``batch_size``, intervals, ``seed``, ``patience_updates``.
         device: where to train.
         precision: for the record.
@@ -55,11 +51,9 @@ class PretrainRun:
     def __init__(
         self,
         loss: LossModule,
-        sources: list[Source],
-        augmenter: Augmenter,
+        turns: Turns,
         *,
         learner: Learner,
-        batches: DeviceBatches | None = None,
         settings: dict[str, Any],
         device: torch.device,
         precision: str,
@@ -67,18 +61,15 @@ class PretrainRun:
         run_dir: Path | None,
         at_updates: Mapping[int, Callable[[LossModule], Any]] | None = None,
     ) -> None:
-        self.loss, self.sources, self.augmenter, self.learner = loss, sources, augmenter, learner
-        self.batches = batches
+        self.loss, self.turns, self.learner = loss, turns, learner
         self.settings, self.device, self.precision = settings, device, precision
         self.logger, self.run_dir, self.at_updates = logger, run_dir, at_updates or {}
-        self.domains = [source.name for source in sources]
-        self.window = Window(loss, self.domains)
+        self.window = Window(loss, turns.names, is_mixed=turns.schedule == "mixed")
         self.monitor = CollapseMonitor(
             num_prototypes(loss),
             patience_updates=settings["patience_updates"],
             cosine_threshold=cosine_threshold(loss),
         )
-        self.keys = keys_read(loss)
         self.checkpoints = None if run_dir is None else CheckpointDir(run_dir / CHECKPOINTS)
         self.history: list[dict[str, Any]] = []
         self.done = self.resumed_from = 0
@@ -88,14 +79,7 @@ class PretrainRun:
         self.made_with = provenance()
         self.started = self.row_started = self.saved_time = time.monotonic()
         self.row_updates = 0
-        self.fingerprint = identity_of(
-            learner,
-            sources,
-            augmenter,
-            settings,
-            precision=precision,
-            draws_on_device=batches is not None,
-        )
+        self.fingerprint = identity_of(learner, turns, settings, precision=precision)
 
     @property
     def seconds(self) -> float:
@@ -128,8 +112,9 @@ class PretrainRun:
         shown = PretrainProgress(total, self.done, is_shown=progress)
         if progress and self.done < total:
             _LOG.info(
-                "pretrain: %s updates of batch %d, one domain after the other (%s); %s on %s",
-                f"{total:,}", self.settings["batch_size"], ", ".join(self.domains), self.precision, self.device,
+                "pretrain: %s updates of batch %d, %s (%s); %s on %s",
+                f"{total:,}", self.settings["batch_size"], self.turns.words, ", ".join(self.turns.domains),
+                self.precision, self.device,
             )  # fmt: skip
         with StopRequest() as stop, shown:
             while self.done < total:
@@ -160,9 +145,7 @@ class PretrainRun:
             "updates": self.done,
             "seconds": self.seconds,
             "learner": self.learner.state_dict(),
-            "sources": {source.name: source.state_dict() for source in self.sources},
-            "augment": self.augmenter.generator.get_state(),
-            "batches": None if self.batches is None else self.batches.state_dict(),
+            **self.turns.state_dict(),
             "global_rng": global_rng_state(),
             "window": self.window.state_dict(),
             "monitor": self.monitor.state_dict(),
@@ -190,11 +173,7 @@ class PretrainRun:
         self.row_updates = self.done
         self.earlier_seconds = state["seconds"]
         self.learner.load_state_dict(state["learner"])
-        for source in self.sources:
-            source.load_state_dict(state["sources"][source.name])
-        self.augmenter.generator.set_state(state["augment"])
-        if self.batches is not None:
-            self.batches.load_state_dict(state["batches"])
+        self.turns.load_state_dict(state)
         set_global_rng_state(state["global_rng"])
         self.window.load_state_dict(state["window"], self.device)
         self.monitor.load_state_dict(state["monitor"])
@@ -209,19 +188,15 @@ class PretrainRun:
             _LOG.info("Pre-training continues from update %d.", self.done)
 
     def _update(self, log_interval: int) -> None:
-        domain = self.done % len(self.sources)
-        source, batch_size = self.sources[domain], self.settings["batch_size"]
-        if self.batches is not None:
-            batch = self.batches.sample(source.name)
-        else:
-            batch = self.augmenter.sample(source, batch_size, self.keys, self.device)
-        values = self.learner.update(batch, index=self.done, domain=self.domains[domain])
-        self.window.add(values, domain)
+        turn = self.turns.turn(self.done)
+        batch = self.turns.batch(turn)
+        values = self.learner.update(batch, index=self.done, domain=self.turns.names[turn])
+        self.window.add(values, turn)
         self.done += 1
-        is_last_of_window = -self.done % log_interval < len(self.sources)
-        is_last_of_run = self.settings["updates"] - self.done < len(self.sources)
+        is_last_of_window = -self.done % log_interval < self.turns.probed_updates
+        is_last_of_run = self.settings["updates"] - self.done < self.turns.probed_updates
         if (is_last_of_window or is_last_of_run) and "embedding_cosine" not in self.learner.names:
-            self.window.probe(batch, domain)
+            self.window.probe(batch, turn)
 
     def _log(self) -> dict[str, float]:
         row = self._row()
@@ -285,7 +260,7 @@ class PretrainRun:
             settings={
                 key: value for key, value in self.fingerprint.items() if key not in ("loss", "datasets")
             },
-            datasets=[source.facts() for source in self.sources],
+            datasets=[source.facts() for source in self.turns.sources],
             metrics=metrics,
             collapse=verdict,
             made_with=self.made_with,

@@ -26,11 +26,13 @@ class Window:
     Args:
         loss: the loss being trained.
         domains: names in cyclic order.
+        is_mixed: whether batches have rows of every domain, under one name then: rows get no columns per domain.
     """
 
-    def __init__(self, loss: LossModule, domains: list[str]) -> None:
+    def __init__(self, loss: LossModule, domains: list[str], *, is_mixed: bool = False) -> None:
         self.loss = loss
         self.domains = domains
+        self.is_mixed = is_mixed
         self.sums: Tensor | None = None
         self.counts = [0] * len(domains)
         self.cosines: dict[str, float] = {}
@@ -47,8 +49,13 @@ class Window:
         """Remember some images of a domain, for losses that do not report the cosine of their embeddings."""
         key = getattr(getattr(self.loss, "tensor_keys", None), "observation", "pixels")
         pixels = batch.get(key, None)
-        if pixels is not None:
-            self._probes[domain] = pixels.reshape(-1, *pixels.shape[-3:])[:PROBE_ROWS].clone()
+        if pixels is None:
+            return
+        images = pixels.reshape(-1, *pixels.shape[-3:])
+        if self.is_mixed:  # the first rows are all of one domain
+            spread = torch.linspace(0, len(images) - 1, min(len(images), PROBE_ROWS)).long()
+            images = images[spread.to(images.device)]
+        self._probes[domain] = images[:PROBE_ROWS].clone()
 
     def row(self, names: list[str]) -> dict[str, float]:
         """Return the metrics of the window without closing it.
@@ -64,10 +71,11 @@ class Window:
         row = {"loss": sum(means[index] for index in terms), **row}
         rows = self.sums.tolist()
         for domain, (sums, count) in enumerate(zip(rows, self.counts)):
-            if count:
+            if count and not self.is_mixed:
                 row[f"loss/{self.domains[domain]}"] = sum(sums[index] for index in terms) / count
         self._measure_cosines(names, rows)
-        row.update({f"cosine/{domain}": value for domain, value in self.cosines.items()})
+        if not self.is_mixed:
+            row.update({f"cosine/{domain}": value for domain, value in self.cosines.items()})
         row.update(self._prototype_row(row))
         return row
 
