@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase
 
 from crptpro.data.collect_worker import EpisodeJob, worker_main
 from crptpro.errors import CRPTproError, RenderingError, error_named
+from crptpro.suspension import SuspensionWatch
 
 logger = logging.getLogger(__name__)
 
@@ -57,6 +58,7 @@ class WorkerPool:
         self, factories: dict[str, Callable[[], EnvBase]], workers: int, stall_timeout_s: float = 300.0
     ):
         self._stall_timeout_s = stall_timeout_s
+        self._suspension = SuspensionWatch()
         for name, factory in factories.items():
             _require_picklable(name, factory)
         context = multiprocessing.get_context("spawn")
@@ -94,6 +96,9 @@ class WorkerPool:
         """
         # A worker's death shows as the end of its pipe, after everything it had still sent.
         ready = wait([worker.connection for worker in self.workers], timeout_s)
+        away = self._suspension.away_s()
+        for worker in self.workers:
+            worker.heard_s = self._suspension.heard_s(worker.heard_s, away_s=away)
         for worker in self.workers:
             if worker.connection in ready:
                 try:

@@ -24,6 +24,7 @@ from torchrl.envs import EnvBase
 from crptpro.errors import CRPTproError, RenderingError, error_named
 from crptpro.modules import resolve_precision, set_compute_dtype
 from crptpro.modules.placement import device_of
+from crptpro.suspension import SuspensionWatch
 from crptpro.training.agent import PixelAgent
 from crptpro.training.evaluate import Episode, episode_seed
 from crptpro.training.evaluation_worker import EvaluationJob, OtherEndGone, receive, send
@@ -65,6 +66,7 @@ class EvaluationPool:
         self._make_env = make_env
         self._count = workers
         self._stall_timeout_s = stall_timeout_s
+        self._suspension = SuspensionWatch()
         self._workers: list[_Worker] = []
         self._driver = ThreadPoolExecutor(1, thread_name_prefix="evaluation")
         self._evaluation: Future[Outcome] | None = None
@@ -170,8 +172,10 @@ class EvaluationPool:
         """Wait up to a second for what the busy processes have to say; returns finished episodes."""
         busy = [worker for worker in self._workers if worker.episode is not None]
         ready = wait([worker.connection for worker in busy], 1.0)
+        away = self._suspension.away_s()
         finished: dict[int, tuple[Episode, Tensor | None]] = {}
         for worker in busy:
+            worker.heard_s = self._suspension.heard_s(worker.heard_s, away_s=away)
             if worker.connection in ready:
                 try:
                     kind, payload = receive(worker.connection)
