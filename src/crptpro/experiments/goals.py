@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import inspect
 import json
 from collections.abc import Iterable
@@ -25,7 +24,7 @@ from crptpro.experiments.pieces import (
     settings,
 )
 from crptpro.experiments.scales import Scale
-from crptpro.objectives import Method, get_method, methods
+from crptpro.objectives import Method, get_method
 
 FINETUNE, DRQ, RANDOM_ENCODER = "crptpro-finetune", "drq", "random-encoder"
 METHODS = (
@@ -87,7 +86,7 @@ class Request:
         """
         for method in self.methods:
             if method not in (FINETUNE, DRQ, RANDOM_ENCODER):
-                _require_method(method)
+                get_method(method, besides=METHODS)
         for group in self.groups:
             if group not in GROUPS:
                 raise UnknownNameError(f"There is no group {group!r}; choose from {', '.join(GROUPS)}.")
@@ -109,16 +108,6 @@ class Request:
     def chosen(self, usual: Iterable[str]) -> tuple[str, ...]:
         """Return the methods asked for, or the experiment's usual ones."""
         return self.methods or tuple(usual)
-
-
-def _require_method(name: str) -> None:
-    """Refuse an unknown name, with the nearest of all that a comparison accepts."""
-    try:
-        get_method(name)
-    except UnknownNameError:
-        known = sorted({*methods(presets=True), *METHODS})
-        nearest = difflib.get_close_matches(name, known, n=3, cutoff=0.4) or known
-        raise UnknownNameError(f"There is no method {name!r}. Did you mean {', '.join(nearest)}?") from None
 
 
 def explores(method: str) -> bool:

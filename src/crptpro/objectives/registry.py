@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import inspect
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -185,8 +186,12 @@ def register_method(
     return method
 
 
-def get_method(name: str) -> Method:
+def get_method(name: str, *, besides: Iterable[str] = ()) -> Method:
     """Look a method or preset up by name.
+
+    Args:
+        name: as it was registered.
+        besides: further names that the caller takes, which the error may propose.
 
     Raises:
         UnknownNameError: with the nearest known names.
@@ -196,7 +201,7 @@ def get_method(name: str) -> Method:
         50000
     """
     if name not in _METHODS:
-        known = sorted(_METHODS)
+        known = sorted({*_METHODS, *besides})
         nearest = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
         raise UnknownNameError(f"There is no method {name!r}. Did you mean {', '.join(nearest or known)}?")
     return _METHODS[name]

@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 
 from crptpro.data import FrameReplay
 from crptpro.downstream_config import DownstreamConfig
+from crptpro.training.env_replay import replay_for
 
 DIRECTORY = "replay"
 SPARE_FRAMES = 2_000
@@ -67,14 +68,14 @@ def make_replay(
     # A checkpoint holds cursors, not frames: whatever it refers to must outlive the next one, and the one after
     # that while it is being written.
     slack = 2 * (config.checkpoint_interval_env_steps // config.resolved_action_repeat) + SPARE_FRAMES
-    replay = _ring(env, config.resolved_replay_capacity, path=run_dir / DIRECTORY, slack=slack)
+    replay = replay_for(env, config.resolved_replay_capacity, path=run_dir / DIRECTORY, slack=slack)
     replay.set_rng(generator)
     return replay
 
 
 def empty_replay(env: EnvBase) -> FrameReplay:
     """Return what a finished run has instead of a replay: a few rows in RAM, which nobody writes or reads."""
-    return _ring(env, 1)
+    return replay_for(env, 1)
 
 
 def has_replay(run_dir: Path) -> bool:
@@ -85,15 +86,3 @@ def has_replay(run_dir: Path) -> bool:
 def remove_replay(run_dir: Path) -> None:
     """Remove the frames of an attempt that left no checkpoint: they may be of another size."""
     shutil.rmtree(run_dir / DIRECTORY, ignore_errors=True)
-
-
-def _ring(env: EnvBase, capacity: int, *, path: Path | None = None, slack: int = 0) -> FrameReplay:
-    channels, height, width = env.observation_spec["pixels"].shape
-    return FrameReplay(
-        capacity,
-        frame_shape=(3, height, width),
-        action_dim=env.action_spec.shape[-1],
-        path=path,
-        slack=slack,
-        frame_stack=channels // 3,
-    )

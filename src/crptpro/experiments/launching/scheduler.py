@@ -97,9 +97,7 @@ def run_pieces(
     for piece in plan.pieces:
         store.describe(piece)
     for piece in plan.missing:
-        if store.is_done(
-            piece
-        ):  # but not all that one of its readers needs: its job would find nothing to do
+        if store.is_done(piece):  # but not all that a reader needs: its job would find nothing to do
             store.forget(piece)
     scheduler = _Scheduler(plan, store, settings, launcher, jobs, attempts)
     shown = tqdm(total=len(plan.pieces), initial=len(plan.done), desc="pieces", unit="piece", disable=None)

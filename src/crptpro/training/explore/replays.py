@@ -12,6 +12,7 @@ from torchrl.objectives import LossModule
 from crptpro.active_config import ActiveConfig
 from crptpro.cards import require_disk
 from crptpro.data import FrameReplay
+from crptpro.training.env_replay import replay_for
 from crptpro.training.explore.plan import Plan
 
 logger = logging.getLogger(__name__)
@@ -42,14 +43,6 @@ def require_room(loss: LossModule, config: ActiveConfig, plan: Plan, domains: in
 
 def make_replay(env: EnvBase, config: ActiveConfig, plan: Plan, path: Path) -> FrameReplay:
     """Make the replay of one domain."""
-    channels, height, width = env.observation_spec["pixels"].shape
     capacity, slack = _replay_size(config, plan)
-    return FrameReplay(
-        capacity,
-        frame_shape=(3, height, width),
-        action_dim=env.action_spec.shape[-1],
-        path=path,
-        slack=slack,
-        frame_stack=channels // 3,
-        extra_columns={} if config.skill_dim is None else {"skill": ((config.skill_dim,), torch.float32)},
-    )
+    columns = {} if config.skill_dim is None else {"skill": ((config.skill_dim,), torch.float32)}
+    return replay_for(env, capacity, path=path, slack=slack, extra_columns=columns)
