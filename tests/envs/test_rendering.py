@@ -183,9 +183,9 @@ def test_a_hung_first_frame_is_ended_and_named_with_its_cause_and_the_alternativ
     probe(f"open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(600)")
     start = time.monotonic()
     with pytest.raises(RenderingError) as caught:
-        select_backend(timeout_s=1.0)
-    assert time.monotonic() - start < 10
-    for part in ("did not arrive within 1 s", "several processes hold EGL contexts", "MUJOCO_GL=osmesa"):
+        select_backend(timeout_s=4.0)
+    assert time.monotonic() - start < 30
+    for part in ("did not arrive within 4 s", "several processes hold EGL contexts", "MUJOCO_GL=osmesa"):
         assert part in str(caught.value)
     assert not Path(f"/proc/{(tmp_path / 'pid').read_text()}").exists()
 
@@ -195,9 +195,9 @@ def test_a_backend_that_hangs_gives_way_to_one_that_renders(
 ) -> None:
     started = probe(f"if b == 'egl': time.sleep(600)\n{ANSWER}")
     with caplog.at_level(logging.WARNING):
-        assert select_backend(timeout_s=1.0) == "osmesa"
+        assert select_backend(timeout_s=4.0) == "osmesa"
     assert "egl: the first frame did not arrive" in caplog.text
-    assert select_backend(timeout_s=1.0, processes=2) == "osmesa"
+    assert select_backend(timeout_s=4.0, processes=2) == "osmesa"
     assert started.read_text().split() == ["egl", "osmesa", "osmesa", "osmesa"], (
         "the hang was waited for twice"
     )

@@ -58,13 +58,13 @@ def test_the_environment_is_made_stepped_and_closed_in_one_thread_that_is_not_th
 
 
 def test_the_caller_goes_on_while_the_environment_works() -> None:
-    env = EnvThread(lambda: ToyEnv(lambda seed: 10, on_step=lambda count: time.sleep(0.5)), is_ahead=True)
+    env = EnvThread(lambda: ToyEnv(lambda seed: 10, on_step=lambda count: time.sleep(2)), is_ahead=True)
     observation = env.reset(0)
     began = time.monotonic()
     env.begin_step(observation.set("action", action(0.0)))
-    assert time.monotonic() - began < 0.25
+    assert time.monotonic() - began < 1
     env.end_step()
-    assert time.monotonic() - began >= 0.5
+    assert time.monotonic() - began >= 2
     env.close()
 
 
