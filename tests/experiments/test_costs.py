@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from crptpro.cards import write_json
+from crptpro.cards import hardware, write_json
 from crptpro.experiments.costs import corrections, estimate, wall_seconds
 from crptpro.experiments.goals import Request
 from crptpro.experiments.matrix import seen
@@ -31,9 +32,12 @@ ENCODER = PretrainedPiece("crptpro", 0, (WALKER,), updates=100)
 RUN = RunPiece("walker_run", ENCODER, 0, config=settings(env_steps=20_000, batch_size=128))
 
 
-def finish(store: Store, piece: Piece, seconds: float, device: str = "cpu") -> None:
+def finish(
+    store: Store, piece: Piece, seconds: float, device: str = "cpu", made_on: dict[str, Any] | None = None
+) -> None:
     store.describe(piece)
-    write_json(store.path(piece) / DONE, {"seconds": seconds, "job": {"device": device}})
+    done = {"seconds": seconds, "job": {"device": device}, "hardware": made_on or hardware()}
+    write_json(store.path(piece) / DONE, done)
     for path in store.outputs(piece):
         path.parent.mkdir(parents=True)
         path.touch()
@@ -96,6 +100,30 @@ def test_finished_pieces_correct_the_estimate_of_their_kind(tmp_path: Path) -> N
     assert cost.corrected == {"dataset"}
 
 
+def test_pieces_of_another_machine_correct_nothing(tmp_path: Path) -> None:
+    store, here = Store(tmp_path), hardware()
+    piece = DatasetPiece("walker", 10_000, 0)
+    finish(store, piece, 1e6, made_on={**here, "cpu": "another"})
+    assert corrections(store) == {}
+    finish(
+        store,
+        DatasetPiece("walker", 10_000, 1),
+        2 * core_seconds(piece),
+        made_on={**here, "gpus": ["another"]},
+    )
+    assert corrections(store) == {"dataset": pytest.approx(2.0)}  # a job on the CPU does not care
+    finish(
+        store,
+        DatasetPiece("walker", 10_000, 2),
+        3 * core_seconds(piece),
+        "cuda",
+        {**here, "gpus": ["another"]},
+    )
+    assert corrections(store, "cuda") == {}
+    finish(store, DatasetPiece("walker", 10_000, 3), 4 * core_seconds(piece), "cuda")
+    assert corrections(store, "cuda:1") == {"dataset": pytest.approx(4.0)}
+
+
 def test_a_record_that_cannot_be_read_corrects_nothing(tmp_path: Path) -> None:
     directory = tmp_path / "pieces" / "odd"
     directory.mkdir(parents=True)
@@ -142,7 +170,7 @@ def test_the_plan_says_how_many_of_each_kind_and_where_the_estimate_comes_from(t
     )
     row = next(line for line in text.splitlines() if line.startswith("downstream runs"))
     assert row.split()[2:5] == ["2", "1", "1"]
-    assert "what finished pieces took here" in text
+    assert "what finished pieces took on this kind of machine" in text
 
 
 def test_a_plan_without_anything_to_do_promises_nothing(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from crptpro.cards import hardware
 from crptpro.experiments.piece_costs import core_seconds, stored_bytes, working_bytes
 from crptpro.experiments.plan import Plan
 from crptpro.experiments.store import DONE, Store
@@ -20,21 +21,26 @@ SHORTEST_S = 60.0
 def corrections(store: Store, device: str = "cpu") -> dict[str, float]:
     """Compare finished pieces with their estimates.
 
+    Records that came from another kind of machine say nothing about this one: between two processors that both
+    multiply bfloat16 the same exploration took one hour and three.
+
     Args:
         store: all of its pieces are looked at.
         device: only of jobs on this kind of device.
 
     Returns:
-        Kind of piece to the median of measured by estimated seconds; kinds of which none is finished that took more
-        than moments are missing.
+        Kind of piece to the median of measured by estimated seconds; kinds of which none that took more than moments
+        was finished on such a machine are missing.
     """
     found: dict[str, list[float]] = {}
+    here = hardware()
     for path in sorted(store.root.glob(f"pieces/*/{DONE}")):
         try:
             done = json.loads(path.read_text())
             piece = store.described(path.parent.name)
             expected = core_seconds(piece)
-            if expected > SHORTEST_S and _kind(str(done["job"]["device"])) == _kind(device):
+            is_alike = all(done["hardware"][name] == here[name] for name in _deciding(device))
+            if expected > SHORTEST_S and is_alike and _kind(str(done["job"]["device"])) == _kind(device):
                 found.setdefault(piece.kind, []).append(float(done["seconds"]) / expected)
         except Exception:  # of another version, or of a plugin that is not loaded: says nothing about costs
             continue
@@ -110,6 +116,11 @@ def wall_seconds(plan: Plan, seconds: Mapping[str, float], jobs: int) -> float:
 
 def _size(directory: Path) -> int:
     return sum(path.stat().st_size for path in directory.rglob("*") if path.is_file())
+
+
+def _deciding(device: str) -> tuple[str, ...]:
+    """What of the hardware decides how long a job takes."""
+    return ("cpu",) if _kind(device) == "cpu" else ("cpu", "gpus")
 
 
 def _kind(device: str) -> str:

@@ -91,14 +91,14 @@ def _basis(plan: Plan, cost: Cost, device: str) -> str:
     kinds = list(dict.fromkeys(piece.kind for piece in plan.missing))
     measured = [kind for kind in kinds if kind in cost.corrected]
     if measured and len(measured) == len(kinds):
-        return "Estimated from what finished pieces took here."
+        return "Estimated from what finished pieces took on this kind of machine."
     reference = "estimated from one core of the reference machine (AMD EPYC, Zen 4)"
     if device != "cpu":
         reference += ", which a GPU will beat by far"
     if not measured:
         return f"Hours are {reference}; they follow this machine once pieces of a kind are finished."
     others = ", ".join(kind for kind in kinds if kind not in measured)
-    return f"Hours follow finished pieces here; those of {others} are {reference}."
+    return f"Hours follow finished pieces of this kind of machine; those of {others} are {reference}."
 
 
 def _gigabytes(size: int) -> str:
