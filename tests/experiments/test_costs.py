@@ -50,8 +50,11 @@ def finish(
     # 10,000 decisions; evaluations at 0, 10,000 and 20,000 env steps, of 10 episodes with 500 decisions each
     (RUN, 10 + 10_000 * (0.05 + 128 * 0.5e-3) + 3 * 10 * 500 * 0.04),
     (RunPiece("reach_duplo", None, 0, config=settings(env_steps=10_000)),
-     10 + 5_000 * (0.05 + 512 * 2.5e-3) + 2 * 10 * 125 * 0.04),
+     10 + 5_000 * (0.05 + 512 * 6.9e-3) + 2 * 10 * 125 * 0.04),
     (ExploredPiece("apt-s", 0, ("walker",), explore=settings(env_steps=2_000, random_agent_steps=100, batch_size=64)),
+     10 + 1_000 * (0.05 + 64 * 3.5e-3) + 450 * 64 * 2.9e-3),
+    (ExploredPiece("proto-rl-s", 0, ("walker",),
+                   explore=settings(env_steps=2_000, random_agent_steps=100, batch_size=64)),
      10 + 1_000 * (0.05 + 64 * 1.25e-3) + 450 * 64 * 2.9e-3),
 ])  # fmt: skip
 def test_seconds_follow_decisions_updates_and_batch(piece: Piece, seconds: float) -> None:

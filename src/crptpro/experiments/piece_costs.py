@@ -39,8 +39,11 @@ ENCODER_ROW_S = 2.9e-3
 """An encoder update, for each row of its batch."""
 ACT_S, EVALUATE_S = 0.05, 0.04
 """A decision of an agent: picture, features, action; while it learns, and while it is evaluated."""
-AGENT_ROW_S, EXPLORER_ROW_S, DRQ_ROW_S = 0.5e-3, 1.25e-3, 2.5e-3
-"""An agent's update for each row: on stored features, on pixels, on pixels with its encoder."""
+AGENT_ROW_S, DRQ_ROW_S = 0.5e-3, 6.9e-3
+"""An agent's update for each row: on stored features, and on two views of pixels with its encoder."""
+EXPLORER_ROW_S = {"averaged-sac": 3.5e-3, "skill-ddpg": 2.7e-3}
+USUAL_EXPLORER_ROW_S = 1.25e-3
+"""An explorer's update for each row, on pixels that are encoded anew, in two views for the averaged one."""
 MEASUREMENT_S = 60.0
 """Any piece that measures something else than time."""
 USUAL_EPISODE_ENV_STEPS = 1_000
@@ -207,7 +210,8 @@ def _batch_size(method: str, options: Settings) -> int:
 def _exploring_s(piece: ExploredPiece) -> float:
     """A decision of an explorer, with its share of the agent's updates."""
     interval = exploration_plan(piece).agent_update_interval
-    return ACT_S + EXPLORER_ROW_S * _batch_size(piece.method, piece.explore) / interval
+    row_s = EXPLORER_ROW_S.get(exploration_config(piece).agent or "", USUAL_EXPLORER_ROW_S)
+    return ACT_S + row_s * _batch_size(piece.method, piece.explore) / interval
 
 
 def _replay_capacity(encoder: EncoderPiece | None) -> int:
