@@ -19,6 +19,7 @@ from crptpro.errors import CRPTproError
 
 WEIGHTS_FILE = "weights.safetensors"
 CARD_FILE = "card.json"
+TRIMMED_FROM = "trimmed_from"
 
 
 def write_artifact(
@@ -96,6 +97,19 @@ def read_artifact(
             continue  # a writer has replaced it meanwhile: the new one counts
         if _identity(source) == before:
             return found
+
+
+def identity_of(card: Mapping[str, Any]) -> str | None:
+    """Return what tells an artifact's weights from any others, as its card says it: the method and a checksum.
+
+    A trimmed artifact is named as the one it comes from, because it serves as that does. ``None`` if the card names no
+    weights.
+    """
+    if TRIMMED_FROM in card:
+        return str(card[TRIMMED_FROM])
+    if "weights_sha256" in card:
+        return f"{card.get('method', 'unknown')}:{card['weights_sha256']}"
+    return None
 
 
 def _read(

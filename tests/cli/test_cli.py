@@ -28,7 +28,7 @@ def encoder(tmp_path: Path) -> Path:
 
 COMMANDS = (
     "doctor", "collect", "pretrain", "finetune", "downstream", "drq", "evaluate", "probe", "reproduce", "report",
-    "import", "export",
+    "import", "export", "trim",
 )  # fmt: skip
 
 

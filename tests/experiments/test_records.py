@@ -162,6 +162,9 @@ def test_the_encoder_of_an_unfinished_run_is_that_of_the_artifact_named(tmp_path
     (artifact / "card.json").write_text(json.dumps({"method": "atc", "weights_sha256": "b" * 64}))
     named = write_run(tmp_path / "run", encoder=None, is_nested=True, pretrained=str(artifact), reached=500)
     assert read_run(named).encoder == "atc:" + "b" * 64
+    origin = "atc:" + "c" * 64
+    (artifact / "card.json").write_text(json.dumps({"weights_sha256": "b" * 64, "trimmed_from": origin}))
+    assert read_run(named).encoder == origin
     assert read_run(write_run(tmp_path / "other", encoder=None)).encoder is None
 
 

@@ -47,6 +47,19 @@ def test_import_and_export_are_commands(call: Callable[..., tuple[int, str]], tm
     assert one == two
 
 
+def test_trimming_is_a_command_that_says_what_it_saved(
+    call: Callable[..., tuple[int, str]], tmp_path: Path
+) -> None:
+    snapshot = save(atc_state(), tmp_path / "params.pkl", is_legacy=True)
+    call("import", snapshot, "--out", tmp_path / "encoder")
+    status, told = call("trim", tmp_path / "encoder", "--out", tmp_path / "trimmed")
+    assert status == 0
+    assert f"pretrained encoder: {tmp_path / 'trimmed'}, 0.0 MB of 0.0" in told  # a tiny one
+    whole, trimmed = (load_pretrained(tmp_path / name) for name in ("encoder", "trimmed"))
+    assert trimmed.identity() == whole.identity()
+    assert trimmed.projector is None
+
+
 def test_a_refusal_is_one_line_and_status_one(call: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("hello")
     status, told = call("import", tmp_path / "notes.txt", "--out", tmp_path / "encoder")

@@ -12,7 +12,14 @@ from toy_world import ToyEnv
 from crptpro.errors import CheckpointError, NonFiniteError, PretrainedError
 from crptpro.loggers import RunLogger, WandbOptions
 from crptpro.modules import PixelEncoder, Projector, Prototypes
-from crptpro.pretrained import Pretrained, random_pretrained
+from crptpro.objectives import ProtoLoss
+from crptpro.pretrained import (
+    Pretrained,
+    load_pretrained,
+    random_pretrained,
+    save_pretrained,
+    trim_pretrained,
+)
 from crptpro.training import DownstreamConfig, load_agent, train_downstream
 from crptpro.training.downstream import _replay_capacity
 from crptpro.training.downstream_run import DownstreamRun
@@ -332,3 +339,24 @@ def test_other_colours_reach_every_environment_the_card_and_what_must_agree(tmp_
     assert card["config"]["colors"] == "reversed_image"
     with pytest.raises(CheckpointError, match="colors was 'normal', now 'reversed_image'"):
         train(tmp_path / "normal", env_factory=toy_env, config=config)
+
+
+def test_a_trimmed_artifact_gives_the_numbers_of_the_one_it_comes_from(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    encoder = PixelEncoder(channels=(4, 4), strides=(2, 1), image_size=16)
+    loss = ProtoLoss(encoder, num_prototypes=8, latent_dim=4, hidden_dim=8)
+    whole = load_pretrained(save_pretrained(loss, tmp_path / "whole"))
+    trimmed = load_pretrained(trim_pretrained(whole, tmp_path / "trimmed"))
+    results = {name: train(tmp_path / f"run_{name}", kind) for name, kind in (("a", whole), ("b", trimmed))}
+    one, two = (rows_without_time(result.evaluations) for result in results.values())
+    assert one == two
+    tables = []
+    for name in results:
+        with open(tmp_path / f"run_{name}" / "train.csv", newline="") as file:
+            rows = list(csv.DictReader(file))
+        unmeasured = ("time", "_per_s", "bytes", "seconds")
+        tables.append([{k: v for k, v in row.items() if not any(u in k for u in unmeasured)} for row in rows])
+        assert float(rows[-1]["intrinsic_reward"]) > 0
+    assert tables[0] == tables[1]
+    cards = [load_agent(tmp_path / f"run_{name}" / "agent")[1]["pretrained"] for name in results]
+    assert cards == [whole.identity()] * 2

@@ -21,6 +21,7 @@ from crptpro.cli.probe import Probe
 from crptpro.cli.report import Report
 from crptpro.cli.reproduce import Reproduce
 from crptpro.cli.request import expand_groups
+from crptpro.cli.trim import Trim
 from crptpro.colors import Colors
 from crptpro.console import run_main
 from crptpro.quality import Quality
@@ -101,6 +102,7 @@ def main() -> None:
         | Annotated[Report, subcommand("report")]
         | Annotated[Import, subcommand("import")]
         | Annotated[Export, subcommand("export")]
+        | Annotated[Trim, subcommand("trim")]
     ]
 
     def run() -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from crptpro.artifact import identity_of
 from crptpro.errors import RecordError
 from crptpro.experiments.statistics import final_score, last_evaluations_score
 
@@ -235,9 +236,7 @@ def _encoder_identity(directory: Path, request: Mapping[str, Any]) -> str | None
     if card.get("pretrained"):
         return str(card["pretrained"])
     if isinstance(request.get("pretrained"), str):
-        artifact = _card(Path(request["pretrained"]) / "card.json")
-        if "weights_sha256" in artifact:
-            return f"{artifact.get('method', 'unknown')}:{artifact['weights_sha256']}"
+        return identity_of(_card(Path(request["pretrained"]) / "card.json"))
     return None
 
 

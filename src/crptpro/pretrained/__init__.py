@@ -7,6 +7,7 @@ from crptpro.pretrained.importing import import_snapshot
 from crptpro.pretrained.loading import load_pretrained
 from crptpro.pretrained.saving import save_pretrained
 from crptpro.pretrained.snapshots import encoder_snapshots, snapshot_path
+from crptpro.pretrained.trimming import trim_pretrained
 
 __all__ = [
     "Pretrained",
@@ -19,5 +20,6 @@ __all__ = [
     "rebuild_loss",
     "save_pretrained",
     "snapshot_path",
+    "trim_pretrained",
     "write_state_dict",
 ]

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from crptpro.artifact import identity_of
 from crptpro.errors import PretrainedError
 from crptpro.modules import PixelEncoder
 from crptpro.seeding import derive_seed
@@ -63,8 +64,8 @@ class Pretrained:
 
     def identity(self) -> str:
         """Return what tells these weights from any others: the method and a checksum."""
-        if "weights_sha256" in self.card:
-            return f"{self.method}:{self.card['weights_sha256']}"
+        if (named := identity_of(self.card)) is not None:
+            return named
         digest = hashlib.sha256()
         for name in (*ROLES, *TARGET_ROLES, ACTOR):
             module = getattr(self, name)

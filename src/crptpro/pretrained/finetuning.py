@@ -8,6 +8,7 @@ from typing import Any
 
 from torchrl.objectives import LossModule
 
+from crptpro.artifact import TRIMMED_FROM
 from crptpro.errors import PretrainedError
 from crptpro.objectives import get_method, methods
 from crptpro.pretrained.bundle import ROLES, TARGET_ROLES, Pretrained
@@ -76,6 +77,11 @@ def rebuild_loss(pretrained: Pretrained) -> LossModule:
         raise PretrainedError(
             f"The artifact was trained with {pretrained.method!r}, which is no registered method. Call "
             "crptpro.objectives.register_method for its loss first."
+        )
+    if TRIMMED_FROM in card:
+        raise PretrainedError(
+            "The artifact was trimmed to what learning a task reads: it lacks the networks that training goes on with. "
+            "Take the one it comes from."
         )
     method = get_method(pretrained.method)
     networks = {
