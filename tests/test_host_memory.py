@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import os
 import random
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -84,3 +87,15 @@ def test_copies_through_numpy_bits_are_exact_and_share_memory(dtype):
     as_numpy_bits(target)[:, 2:] = as_numpy_bits(source)[:, 2:]
     assert torch.equal(target[:, 2:], source[:, 2:])
     assert not target[:, :2].any()
+
+
+def test_large_tensors_are_asked_for_on_huge_pages_unless_that_was_turned_off():
+    code = "import os, crptpro; print(os.environ['THP_MEM_ALLOC_ENABLE'])"
+    for given, expected in ((None, "1"), ("0", "0")):
+        environment = {k: v for k, v in os.environ.items() if k != "THP_MEM_ALLOC_ENABLE"}
+        if given is not None:
+            environment["THP_MEM_ALLOC_ENABLE"] = given
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+        )
+        assert done.stdout.strip() == expected
