@@ -22,7 +22,7 @@ from crptpro.experiments.catalogue import EXPERIMENTS
 from crptpro.experiments.goals import METHODS
 from crptpro.experiments.store import Store
 
-pytestmark = [pytest.mark.gl, pytest.mark.slow, pytest.mark.timeout(1_200)]
+pytestmark = [pytest.mark.gl, pytest.mark.slow, pytest.mark.timeout(2_400)]  # some 10 min on an idle core
 
 PENDULUM = ("--tasks", "pendulum_swingup")
 GROUP_D = ("--groups", "D", *PENDULUM)
