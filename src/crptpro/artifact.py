@@ -61,6 +61,7 @@ def write_artifact(
     try:
         weights = temporary / WEIGHTS_FILE
         save_file(tensors, weights)
+        weights.chmod(0o644)  # safetensors makes files that only their owner can read
         with open(weights, "rb") as file:
             os.fsync(file.fileno())
         digest = _sha256(weights)

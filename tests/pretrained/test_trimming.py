@@ -47,6 +47,11 @@ def test_prototypes_projector_and_actor_stay_and_what_only_training_reads_goes(
     assert not trimmed.rest
 
 
+def test_whoever_may_read_the_directory_may_read_what_is_in_it(prototypical: Path, tmp_path: Path) -> None:
+    path = trim_pretrained(load_pretrained(prototypical), tmp_path / "trimmed")
+    assert {file.stat().st_mode & 0o777 for file in path.iterdir()} == {0o644}
+
+
 def test_a_queue_stays_with_its_prototypes(prototypical: Path, tmp_path: Path) -> None:
     whole = load_pretrained(prototypical)
     whole.queue = torch.randn(16, 4)
