@@ -22,7 +22,11 @@ from crptpro.experiments.catalogue import EXPERIMENTS
 from crptpro.experiments.goals import METHODS
 from crptpro.experiments.store import Store
 
-pytestmark = [pytest.mark.gl, pytest.mark.slow, pytest.mark.timeout(2_400)]  # some 10 min on an idle core
+pytestmark = [
+    pytest.mark.gl,
+    pytest.mark.slow,
+    pytest.mark.timeout(2_400),
+]  # 20 min were too few on half a machine
 
 PENDULUM = ("--tasks", "pendulum_swingup")
 GROUP_D = ("--groups", "D", *PENDULUM)

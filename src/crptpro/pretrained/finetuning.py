@@ -64,24 +64,23 @@ def rebuild_loss(pretrained: Pretrained) -> LossModule:
 
     Raises:
         PretrainedError: if its method is not registered, or does not take the stored networks, or if it is a snapshot
-            without all of them.
+            or a trimmed one, without all of them.
     """
     pretrained = copy.deepcopy(pretrained)  # training must not move the networks somebody else holds
     card = pretrained.card
-    if card.get(IS_SNAPSHOT):
+    if card.get(IS_SNAPSHOT) or TRIMMED_FROM in card:
+        was, whole = (
+            ("trimmed to what learning a task reads", "it comes from")
+            if TRIMMED_FROM in card
+            else ("kept along a training, to be read", "that the run ended with")
+        )
         raise PretrainedError(
-            "The artifact was kept along a training, to be read: it lacks the networks that training goes on with. "
-            "Take the one that the run ended with."
+            f"The artifact was {was}: it lacks the networks that training goes on with. Take the one {whole}."
         )
     if pretrained.method not in methods(presets=True):
         raise PretrainedError(
             f"The artifact was trained with {pretrained.method!r}, which is no registered method. Call "
             "crptpro.objectives.register_method for its loss first."
-        )
-    if TRIMMED_FROM in card:
-        raise PretrainedError(
-            "The artifact was trimmed to what learning a task reads: it lacks the networks that training goes on with. "
-            "Take the one it comes from."
         )
     method = get_method(pretrained.method)
     networks = {

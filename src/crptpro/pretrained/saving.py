@@ -96,15 +96,6 @@ def save_pretrained(
         **provenance(),
         **(extra_card or {}),
     }
-    return write_pretrained(path, states, card)
-
-
-def write_pretrained(path: Path, states: Mapping[str, Mapping[str, Tensor]], card: Mapping[str, Any]) -> Path:
-    """Write the tensors of an artifact's parts and its card as they are.
-
-    Raises:
-        DiskSpaceError: if the disk is full; an artifact there is kept.
-    """
     try:
         return write_artifact(path, states, card=card, format_name=FORMAT, version=VERSION)
     except (OSError, SafetensorError) as reason:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torch import Tensor
-
 from crptpro.artifact import TRIMMED_FROM
 from crptpro.errors import PretrainedError
-from crptpro.pretrained.bundle import ACTOR, QUEUE, Pretrained
-from crptpro.pretrained.saving import refuse_foreign, write_pretrained
+from crptpro.pretrained.bundle import Pretrained
+from crptpro.pretrained.saving import save_pretrained
 
 
 def trim_pretrained(pretrained: Pretrained, path: str | Path) -> Path:
@@ -20,7 +18,8 @@ def trim_pretrained(pretrained: Pretrained, path: str | Path) -> Path:
     Kept are the encoder, the actor if there is one, and, of an artifact with prototypes, projector, prototypes and
     queue, which its bonus reads. Left out are predictor, slow copies and further heads, and the projector where there
     are no prototypes: an encoder of BeCL then takes 0.1 MB instead of 165. Learning a task from it gives the same
-    numbers, and records name it as the artifact that it comes from.
+    numbers, and records name it as the artifact that it comes from; fine-tuning from it is refused, and the state probe
+    of an artifact without projector has no rows of z.
 
     Args:
         pretrained: the artifact, as loaded.
@@ -37,16 +36,16 @@ def trim_pretrained(pretrained: Pretrained, path: str | Path) -> Path:
         raise PretrainedError(
             "Only an artifact that was read from disk can be trimmed; save_pretrained it, load_pretrained it."
         )
-    path = Path(path)
-    refuse_foreign(path)
-    roles = ["encoder"]
-    if pretrained.prototypes is not None and pretrained.projector is not None:
-        roles += ["projector", "prototypes"]
-    if pretrained.actor is not None:
-        roles.append(ACTOR)
-    states: dict[str, Mapping[str, Tensor]] = {role: getattr(pretrained, role).state_dict() for role in roles}
-    described: dict[str, Any] = {role: pretrained.card["modules"][role] for role in roles}
-    if pretrained.queue is not None and "prototypes" in roles:
-        states[QUEUE] = {"latents": pretrained.queue}
-    card = {**pretrained.card, "modules": described, TRIMMED_FROM: pretrained.identity()}
-    return write_pretrained(path, states, card)
+    left_out: dict[str, Any] = {
+        "predictor": None,
+        "target_encoder": None,
+        "target_projector": None,
+        "rest": {},
+    }
+    if pretrained.prototypes is None or pretrained.projector is None:
+        left_out |= {"projector": None, "prototypes": None, "queue": None}
+    # Who made it, when and on what stays as it was: trimming makes nothing new.
+    facts = {key: value for key, value in pretrained.card.items() if key != "modules"}
+    return save_pretrained(
+        replace(pretrained, **left_out), path, extra_card={**facts, TRIMMED_FROM: pretrained.identity()}
+    )
