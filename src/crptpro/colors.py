@@ -9,3 +9,8 @@ from typing import Literal, get_args
 Colors = Literal["normal", "reversed_background", "reversed_image"]
 
 COLORS: tuple[str, ...] = get_args(Colors)
+
+
+def is_drawn(stored: Colors, wanted: Colors) -> bool:
+    """Whether a picture in the wanted colours must be drawn: it cannot be made of the stored one."""
+    return stored != wanted and {stored, wanted} != {"normal", "reversed_image"}

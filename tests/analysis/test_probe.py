@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from toy_world import collection_request, random_episode
 
-from crptpro.analysis.probe import ProbeSamples, probe, probe_embeddings, probe_samples
+from crptpro.analysis.probe import ProbeSamples, probe, probe_embeddings, probe_frame_rows, probe_samples
 from crptpro.data import Episode, FrameDataset
 from crptpro.data.collection import DomainCollection
 from crptpro.errors import DatasetError
@@ -70,6 +70,14 @@ def test_no_episode_is_in_two_parts_and_every_sample_is_in_one(dataset: FrameDat
     episodes = [set(marks[part].tolist()) for part in parts]
     assert len(episodes[0] | episodes[1] | episodes[2]) == sum(map(len, episodes))
     assert len(episodes[2]) == 3
+
+
+def test_the_frames_that_samples_read_are_known_beforehand(dataset: FrameDataset) -> None:
+    samples = probe_samples(dataset, samples=50, seed=1)
+    rows = probe_frame_rows(dataset, samples=50, seed=1)
+    read = samples.pixels.reshape(-1, 3, SIZE, SIZE).unique(dim=0)
+    assert dataset.frames_at(rows).unique(dim=0).equal(read)
+    assert rows.diff().min() > 0
 
 
 def test_states_belong_to_the_newest_frame_of_their_stack(dataset: FrameDataset) -> None:

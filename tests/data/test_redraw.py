@@ -10,6 +10,7 @@ from toy_world import FIXED, collection_request, run_in_order
 from crptpro.data import FrameDataset
 from crptpro.data.collect_worker import EpisodeRoller
 from crptpro.data.collection import DomainCollection
+from crptpro.data.drawn_frames import DrawnFrames
 from crptpro.data.redraw import redraw
 from crptpro.domains import Domain, get_domain
 from crptpro.envs import make_env
@@ -94,3 +95,19 @@ def test_worlds_without_a_known_background_say_so(tmp_path, monkeypatch):
     dataset = collect_here(FIXED, tmp_path, 5)
     with pytest.raises(DatasetError, match="dm_control"):
         redraw(dataset, torch.arange(3), colors="reversed_background")
+
+
+@pytest.mark.gl
+def test_frames_that_were_drawn_before_are_read_and_only_the_others_drawn(tmp_path):
+    dataset, colors = collect_here("cartpole", tmp_path / "data", 12), "reversed_background"
+    rows = torch.tensor([14, 0, 7, 5, 7])
+    expected = redraw(dataset, rows, colors=colors)
+    marked = torch.full_like(expected[:2], 9)  # no drawing looks like this
+    drawn = DrawnFrames("cartpole", colors, torch.tensor([5, 7]), marked)
+    found = redraw(dataset, rows, colors=colors, drawn=drawn)
+    assert found[:2].equal(expected[:2])
+    assert (found[2:] == 9).all()
+    assert redraw(dataset, rows, colors="normal", drawn=drawn).equal(dataset.frames_at(rows))
+    other = DrawnFrames("walker", colors, drawn.rows, drawn.frames)
+    with pytest.raises(DatasetError, match="walker in reversed_background were given for cartpole"):
+        redraw(dataset, rows, colors=colors, drawn=other)

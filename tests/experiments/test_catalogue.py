@@ -50,8 +50,8 @@ AT_PAPER_SCALE = {
     "stability": (3, 0, 0, 3, 3),
     # Groups B and C share manipulation.
     "visualize": (2, 0, 2, 4, 5),
-    # 8 encoders x 5 domains x 2 colours.
-    "probe": (80, 0, 80, 8, 5),
+    # 8 encoders x 5 domains x 2 colours; the reversed ones of each domain are drawn once.
+    "probe": (80, 0, 80 + 5, 8, 5),
 }
 
 

@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 
 from crptpro.cards import read_json
-from crptpro.data import StoredReplay
+from crptpro.data import FrameDataset, StoredReplay
 from crptpro.errors import RecordError
 from crptpro.experiments.budgets import budget
 from crptpro.experiments.building import JobSettings, build
@@ -36,6 +36,7 @@ from crptpro.experiments.pieces import (
 )
 from crptpro.experiments.plan import make_plan
 from crptpro.experiments.probing import COLUMNS as PROBE_COLUMNS
+from crptpro.experiments.probing import probe_rows
 from crptpro.experiments.row_files import read_rows
 from crptpro.experiments.scales import TINY
 from crptpro.experiments.store import Store
@@ -250,6 +251,42 @@ def test_the_state_probe_of_an_encoder_in_both_colours(store: Store, colors: str
     assert {row["embedding"] for row in rows} == {"features", "z"}
     assert {"r2_position", "r2_velocity", "effective_rank", "mean_cosine"} == {row["measure"] for row in rows}
     assert {row["samples"] for row in rows} == {"60"}
+
+
+def test_other_colours_are_drawn_once_for_all_encoders(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = ProbePiece(trained(), DATA[0], colors="reversed_background", samples=TINY.probe_samples)
+    second = replace(first, encoder=UntrainedPiece("random-encoder", 0))
+    drawn, dataset = first.redrawn, store.dataset(DATA[0])
+    make(first, store)
+    assert drawn is not None
+    assert store.is_done(drawn)
+
+    def refuse(*args: object, **kwargs: object) -> None:
+        raise AssertionError("it was drawn again")
+
+    monkeypatch.setattr("crptpro.data.redraw._draw", refuse)
+    shared = read_rows(make(second, store) / "probe.csv")
+    monkeypatch.undo()
+    alone = probe_rows(
+        load_pretrained(store.encoder(second.encoder)),
+        FrameDataset.open(dataset),
+        encoder=second.encoder.key,
+        colors="reversed_background",
+        samples=TINY.probe_samples,
+    )
+    assert [row["value"] for row in shared] == [str(row["value"]) for row in alone.measures]
+
+
+def test_pictures_that_were_removed_are_drawn_again_for_a_new_probe(store: Store) -> None:
+    piece = ProbePiece(trained(), DATA[0], colors="reversed_background", samples=40)
+    make(piece, store)
+    assert piece.redrawn is not None
+    (store.redrawn(piece.redrawn) / "weights.safetensors").unlink()
+    assert make_plan([piece], store).missing == ()  # its records are all that is asked for
+    other = replace(piece, encoder=UntrainedPiece("random-encoder", 0))
+    assert piece.redrawn in make_plan([other], store).missing
+    make(other, store)
+    assert store.is_done(piece.redrawn)
 
 
 def test_a_domain_that_the_encoder_never_saw_is_probed_as_unseen(store: Store) -> None:

@@ -103,6 +103,22 @@ def test_a_piece_needs_the_pieces_in_its_fields() -> None:
     )
 
 
+def test_probes_in_other_colours_share_what_has_to_be_drawn() -> None:
+    control = UntrainedPiece("random-encoder", 0)
+    probes = [ProbePiece(piece, WALKER, colors="reversed_background") for piece in (control, ENCODER)]
+    drawn = probes[0].redrawn
+    assert drawn is not None
+    assert probes[0].needs == (control, WALKER, drawn)
+    assert probes[1].needs == (ENCODER, WALKER, drawn)
+    assert drawn.needs == (WALKER,)
+    assert "colors" in drawn.to_json()
+    more = replace(probes[0], samples=4_000)
+    assert more.redrawn != drawn
+    # Whole images are reversed without a simulator.
+    assert replace(probes[0], colors="reversed_image").redrawn is None
+    assert replace(probes[0], dataset=replace(WALKER, colors="reversed_background")).redrawn is None
+
+
 def test_an_encoder_knows_the_domains_of_its_last_training() -> None:
     cheetah = replace(WALKER, domain="cheetah")
     both = replace(ENCODER, datasets=(cheetah, WALKER))

@@ -11,6 +11,7 @@ from crptpro.analysis.coordinates import Joint, joints_of, position_coordinates,
 from crptpro.analysis.ridge import effective_rank, fit_ridge, standardized_gram
 from crptpro.colors import Colors
 from crptpro.data import FrameDataset
+from crptpro.data.drawn_frames import DrawnFrames
 from crptpro.data.frame_stacks import stack_rows
 from crptpro.data.redraw import redraw
 from crptpro.errors import DatasetError
@@ -88,6 +89,7 @@ def probe_samples(
     colors: Colors | None = None,
     frame_stack: int | None = None,
     joints: tuple[Joint, ...] | None = None,
+    drawn: DrawnFrames | None = None,
 ) -> ProbeSamples:
     """Draw observations and states of a dataset, and divide its episodes.
 
@@ -102,13 +104,14 @@ def probe_samples(
         frame_stack: Frames per observation; the dataset's if ``None``.
         joints: What ``qpos`` and ``qvel`` are, see :func:`~crptpro.analysis.coordinates.joints_of`, which is asked
             if ``None``.
+        drawn: Frames in other colours that were drawn before, see :func:`probe_frame_rows`.
 
     Raises:
         DatasetError: if there is no physical state, or episodes or samples are too few to split.
     """
-    generator = torch.Generator().manual_seed(derive_seed(seed, "probe", dataset.domain))
     transitions = dataset.transitions
-    chosen = torch.randperm(len(transitions), generator=generator)[:samples].sort().values
+    generator = _generator(dataset, seed)
+    chosen = _choose(dataset, samples, generator)
     row, step, episode = (transitions.get(name)[chosen] for name in ("row", "step", "episode"))
     state = dataset.physics_at(row)
     episodes = episode.unique()
@@ -128,11 +131,29 @@ def probe_samples(
     velocity_names, velocities = velocity_coordinates(state["qvel"], joints)
     rows = stack_rows(row, step, frame_stack or dataset.frame_stack)
     own = dataset.card.get("colors", "normal")
-    frames = redraw(dataset, rows.reshape(-1), colors=own if colors is None else colors)
+    frames = redraw(dataset, rows.reshape(-1), colors=own if colors is None else colors, drawn=drawn)
     pixels = frames.reshape(len(rows), -1, *frames.shape[-2:])
     return ProbeSamples(
         pixels, positions, velocities, position_names, velocity_names, train, validation, test, held_out
     )
+
+
+def probe_frame_rows(
+    dataset: FrameDataset, *, samples: int = 2_000, seed: int = 0, frame_stack: int | None = None
+) -> Tensor:
+    """Return the frame rows, int64 ``[N]`` and ascending, that :func:`probe_samples` reads with the same arguments."""
+    chosen = _choose(dataset, samples, _generator(dataset, seed))
+    row, step = (dataset.transitions.get(name)[chosen] for name in ("row", "step"))
+    return stack_rows(row, step, frame_stack or dataset.frame_stack).unique()
+
+
+def _generator(dataset: FrameDataset, seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(derive_seed(seed, "probe", dataset.domain))
+
+
+def _choose(dataset: FrameDataset, samples: int, generator: torch.Generator) -> Tensor:
+    """Draw transitions without replacement, ascending."""
+    return torch.randperm(len(dataset.transitions), generator=generator)[:samples].sort().values
 
 
 @torch.no_grad()

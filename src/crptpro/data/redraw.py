@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from crptpro.colors import Colors
+from crptpro.colors import Colors, is_drawn
 from crptpro.data.dataset import FrameDataset
+from crptpro.data.drawn_frames import DrawnFrames
 from crptpro.domains import get_domain
 from crptpro.errors import DatasetError
 from crptpro.seeding import derive_seed
@@ -24,7 +25,9 @@ TOLERANCE = 1.0
 """Mean difference, grey levels, that another GL renderer may cause (measured: none on the same machine)."""
 
 
-def redraw(dataset: FrameDataset, rows: Tensor, *, colors: Colors) -> Tensor:
+def redraw(
+    dataset: FrameDataset, rows: Tensor, *, colors: Colors, drawn: DrawnFrames | None = None
+) -> Tensor:
     """Return frames of a dataset as its world would have been drawn in other colours.
 
     Frames in the dataset's own colours are read. Whole images are reversed by reversing them. Everything else is drawn
@@ -36,23 +39,40 @@ def redraw(dataset: FrameDataset, rows: Tensor, *, colors: Colors) -> Tensor:
         dataset: Made by :func:`~crptpro.data.collect_random`.
         rows: int64 ``[N]``, frame rows.
         colors: As of :func:`crptpro.envs.make_env`.
+        drawn: Frames of this dataset that were drawn before; only those that are not among them are drawn.
 
     Returns:
         uint8 ``[N, C, H, W]``.
 
     Raises:
-        DatasetError: if the dataset has no physical state, is not of dm_control, or its own frames come out different.
+        DatasetError: if the dataset has no physical state, is not of dm_control, or its own frames come out different;
+            if frames that were drawn before are of another domain or of other colours.
     """
     stored = dataset.card.get("colors", "normal")
-    if colors == stored:
-        return dataset.frames_at(rows)
-    if {colors, stored} == {"normal", "reversed_image"}:
-        return swap_colors(dataset.frames_at(rows))
+    if not is_drawn(stored, colors):
+        frames = dataset.frames_at(rows)
+        return frames if colors == stored else swap_colors(frames)
     wanted, where = rows.unique(return_inverse=True)
-    groups = _by_episode(dataset, wanted)
+    if drawn is None:
+        return _redrawn(dataset, wanted, stored, colors)[where]
+    if (drawn.domain, drawn.colors) != (dataset.domain, colors):
+        raise DatasetError(
+            f"Frames of {drawn.domain} in {drawn.colors} were given for {dataset.domain} in {colors}."
+        )
+    known = drawn.have(wanted)
+    frames = torch.empty(len(wanted), *drawn.frames.shape[1:], dtype=drawn.frames.dtype)
+    frames[known] = drawn.at(wanted[known])
+    if not known.all():
+        frames[~known] = _redrawn(dataset, wanted[~known], stored, colors)
+    return frames[where]
+
+
+def _redrawn(dataset: FrameDataset, rows: Tensor, stored: Colors, colors: Colors) -> Tensor:
+    """Draw sorted rows, after a proof that the stored state draws the dataset's own frames."""
+    groups = _by_episode(dataset, rows)
     proofs = {episode: own[[0, -1]].unique() for episode, own in list(groups.items())[:PROOFS]}
     _compare(dataset, torch.cat(list(proofs.values())), _draw(dataset, proofs, stored))
-    return _draw(dataset, groups, colors)[where]
+    return _draw(dataset, groups, colors)
 
 
 def _by_episode(dataset: FrameDataset, rows: Tensor) -> dict[int, Tensor]:

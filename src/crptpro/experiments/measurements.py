@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from crptpro.colors import Colors
+from crptpro.colors import Colors, is_drawn
 from crptpro.experiments.pieces import DatasetPiece, EncoderPiece, ExploredPiece, Piece
 
 
@@ -55,6 +55,31 @@ class TimingPiece(Piece):
 
 
 @dataclass(frozen=True)
+class RedrawnPiece(Piece):
+    """What probes of a dataset read, drawn in other colours once for all encoders, in ``<piece>/frames``.
+
+    Args:
+        dataset: with the states.
+        colors: in which they are drawn.
+        samples: of the probes.
+        seed: of their draw.
+        frame_stack: frames per observation.
+    """
+
+    kind = "redrawn"
+    dataset: DatasetPiece
+    colors: Colors
+    samples: int
+    seed: int
+    frame_stack: int = 3
+
+    @property
+    def title(self) -> str:
+        """Domain and colours."""
+        return f"{self.dataset.domain} {self.colors} seed {self.dataset.seed}"
+
+
+@dataclass(frozen=True)
 class ProbePiece(Piece):
     """The state probe of one encoder on one domain, as ``probe.csv``.
 
@@ -81,6 +106,19 @@ class ProbePiece(Piece):
         colors = "" if self.colors == "normal" else f" {self.colors}"
         when = "" if self.at_updates is None else f" at {self.at_updates}"
         return f"{self.encoder.method} seed {self.encoder.seed}{when} on {self.dataset.domain}{colors}"
+
+    @property
+    def needs(self) -> tuple[Piece, ...]:
+        """Encoder and dataset, and the pictures if other colours have to be drawn."""
+        drawn = () if self.redrawn is None else (self.redrawn,)
+        return (self.encoder, self.dataset, *drawn)
+
+    @property
+    def redrawn(self) -> RedrawnPiece | None:
+        """The pictures in other colours; ``None`` where those of the dataset serve."""
+        if not is_drawn(self.dataset.colors, self.colors):
+            return None
+        return RedrawnPiece(self.dataset, self.colors, self.samples, self.seed)
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,11 @@ from torch import Tensor
 
 from crptpro.analysis.coverage import coverage
 from crptpro.analysis.embeddings import embed_pixels, principal_components, sample_pixels
+from crptpro.analysis.probe import probe_frame_rows
 from crptpro.cards import write_json
 from crptpro.data import FrameDataset, StoredReplay
+from crptpro.data.drawn_frames import DrawnFrames
+from crptpro.data.redraw import redraw
 from crptpro.errors import RecordError
 from crptpro.experiments import probing, timing
 from crptpro.experiments.building import JobSettings, register
@@ -20,6 +23,7 @@ from crptpro.experiments.measurements import (
     EmbeddingsPiece,
     ProbePiece,
     PrototypesPiece,
+    RedrawnPiece,
     TimingPiece,
 )
 from crptpro.experiments.pieces import EncoderPiece, ExploredPiece
@@ -54,6 +58,14 @@ def _(piece: TimingPiece, store: Store, job: JobSettings) -> None:
 
 
 @register
+def _(piece: RedrawnPiece, store: Store, job: JobSettings) -> None:
+    dataset = FrameDataset.open(store.dataset(piece.dataset))
+    rows = probe_frame_rows(dataset, samples=piece.samples, seed=piece.seed, frame_stack=piece.frame_stack)
+    frames = redraw(dataset, rows, colors=piece.colors)
+    DrawnFrames(dataset.domain, piece.colors, rows, frames).save(store.redrawn(piece))
+
+
+@register
 def _(piece: ProbePiece, store: Store, job: JobSettings) -> None:
     found = probing.probe_rows(
         _load(piece.encoder, store, job, piece.at_updates),
@@ -62,6 +74,7 @@ def _(piece: ProbePiece, store: Store, job: JobSettings) -> None:
         colors=piece.colors,
         samples=piece.samples,
         seed=piece.seed,
+        drawn=None if piece.redrawn is None else DrawnFrames.load(store.redrawn(piece.redrawn)),
     )
     write_rows(store.path(piece) / "probe.csv", probing.COLUMNS, found.measures)
 

@@ -15,7 +15,7 @@ import torch
 from crptpro.data.layout import estimate_bytes
 from crptpro.domains import get_domain
 from crptpro.experiments.budgets import exploration_config, exploration_plan, run_config
-from crptpro.experiments.measurements import TimingPiece
+from crptpro.experiments.measurements import RedrawnPiece, TimingPiece
 from crptpro.experiments.pieces import (
     DatasetPiece,
     EncoderPiece,
@@ -94,6 +94,20 @@ def _(piece: DatasetPiece) -> float:
 @register_stored
 def _(piece: DatasetPiece) -> int:
     return estimate_bytes(piece.transitions, IMAGE_SIZE, None)
+
+
+@register_seconds
+def _(piece: RedrawnPiece) -> float:
+    return START_S + _redrawn_frames(piece) * DECISION_S.get(piece.dataset.domain, USUAL_DECISION_S)
+
+
+@register_stored
+def _(piece: RedrawnPiece) -> int:
+    return OTHER_BYTES + _redrawn_frames(piece) * FRAME_BYTES
+
+
+def _redrawn_frames(piece: RedrawnPiece) -> int:
+    return min(piece.frame_stack * piece.samples, piece.dataset.transitions)
 
 
 # --- encoders -----------------------------------------------------------------------------------------------------

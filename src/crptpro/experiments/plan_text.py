@@ -17,6 +17,7 @@ KIND_NAMES = {
     "explored": "encoders trained by exploring",
     "finetuned": "encoders fine-tuned",
     "run": "downstream runs",
+    "redrawn": "observations in other colours",
     "probe": "state probes",
     "timing": "timings, alone on the machine",
     "prototypes": "prototype measurements",

@@ -10,6 +10,7 @@ from crptpro.analysis.coordinates import joints_of
 from crptpro.analysis.probe import ProbeResult, probe, probe_samples
 from crptpro.colors import Colors
 from crptpro.data import FrameDataset
+from crptpro.data.drawn_frames import DrawnFrames
 from crptpro.pretrained import Pretrained
 
 logger = logging.getLogger(__name__)
@@ -41,6 +42,7 @@ def probe_rows(
     colors: Colors = "normal",
     samples: int = 2_000,
     seed: int = 0,
+    drawn: DrawnFrames | None = None,
 ) -> ProbeRows:
     """Probe an encoder on a dataset in some colours.
 
@@ -51,18 +53,20 @@ def probe_rows(
         colors: in which the observations are drawn, whatever the dataset's own.
         samples: drawn from the dataset.
         seed: of the draw.
+        drawn: frames of the dataset in these colours that were drawn before.
 
     Raises:
         DatasetError: if there is no physical state, or too little data to split.
     """
     logger.info("%s, %s: %s samples", dataset.domain, colors, f"{samples:,}")
-    drawn = probe_samples(
+    observed = probe_samples(
         dataset,
         samples=samples,
         seed=seed,
         colors=colors,
         joints=joints_of(dataset.card["task"]),
         frame_stack=pretrained.encoder.in_channels // 3,
+        drawn=drawn,
     )
     about = {
         "encoder": encoder,
@@ -71,9 +75,9 @@ def probe_rows(
         "seen": "yes" if dataset.domain in domains_seen(pretrained) else "no",
         "colors": colors,
     }
-    counts = {"samples": len(drawn.pixels), "held_out_episodes": drawn.held_out_episodes, "seed": seed}
+    counts = {"samples": len(observed.pixels), "held_out_episodes": observed.held_out_episodes, "seed": seed}
     found = ProbeRows([], [])
-    for embedding, result in probe(drawn, pretrained.encoder, pretrained.projector).items():
+    for embedding, result in probe(observed, pretrained.encoder, pretrained.projector).items():
         named = {**about, "embedding": embedding}
         found.table.append(_table_row(named, result))
         found.measures.extend({**named, **measure, **counts} for measure in _measures(result))

@@ -6,11 +6,11 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-import crptpro.experiments.measurements  # noqa: F401 - makes its kinds of pieces known
 from crptpro.artifact import WEIGHTS_FILE
 from crptpro.cards import read_json, write_json
 from crptpro.data.layout import PIXELS_FILE
 from crptpro.errors import RecordError
+from crptpro.experiments.measurements import RedrawnPiece
 from crptpro.experiments.pieces import (
     DatasetPiece,
     EncoderPiece,
@@ -69,6 +69,8 @@ class Store:
     def _output_directories(self, piece: Piece) -> list[Path]:
         if isinstance(piece, DatasetPiece):
             return [self.dataset(piece)]
+        if isinstance(piece, RedrawnPiece):
+            return [self.redrawn(piece)]
         if not isinstance(piece, EncoderPiece):
             return []
         snapshots = piece.snapshots if isinstance(piece, PretrainedPiece) else ()
@@ -83,6 +85,10 @@ class Store:
         from crptpro.data.incoming import dataset_path
 
         return dataset_path(self.path(piece), piece.domain)
+
+    def redrawn(self, piece: RedrawnPiece) -> Path:
+        """Directory of the pictures of a dataset in other colours."""
+        return self.path(piece) / "frames"
 
     def encoder(self, piece: EncoderPiece, at_updates: int | None = None) -> Path:
         """Directory of an encoder's artifact, or of one of its snapshots."""
