@@ -11,8 +11,10 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
+from crptpro.objectives.out_keys import OutKeys
 
-class PretrainingLoss(LossModule):
+
+class PretrainingLoss(OutKeys, LossModule):
     """A self-supervised loss on pairs of consecutive observations.
 
     A subclass converts its networks with ``convert_to_functional``, lists their names in ``network_names``,
@@ -38,15 +40,11 @@ class PretrainingLoss(LossModule):
     network_names: ClassVar[tuple[str, ...]] = ()
     """Names given to ``convert_to_functional``, in the order of re-initialisation."""
 
-    default_out_keys: ClassVar[tuple[str, ...]] = ()
-    """Entries that ``forward`` returns."""
-
     method_name: str | None = None
     """Registered method or preset that built this loss, if it was built by name."""
 
     def __init__(self, *, reduction: str | None = None) -> None:
         self._in_keys: list[NestedKey] | None = None
-        self._out_keys: list[NestedKey] | None = None
         super().__init__()
         reduction = "mean" if reduction is None else reduction
         if reduction not in ("none", "mean", "sum"):
@@ -63,17 +61,6 @@ class PretrainingLoss(LossModule):
     @in_keys.setter
     def in_keys(self, values: list[NestedKey]) -> None:
         self._in_keys = values
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """Entries that ``forward`` returns."""
-        if self._out_keys is None:
-            self._out_keys = list(self.default_out_keys)
-        return self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, values: list[NestedKey]) -> None:
-        self._out_keys = values
 
     @property
     def views(self) -> dict[NestedKey, NestedKey]:

@@ -18,9 +18,10 @@ from crptpro.modules.actor_critic import standard_normal_like
 from crptpro.modules.distributions import SquashedGaussian
 from crptpro.objectives.base import valid_rows
 from crptpro.objectives.masked_rows import mean_of_rows, without_masked_values
+from crptpro.objectives.out_keys import OutKeys
 
 
-class RADSACLoss(SACLoss):
+class RADSACLoss(OutKeys, SACLoss):
     r"""RAD-SAC of CRPTpro (liuxin0824/CRPTpro and denisyarats/proto, ``proto.py``) on TorchRL's ``SACLoss``.
 
     With :math:`h, h'` the features of an observation and the next, :math:`a' \sim \pi(h')`:
@@ -90,8 +91,6 @@ class RADSACLoss(SACLoss):
     view_names: ClassVar[tuple[str, ...]] = ("observation",)
     """Configurable keys of the views of an observation."""
 
-    _out_keys: list[NestedKey] | None
-
     default_out_keys = (
         "loss_actor",
         "loss_qvalue",
@@ -145,17 +144,6 @@ class RADSACLoss(SACLoss):
         self.generator = generator
         self.set_keys(observation=observation)
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """Entries that ``forward`` returns."""
-        if self._out_keys is None:
-            self._out_keys = list(self.default_out_keys)
-        return self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, values: list[NestedKey]) -> None:
-        self._out_keys = values
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -16,9 +16,10 @@ from crptpro.modules import DeterministicActor, TwinCritic
 from crptpro.modules.deterministic_actor import with_skill
 from crptpro.objectives.base import valid_rows
 from crptpro.objectives.masked_rows import mean_of_rows, without_masked_values
+from crptpro.objectives.out_keys import OutKeys
 
 
-class SkillDDPGLoss(LossModule):
+class SkillDDPGLoss(OutKeys, LossModule):
     r"""DDPG of the unsupervised RL benchmark (rll-research/url_benchmark ``agent/ddpg.py``; BeCL's own agent).
 
     With :math:`s = [h, z]` the features of an observation and its skill, :math:`s^+ = [h^+, z]` n steps later:
@@ -109,7 +110,6 @@ class SkillDDPGLoss(LossModule):
                 f"and skill); build the critic with feature_dim={inputs}."
             )
         self._in_keys: list[NestedKey] | None = None
-        self._out_keys: list[NestedKey] | None = None
         super().__init__()
         self.noise_clip = noise_clip
         self.generator = generator
@@ -134,17 +134,6 @@ class SkillDDPGLoss(LossModule):
     @in_keys.setter
     def in_keys(self, values: list[NestedKey]) -> None:
         self._in_keys = values
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """Entries that ``forward`` returns."""
-        if self._out_keys is None:
-            self._out_keys = list(self.default_out_keys)
-        return self._out_keys
-
-    @out_keys.setter
-    def out_keys(self, values: list[NestedKey]) -> None:
-        self._out_keys = values
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
