@@ -3,7 +3,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from crptpro.analysis.ridge import PENALTIES, effective_rank, fit_ridge, standardized_gram
+from crptpro.analysis.ridge import PENALTIES, effective_rank, fit_ridge, mean_cosine, standardized_gram
+from crptpro.objectives.metrics import mean_pairwise_cosine
 
 ROWS = torch.arange(240)
 TRAIN, VALIDATION, TEST = ROWS[:120], ROWS[120:160], ROWS[160:]
@@ -44,6 +45,33 @@ def test_a_penalty_is_chosen_for_each_target_by_what_was_not_fitted() -> None:
     assert set(fit.penalty.tolist()) <= set(PENALTIES)
     assert fit.penalty[0] < fit.penalty[1]
     assert fit.r2[0] > 0.2 > fit.r2[1]
+
+
+@pytest.mark.parametrize("train", [FITTED, torch.isin(ROWS, FITTED)])
+def test_inner_products_are_those_of_standardised_features(train: torch.Tensor) -> None:
+    features = 2 + torch.randn(240, 5_000).double() * torch.logspace(-1, 1, 5_000).double()
+    before = features.clone()
+    deviation = features[FITTED].std(0, correction=0)
+    scale = deviation + deviation.square().mean().sqrt()
+    x = (features - features[FITTED].mean(0)) / scale
+    gram = standardized_gram(features, train)
+    torch.testing.assert_close(gram, x @ x.T)
+    assert gram.equal(gram.T)
+    assert features.equal(before)
+    torch.testing.assert_close(standardized_gram(features.float(), train), x @ x.T, rtol=1e-5, atol=1e-3)
+
+
+def test_the_mean_cosine_is_that_of_all_pairs() -> None:
+    features = 0.3 + torch.randn(240, 5_000)
+    features[7] = 0
+    unit = torch.nn.functional.normalize(features.double(), dim=-1)
+    assert mean_cosine(features) == pytest.approx(float(mean_pairwise_cosine(unit)), abs=1e-9)
+    assert mean_cosine(features[:1]) == 0
+    assert mean_cosine(torch.ones(3, 2)) == pytest.approx(1, abs=1e-12)
+    before = unit.clone()
+    mean_cosine(unit)
+    effective_rank(unit)
+    assert unit.equal(before)
 
 
 def test_the_dual_form_is_ridge_regression() -> None:

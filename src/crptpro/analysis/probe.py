@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from crptpro.analysis.coordinates import Joint, joints_of, position_coordinates, velocity_coordinates
-from crptpro.analysis.ridge import effective_rank, fit_ridge, standardized_gram
+from crptpro.analysis.ridge import effective_rank, fit_ridge, mean_cosine, standardized_gram
 from crptpro.colors import Colors
 from crptpro.data import FrameDataset
 from crptpro.data.drawn_frames import DrawnFrames
@@ -16,7 +16,6 @@ from crptpro.data.frame_stacks import stack_rows
 from crptpro.data.redraw import redraw
 from crptpro.errors import DatasetError
 from crptpro.modules.placement import device_of
-from crptpro.objectives.metrics import mean_pairwise_cosine
 from crptpro.seeding import derive_seed
 
 HELD_OUT = 0.25
@@ -201,13 +200,12 @@ def probe_embeddings(samples: ProbeSamples, embeddings: Tensor) -> ProbeResult:
     varies = (spread > LEAST_SPREAD).nonzero().squeeze(-1)
     fit = fit_ridge(gram, targets[:, varies], samples.train, samples.validation, samples.test)
     scores = {names[index]: float(r2) for index, r2 in zip(varies.tolist(), fit.r2)}
-    unit = torch.nn.functional.normalize(embeddings, dim=-1)
     return ProbeResult(
         positions={name: r2 for (kind, name), r2 in scores.items() if kind == "position"},
         velocities={name: r2 for (kind, name), r2 in scores.items() if kind == "velocity"},
         left_out=tuple(f"{kind} {name}" for kind, name in names if (kind, name) not in scores),
         effective_rank=effective_rank(embeddings),
-        mean_cosine=float(mean_pairwise_cosine(unit.double())),
+        mean_cosine=mean_cosine(embeddings),
     )
 
 

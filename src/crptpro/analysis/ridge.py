@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -11,6 +12,9 @@ from torch import Tensor
 PENALTIES = tuple(10.0**power for power in range(-6, 3))
 
 _BLOCK = 4096
+"""Features that are taken to float64 at a time: all at once would take gigabytes."""
+_ROWS = 128
+"""Of a Gram matrix at a time; the fewer, the less is computed twice."""
 
 
 class RidgeFit(NamedTuple):
@@ -38,18 +42,31 @@ def standardized_gram(features: Tensor, train: Tensor) -> Tensor:
     Returns:
         float64 ``[N, N]``.
     """
-    gram = torch.zeros(len(features), len(features), dtype=torch.float64, device=features.device)
-    # All features in float64 at once would take gigabytes.
-    blocks = features.split(_BLOCK, dim=1)
-    deviations = [block[train].double().std(0, correction=0) for block in blocks]
+    moments = [torch.var_mean(block[train], 0, correction=0) for block in _blocks(features)]
+    deviations = [variance.sqrt() for variance, _ in moments]
     usual = torch.cat(deviations).square().mean().sqrt()
+    gram = torch.zeros(len(features), len(features), dtype=torch.float64, device=features.device)
     if not usual:
         return gram
-    for block, deviation in zip(blocks, deviations):
-        block = block.double()
-        block = (block - block[train].mean(0)) / (deviation + usual)
-        gram.addmm_(block, block.T)
-    return gram
+    for block, deviation, (_, mean) in zip(_blocks(features), deviations, moments):
+        _add_products(gram, block.sub_(mean).div_(deviation + usual))
+    return _mirrored(gram)
+
+
+def _blocks(features: Tensor) -> Iterator[Tensor]:
+    """Copies of some features at a time, in float64."""
+    for block in features.split(_BLOCK, dim=1):
+        yield block.to(torch.float64, copy=True)
+
+
+def _add_products(gram: Tensor, block: Tensor) -> None:
+    """Add the rows' inner products on and above the diagonal: those below are the same."""
+    for start in range(0, len(block), _ROWS):
+        gram[start : start + _ROWS, start:].addmm_(block[start : start + _ROWS], block[start:].T)
+
+
+def _mirrored(gram: Tensor) -> Tensor:
+    return gram.triu() + gram.triu(1).T
 
 
 def fit_ridge(gram: Tensor, targets: Tensor, train: Tensor, validation: Tensor, test: Tensor) -> RidgeFit:
@@ -107,14 +124,31 @@ def effective_rank(features: Tensor) -> float:
         >>> round(effective_rank(torch.tensor([[1.0, 0], [-1, 0], [0, 1], [0, -1]])), 6)
         2.0
     """
-    mean = features.mean(0, dtype=torch.float64)
     gram = torch.zeros(len(features), len(features), dtype=torch.float64, device=features.device)
-    for block, centre in zip(features.split(_BLOCK, dim=1), mean.split(_BLOCK)):
-        centred = block.double() - centre
-        gram.addmm_(centred, centred.T)
-    singular = torch.linalg.eigvalsh(gram).clamp(min=0).sqrt()
+    for block in _blocks(features):
+        _add_products(gram, block.sub_(block.mean(0)))
+    singular = torch.linalg.eigvalsh(_mirrored(gram)).clamp(min=0).sqrt()
     # Squaring has cost half of the digits: what is below is rounding.
     singular = singular[singular > 1e-7 * singular.max()]
     if not len(singular):
         return 0.0
     return float(torch.special.entr(singular / singular.sum()).sum().exp())
+
+
+def mean_cosine(features: Tensor) -> float:
+    """Return the mean cosine between different samples' features; 1 if all point the same way, 0 for one sample.
+
+    What :func:`crptpro.objectives.metrics.mean_pairwise_cosine` is, summed in float64 a few features at a time. A
+    sample whose features are all 0 has the cosine 0 with every other.
+
+    Args:
+        features: ``[N, D]``, any floating dtype.
+    """
+    if len(features) < 2:
+        return 0.0
+    squares = sum(
+        (block.square().sum(1) for block in _blocks(features)), features.new_zeros((), dtype=torch.float64)
+    )
+    scale = squares.sqrt().clamp(min=1e-12).reciprocal()
+    of_sum = sum((scale @ block).square().sum() for block in _blocks(features))
+    return float(of_sum - (scale.square() * squares).sum()) / (len(features) * (len(features) - 1))
