@@ -60,6 +60,21 @@ class Panel:
     ticks: Sequence[str] = ()
 
 
+@dataclass(frozen=True)
+class Dots:
+    """One system's mark in every row of a dot plot.
+
+    Args:
+        label: in the legend.
+        style: of the system.
+        values: one per row; ``None`` leaves a gap.
+    """
+
+    label: str
+    style: Style
+    values: Sequence[float | None]
+
+
 @contextlib.contextmanager
 def theme() -> Iterator[None]:
     """Draw and save with this report's look."""
@@ -142,6 +157,40 @@ def bars(groups: Sequence[str], series: Mapping[str, Sequence[float | None]], un
         axis.set(xlabel=unit)
         axis.margins(x=0.12)
         _legend(figure, dict(zip(series, axis.containers)))
+        return figure
+
+
+def dots(rows: Sequence[str], panels: Sequence[tuple[str, Sequence[Dots]]]) -> Any:
+    """Draw systems as marks on shared rows, a panel per quantity.
+
+    Args:
+        rows: names, from top to bottom.
+        panels: name of the quantity, with every system's marks.
+
+    Returns:
+        Matplotlib's figure.
+    """
+    # A row has room for its systems' marks, one below the other.
+    step = max(0.3, 0.075 * max((len(systems) for _, systems in panels), default=0))
+    with theme():
+        figure, axes = make_figure(
+            1, len(panels), width=7.4 / len(panels) + 1.4, height=0.7 + step * len(rows)
+        )
+        named: dict[str, Any] = {}
+        for place, (axis, (name, systems)) in enumerate(zip(axes[0], panels)):
+            for index, system in enumerate(systems):
+                # Equal values stand one below the other, in the order of the legend.
+                offset = 0.7 * ((index + 0.5) / len(systems) - 0.5)
+                drawn = axis.plot(
+                    [math.nan if value is None else value for value in system.values],
+                    [row + offset for row in range(len(rows))],
+                    system.style.marker, color=system.style.color, markersize=4.5, linestyle="none",
+                )  # fmt: skip
+                named.setdefault(system.label, drawn[0])
+            axis.set_yticks(range(len(rows)), rows if place == 0 else [""] * len(rows))
+            axis.set_ylim(len(rows) - 0.5, -0.5)
+            axis.set(xlabel=name)
+        _legend(figure, named)
         return figure
 
 

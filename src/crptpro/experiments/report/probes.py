@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Table, cells
+from crptpro.experiments.report import drawing
+from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Figure, Table, cells
 from crptpro.experiments.report.measurements import Row, rows_of
-from crptpro.experiments.report.palette import in_order
+from crptpro.experiments.report.palette import in_order, styles
 from crptpro.experiments.report.reading import Asked
 
 MEASURES = {
@@ -18,12 +19,22 @@ MEASURES = {
     "mean_cosine": ("Mean pairwise cosine", ".4f"),
 }
 """Measure of a probe's table to what it is and how it is printed."""
+DRAWN = ("r2_position", "r2_velocity")
+"""Measures that the figure shows side by side."""
+
+System = tuple[str, str]
+"""An encoder's label and the group that it was pre-trained for, empty for none."""
+Column = tuple[str, str]
+"""A domain and its colours."""
 
 
 def probes(asked: Asked) -> tuple[Block, ...]:
-    """Report state probes: one table per measure and embedding, a column per domain and colours."""
+    """Report state probes: one table per measure and embedding, a column per domain and colours, and a figure."""
     rows, blocks = rows_of(asked, "probe")
     means = [row for row in rows if not row["coordinate"]]
+    drawn = [row for row in means if row["embedding"] == "features" and row["measure"] in DRAWN]
+    if drawn:
+        blocks.append(_figure(f"{asked.name}-features", drawn))
     for embedding in dict.fromkeys(row["embedding"] for row in means):
         for measure in MEASURES:
             part = [row for row in means if (row["embedding"], row["measure"]) == (embedding, measure)]
@@ -32,31 +43,103 @@ def probes(asked: Asked) -> tuple[Block, ...]:
     return tuple(blocks)
 
 
+def _figure(name: str, rows: Sequence[Row]) -> Figure:
+    columns = _columns(rows)
+    systems = _systems(rows)
+    several = len({group for _, group in systems}) > 1
+    names = {system: ", ".join(system) if several and system[1] else system[0] for system in systems}
+    look = styles(names.values())
+    panels = []
+    for measure in DRAWN:
+        dots = [
+            drawing.Dots(
+                name,
+                look[name],
+                [_mean([r for r in rows if r["measure"] == measure], system, column) for column in columns],
+            )
+            for system, name in names.items()
+        ]
+        panels.append((MEASURES[measure][0], dots))
+    caption = (
+        "What a linear model reads from the features of the frozen encoder: R2 on held-out episodes, mean over "
+        f"coordinates and encoders ({_counted(_counts(rows, systems, columns))})."
+    )
+    return Figure(name, caption, drawing.dots([_heading(column) for column in columns], panels))
+
+
 def _table(rows: Sequence[Row], measure: str, embedding: str) -> Table:
     name, spec = MEASURES[measure]
-    columns = list(dict.fromkeys((row["domain"], row["colors"]) for row in sorted(rows, key=_order)))
-    groups = {(row.goal.label, str(row.goal.place.get("group", ""))) for row in rows}
-    labels = in_order(label for label, _ in sorted(groups))
-    lines = []
-    for label in labels:
-        for group in sorted(group for other, group in groups if other == label):
-            own = [r for r in rows if (r.goal.label, str(r.goal.place.get("group", ""))) == (label, group)]
-            lines.append(cells(label, group or ABSENT, *(_cell(own, column, spec) for column in columns)))
-    headings = [domain if colors == "normal" else f"{domain}, {colors}" for domain, colors in columns]
+    columns, systems = _columns(rows), _systems(rows)
+    counts = _counts(rows, systems, columns)
+    lines = [
+        cells(
+            label,
+            group or ABSENT,
+            *(_cell(_own(rows, (label, group), column), spec, len(counts) > 1) for column in columns),
+        )
+        for label, group in systems
+    ]
     what = "features of the frozen encoder" if embedding == "features" else f"embedding {embedding}"
-    caption = f"{name}, {what}: mean over encoders (n), and whether their pre-training saw the domain."
-    return Table(caption, ("encoder", "group", *headings), tuple(lines), labels=2)
+    caption = f"{name}, {what}: mean over encoders ({_counted(counts)}), and whether their pre-training saw the domain."
+    return Table(caption, ("encoder", "group", *map(_heading, columns)), tuple(lines), labels=2)
 
 
-def _cell(rows: Sequence[Row], column: tuple[str, str], spec: str) -> Cell:
-    own = [row for row in rows if (row["domain"], row["colors"]) == column]
-    values = [value for row in own if (value := row.number("value")) is not None]
+def _cell(own: Sequence[Row], spec: str, is_counted: bool) -> Cell:
+    values = _values(own)
     if not values:
         return Cell(ABSENT)
     spread = f" ± {np.std(values, ddof=1):{spec}}" if len(values) > 1 else ""
     seen = " or ".join(sorted({"seen" if row["seen"] == "yes" else "unseen" for row in own}))
-    return Cell(f"{np.mean(values):{spec}}{spread}", f"{seen}, n = {len(values)}")
+    count = f", n = {len(values)}" if is_counted else ""
+    return Cell(f"{np.mean(values):{spec}}{spread}", f"{seen}{count}")
 
 
-def _order(row: Row) -> tuple[bool, str]:
-    return row["colors"] != "normal", row["domain"]
+def _systems(rows: Sequence[Row]) -> list[System]:
+    """Return encoders' labels and groups, in the order of tables."""
+    found = {(row.goal.label, str(row.goal.place.get("group", ""))) for row in rows}
+    labels = in_order(label for label, _ in sorted(found))
+    return [(label, group) for label in labels for group in sorted(g for other, g in found if other == label)]
+
+
+def _columns(rows: Sequence[Row]) -> list[Column]:
+    """Return domains, each in its usual colours first."""
+    found = {(row["domain"], row["colors"]) for row in rows}
+    return sorted(found, key=lambda column: (column[0], column[1] != "normal", column[1]))
+
+
+def _heading(column: Column) -> str:
+    domain, colors = column
+    return domain if colors == "normal" else f"{domain}, {colors}"
+
+
+def _own(rows: Sequence[Row], system: System, column: Column) -> list[Row]:
+    return [
+        row
+        for row in rows
+        if (row["domain"], row["colors"]) == column
+        and (row.goal.label, str(row.goal.place.get("group", ""))) == system
+    ]
+
+
+def _values(rows: Sequence[Row]) -> list[float]:
+    return [value for row in rows if (value := row.number("value")) is not None]
+
+
+def _mean(rows: Sequence[Row], system: System, column: Column) -> float | None:
+    values = _values(_own(rows, system, column))
+    return float(np.mean(values)) if values else None
+
+
+def _counts(rows: Sequence[Row], systems: Sequence[System], columns: Sequence[Column]) -> set[int]:
+    """Return how many encoders cells stand on, each number once; rows of one measure count an encoder once."""
+    return {
+        len({row.goal.piece.key for row in own if row.number("value") is not None})
+        for system in systems
+        for column in columns
+        if (own := _own(rows, system, column))
+    }
+
+
+def _counted(counts: set[int]) -> str:
+    low, high = min(counts, default=0), max(counts, default=0)
+    return f"n = {low} each" if low == high else f"n = {low} to {high}"
