@@ -17,7 +17,7 @@ from crptpro.experiments.estimates import (
 from crptpro.experiments.intervals import Bootstrap, Estimate
 from crptpro.experiments.published import EXPERT_SCORES
 from crptpro.experiments.report import drawing
-from crptpro.experiments.report.blocks import Block, Cell, Figure, Paragraph, Table, cells
+from crptpro.experiments.report.blocks import Block, Cell, Figure, Paragraph, Table, cells, counted
 from crptpro.experiments.report.palette import styles
 from crptpro.experiments.report.runs import Placed, Spot, published, tables_of
 from crptpro.experiments.score_table import ScoreTable
@@ -29,7 +29,7 @@ REFERENCE = "crptpro"
 
 
 def aggregates(placed: Sequence[Placed], name: str, bootstrap: Bootstrap) -> list[Block]:
-    """Aggregate over the rows on which every method has runs.
+    """Aggregate over the tasks on which every method has runs.
 
     Args:
         placed: finished runs.
@@ -83,11 +83,12 @@ def _tables(tables: Mapping[str, ScoreTable], shared: Sequence[Spot], bootstrap:
                 _against_drq(table, tables[DRQ], bootstrap) if label != DRQ else Cell("1", "by definition")
             )
         rows.append(cells(*row))
-    columns = ["method", "rows", "runs", "mean score", *(_NORMALIZED if normalizable else ())]
+    columns = ["method", "tasks", "runs", "mean score", *(_NORMALIZED if normalizable else ())]
     columns += ["mean / DrQ here"] * bool(here)
     caption = (
-        f"Over the {len(shared)} row(s) that all methods share; {bootstrap.confidence:.0%} intervals over runs, {how}. "
-        "A run that stands in several rows counts once. Normalised scores are divided by the paper's DrQ."
+        f"Over the {counted(len(shared), 'task')} that all methods share; {bootstrap.confidence:.0%} intervals over "
+        f"runs, {how}. A task counts once per group and colours, a run of several once. Normalised scores are divided "
+        "by the paper's DrQ."
     )
     if here:
         caption += " DrQ here has few runs itself: they are redrawn with the others', so that the intervals know of it."
@@ -106,9 +107,9 @@ def _tables(tables: Mapping[str, ScoreTable], shared: Sequence[Spot], bootstrap:
     if fewest < ENOUGH_DRAWS:
         held = "; ".join(f"{count}: {share:.0%}" for count, share in COVERAGE.items())
         text = (
-            f"Rows have as few as {fewest} run(s), and bootstrap intervals of few draws are too narrow: one of two is "
-            "their range. Where runs follow a normal law, 95% intervals of a single row's mean hold the truth, by "
-            f"number of runs, {held}. The same holds for encoders."
+            f"Tasks have as few as {counted(fewest, 'run')}, and bootstrap intervals of few draws are too narrow: one "
+            "of two is their range. Where runs follow a normal law, 95% intervals of a single task's mean hold the "
+            f"truth, by number of runs, {held}. The same holds for encoders."
         )
         blocks.append(Paragraph(text, "warning"))
     return blocks
@@ -148,7 +149,7 @@ def _over_encoders(
     if not rows:
         text = (
             "Intervals are over runs, and speak of these encoders: no method has runs on two encoders or more that "
-            "runs share on every row, which an interval over encoders would need."
+            "runs share on every task, which an interval over encoders would need."
         )
         return [Paragraph(text, "note")]
     caption = (
@@ -175,7 +176,7 @@ def _improvement(tables: Mapping[str, ScoreTable], name: str, bootstrap: Bootstr
         drawn.append((label, look[label], found.value, found.interval))
     caption = (
         f"Probability that a run of {REFERENCE} scores higher than one of the other method on the same task; "
-        f"{bootstrap.confidence:.0%} intervals, over encoders where both methods have two or more on every row and "
+        f"{bootstrap.confidence:.0%} intervals, over encoders where both methods have two or more on every task and "
         "one of them shares some among its runs, else over runs."
     )
     picture = drawing.intervals(drawn, f"P({REFERENCE} > other); 0.5: no difference", 0.5)
@@ -213,7 +214,7 @@ def _profiles(tables: Mapping[str, ScoreTable], name: str, bootstrap: Bootstrap)
     panel = drawing.Panel("", "score / the paper's DrQ", "fraction of runs above it", curves)
     caption = (
         f"Performance profiles with {bootstrap.confidence:.0%} intervals, over encoders where the legend counts them, "
-        "else over runs; n counts runs of all rows."
+        "else over runs; n counts runs of all tasks."
     )
     return Figure(f"{name}-profiles", caption, drawing.lines([panel]))
 

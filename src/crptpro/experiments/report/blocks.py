@@ -164,6 +164,16 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number of things.
+
+    Examples:
+        >>> counted(1, "run"), counted(1_200, "piece")
+        ('1 run', '1,200 pieces')
+    """
+    return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
 def facts(caption: str, pairs: dict[str, str]) -> Table:
     """Return a table of names and values."""
     return Table(

@@ -11,7 +11,7 @@ from crptpro.errors import CRPTproError, RecordError
 from crptpro.experiments.durations import duration
 from crptpro.experiments.pieces import piece_from_json
 from crptpro.experiments.records import Run
-from crptpro.experiments.report.blocks import Block, Cell, Fold, Table, cells, facts
+from crptpro.experiments.report.blocks import Block, Cell, Fold, Table, cells, counted, facts
 from crptpro.experiments.report.reading import Made
 
 LENGTHY = {"versions", "hardware", "modules", "crc32", "layout", "tensors", "records", "git_revision"}
@@ -35,7 +35,7 @@ def piece_cards(pieces: Mapping[str, Made]) -> tuple[Block, ...]:
     for piece in pieces.values():
         by_kind.setdefault(piece.kind, []).append(piece)
     return tuple(
-        Fold(f"{kind}: {len(own)} piece(s)", tuple(_card(piece, pieces) for piece in own))
+        Fold(f"{kind}: {counted(len(own), 'piece')}", tuple(_card(piece, pieces) for piece in own))
         for kind, own in by_kind.items()
     )
 
@@ -54,9 +54,11 @@ def run_cards(runs: Iterable[Run]) -> tuple[Block, ...]:
 def _card(piece: Made, pieces: Mapping[str, Made]) -> Fold:
     rows = [cells("state", piece.state)]
     if piece.done is not None:
-        if isinstance(seconds := piece.done.get("seconds"), (int, float)):
+        if piece.seconds is not None:
             attempts = piece.done.get("attempts", 1)
-            rows.append(cells(f"wall clock, {attempts} attempt{'s' * (attempts != 1)}", duration(seconds)))
+            rows.append(
+                cells(f"wall clock, {attempts} attempt{'s' * (attempts != 1)}", duration(piece.seconds))
+            )
         rows += [cells(f"job {name}", value) for name, value in _flat(piece.done.get("job", {}))]
         rows.append(cells("git revision", str(piece.done.get("git_revision", "unknown"))))
     for name, value in piece.description.items():

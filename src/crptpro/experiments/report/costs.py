@@ -23,7 +23,8 @@ def efficiency(asked: Asked) -> tuple[Block, ...]:
     rows, blocks = rows_of(asked, "timing")
     by_place: dict[str, list[Row]] = {}
     for row in rows:
-        where = f"{row['device'] or 'device not recorded'}, {row['threads'] or '?'} thread(s)"
+        threads = f"{row['threads'] or '?'} thread{'s' * (row['threads'] != '1')}"
+        where = f"{row['device'] or 'device not recorded'}, {threads}"
         by_place.setdefault(where, []).append(row)
     for where, part in sorted(by_place.items()):
         name = (

@@ -8,7 +8,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from crptpro.experiments.published import DRQ_ENV_STEPS, ENV_STEPS
-from crptpro.experiments.report.blocks import ABSENT, Block, Bullets, Cell, Fold, Paragraph, Table, cells
+from crptpro.experiments.report.blocks import (
+    ABSENT,
+    Block,
+    Bullets,
+    Cell,
+    Fold,
+    Paragraph,
+    Table,
+    cells,
+    counted,
+)
 from crptpro.experiments.report.cards import anchor_of
 from crptpro.experiments.report.reading import Asked, Made, Source
 from crptpro.experiments.scales import PAPER, SCALES, Scale
@@ -46,7 +56,7 @@ def contents(source: Source) -> tuple[Block, ...]:
     if source.pieces:
         kinds = Counter(piece.kind for piece in source.pieces.values())
         done = Counter(piece.kind for piece in source.pieces.values() if piece.done is not None)
-        seconds = [float(p.done.get("seconds", 0)) for p in source.pieces.values() if p.done is not None]
+        seconds = [piece.seconds or 0.0 for piece in source.pieces.values()]
         told = ", ".join(f"{done[kind]} of {count} {kind}" for kind, count in kinds.items())
         blocks.append(Paragraph(f"Pieces finished: {told}; {sum(seconds) / 3600:.1f} h of work in all."))
     if source.runs:
@@ -85,7 +95,7 @@ def caveats(source: Source) -> tuple[Block, ...]:
     unknown = [name for name in names if name not in SCALES]
     if unknown:
         blocks.append(
-            Paragraph(f"Budgets of the scale(s) {', '.join(unknown)} are not known here.", "warning")
+            Paragraph(f"The budgets of scale {' and '.join(unknown)} are not known here.", "warning")
         )
     if short:
         told = ", ".join(f"{budget:,}" for budget in short)
@@ -113,7 +123,7 @@ def provenance(source: Source) -> tuple[Block, ...]:
         if len(versions) == 1
         else (
             "package",
-            *(f"set {i + 1}: {count} piece(s)" for i, (_, count) in enumerate(found.most_common())),
+            *(f"set {i + 1}: {counted(count, 'piece')}" for i, (_, count) in enumerate(found.most_common())),
         )
     )
     rows = tuple(cells(name, *(version.get(name, ABSENT) for version in versions)) for name in packages)

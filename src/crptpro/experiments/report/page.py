@@ -25,6 +25,7 @@ from crptpro.experiments.report.probes import probes
 from crptpro.experiments.report.reading import Asked, Source, read_source
 from crptpro.experiments.report.runs import placed_runs, unplaced_runs
 from crptpro.experiments.report.scores import blocks_of_runs, score_blocks
+from crptpro.experiments.report.spending import spending
 from crptpro.experiments.report.study import study
 
 logger = logging.getLogger(__name__)
@@ -120,6 +121,7 @@ def _experiment(asked: Asked, source: Source, bootstrap: Bootstrap) -> Section:
         if asked.experiment in MEASURED:
             blocks += MEASURED[asked.experiment](asked)
         blocks += score_blocks(asked, bootstrap)
+        blocks += spending(asked, source.pieces)
     except RecordError as reason:
         logger.warning("%s: %s", asked.name, reason)
         blocks += (Paragraph(f"The rest of this section cannot be made: {reason}", "warning"),)

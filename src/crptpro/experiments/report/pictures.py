@@ -13,7 +13,7 @@ from crptpro.data.incoming import dataset_path
 from crptpro.errors import CRPTproError
 from crptpro.experiments.plots import draw_stacks
 from crptpro.experiments.report import drawing
-from crptpro.experiments.report.blocks import Block, Bullets, Figure, Paragraph
+from crptpro.experiments.report.blocks import Block, Bullets, Figure, Paragraph, counted
 from crptpro.experiments.report.reading import Made
 from crptpro.experiments.report.runs import Placed
 
@@ -72,7 +72,8 @@ def videos(placed: Iterable[Placed]) -> tuple[Block, ...]:
     if not newest:
         return ()
     if importlib.util.find_spec("imageio_ffmpeg") is None:
-        text = f"{len(newest)} evaluation video(s) not shown: install the extra with `pip install 'crptpro[video]'`."
+        shown = counted(len(newest), "evaluation video")
+        text = f"{shown} not shown: install the extra with `pip install 'crptpro[video]'`."
         return (Paragraph(text, "note"),)
     strips: dict[str, list[np.ndarray]] = {}
     problems = []

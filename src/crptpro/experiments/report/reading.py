@@ -38,6 +38,12 @@ class Made:
         return str(self.description.get("kind") or self.key.split("-", 1)[0])
 
     @property
+    def seconds(self) -> float | None:
+        """Wall clock of all attempts; ``None`` where it is not known."""
+        seconds = (self.done or {}).get("seconds")
+        return float(seconds) if isinstance(seconds, (int, float)) else None
+
+    @property
     def state(self) -> str:
         """How far it is, in words."""
         if self.done is not None:

@@ -26,6 +26,9 @@ from crptpro.experiments.report.runs import (
 )
 from crptpro.experiments.report.sensitivity import sensitivity
 
+FEW = 3
+"""Tasks at most whose scores stand in columns, with a row per method; more have rows, as in the paper."""
+
 
 def score_blocks(asked: Asked, bootstrap: Bootstrap) -> tuple[Block, ...]:
     """Report an experiment whose numbers are downstream scores."""
@@ -81,6 +84,11 @@ def _parts(placed: Sequence[Placed]) -> list[tuple[str, list[Placed]]]:
 
 def _score_table(placed: Sequence[Placed], score: Callable[[Run], float], caption: str) -> Table:
     labels, spots = labels_of(placed), spots_of(placed)
+    if len(spots) <= FEW < len(labels):  # a page has no room for a column per method
+        lines = (
+            cells(label, *(_score_cell(placed, spot, label, score) for spot in spots)) for label in labels
+        )
+        return Table(caption, ("method", *map(str, spots)), tuple(lines))
     has_groups, has_colors = any(s.group for s in spots), any(s.colors != "normal" for s in spots)
     rows = []
     for spot in spots:
