@@ -153,7 +153,7 @@ def test_coverage_probe_stability_and_study_have_their_numbers(page: Page) -> No
     probed = blocks_of(page, "probe-small")
     assert cell(table_in(probed, "R2 of velocities, features"), "walker", "crptpro", "A").text == "0.400"
     assert cell(table_in(probed, "R2 of positions, embedding z"), "cheetah", "crptpro", "A").beside == "seen"
-    assert "cheetah, reversed_background" in table_in(probed, "R2 of positions, features").columns
+    assert "cheetah, reversed background" in table_in(probed, "R2 of positions, features").columns
     finals = table_in(blocks_of(page, "stability-small"), "Diagnostics at the end")
     last = np.mean([np.log(128) * (1 - (updates - 200) / 1000) for updates in (920, 940, 960, 980, 1000)])
     assert cell(finals, "comparative loss [nats]", "crptpro").text == f"{last:.4g}"

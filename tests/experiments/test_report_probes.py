@@ -46,7 +46,7 @@ def test_other_colours_of_a_domain_stand_beside_its_own(tmp_path: Path) -> None:
         probed(tmp_path, "atc", "cheetah", 0.6),
     )
     columns = table_in(blocks, "R2 of velocities").columns
-    assert columns == ("encoder", "group", "cheetah", "walker", "walker, reversed_background")
+    assert columns == ("encoder", "group", "cheetah", "walker", "walker, reversed background")
 
 
 def test_one_number_of_encoders_is_said_once_and_several_in_every_cell(tmp_path: Path) -> None:

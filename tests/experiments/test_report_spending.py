@@ -82,7 +82,7 @@ def test_every_method_has_its_budget_and_its_time(
     assert found == [updates, env_steps, collecting, pretraining]
     assert cell(table, "one run", method).text == "90 min"  # of an hour and of two
     assert (cell(table, "encoders", method).text, cell(table, "runs", method).text) == ("1", "2")
-    assert cell(table, "env steps of the task", method).text == f"{BUDGET:,}"
+    assert cell(table, "runs", method).beside == f"{BUDGET:,} env steps"
 
 
 def test_the_updates_of_a_method_without_pre_training_come_with_the_task(blocks: tuple[Block, ...]) -> None:
@@ -93,16 +93,17 @@ def test_the_updates_of_a_method_without_pre_training_come_with_the_task(blocks:
 
 def test_times_of_several_machines_come_with_a_warning(tmp_path: Path) -> None:
     goals = fill(tmp_path, ("crptpro", "drq"))
-    assert "only within one machine" not in words(spent(tmp_path))
+    assert "Made on a: A CPU, 1 thread." in words(spent(tmp_path))
+    assert "pieces that shared one slowed" not in words(spent(tmp_path))
     piece = next(goal.piece for goal in goals if goal.label == "drq")
     path = tmp_path / "pieces" / piece.key / DONE
     done = json.loads(path.read_text())
     hardware = {**done["hardware"], "gpus": ["A GPU"]}
     path.write_text(json.dumps({**done, "hardware": hardware, "job": {"device": "cuda"}}))
     found = spent(tmp_path)
-    assert cell(table_in(found, TOOK), "made on", "drq").text == "A CPU, 1 thread; A GPU"
-    assert cell(table_in(found, TOOK), "made on", "crptpro").text == "A CPU, 1 thread"
-    assert "only within one machine" in words(found)
+    assert cell(table_in(found, TOOK), "made on", "drq").text == "a, b"
+    assert cell(table_in(found, TOOK), "made on", "crptpro").text == "a"
+    assert "Made on a: A CPU, 1 thread; b: A GPU. Times compare only within one machine" in words(found)
 
 
 def test_a_time_that_is_not_recorded_leaves_a_gap(tmp_path: Path) -> None:

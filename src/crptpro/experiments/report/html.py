@@ -23,6 +23,8 @@ from crptpro.experiments.report.style import CSS
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
 """What a browser is told that the page may load: what is inside it."""
+MANY = 9
+"""Tables of more columns are set closer."""
 
 
 class Saved(NamedTuple):
@@ -110,10 +112,11 @@ def _table(block: Table) -> str:
     )
     # Facts hold sentences and paths, tables of numbers must not break.
     longest = max((len(cell.text) for row in block.rows for cell in row), default=0)
-    wide = ' class="wide"' if longest > 40 else ""
+    looks = ["wide"] * (longest > 40) + ["many"] * (len(block.columns) > MANY)
+    look = f' class="{" ".join(looks)}"' if looks else ""
     return (
         f'<figure class="table"><figcaption>{escape(block.caption)}</figcaption><div class="sheet" tabindex="0" '
-        f'role="region" aria-label="{escape(block.caption)}"><table{wide}>\n<thead><tr>{head}</tr></thead>\n'
+        f'role="region" aria-label="{escape(block.caption)}"><table{look}>\n<thead><tr>{head}</tr></thead>\n'
         f"<tbody>\n{body}\n</tbody></table></div></figure>"
     )
 

@@ -57,7 +57,8 @@ def learning_curves(placed: Sequence[Placed], name: str, bootstrap: Bootstrap) -
             f"{name}-curves-time",
             "The same against the time since a run's first record, mean over runs (n in the legend). Pauses of a run "
             "that was continued do not count: what is longer than ten minutes and than twenty usual distances between "
-            "records counts as one of these. Runs that shared a machine slowed each other down.",
+            "records counts as one of these. Times compare only within one machine, and runs that shared it slowed "
+            "each other down.",
             drawing.lines(by_hours),
         ),
     ]

@@ -109,7 +109,7 @@ def _columns(rows: Sequence[Row]) -> list[Column]:
 
 def _heading(column: Column) -> str:
     domain, colors = column
-    return domain if colors == "normal" else f"{domain}, {colors}"
+    return domain if colors == "normal" else f"{domain}, {colors.replace('_', ' ')}"
 
 
 def _own(rows: Sequence[Row], system: System, column: Column) -> list[Row]:

@@ -25,8 +25,8 @@ from crptpro.experiments.report.reading import Asked, Made
 from crptpro.training.action_repeat import action_repeat_of
 
 COLUMNS = (
-    "method", "encoders", "encoder updates", "env steps before", "collecting", "pre-training", "runs",
-    "env steps of the task", "one run", "made on",
+    "method", "encoders", "encoder updates", "env steps before", "collecting", "pre-training", "runs", "one run",
+    "made on",
 )  # fmt: skip
 
 
@@ -44,27 +44,23 @@ def spending(asked: Asked, pieces: Mapping[str, Made]) -> tuple[Block, ...]:
             runs.setdefault(goal.label, {})[piece.key] = piece
     if not runs:
         return ()
-    machines: set[str] = set()
-    lines = []
-    for label in in_order(runs):
-        line, made_on = _line(label, list(runs[label].values()), pieces)
-        lines.append(line)
-        machines |= made_on
+    places: dict[str, str] = {}
+    lines = [_line(label, list(runs[label].values()), pieces, places) for label in in_order(runs)]
     caption = (
         "What scores took: means over the encoders and over the runs of a method, wall clock of all attempts. "
         "Pre-training includes its exploring; an encoder that was fine-tuned counts with what it started from, and "
         "data that methods share with each of them."
     )
-    blocks: list[Block] = [Table(caption, COLUMNS, tuple(lines))]
-    if len(machines) > 1:
-        text = "Times compare only within one machine, and pieces that shared one slowed each other down."
-        blocks.append(Paragraph(text, "note"))
-    return tuple(blocks)
+    text = f"Made on {'; '.join(f'{letter}: {name}' for name, letter in places.items())}."
+    if len(places) > 1:
+        text += " Times compare only within one machine, and pieces that shared one slowed each other down."
+    return (Table(caption, COLUMNS, tuple(lines)), *([Paragraph(text, "note")] if places else []))
 
 
 def _line(
-    label: str, runs: Sequence[RunPiece], pieces: Mapping[str, Made]
-) -> tuple[tuple[Cell, ...], set[str]]:
+    label: str, runs: Sequence[RunPiece], pieces: Mapping[str, Made], places: dict[str, str]
+) -> tuple[Cell, ...]:
+    """Return a method's row; machines that have no letter in ``places`` get the next one."""
     chains = [
         _chain(encoder) for encoder in dict.fromkeys(run.encoder for run in runs) if encoder is not None
     ]
@@ -72,24 +68,25 @@ def _line(
     updates = Cell(_mean([_updates(chain) for chain in chains]))
     if not chains:
         updates = Cell(_mean([_updates_with_the_task(run, pieces) for run in runs]), "with the task")
-    line = cells(
+    needed: list[Piece] = [*(e for chain in chains for e in chain), *(d for own in data for d in own), *runs]
+    for name in sorted({_machine(pieces.get(piece.key)) for piece in needed} - {""}):
+        places.setdefault(name, _letter(len(places)))
+    made_on = {places[name] for piece in needed if (name := _machine(pieces.get(piece.key)))}
+    return cells(
         label,
         str(len(chains)),
         updates,
         _mean([_env_steps(chain, own) for chain, own in zip(chains, data)]) if chains else "0",
         _time([_seconds(own, pieces) for own in data]) if any(data) else ABSENT,
         _time([_seconds(chain, pieces) for chain in chains]),
-        str(len(runs)),
-        _mean([run_config(run).env_steps for run in runs]),
+        Cell(str(len(runs)), f"{_mean([run_config(run).env_steps for run in runs])} env steps"),
         _time([_seconds([run], pieces) for run in runs]),
+        ", ".join(sorted(made_on)) or ABSENT,
     )
-    everything: list[Piece] = [
-        *(e for chain in chains for e in chain),
-        *(d for own in data for d in own),
-        *runs,
-    ]
-    made_on = {name for piece in everything if (name := _machine(pieces.get(piece.key)))}
-    return (*line, Cell("; ".join(sorted(made_on)) or ABSENT)), made_on
+
+
+def _letter(place: int) -> str:
+    return chr(ord("a") + place) if place < 26 else str(place)
 
 
 def _described(made: Made) -> Piece | None:

@@ -41,6 +41,7 @@ tbody tr:hover { background:var(--soft); }
 td:first-child, th:first-child { padding-left:.1rem; }
 .wide td, .wide tbody th { white-space:normal; font-weight:400; overflow-wrap:anywhere; min-width:9rem;
   max-width:34rem; }
+.many th, .many td { padding-left:.25rem; padding-right:.5rem; }
 td small { display:block; color:var(--dim); font-size:.82em; line-height:1.35; }
 details { margin:.5rem 0; border:1px solid var(--rule); border-radius:4px; padding:.35rem .8rem; max-width:100%; }
 details[open] { padding-bottom:.6rem; }
