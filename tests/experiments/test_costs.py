@@ -56,6 +56,8 @@ def finish(
     (ExploredPiece("proto-rl-s", 0, ("walker",),
                    explore=settings(env_steps=2_000, random_agent_steps=100, batch_size=64)),
      10 + 1_000 * (0.05 + 64 * 1.25e-3) + 450 * 64 * 2.9e-3),
+    # Features of every sample, and their products with those of every other.
+    (ProbePiece(ENCODER, WALKER, samples=1_000), 10 + 1_000 * 4e-3 + 1_000**2 * 2.5e-6),
 ])  # fmt: skip
 def test_seconds_follow_decisions_updates_and_batch(piece: Piece, seconds: float) -> None:
     assert core_seconds(piece) == pytest.approx(seconds)

@@ -15,7 +15,7 @@ import torch
 from crptpro.data.layout import estimate_bytes
 from crptpro.domains import get_domain
 from crptpro.experiments.budgets import exploration_config, exploration_plan, run_config
-from crptpro.experiments.measurements import RedrawnPiece, TimingPiece
+from crptpro.experiments.measurements import ProbePiece, RedrawnPiece, TimingPiece
 from crptpro.experiments.pieces import (
     DatasetPiece,
     EncoderPiece,
@@ -44,8 +44,10 @@ AGENT_ROW_S, DRQ_ROW_S = 0.5e-3, 6.9e-3
 EXPLORER_ROW_S = {"averaged-sac": 3.5e-3, "skill-ddpg": 2.7e-3}
 USUAL_EXPLORER_ROW_S = 1.25e-3
 """An explorer's update for each row, on pixels that are encoded anew, in two views for the averaged one."""
+PROBE_SAMPLE_S, PROBE_PAIR_S = 4e-3, 2.5e-6
+"""A state probe: features of each sample, and a product for each two of them."""
 MEASUREMENT_S = 60.0
-"""Any piece that measures something else than time."""
+"""Any other piece that measures something else than time."""
 USUAL_EPISODE_ENV_STEPS = 1_000
 
 IMAGE_SIZE = 84
@@ -108,6 +110,11 @@ def _(piece: RedrawnPiece) -> int:
 
 def _redrawn_frames(piece: RedrawnPiece) -> int:
     return min(piece.frame_stack * piece.samples, piece.dataset.transitions)
+
+
+@register_seconds
+def _(piece: ProbePiece) -> float:
+    return START_S + piece.samples * PROBE_SAMPLE_S + piece.samples**2 * PROBE_PAIR_S
 
 
 # --- encoders -----------------------------------------------------------------------------------------------------
