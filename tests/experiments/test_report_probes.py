@@ -52,7 +52,7 @@ def test_other_colours_of_a_domain_stand_beside_its_own(tmp_path: Path) -> None:
 def test_one_number_of_encoders_is_said_once_and_several_in_every_cell(tmp_path: Path) -> None:
     goals = [probed(tmp_path, "atc", domain, 0.4) for domain in ("walker", "cheetah")]
     table = table_in(blocks_of(*goals), "R2 of velocities")
-    assert "(n = 1 each)" in table.caption
+    assert "(n = 1)" in table.caption
     assert cell(table, "walker", "atc", "A").beside == "seen"
     table = table_in(blocks_of(*goals, probed(tmp_path, "atc", "walker", 0.6, seed=1)), "R2 of velocities")
     assert "(n = 1 to 2)" in table.caption

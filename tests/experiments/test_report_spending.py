@@ -93,7 +93,7 @@ def test_the_updates_of_a_method_without_pre_training_come_with_the_task(blocks:
 
 def test_times_of_several_machines_come_with_a_warning(tmp_path: Path) -> None:
     goals = fill(tmp_path, ("crptpro", "drq"))
-    assert "Made on a: A CPU, 1 thread." in words(spent(tmp_path))
+    assert "Made on 1: A CPU, 2 cores, 24 GiB, no GPU, 1 thread." in words(spent(tmp_path))
     assert "pieces that shared one slowed" not in words(spent(tmp_path))
     piece = next(goal.piece for goal in goals if goal.label == "drq")
     path = tmp_path / "pieces" / piece.key / DONE
@@ -101,9 +101,10 @@ def test_times_of_several_machines_come_with_a_warning(tmp_path: Path) -> None:
     hardware = {**done["hardware"], "gpus": ["A GPU"]}
     path.write_text(json.dumps({**done, "hardware": hardware, "job": {"device": "cuda"}}))
     found = spent(tmp_path)
-    assert cell(table_in(found, TOOK), "made on", "drq").text == "a, b"
-    assert cell(table_in(found, TOOK), "made on", "crptpro").text == "a"
-    assert "Made on a: A CPU, 1 thread; b: A GPU. Times compare only within one machine" in words(found)
+    assert cell(table_in(found, TOOK), "made on", "drq").text == "1, 2"
+    assert cell(table_in(found, TOOK), "made on", "crptpro").text == "1"
+    plain, with_gpu = "1: A CPU, 2 cores, 24 GiB, no GPU, 1 thread", "2: A CPU, 2 cores, 24 GiB, A GPU, cuda"
+    assert f"Made on {plain}; {with_gpu}. Times compare only within one machine" in words(found)
 
 
 def test_a_time_that_is_not_recorded_leaves_a_gap(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from toy_world import ToyEnv
 
 from crptpro.errors import CheckpointError, NonFiniteError, PretrainedError
 from crptpro.loggers import RunLogger, WandbOptions
-from crptpro.modules import PixelEncoder, Projector, Prototypes
+from crptpro.modules import PixelEncoder, Projector, Prototypes, set_compute_dtype
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import (
     Pretrained,
@@ -82,6 +82,19 @@ def test_a_run_evaluates_at_every_interval_and_at_both_ends(tmp_path: Path) -> N
     pixels = torch.randint(0, 256, (9, 16, 16), dtype=torch.uint8)
     torch.testing.assert_close(agent(pixels), result.policy(pixels), rtol=0, atol=0)
     assert card["task"] == "toy"
+
+
+@pytest.mark.parametrize("channels_last", ["on", "off"])
+def test_a_saved_agent_acts_in_the_arithmetic_of_its_run(tmp_path: Path, channels_last: str) -> None:
+    result = train(tmp_path, env_steps=40, precision="bf16", channels_last=channels_last)
+    agent, card = load_agent(tmp_path / "agent")
+    assert card["config"]["precision"] == "bf16"
+    pixels = torch.randint(0, 256, (9, 16, 16), dtype=torch.uint8)
+    assert agent.encoder.channels_last is (channels_last == "on")
+    torch.testing.assert_close(agent(pixels), result.policy(pixels), rtol=0, atol=0)
+    set_compute_dtype(agent.actor, torch.float32)
+    set_compute_dtype(agent.encoder, torch.float32)
+    assert not torch.equal(agent(pixels), result.policy(pixels))
 
 
 def test_training_changes_the_actor_and_leaves_the_encoder_projector_and_prototypes_alone(

@@ -237,20 +237,18 @@ def _exploring_s(piece: ExploredPiece) -> float:
 
 def _replay_capacity(encoder: EncoderPiece | None) -> int:
     """What an encoder's method keeps for agents."""
-    if isinstance(encoder, FinetunedPiece):
-        return _replay_capacity(encoder.base)
-    if encoder is None or isinstance(encoder, UntrainedPiece):
+    first = None if encoder is None else encoder.lineage[-1]
+    if first is None or isinstance(first, UntrainedPiece):
         return get_method("crptpro").replay_capacity
-    return get_method(encoder.method).replay_capacity
+    return get_method(first.method).replay_capacity
 
 
 def _parameters(piece: EncoderPiece) -> tuple[int, int]:
     """Numbers that are trained, and all numbers, targets included; without a training, an encoder's own."""
-    if isinstance(piece, FinetunedPiece):
-        return _parameters(piece.base)
-    if isinstance(piece, UntrainedPiece):
+    first = piece.lineage[-1]
+    if isinstance(first, UntrainedPiece):
         return 0, 300_000
-    return _loss_parameters(piece.method, getattr(piece, "loss", ()))
+    return _loss_parameters(first.method, getattr(first, "loss", ()))
 
 
 @functools.cache

@@ -152,6 +152,11 @@ class EncoderPiece(Piece):
         """Domains that it was trained on last."""
         return ()
 
+    @property
+    def lineage(self) -> tuple[EncoderPiece, ...]:
+        """The encoder, then those that it started from, the first of all last."""
+        return (self,)
+
 
 @dataclass(frozen=True)
 class UntrainedPiece(EncoderPiece):
@@ -248,6 +253,11 @@ class FinetunedPiece(EncoderPiece):
     def domain_names(self) -> tuple[str, ...]:
         """The one domain."""
         return (self.dataset.domain,)
+
+    @property
+    def lineage(self) -> tuple[EncoderPiece, ...]:
+        """The encoder, then those that it started from, the first of all last."""
+        return (self, *self.base.lineage)
 
     @property
     def title(self) -> str:

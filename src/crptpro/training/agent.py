@@ -13,7 +13,15 @@ from torch import Tensor, nn
 from crptpro.artifact import read_artifact, write_artifact
 from crptpro.cards import provenance
 from crptpro.errors import CheckpointError
-from crptpro.modules import FixedSkillActor, PixelEncoder, SquashedGaussianActor
+from crptpro.modules import (
+    FixedSkillActor,
+    PixelEncoder,
+    SquashedGaussianActor,
+    resolve_channels_last,
+    resolve_precision,
+    set_channels_last,
+    set_compute_dtype,
+)
 from crptpro.modules.placement import device_of
 
 AGENT_FORMAT = "crptpro-agent"
@@ -89,6 +97,9 @@ def save_agent(path: str | Path, agent: PixelAgent, *, card: dict[str, Any]) -> 
 def load_agent(path: str | Path) -> tuple[PixelAgent, dict[str, Any]]:
     """Rebuild an agent from its artifact alone.
 
+    It acts in the arithmetic that its run learned and evaluated it in: what the card's ``precision`` and
+    ``channels_last`` mean on this machine; in float32 if the card has none.
+
     Returns:
         The agent, ready to act, and its card.
 
@@ -108,6 +119,11 @@ def load_agent(path: str | Path) -> tuple[PixelAgent, dict[str, Any]]:
                 {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
             )
             module.requires_grad_(False).eval()
+        learned_with = card.get("config", {})
+        dtype = resolve_precision(learned_with.get("precision", "fp32"), "cpu")
+        for module in (encoder, actor):
+            set_compute_dtype(module, dtype)
+        set_channels_last(encoder, resolve_channels_last(learned_with.get("channels_last", "auto")))
     except (KeyError, TypeError, ValueError, RuntimeError) as reason:
         raise CheckpointError(f"{path} holds no agent that can be rebuilt: {reason!r}") from reason
     return PixelAgent(encoder, actor), card

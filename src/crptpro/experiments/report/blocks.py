@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -172,6 +173,17 @@ def counted(number: int, noun: str) -> str:
         ('1 run', '1,200 pieces')
     """
     return f"{number:,} {noun}{'s' * (number != 1)}"
+
+
+def numbered(counts: Collection[int]) -> str:
+    """Return how many draws numbers stand on.
+
+    Examples:
+        >>> numbered([2, 2]), numbered({1, 3})
+        ('n = 2', 'n = 1 to 3')
+    """
+    low, high = min(counts, default=0), max(counts, default=0)
+    return f"n = {low}" if low == high else f"n = {low} to {high}"
 
 
 def facts(caption: str, pairs: dict[str, str]) -> Table:

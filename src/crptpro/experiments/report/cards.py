@@ -56,9 +56,7 @@ def _card(piece: Made, pieces: Mapping[str, Made]) -> Fold:
     if piece.done is not None:
         if piece.seconds is not None:
             attempts = piece.done.get("attempts", 1)
-            rows.append(
-                cells(f"wall clock, {attempts} attempt{'s' * (attempts != 1)}", duration(piece.seconds))
-            )
+            rows.append(cells(f"wall clock, {counted(attempts, 'attempt')}", duration(piece.seconds)))
         rows += [cells(f"job {name}", value) for name, value in _flat(piece.done.get("job", {}))]
         rows.append(cells("git revision", str(piece.done.get("git_revision", "unknown"))))
     for name, value in piece.description.items():

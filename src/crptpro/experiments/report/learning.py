@@ -11,7 +11,7 @@ from crptpro.experiments.estimates import estimate_curve
 from crptpro.experiments.intervals import Bootstrap
 from crptpro.experiments.records import Run
 from crptpro.experiments.report import drawing
-from crptpro.experiments.report.blocks import Block, Figure
+from crptpro.experiments.report.blocks import Block, Figure, numbered
 from crptpro.experiments.report.palette import Style, styles
 from crptpro.experiments.report.reading import number
 from crptpro.experiments.report.runs import Placed, Spot, labels_of, spots_of
@@ -40,7 +40,7 @@ def learning_curves(placed: Sequence[Placed], name: str, bootstrap: Bootstrap) -
     counts = {
         label: [len(grouped[spot, label]) for spot in spots if grouped[spot, label]] for label in labels
     }
-    named = {label: f"{label} ({_runs(counts[label])})" for label in labels}
+    named = {label: f"{label} ({numbered(counts[label])})" for label in labels}
     by_env_steps, by_hours = [], []
     for spot in spots:
         here = {label: grouped[spot, label] for label in labels if grouped[spot, label]}
@@ -127,8 +127,3 @@ def _panel(
 
 def _columns(run: Run) -> tuple[list[int], list[float]]:
     return [e.env_steps for e in run.episodes], [e.episode_return for e in run.episodes]
-
-
-def _runs(counts: Sequence[int]) -> str:
-    low, high = min(counts), max(counts)
-    return f"n = {low}" if low == high else f"n = {low} to {high}"

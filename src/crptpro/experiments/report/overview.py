@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
 
 from crptpro.experiments.published import DRQ_ENV_STEPS, ENV_STEPS
 from crptpro.experiments.report.blocks import (
@@ -20,7 +19,7 @@ from crptpro.experiments.report.blocks import (
     counted,
 )
 from crptpro.experiments.report.cards import anchor_of
-from crptpro.experiments.report.reading import Asked, Made, Source
+from crptpro.experiments.report.reading import Asked, Made, Source, machine
 from crptpro.experiments.scales import PAPER, SCALES, Scale
 
 SHORTCOMINGS = (
@@ -69,7 +68,7 @@ def contents(source: Source) -> tuple[Block, ...]:
                 "DrQ's, which do not depend on it, stand beside."
             )
         )
-    machines = dict.fromkeys(_machine(record.get("hardware") or {}) for record in source.provenance)
+    machines = dict.fromkeys(machine(record.get("hardware") or {}) for record in source.provenance)
     revisions = dict.fromkeys(str(record.get("git_revision", "unknown")) for record in source.provenance)
     if machines:
         text = f"Made on {'; '.join(machines)}, from source revision {', '.join(revisions)}; versions are at the end."
@@ -111,7 +110,7 @@ def provenance(source: Source) -> tuple[Block, ...]:
     """Versions, hardware and revisions of all that is shown; each that occurs is listed."""
     records = source.provenance
     blocks: list[Block] = []
-    machines = Counter(_machine(record.get("hardware") or {}) for record in records)
+    machines = Counter(machine(record.get("hardware") or {}) for record in records)
     blocks.append(_counted("Hardware", machines))
     revisions = Counter(str(record.get("git_revision", "unknown")) for record in records)
     blocks.append(_counted("Source revision", revisions))
@@ -185,11 +184,3 @@ def _budgets(scale: Scale) -> dict[str, str]:
 def _counted(caption: str, found: Counter[str]) -> Table:
     rows = tuple(cells(text, str(count)) for text, count in found.most_common())
     return Table(caption, (caption.lower(), "pieces or runs"), rows)
-
-
-def _machine(hardware: Mapping[str, Any]) -> str:
-    if not hardware:
-        return "not recorded"
-    gpus: Sequence[str] = hardware.get("gpus") or ()
-    ram = float(hardware.get("ram_bytes") or 0) / 2**30
-    return f"{hardware.get('cpu')}, {hardware.get('cpu_cores')} cores, {ram:.0f} GiB, {', '.join(gpus) or 'no GPU'}"

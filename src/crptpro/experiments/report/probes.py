@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from crptpro.experiments.report import drawing
-from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Figure, Table, cells
+from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Figure, Table, cells, numbered
 from crptpro.experiments.report.measurements import Row, rows_of
 from crptpro.experiments.report.palette import in_order, styles
 from crptpro.experiments.report.reading import Asked
@@ -62,7 +62,7 @@ def _figure(name: str, rows: Sequence[Row]) -> Figure:
         panels.append((MEASURES[measure][0], dots))
     caption = (
         "What a linear model reads from the features of the frozen encoder: R2 on held-out episodes, mean over "
-        f"coordinates and encoders ({_counted(_counts(rows, systems, columns))})."
+        f"coordinates and encoders ({numbered(_counts(rows, systems, columns))})."
     )
     return Figure(name, caption, drawing.dots([_heading(column) for column in columns], panels))
 
@@ -80,7 +80,7 @@ def _table(rows: Sequence[Row], measure: str, embedding: str) -> Table:
         for label, group in systems
     ]
     what = "features of the frozen encoder" if embedding == "features" else f"embedding {embedding}"
-    caption = f"{name}, {what}: mean over encoders ({_counted(counts)}), and whether their pre-training saw the domain."
+    caption = f"{name}, {what}: mean over encoders ({numbered(counts)}), and whether their pre-training saw the domain."
     return Table(caption, ("encoder", "group", *map(_heading, columns)), tuple(lines), labels=2)
 
 
@@ -138,8 +138,3 @@ def _counts(rows: Sequence[Row], systems: Sequence[System], columns: Sequence[Co
         for column in columns
         if (own := _own(rows, system, column))
     }
-
-
-def _counted(counts: set[int]) -> str:
-    low, high = min(counts, default=0), max(counts, default=0)
-    return f"n = {low} each" if low == high else f"n = {low} to {high}"

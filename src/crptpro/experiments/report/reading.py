@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -164,6 +164,15 @@ def read_source(root: str | Path) -> Source:
             f"({EXPERIMENTS_DIRECTORY}/*.json) and no finished downstream run.{detail}"
         )
     return Source(root, (), pieces, tuple(runs), tuple(problems))
+
+
+def machine(hardware: Mapping[str, Any]) -> str:
+    """Describe the hardware of a record in words."""
+    if not hardware:
+        return "not recorded"
+    gpus: Sequence[str] = hardware.get("gpus") or ()
+    ram = float(hardware.get("ram_bytes") or 0) / 2**30
+    return f"{hardware.get('cpu')}, {hardware.get('cpu_cores')} cores, {ram:.0f} GiB, {', '.join(gpus) or 'no GPU'}"
 
 
 def number(row: Mapping[str, str], column: str) -> float | None:

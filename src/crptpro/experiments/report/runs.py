@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from crptpro.errors import RecordError
-from crptpro.experiments.pieces import piece_from_json
+from crptpro.experiments.pieces import EncoderPiece, piece_from_json
 from crptpro.experiments.published import COLORS, SEEN, UNSEEN, Score
 from crptpro.experiments.records import Run, read_run
 from crptpro.experiments.report.palette import in_order
@@ -88,9 +88,8 @@ def _on_base(run: Run, description: Mapping[str, Any]) -> Run:
     encoder = description.get("encoder") or {}
     if encoder.get("kind") != "finetuned":
         return run
-    while encoder.get("kind") == "finetuned":
-        encoder = encoder["base"]
-    return dataclasses.replace(run, encoder=f"base:{piece_from_json(encoder).key}")
+    piece = cast(EncoderPiece, piece_from_json(encoder))
+    return dataclasses.replace(run, encoder=f"base:{piece.lineage[-1].key}")
 
 
 def unplaced_runs(runs: Iterable[Run]) -> list[Placed]:

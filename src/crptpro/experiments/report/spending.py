@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -13,15 +14,14 @@ from crptpro.experiments.pieces import (
     DatasetPiece,
     EncoderPiece,
     ExploredPiece,
-    FinetunedPiece,
     Piece,
     RunPiece,
     piece_from_json,
 )
 from crptpro.experiments.records import read_run
-from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Paragraph, Table, cells
+from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Paragraph, Table, cells, counted
 from crptpro.experiments.report.palette import in_order
-from crptpro.experiments.report.reading import Asked, Made
+from crptpro.experiments.report.reading import Asked, Made, machine
 from crptpro.training.action_repeat import action_repeat_of
 
 COLUMNS = (
@@ -51,7 +51,7 @@ def spending(asked: Asked, pieces: Mapping[str, Made]) -> tuple[Block, ...]:
         "Pre-training includes its exploring; an encoder that was fine-tuned counts with what it started from, and "
         "data that methods share with each of them."
     )
-    text = f"Made on {'; '.join(f'{letter}: {name}' for name, letter in places.items())}."
+    text = f"Made on {'; '.join(f'{number}: {name}' for name, number in places.items())}."
     if len(places) > 1:
         text += " Times compare only within one machine, and pieces that shared one slowed each other down."
     return (Table(caption, COLUMNS, tuple(lines)), *([Paragraph(text, "note")] if places else []))
@@ -60,18 +60,17 @@ def spending(asked: Asked, pieces: Mapping[str, Made]) -> tuple[Block, ...]:
 def _line(
     label: str, runs: Sequence[RunPiece], pieces: Mapping[str, Made], places: dict[str, str]
 ) -> tuple[Cell, ...]:
-    """Return a method's row; machines that have no letter in ``places`` get the next one."""
-    chains = [
-        _chain(encoder) for encoder in dict.fromkeys(run.encoder for run in runs) if encoder is not None
-    ]
+    """Return a method's row; machines that have no number in ``places`` get the next one."""
+    encoders = [encoder for encoder in dict.fromkeys(run.encoder for run in runs) if encoder is not None]
+    chains = [encoder.lineage for encoder in encoders]
     data = [_datasets(chain) for chain in chains]
     updates = Cell(_mean([_updates(chain) for chain in chains]))
     if not chains:
         updates = Cell(_mean([_updates_with_the_task(run, pieces) for run in runs]), "with the task")
     needed: list[Piece] = [*(e for chain in chains for e in chain), *(d for own in data for d in own), *runs]
-    for name in sorted({_machine(pieces.get(piece.key)) for piece in needed} - {""}):
-        places.setdefault(name, _letter(len(places)))
-    made_on = {places[name] for piece in needed if (name := _machine(pieces.get(piece.key)))}
+    made = [pieces[piece.key].done for piece in needed if piece.key in pieces]
+    where = sorted({_machine(done) for done in made if done is not None})
+    made_on = [places.setdefault(name, str(len(places) + 1)) for name in where]
     return cells(
         label,
         str(len(chains)),
@@ -85,23 +84,11 @@ def _line(
     )
 
 
-def _letter(place: int) -> str:
-    return chr(ord("a") + place) if place < 26 else str(place)
-
-
 def _described(made: Made) -> Piece | None:
     try:
         return piece_from_json(dict(made.description))
     except CRPTproError:
         return None
-
-
-def _chain(encoder: EncoderPiece) -> list[EncoderPiece]:
-    """Return an encoder and those that it started from."""
-    chain = [encoder]
-    while isinstance(chain[-1], FinetunedPiece):
-        chain.append(chain[-1].base)
-    return chain
 
 
 def _datasets(chain: Iterable[EncoderPiece]) -> list[DatasetPiece]:
@@ -144,13 +131,12 @@ def _seconds(needed: Sequence[Piece], pieces: Mapping[str, Made]) -> float | Non
     return total
 
 
-def _machine(made: Made | None) -> str:
-    done = (None if made is None else made.done) or {}
-    hardware, job = done.get("hardware") or {}, done.get("job") or {}
-    if str(job.get("device", "cpu")).startswith("cuda") and hardware.get("gpus"):
-        return str(hardware["gpus"][0])
-    threads = job.get("threads")
-    return str(hardware.get("cpu", "")) + (f", {threads} thread{'s' * (threads != 1)}" if threads else "")
+def _machine(done: Mapping[str, Any]) -> str:
+    job = done.get("job") or {}
+    device = str(job.get("device", "cpu"))
+    if device == "cpu" and job.get("threads"):
+        device = counted(job["threads"], "thread")
+    return f"{machine(done.get('hardware') or {})}, {device}"
 
 
 def _mean(values: Sequence[float | None]) -> str:
