@@ -25,6 +25,8 @@ NAMES = {
 DRAWN = ("comp", "embedding_cosine", "assignment_entropy_frac")
 WINDOW = 5
 """Rows at the end of a record that a final value averages over."""
+PLATEAU = 0.99
+"""Share of ln M: a comparative loss that stays below has left the plateau, where all prototypes look alike."""
 
 Record = tuple[Wanted, list[dict[str, str]]]
 Naming = Callable[[Wanted], str]
@@ -72,6 +74,28 @@ def groups_of(goals: Sequence[Wanted]) -> list[str]:
     return sorted({group_of(goal) for goal in goals})
 
 
+def left_plateau(rows: Sequence[dict[str, str]]) -> float | None:
+    """Return after how many updates a comparative loss has left its plateau for good.
+
+    Args:
+        rows: of ``pretrain.csv``, in order.
+
+    Returns:
+        Encoder updates at the first row from which the loss stays below :data:`PLATEAU` of ln M; ``None`` if the record
+        ends on the plateau, or there is no such loss.
+    """
+    left = None
+    for row in rows:
+        loss, uniform = number(row, "comp"), number(row, "ln_num_prototypes")
+        if loss is None or uniform is None:
+            continue
+        if loss >= PLATEAU * uniform:
+            left = None
+        elif left is None:
+            left = number(row, "updates")
+    return left
+
+
 def diagnostics(records: Sequence[Record], name: Naming, heading: str, figure: str, of: str) -> list[Block]:
     """Show final values and curves of encoders.
 
@@ -114,11 +138,26 @@ def _finals(records: Sequence[Record], name: Naming, heading: str, of: str) -> T
         own = [rows for goal, rows in records if name(goal) == label]
         reached = {number(rows[-1], "updates") or 0 for rows in own if rows}
         updates = " or ".join(f"{at:,.0f}" for at in sorted(reached))
-        lines.append(cells(label, str(len(own)), updates, *(_final(own, column) for column in NAMES)))
+        finals = (_final(own, column) for column in NAMES)
+        lines.append(cells(label, str(len(own)), updates, _plateau(own), *finals))
     caption = (
-        f"{of}diagnostics at the end of pre-training, mean of the last {WINDOW} rows, then over encoders."
+        f"{of}diagnostics at the end of pre-training, mean of the last {WINDOW} rows, then over encoders. The plateau "
+        f"is left where the comparative loss stays below {PLATEAU:.0%} of ln M from then on."
     )
-    return Table(sentence(caption), (heading, "encoders", "updates", *NAMES.values()), tuple(lines))
+    columns = (heading, "encoders", "updates", "left the plateau at", *NAMES.values())
+    return Table(sentence(caption), columns, tuple(lines))
+
+
+def _plateau(records: Sequence[list[dict[str, str]]]) -> Cell:
+    left = [left_plateau(rows) for rows in records if rows and number(rows[-1], "ln_num_prototypes")]
+    known = [updates for updates in left if updates is not None]
+    if not left:
+        return Cell(ABSENT)
+    if not known:
+        return Cell("not left")
+    among = "" if len(known) == len(left) else f"{len(known)} of {len(left)} encoders"
+    spread = f"{min(known):,.0f} to {max(known):,.0f}" if min(known) < max(known) else ""
+    return Cell(f"{np.mean(known):,.0f}", "; ".join(part for part in (among, spread) if part))
 
 
 def _final(records: Sequence[list[dict[str, str]]], column: str) -> Cell:
