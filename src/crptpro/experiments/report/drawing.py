@@ -155,6 +155,7 @@ def bars(groups: Sequence[str], series: Mapping[str, Sequence[float | None]], un
         axis.invert_yaxis()
         axis.grid(visible=False, axis="y")
         axis.set(xlabel=unit)
+        axis.xaxis.set_major_formatter("{x:,g}")
         axis.margins(x=0.12)
         _legend(figure, dict(zip(series, axis.containers)))
         return figure
