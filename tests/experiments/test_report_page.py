@@ -159,10 +159,12 @@ def test_coverage_probe_stability_and_study_have_their_numbers(page: Page) -> No
     assert cell(finals, "comparative loss [nats]", "crptpro").text == f"{last:.4g}"
     tried = blocks_of(page, "study-small")
     assert cell(table_in(tried, "diagnostics at the end"), "encoders", "0.05").text == "2"
-    assert (
-        cell(table_in(tried, "state probe"), "walker, features, velocities", "annealed").text
-        == "0.400 ± 0.000"
+    probed = cell(table_in(tried, "read from features"), "walker", "annealed")
+    assert (probed.text, probed.beside) == ("0.700 / 0.400", "± 0.000 / 0.000, n = 2")
+    gained = cell(
+        table_in(tried, "at a glance"), "velocities, features", "assignment temperature", "annealed"
     )
+    assert (gained.text, gained.beside) == ("0.400", "+0.200")
 
 
 def test_the_same_directory_gives_the_same_figures(tmp_path: Path) -> None:

@@ -7,11 +7,13 @@ from pathlib import Path
 import pytest
 from report_reading import cell, table_in
 
-from crptpro.experiments.report.blocks import ABSENT, Figure
+from crptpro.experiments.report.blocks import ABSENT, Figure, Paragraph
 from crptpro.experiments.report.diagnostics import diagnostics, left_plateau
+from crptpro.experiments.report.glance import glance
 from crptpro.experiments.report.measurements import Row
 from crptpro.experiments.report.reading import Made, Wanted
 from crptpro.experiments.report.study import _along
+from crptpro.experiments.report.trials import Trial, changes, readings
 
 
 def row(updates: int, r2: str) -> Row:
@@ -67,3 +69,103 @@ def test_the_table_of_diagnostics_says_when_the_plateau_was_left_and_by_how_many
     assert (found["one"].text, found["one"].beside) == ("200", "1 of 2 encoders")
     assert found["none"].text == "not left"
     assert found["no prototypes"].text == ABSENT
+
+
+def probed(
+    value: str, seed: int, updates: int, r2: dict[str, float | str], *, group: str = "A", factor: str = "tau"
+) -> list[Row]:
+    """An encoder's velocities, as read from its features on each domain."""
+    place = {
+        "factor": factor,
+        "value": value,
+        "usual": "0.1",
+        "group": group,
+        "encoder_seed": seed,
+        "updates": updates,
+    }
+    key = f"probe-{value}-{group}{seed}-{updates}"
+    cells = {"colors": "normal", "embedding": "features", "measure": "r2_velocity", "coordinate": ""}
+    goal = Wanted("crptpro", place, Made(key, Path(key), {"kind": "probe"}, {}))
+    return [Row(goal, {**cells, "domain": domain, "value": str(number)}) for domain, number in r2.items()]
+
+
+def both(walker: float | str, finger: float | str) -> dict[str, float | str]:
+    return {"walker": walker, "finger": finger}
+
+
+MEASURE = ("r2_velocity", "features")
+SHARP = {group: Trial("tau", "0.05", "0.1", group) for group in "AC"}
+FOUND = readings(
+    [
+        *probed("0.1", 0, 100, both(0.1, 0.2)),
+        *probed("0.1", 0, 300, both(0.2, 0.4)),
+        *probed("0.1", 1, 300, both(0.3, 0.5)),
+        *probed("0.05", 0, 100, both(0.3, 0.5)),
+        *probed("0.05", 0, 300, both(0.3, 0.6)),
+        *probed("0.05", 1, 300, both(0.2, 0.5)),
+        *probed("0.05", 2, 300, both(0.9, 0.9)),  # nothing to compare with
+        *probed("0.1", 0, 300, {"reacher": 0.4}, group="C"),
+        *probed("0.05", 0, 300, {"reacher": 0.6}, group="C"),
+        *probed("untrained", 0, 0, both(0.0, 0.1), factor="control"),
+    ]
+)
+
+
+def test_encoders_are_compared_with_the_usual_ones_of_their_group_seed_and_updates() -> None:
+    end = pytest.approx([0.45 - 0.3, 0.35 - 0.4])
+    assert changes(FOUND, [SHARP["A"]], None, MEASURE) == end
+    assert changes(FOUND, [SHARP["A"]], 300, MEASURE) == end
+    assert changes(FOUND, [SHARP["A"]], 100, MEASURE) == pytest.approx([0.4 - 0.15])
+    assert changes(FOUND, SHARP.values(), 300, MEASURE) == pytest.approx([0.45 - 0.3, 0.35 - 0.4, 0.6 - 0.4])
+    assert changes(FOUND, SHARP.values(), 200, MEASURE) == []
+    assert changes(FOUND, SHARP.values(), None, ("r2_velocity", "z")) == []
+
+
+def test_ends_after_different_updates_do_not_compare() -> None:
+    found = readings([*probed("0.1", 0, 300, both(0.1, 0.1)), *probed("0.05", 0, 200, both(0.2, 0.2))])
+    assert changes(found, [SHARP["A"]], None, MEASURE) == []
+
+
+def test_an_encoder_counts_once_it_is_probed_on_every_domain_of_its_group() -> None:
+    part = [*probed("0.1", 0, 300, both(0.2, 0.4)), *probed("0.05", 0, 300, {"walker": 0.9})]
+    assert [(reading.trial.value, reading.values[MEASURE]) for reading in readings(part)] == [
+        ("0.1", pytest.approx(0.3))
+    ]
+    (reading,) = readings(probed("0.1", 0, 300, both(0.2, 0.4)) + probed("0.05", 0, 300, both(0.2, "")))
+    assert reading.trial.is_usual
+
+
+def test_a_glance_has_every_value_with_its_change_and_the_untrained_encoder_last() -> None:
+    blocks = tuple(glance(FOUND, [], "study"))
+    table = table_in(blocks, "at a glance")
+    assert [[cell.text for cell in line[:4]] for line in table.rows] == [
+        ["tau", "0.1 (usual)", "A", "2"],
+        ["tau", "0.05", "A", "3"],
+        ["tau", "0.1 (usual)", "C", "1"],
+        ["tau", "0.05", "C", "1"],
+        [ABSENT, "untrained", "A", "1"],
+    ]
+    read = [line[table.columns.index("velocities, features")] for line in table.rows]
+    assert [(cell.text, cell.beside) for cell in read] == [
+        ("0.350", ""),
+        ("0.567", "+0.050"),
+        ("0.400", ""),
+        ("0.600", "+0.200"),
+        ("0.050", ""),
+    ]
+    assert any(isinstance(block, Paragraph) and "one pair of encoders" in block.text for block in blocks)
+    along = table_in(blocks, "velocities from features against the usual")
+    assert along.columns == ("factor", "value", "pairs", "100", "300")
+    assert [(c.text, c.beside) for c in along.rows[0][3:]] == [
+        ("+0.250", ""),
+        ("+0.100", "-0.050 to +0.200"),
+    ]
+    assert [[cell.text for cell in line[:3]] for line in along.rows] == [["tau", "0.05", "3"]]
+    (figure,) = (block for block in blocks if isinstance(block, Figure))
+    marks = figure.drawing.axes[0].lines
+    assert marks[0].get_xdata()[0] == pytest.approx(0.25)
+    assert marks[1].get_xdata()[0] == pytest.approx(0.1)
+
+
+def test_there_is_no_glance_where_nothing_is_the_usual_value() -> None:
+    assert glance([reading for reading in FOUND if not reading.trial.is_usual], [], "study") == []

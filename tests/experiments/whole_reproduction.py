@@ -139,7 +139,7 @@ def _measurements(made: Reproduction) -> None:
         for seed in (0, 1):
             variant = encoder(SMALL, "crptpro", ("walker", "finger"), seed, loss=settings(variant=value))
             made.encoder(variant, plateau=600 - 250 * place + 30 * seed)
-            where = settings(factor="assignment temperature", value=value, seed=seed)
+            where = settings(factor="assignment temperature", value=value, usual="0.1", seed=seed)
             tried.append(Goal(f"crptpro, temperature {value}", variant, where))
             for updates in (500, 1000):
                 piece = ProbePiece(variant, random_data.datasets[1], samples=updates)

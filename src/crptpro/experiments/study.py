@@ -77,7 +77,7 @@ def temperatures(request: Request) -> list[Goal]:
     for group in request.groups or ("A", "C"):
         for seed in (first, *(more or (first + 1,))):
             for value, loss in variants.items():
-                place = {"factor": "assignment_temperature", "value": value, "group": group}
+                place = {"factor": "assignment_temperature", "value": value, "usual": "0.1", "group": group}
                 piece = _trial(request.scale, group, seed, updates, SNAPSHOTS, loss=loss)
                 found += _judged(request.scale, f"{METHOD}, assignment_temperature {value}", piece, place)
                 found += _learned(request, f"{METHOD}, assignment_temperature {value}", piece, place)
@@ -93,7 +93,12 @@ def factors(request: Request) -> list[Goal]:
     for factor in factors_of(scale):
         for value in factor.values:
             changed = {} if value == factor.usual else {factor.where: {factor.name: value}}
-            place = {"factor": factor.name, "value": f"{value:g}", "group": group}
+            place = {
+                "factor": factor.name,
+                "value": f"{value:g}",
+                "usual": f"{factor.usual:g}",
+                "group": group,
+            }
             piece = _trial(scale, group, seed, scale.updates, FACTOR_SNAPSHOTS, **changed)
             found += _judged(scale, f"{METHOD}, {factor.name} {value:g}", piece, place)
     return [*found, *_control(request, group, seed)]

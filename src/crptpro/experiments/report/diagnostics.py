@@ -139,7 +139,7 @@ def _finals(records: Sequence[Record], name: Naming, heading: str, of: str) -> T
         reached = {number(rows[-1], "updates") or 0 for rows in own if rows}
         updates = " or ".join(f"{at:,.0f}" for at in sorted(reached))
         finals = (_final(own, column) for column in NAMES)
-        lines.append(cells(label, str(len(own)), updates, _plateau(own), *finals))
+        lines.append(cells(label, str(len(own)), updates, plateau(own), *finals))
     caption = (
         f"{of}diagnostics at the end of pre-training, mean of the last {WINDOW} rows, then over encoders. The plateau "
         f"is left where the comparative loss stays below {PLATEAU:.0%} of ln M from then on."
@@ -148,7 +148,12 @@ def _finals(records: Sequence[Record], name: Naming, heading: str, of: str) -> T
     return Table(sentence(caption), columns, tuple(lines))
 
 
-def _plateau(records: Sequence[list[dict[str, str]]]) -> Cell:
+def plateau(records: Sequence[list[dict[str, str]]]) -> Cell:
+    """Say when encoders left their plateau, mean and range, and how many did.
+
+    Args:
+        records: rows of ``pretrain.csv`` of each encoder.
+    """
     left = [left_plateau(rows) for rows in records if rows and number(rows[-1], "ln_num_prototypes")]
     known = [updates for updates in left if updates is not None]
     if not left:

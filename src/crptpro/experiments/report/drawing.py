@@ -161,12 +161,15 @@ def bars(groups: Sequence[str], series: Mapping[str, Sequence[float | None]], un
         return figure
 
 
-def dots(rows: Sequence[str], panels: Sequence[tuple[str, Sequence[Dots]]]) -> Any:
+def dots(
+    rows: Sequence[str], panels: Sequence[tuple[str, Sequence[Dots]]], *, mark: float | None = None
+) -> Any:
     """Draw systems as marks on shared rows, a panel per quantity.
 
     Args:
         rows: names, from top to bottom.
         panels: name of the quantity, with every system's marks.
+        mark: place of an upright dashed line, e.g. where nothing has changed.
 
     Returns:
         Matplotlib's figure.
@@ -188,6 +191,8 @@ def dots(rows: Sequence[str], panels: Sequence[tuple[str, Sequence[Dots]]]) -> A
                     system.style.marker, color=system.style.color, markersize=4.5, linestyle="none",
                 )  # fmt: skip
                 named.setdefault(system.label, drawn[0])
+            if mark is not None:
+                axis.axvline(mark, color=INK, linestyle=(0, (4, 3)), linewidth=0.8)
             axis.set_yticks(range(len(rows)), rows if place == 0 else [""] * len(rows))
             axis.set_ylim(len(rows) - 0.5, -0.5)
             axis.set(xlabel=name)

@@ -1,4 +1,4 @@
-"""One-factor trials of pre-training: diagnostics, probes and scores by the value of what was changed."""
+"""One-factor trials of pre-training: what was gained at a glance, then diagnostics and probes of each factor."""
 
 from __future__ import annotations
 
@@ -7,78 +7,93 @@ from collections.abc import Sequence
 import numpy as np
 
 from crptpro.experiments.report import drawing
-from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Figure, Heading, Table, sentence
-from crptpro.experiments.report.diagnostics import diagnostics, group_of, groups_of, records_of
+from crptpro.experiments.report.blocks import (
+    ABSENT,
+    Block,
+    Cell,
+    Figure,
+    Heading,
+    Table,
+    sentence,
+)
+from crptpro.experiments.report.diagnostics import diagnostics, records_of
+from crptpro.experiments.report.glance import POSITIONS, VELOCITIES, glance, words
 from crptpro.experiments.report.measurements import Row, rows_of
 from crptpro.experiments.report.palette import in_order, styles
 from crptpro.experiments.report.reading import Asked, Wanted
-
-READ = {"r2_position": "positions", "r2_velocity": "velocities"}
-CONTROL = "control"
-"""The factor of an untrained encoder, which stands in the tables of every other."""
+from crptpro.experiments.report.trials import CONTROL, readings, seed_of, trial_of, updates_of
 
 
 def study(asked: Asked) -> tuple[Block, ...]:
-    """Report, for each factor and group, final diagnostics, curves and probes by value.
+    """Report what each value changed; then, for each factor and group, final diagnostics, curves and probes.
 
-    A goal's place names its ``factor`` and ``value``, its ``group``, and ``updates`` if an encoder was probed along its
-    training.
+    A goal's place names its ``factor``, ``value`` and ``usual`` value, its ``group``, and ``updates`` if an encoder was
+    probed along its training.
     """
     probes, blocks = rows_of(asked, "probe")
-    probes = [row for row in probes if not row["coordinate"] and row["measure"] in READ]
+    probes = [row for row in probes if not row["coordinate"] and row["measure"] in (POSITIONS, VELOCITIES)]
     records = records_of(asked)
-    factors = list(dict.fromkeys(_factor(goal) for goal in asked.finished if goal.piece.kind != "run"))
-    for number, factor in enumerate(factors):
-        if factor == CONTROL and len(factors) > 1:
+    blocks += glance(readings(probes), records, asked.name)
+    trials = dict.fromkeys(trial_of(goal) for goal in asked.finished if goal.piece.kind != "run")
+    parts = dict.fromkeys((trial.factor, trial.group) for trial in trials)
+    for factor, group in parts:
+        if factor == CONTROL and any(other != CONTROL for other, _ in parts):
             continue
-        goals = [goal for goal in asked.finished if _factor(goal) == factor]
-        for group in groups_of(goals):
-            of = ", ".join(part for part in (_words(factor), f"group {group}" * bool(group)) if part)
-            if of:
-                blocks.append(Heading(sentence(of)))
-                of = f"{of}: "
-            heading = _words(factor) or "variant"
-            name = f"{asked.name}-{number + 1}{group}"
-            own = [
-                (goal, rows) for goal, rows in records if (_factor(goal), group_of(goal)) == (factor, group)
-            ]
-            read = [
-                row
-                for row in probes
-                if _factor(row.goal) in (factor, CONTROL) and group_of(row.goal) == group
-            ]
-            if own:
-                blocks += diagnostics(own, _value, heading, name, of)
-            if read:
-                blocks.append(_table(read, heading, of))
-                blocks += _along(read, f"{name}-probe", of)
+        of = ", ".join(part for part in (words(factor), f"group {group}" * bool(group)) if part)
+        if of:
+            blocks.append(Heading(sentence(of)))
+            of = f"{of}: "
+        heading = words(factor) or "variant"
+        name = f"{asked.name}-{list(dict.fromkeys(f for f, _ in parts)).index(factor) + 1}{group}"
+        own = [record for record in records if _stands(record[0], (factor,), group)]
+        read = [row for row in probes if _stands(row.goal, (factor, CONTROL), group)]
+        if own:
+            blocks += diagnostics(own, _value, heading, name, of)
+        if read:
+            embeddings = dict.fromkeys(row["embedding"] for row in read)
+            blocks += [_probes(read, embedding, heading, of) for embedding in embeddings]
+            blocks += _along(read, f"{name}-probe", of)
     return tuple(blocks)
 
 
-def _table(rows: Sequence[Row], heading: str, of: str) -> Table:
-    last = {key: max(_updates(r) for r in rows if _encoder(r) == key) for key in {_encoder(r) for r in rows}}
-    ends = [row for row in rows if _updates(row) == last[_encoder(row)]]
+def _probes(rows: Sequence[Row], embedding: str, heading: str, of: str) -> Table:
+    """What is read from an embedding at the end, a column per domain."""
+    rows = [row for row in rows if row["embedding"] == embedding]
+    last = {key: max(updates_of(r.goal) for r in rows if _encoder(r) == key) for key in map(_encoder, rows)}
+    ends = [row for row in rows if updates_of(row.goal) == last[_encoder(row)]]
+    ends.sort(key=lambda row: trial_of(row.goal).factor == CONTROL)
     columns = list(dict.fromkeys(_column(row) for row in ends))
     lines = []
-    ends.sort(key=lambda row: _factor(row.goal) == CONTROL)
     for label in in_order(_value(row.goal) for row in ends):
         line = [Cell(label)]
         for column in columns:
-            own = [row for row in ends if _value(row.goal) == label and _column(row) == column]
-            values = [value for row in own if (value := row.number("value")) is not None]
-            spread = f" ± {np.std(values, ddof=1):.3f}" if len(values) > 1 else ""
-            told = Cell(f"{np.mean(values):.3f}{spread}", f"n = {len(values)}") if values else Cell(ABSENT)
-            line.append(told)
+            own = [row for row in ends if (_value(row.goal), _column(row)) == (label, column)]
+            line.append(_both(own))
         lines.append(tuple(line))
-    caption = f"{of}state probe at the end, R2 on held-out episodes, mean over encoders (n)."
+    caption = (
+        f"{of}positions / velocities read from {embedding} at the end, held-out R2, mean over encoders (n)."
+    )
     return Table(sentence(caption), (heading, *columns), tuple(lines))
+
+
+def _both(rows: Sequence[Row]) -> Cell:
+    parts = []
+    for measure in (POSITIONS, VELOCITIES):
+        values = [v for row in rows if row["measure"] == measure and (v := row.number("value")) is not None]
+        spread = f"{np.std(values, ddof=1):.3f}" if len(values) > 1 else ABSENT
+        parts.append((f"{np.mean(values):.3f}", len(values), spread) if values else (ABSENT, 0, ABSENT))
+    count = max(count for _, count, _ in parts)
+    if not count:
+        return Cell(ABSENT)
+    spread = f"± {parts[0][2]} / {parts[1][2]}, " if count > 1 else ""
+    return Cell(" / ".join(text for text, _, _ in parts), f"{spread}n = {count}")
 
 
 def _along(rows: Sequence[Row], name: str, of: str) -> list[Block]:
     """R2 of velocities along training, from features; nothing where encoders were probed at their end alone."""
-    rows = [row for row in rows if row["measure"] == "r2_velocity" and row["embedding"] == "features"]
-    trained = [row for row in rows if _factor(row.goal) != CONTROL]
-    if len({_updates(row) for row in trained}) < 2:
+    rows = [row for row in rows if row["measure"] == VELOCITIES and row["embedding"] == "features"]
+    trained = [row for row in rows if trial_of(row.goal).factor != CONTROL]
+    if len({updates_of(row.goal) for row in trained}) < 2:
         return []
     labels = in_order(_value(row.goal) for row in trained)
     look, panels = styles(labels), []
@@ -87,42 +102,32 @@ def _along(rows: Sequence[Row], name: str, of: str) -> list[Block]:
         curves = []
         for label in labels:
             own = [row for row in here if _value(row.goal) == label]
-            places = sorted({_updates(row) for row in own})
-            read = [[r.number("value") for r in own if _updates(r) == at] for at in places]
+            places = sorted({updates_of(row.goal) for row in own})
+            read = [[r.number("value") for r in own if updates_of(r.goal) == at] for at in places]
             means = [np.mean([np.nan if value is None else value for value in part]) for part in read]
             encoders = len({_encoder(row) for row in own})
             curves.append(drawing.Line(f"{label} (n = {encoders})", look[label], places, means))
-        untrained = [r.number("value") for r in rows if _factor(r.goal) == CONTROL and _column(r) == column]
-        known = [value for value in untrained if value is not None]
+        controls = [row for row in rows if trial_of(row.goal).factor == CONTROL and _column(row) == column]
+        known = [value for row in controls if (value := row.number("value")) is not None]
         marks = {"untrained": float(np.mean(known))} if known else {}
-        panels.append(
-            drawing.Panel(column.split(",")[0], "encoder updates", "R2 of velocities", curves, marks)
-        )
+        panels.append(drawing.Panel(column, "encoder updates", "R2 of velocities", curves, marks))
     caption = f"{of}state probe of the features along training, mean over encoders (n in the legend)."
     return [Figure(name, sentence(caption), drawing.lines(panels, columns=2))]
 
 
-def _factor(goal: Wanted) -> str:
-    return str(goal.place.get("factor", ""))
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")
+def _stands(goal: Wanted, factors: Sequence[str], group: str) -> bool:
+    trial = trial_of(goal)
+    return trial.factor in factors and trial.group == group
 
 
 def _value(goal: Wanted) -> str:
-    return str(goal.place.get("value", goal.label))
-
-
-def _updates(row: Row) -> float:
-    return float(row.goal.place.get("updates", 0))
+    return trial_of(goal).value
 
 
 def _encoder(row: Row) -> tuple[str, str]:
     """Which encoder a row is about; its probes are pieces of their own."""
-    return _value(row.goal), str(row.goal.place.get("encoder_seed", row.goal.place.get("seed", "")))
+    return _value(row.goal), seed_of(row.goal)
 
 
 def _column(row: Row) -> str:
-    where = row["domain"] if row["colors"] == "normal" else f"{row['domain']} {row['colors']}"
-    return f"{where}, {row['embedding']}, {READ.get(row['measure'], '')}"
+    return row["domain"] if row["colors"] == "normal" else f"{row['domain']} {row['colors']}"
