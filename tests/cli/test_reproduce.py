@@ -149,23 +149,48 @@ class Command:
             for path in self.root.glob("pieces/*/count.txt")
         }
 
+    def jobs_of(self, *names: str) -> list[psutil.Process]:
+        """All processes that the command has started, once the jobs of these pieces have begun."""
+        deadline = time.monotonic() + 90
+        while time.monotonic() < deadline and not set(names) <= set(self.counts()):
+            time.sleep(0.05)
+        return psutil.Process(self.process.pid).children(recursive=True)
+
+
+def alive(processes: list[psutil.Process], *, within_s: float) -> list[psutil.Process]:
+    """Those that have not ended by then; nobody may be there to collect orphans."""
+    deadline = time.monotonic() + within_s
+    while (left := [p for p in processes if _lives(p)]) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return left
+
+
+def _lives(process: psutil.Process) -> bool:
+    try:
+        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def begun(root: Path) -> dict[str, list[int]]:
+    """What the attempts at each long piece counted on from."""
+    found = {}
+    for path in root.glob("pieces/*/attempts.txt"):
+        name = path.parent.name.split("-")[1]
+        found[name] = [int(line.split()[0].removeprefix("from=")) for line in path.read_text().splitlines()]
+    return {name: values for name, values in found.items() if name in ("crptpro", "atc")}
+
 
 @pytest.mark.slow
 def test_ctrl_c_stops_the_jobs_at_a_checkpoint_and_the_same_command_continues(tmp_path: Path) -> None:
     root = tmp_path / "root"
     first = Command(root, "fake", "--jobs", 2)
-    deadline = time.monotonic() + 90
-    while time.monotonic() < deadline and not {"crptpro", "atc"} <= set(first.counts()):
-        time.sleep(0.05)
-    jobs = psutil.Process(first.process.pid).children(recursive=True)
+    jobs = first.jobs_of("crptpro", "atc")
     os.killpg(first.process.pid, signal.SIGINT)  # as a terminal does
     status, out, err = first.end()
     assert status == 130, err
     assert "the same command continues" in err
-    _, alive = psutil.wait_procs(jobs, timeout=1)
-    assert not [
-        job for job in alive if job.status() != psutil.STATUS_ZOMBIE
-    ]  # nobody is there to collect orphans
+    assert not alive(jobs, within_s=1)
     counts = first.counts()
     assert 1 <= counts["crptpro"] < 40
     assert not list(root.glob("pieces/*/*.partial"))
@@ -176,13 +201,28 @@ def test_ctrl_c_stops_the_jobs_at_a_checkpoint_and_the_same_command_continues(tm
     status, out, err = Command(root, "fake", "--jobs", 2).end()
     assert status == 0, err
     assert f"crptpro report {root}" in out
-    for name in ("crptpro", "atc"):
-        [path] = root.glob(f"pieces/*-{name}-*/attempts.txt")
-        begun = [int(line.split()[0].removeprefix("from=")) for line in path.read_text().splitlines()]
-        assert begun == [
-            0,
-            counts[name],
-        ]  # the job wrote a checkpoint when it was stopped, and went on from it
+    # The jobs wrote a checkpoint when they were stopped, and went on from it.
+    assert begun(root) == {name: [0, counts[name]] for name in ("crptpro", "atc")}
+
+
+@pytest.mark.slow
+def test_jobs_whose_command_was_killed_leave_a_checkpoint_and_the_same_command_continues(
+    tmp_path: Path,
+) -> None:
+    root = tmp_path / "root"
+    first = Command(root, "fake", "--jobs", 2)
+    jobs = first.jobs_of("crptpro", "atc")
+    assert len(jobs) >= 2
+    first.process.kill()
+    first.process.wait()
+    assert not alive(jobs, within_s=10)
+    counts = first.counts()
+    assert 1 <= counts["crptpro"] < 40
+    assert not list(root.glob("pieces/*/*.partial"))
+    assert "is gone" in next(root.glob("pieces/*-crptpro-*/log.txt")).read_text()
+    status, _, err = Command(root, "fake", "--jobs", 2).end()
+    assert status == 0, err
+    assert begun(root) == {name: [0, counts[name]] for name in ("crptpro", "atc")}
 
 
 @pytest.mark.slow

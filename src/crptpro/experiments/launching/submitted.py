@@ -17,6 +17,7 @@ from typing import Any
 from crptpro.errors import CRPTproError
 from crptpro.experiments.launching.gpus import visible_gpus
 from crptpro.experiments.launching.launchers import Outcome
+from crptpro.experiments.launching.orphans import leave_with
 from crptpro.experiments.launching.work import THREAD_VARIABLES, Work
 
 FOLDER = "jobs"
@@ -29,9 +30,15 @@ MAX_REQUEUES = 1_000
 
 @dataclass(frozen=True)
 class SubmittedWork:
-    """The function that submitit pickles."""
+    """The function that submitit pickles.
+
+    Args:
+        work: what to do.
+        scheduler: process of this machine that the job ends with; ``None`` on a cluster, which keeps its own watch.
+    """
 
     work: Work
+    scheduler: int | None = None
 
     def __call__(self) -> str:
         """Make the piece in a process of submitit's."""
@@ -41,6 +48,8 @@ class SubmittedWork:
             os.setsid()
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, _leave)
+        if self.scheduler is not None:
+            leave_with(self.scheduler)
         return self.work.run_logged()
 
     def checkpoint(self) -> Any:
@@ -140,7 +149,7 @@ class LocalLauncher:
         executor = LocalExecutor(folder)
         executor.update_parameters(timeout_min=ENDLESS_MINUTES)
         with _environment_of_jobs(work.settings.threads):
-            submitted: Any = executor.submit(SubmittedWork(work))
+            submitted: Any = executor.submit(SubmittedWork(work, scheduler=os.getpid()))
         submitted._results_timeout_s = 0  # the result is on this machine's disk when the process has ended
         self._jobs.append(SubmittedJob(submitted, folder, work))
         return self._jobs[-1]
