@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,10 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crptpro.experiments.plots import make_figure
+from crptpro.experiments.report.canvas import INK, grid, legend, theme
 from crptpro.experiments.report.palette import Style
-
-INK, PAPER, RULE = "#1f2328", "#fefefd", "#d8dce1"
-"""Text, background and grid of the files; inline in a page they are the page's own."""
 
 
 @dataclass(frozen=True)
@@ -75,27 +72,6 @@ class Dots:
     values: Sequence[float | None]
 
 
-@contextlib.contextmanager
-def theme() -> Iterator[None]:
-    """Draw and save with this report's look."""
-    import matplotlib
-
-    look: Any = {
-        "svg.fonttype": "none",
-        "svg.hashsalt": "crptpro",  # the same numbers give the same file
-        "font.size": 9,
-        "text.color": INK, "axes.labelcolor": INK, "xtick.color": INK, "ytick.color": INK, "axes.edgecolor": INK,
-        "figure.facecolor": PAPER, "axes.facecolor": PAPER, "savefig.facecolor": PAPER,
-        "axes.grid": True, "grid.color": RULE, "grid.linewidth": 0.6, "axes.axisbelow": True,
-        "axes.spines.top": False, "axes.spines.right": False,
-        "axes.titlesize": 9.5, "axes.titlelocation": "left", "axes.titleweight": "bold",
-        "legend.frameon": False,
-        "axes.formatter.useoffset": False,
-    }  # fmt: skip
-    with matplotlib.rc_context(look):
-        yield
-
-
 def lines(panels: Sequence[Panel], *, columns: int = 3) -> Any:
     """Draw curves with one legend below.
 
@@ -107,7 +83,7 @@ def lines(panels: Sequence[Panel], *, columns: int = 3) -> Any:
         Matplotlib's figure.
     """
     with theme():
-        figure, axes = _grid(len(panels), columns)
+        figure, axes = grid(len(panels), columns)
         named: dict[str, Any] = {}
         for axis, panel in zip(axes, panels):
             for line in panel.lines:
@@ -122,7 +98,7 @@ def lines(panels: Sequence[Panel], *, columns: int = 3) -> Any:
             largest = max((float(np.max(line.x)) for line in panel.lines if np.size(line.x)), default=0)
             if largest >= 10_000:
                 axis.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
-        _legend(figure, named)
+        legend(figure, named)
         return figure
 
 
@@ -157,7 +133,7 @@ def bars(groups: Sequence[str], series: Mapping[str, Sequence[float | None]], un
         axis.set(xlabel=unit)
         axis.xaxis.set_major_formatter("{x:,g}")
         axis.margins(x=0.12)
-        _legend(figure, dict(zip(series, axis.containers)))
+        legend(figure, dict(zip(series, axis.containers)))
         return figure
 
 
@@ -196,7 +172,9 @@ def dots(
             axis.set_yticks(range(len(rows)), rows if place == 0 else [""] * len(rows))
             axis.set_ylim(len(rows) - 0.5, -0.5)
             axis.set(xlabel=name)
-        _legend(figure, named)
+            # Tiny ranges have long numbers; of more than five they touch.
+            axis.locator_params(axis="x", nbins=5, min_n_ticks=3)
+        legend(figure, named)
         return figure
 
 
@@ -230,7 +208,7 @@ def scatter(
         pairs: which two dimensions each panel shows.
     """
     with theme():
-        figure, axes = _grid(len(pairs), 3, height=3.3)
+        figure, axes = grid(len(pairs), 3, height=3.3)
         named: dict[str, Any] = {}
         for axis, (first, second) in zip(axes, pairs):
             for label, (style, points) in clouds.items():
@@ -240,7 +218,7 @@ def scatter(
                 )  # fmt: skip
                 named.setdefault(f"{label} ({len(points)} points)", drawn[0])
             axis.set(xlabel=names[first], ylabel=names[second])
-        _legend(figure, named)
+        legend(figure, named)
         return figure
 
 
@@ -263,16 +241,6 @@ def strips(rows: Mapping[str, Sequence[np.ndarray]], *, size: float = 1.0) -> An
         return figure
 
 
-def _grid(panels: int, most: int, *, height: float = 2.9) -> tuple[Any, list[Any]]:
-    columns = min(panels, most)
-    width = {1: 7.4, 2: 5.2}.get(columns, 3.7)
-    figure, axes = make_figure(math.ceil(panels / columns), columns, width=width, height=height)
-    flat = list(axes.flat)
-    for axis in flat[panels:]:
-        axis.set_axis_off()
-    return figure, flat
-
-
 def _draw(axis: Any, line: Line) -> Any:
     x = np.asarray(line.x, dtype=float)
     style = line.style
@@ -285,18 +253,6 @@ def _draw(axis: Any, line: Line) -> Any:
     if line.low is not None and line.high is not None:
         axis.fill_between(x, line.low, line.high, color=style.color, alpha=0.18, linewidth=0)
     return drawn
-
-
-def _legend(figure: Any, named: Mapping[str, Any]) -> None:
-    """One legend for all panels, below them; the figure grows by what it takes."""
-    if not named:
-        return
-    width, height = figure.get_size_inches()
-    entry = 0.6 + 0.062 * max(len(name) for name in named)  # inches
-    columns = max(1, min(len(named), int(width / entry)))
-    rows = math.ceil(len(named) / columns)
-    figure.set_size_inches(width, height + 0.17 * rows + 0.1)
-    figure.legend(named.values(), named.keys(), loc="outside lower center", ncols=columns, fontsize=8)
 
 
 def _short(value: float) -> str:

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from crptpro.experiments.report.drawing import INK, PAPER, RULE, theme
+from crptpro.experiments.report.canvas import INK, PAPER, RULE, theme
 
 
 def save(drawing: Any, folder: Path, name: str) -> tuple[str, bytes]:

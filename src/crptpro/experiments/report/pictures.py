@@ -14,6 +14,7 @@ from crptpro.errors import CRPTproError
 from crptpro.experiments.plots import draw_stacks
 from crptpro.experiments.report import drawing
 from crptpro.experiments.report.blocks import Block, Bullets, Figure, Paragraph, counted
+from crptpro.experiments.report.canvas import theme
 from crptpro.experiments.report.reading import Made
 from crptpro.experiments.report.runs import Placed
 
@@ -44,7 +45,7 @@ def observations(pieces: Iterable[Made]) -> tuple[Block, ...]:
             problems.append(f"{name}: {reason}")
     blocks: list[Block] = []
     if opened:
-        with drawing.theme():
+        with theme():
             picture = draw_stacks(opened, stacks=STACKS)
             for axis in picture.axes:
                 axis.grid(visible=False)
