@@ -21,6 +21,7 @@ from crptpro.pretrained import (
     trim_pretrained,
 )
 from crptpro.training import DownstreamConfig, load_agent, train_downstream
+from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.downstream import _replay_capacity
 from crptpro.training.downstream_run import DownstreamRun
 from crptpro.training.frozen_features import FrozenFeatures
@@ -285,6 +286,19 @@ def test_what_auto_became_must_agree_when_a_run_is_continued(
     with pytest.raises(CheckpointError, match="channels_last was 'absent', now 'off'"):
         train(tmp_path, features="dense", channels_last="off")
     assert train(tmp_path, features="dense", compile="off").env_steps == 120
+
+
+@pytest.mark.parametrize("begun_in", ["fp32", "bf16"])
+def test_a_run_goes_on_in_the_arithmetic_that_it_began_in_on_a_machine_with_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begun_in: str
+) -> None:
+    monkeypatch.setattr("crptpro.modules.precision._cpu_multiplies_bf16", lambda: begun_in == "bf16")
+    train(tmp_path, env_steps=60, precision="auto")
+    monkeypatch.setattr("crptpro.modules.precision._cpu_multiplies_bf16", lambda: begun_in != "bf16")
+    assert train(tmp_path, precision="auto").env_steps == 120
+    kept = CheckpointDir(tmp_path / "checkpoints").load_latest()
+    assert kept is not None
+    assert kept["fingerprint"]["precision"] == begun_in
 
 
 def test_a_finished_run_encodes_nothing_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

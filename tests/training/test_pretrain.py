@@ -96,6 +96,22 @@ def test_two_n_updates_equal_n_stop_and_resume_n(tmp_path: Path) -> None:
     assert [int(row["updates"]) for row in record(tmp_path / "parts")] == [4, 8, 12, 16, 20, 22]
 
 
+@pytest.mark.parametrize("begun_in", ["fp32", "bf16"])
+def test_a_run_goes_on_in_the_arithmetic_that_it_began_in_on_a_machine_with_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begun_in: str
+) -> None:
+    whole, second = make_loss(), make_loss()
+    run(whole, 8, precision=begun_in)
+    monkeypatch.setattr("crptpro.modules.precision._cpu_multiplies_bf16", lambda: begun_in == "bf16")
+    assert run(make_loss(), 4, run_dir=tmp_path, precision="auto").precision == begun_in
+    monkeypatch.setattr("crptpro.modules.precision._cpu_multiplies_bf16", lambda: begun_in != "bf16")
+    assert run(second, 8, run_dir=tmp_path, precision="auto").precision == begun_in
+    assert same_state(whole, second)
+    other = "bf16" if begun_in == "fp32" else "fp32"
+    with pytest.raises(CheckpointError, match=f"precision was '{begun_in}', now '{other}'"):
+        run(make_loss(), 8, run_dir=tmp_path, precision=other)
+
+
 def test_seeds_make_runs_equal_or_different_and_leave_the_global_generator_alone() -> None:
     losses = [make_loss() for _ in range(3)]
     torch.manual_seed(5)

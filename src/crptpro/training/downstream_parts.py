@@ -33,6 +33,7 @@ from crptpro.training.downstream_algorithms import DownstreamAlgorithm, Learner,
 from crptpro.training.downstream_bonus import build_bonus, require_queue
 from crptpro.training.downstream_checkpoint import is_complete
 from crptpro.training.downstream_replay import empty_replay, make_replay
+from crptpro.training.fingerprint import precision_to_continue
 from crptpro.training.frozen_features import FrozenFeatures, dense_slots
 from crptpro.training.trained_features import TrainedFeatures
 from crptpro.transforms import PrototypeReward, choose_feature_mode
@@ -145,7 +146,7 @@ def build_parts(
     channels, image_size, _ = env.observation_spec["pixels"].shape
     pretrained.require(image_size=image_size, frame_stack=channels // 3)
     require_queue(pretrained, config)
-    dtype = resolve_precision(config.precision, config.device)
+    dtype = resolve_precision(precision_to_continue(config.precision, state), config.device)
     networks = (pretrained.encoder, pretrained.projector, pretrained.prototypes)
     encoder, projector, prototypes = copy.deepcopy(networks)
     for module in (encoder, projector, prototypes):

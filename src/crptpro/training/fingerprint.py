@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from crptpro.errors import CheckpointError
+from crptpro.modules.precision import Precision
 
 
 def describe_loss(loss: LossModule) -> dict[str, Any]:
@@ -24,6 +25,20 @@ def describe_loss(loss: LossModule) -> dict[str, Any]:
         if isinstance(value, Tensor):
             described[f"shape of {name}"] = f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
     return {name: value for name, value in described.items() if not isinstance(value, Tensor)}
+
+
+def precision_to_continue(asked: Precision, state: Mapping[str, Any] | None) -> Precision:
+    """Return the precision of a run: where it is left open, the one that it began with.
+
+    What ``"auto"`` stands for depends on the hardware, and an interrupted run may find itself on another machine.
+
+    Args:
+        asked: by the user.
+        state: of the checkpoint that is continued, if any.
+    """
+    if asked != "auto" or state is None:
+        return asked
+    return state["fingerprint"].get("precision", asked)
 
 
 def require_same(saved: Mapping[str, Any], now: Mapping[str, Any], where: Any) -> None:

@@ -323,6 +323,30 @@ def test_short_episodes_cost_frames_and_a_killed_run_of_them_is_continued_too(
     assert same_state(whole, resumed)
 
 
+@pytest.mark.parametrize("begun_in", ["fp32", "bf16"])
+def test_a_run_goes_on_in_the_arithmetic_that_it_began_in_on_a_machine_with_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begun_in: str
+) -> None:
+    whole, _ = explore(None, precision=begun_in)
+    original = ActiveRun._turn
+
+    def dies(run: ActiveRun, index: int) -> None:
+        if run.decisions == 70:
+            raise Killed
+        original(run, index)
+
+    with monkeypatch.context() as patched:
+        patched.setattr("crptpro.modules.precision._cpu_multiplies_bf16", lambda: begun_in == "bf16")
+        patched.setattr(ActiveRun, "_turn", dies)
+        with pytest.raises(Killed):
+            explore(tmp_path, precision="auto")
+    monkeypatch.setattr("crptpro.modules.precision._cpu_multiplies_bf16", lambda: begun_in != "bf16")
+    resumed, result = explore(tmp_path, precision="auto")
+    assert result.resumed_from > 0
+    assert result.precision == begun_in
+    assert same_state(whole, resumed)
+
+
 def test_another_budget_is_refused_by_name_and_nothing_is_built_for_it(tmp_path: Path) -> None:
     explore(tmp_path)
 

@@ -45,7 +45,7 @@ from crptpro.training.explore.checkpoint import action_sizes
 from crptpro.training.explore.plan import resolve
 from crptpro.training.explore.replays import DIRECTORY
 from crptpro.training.explore.request import domain_names, require_explorable
-from crptpro.training.fingerprint import require_same
+from crptpro.training.fingerprint import precision_to_continue, require_same
 from crptpro.training.pretrain.result import PretrainResult, training_record
 
 _LOG = logging.getLogger(__name__)
@@ -121,12 +121,9 @@ def pretrain_active(
     config = resolve(config, exploration, defaults)
     _warn_of_another_encoder(loss)
     named = domain_names(loss, domains, exploration)
-    dtype = resolve_precision(config.precision, config.device)
     cuda = [device.index or 0] if device.type == "cuda" else []
     loss.to(device).train()
     with contextlib.ExitStack() as stack:
-        channels_last = resolve_channels_last(config.channels_last)
-        stack.enter_context(computing(loss, dtype, channels_last=channels_last))
         stack.enter_context(torch.random.fork_rng(devices=cuda))
         require_explorable(loss, domains, config)
         torch.manual_seed(derive_seed(config.seed, "active", "loss"))
@@ -138,6 +135,9 @@ def pretrain_active(
         if run_dir is not None and logger is None:
             logger = stack.enter_context(RunLogger(directory, config=config))
         state = None if checkpoints is None else checkpoints.load_latest()
+        dtype = resolve_precision(precision_to_continue(config.precision, state), config.device)
+        channels_last = resolve_channels_last(config.channels_last)
+        stack.enter_context(computing(loss, dtype, channels_last=channels_last))
         now = fingerprint(loss, list(named), config, defaults, dtype)
         finished = None
         if state is not None:

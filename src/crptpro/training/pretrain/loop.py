@@ -26,11 +26,12 @@ from crptpro.seeding import derive_seed
 from crptpro.switches import Switch
 from crptpro.training.captured import resolve_cuda_graph
 from crptpro.training.compiled import Compiled, resolve_compile
+from crptpro.training.fingerprint import precision_to_continue
 from crptpro.training.pretrain.device_batches import DeviceBatches
 from crptpro.training.pretrain.learner import Learner
 from crptpro.training.pretrain.moments import read_moments
 from crptpro.training.pretrain.result import PretrainResult
-from crptpro.training.pretrain.run import PretrainRun
+from crptpro.training.pretrain.run import PretrainRun, read_state
 from crptpro.training.pretrain.sources import (
     SHIFT_PAD,
     Augment,
@@ -103,7 +104,8 @@ def pretrain(
         augment: ``"random_shift"`` (4 pixels, replicated border; independent per image and per sample),
             ``"none"``, or a function of a batch and a generator. Entries that the loss names in ``views`` are
             the same images, shifted once more (copies for ``"none"`` and a function).
-        precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (bf16 where the hardware multiplies it natively).
+        precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (bf16 where the hardware multiplies it natively; a run
+            that is continued keeps what it began with).
             Deviation: the released code computes in fp32 throughout, which ``"fp32"`` gives.
         channels_last: ``"on"``, ``"off"`` or ``"auto"`` (on): the memory layout of the convolutions. Changes rounding
             only.
@@ -168,14 +170,12 @@ def pretrain(
     if encoder_tau is not None and not 0 <= encoder_tau <= 1:
         raise ValueError(f"`encoder_tau` must be in [0, 1], got {encoder_tau}.")
     device = usable_device(device)
-    dtype = resolve_precision(precision, device)
     puts_channels_last = resolve_channels_last(channels_last)
     compiled = Compiled(is_on=resolve_compile(compile))
     captures = resolve_cuda_graph(cuda_graph, device)
     cuda = [device.index or 0] if device.type == "cuda" else []
     loss.to(device).train()
     with contextlib.ExitStack() as stack:
-        stack.enter_context(computing(loss, dtype, channels_last=puts_channels_last))
         stack.enter_context(torch.random.fork_rng(devices=cuda))
         torch.manual_seed(derive_seed(seed, "pretrain", "loss"))
         sources = open_sources(datasets, seed=seed, device=device)
@@ -186,6 +186,9 @@ def pretrain(
         if run_dir is not None:
             stack.enter_context(DirectoryLock(run_dir, error=CheckpointError, is_reentrant=True))
             logger = logger or stack.enter_context(RunLogger(run_dir))
+        state = None if run_dir is None else read_state(run_dir, resume=resume)
+        dtype = resolve_precision(precision_to_continue(precision, state), device)
+        stack.enter_context(computing(loss, dtype, channels_last=puts_channels_last))
         batches = None
         if domain_schedule != "mixed":
             batches = _device_batches(
@@ -221,7 +224,7 @@ def pretrain(
             run_dir=None if run_dir is None else Path(run_dir),
             at_updates=at_updates,
         )
-        run.prepare(resume=resume)
+        run.prepare(state)
         return run.train(progress=progress)
 
 

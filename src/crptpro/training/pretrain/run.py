@@ -86,15 +86,8 @@ class PretrainRun:
         """Training time so far, resumptions included."""
         return self.earlier_seconds + time.monotonic() - self.started
 
-    def prepare(self, *, resume: bool) -> None:
-        """Continue from the newest checkpoint, or clear the record for a fresh start."""
-        state = None
-        if self.checkpoints is not None:
-            if not resume and self.checkpoints.latest_counter() is not None:
-                raise CheckpointError(
-                    f"{self.run_dir} already holds a run. Choose another directory, or resume it."
-                )
-            state = self.checkpoints.load_latest()
+    def prepare(self, state: dict[str, Any] | None) -> None:
+        """Continue from what :func:`read_state` found, or clear the record for a fresh start."""
         if state is not None:
             self._load(state)
             return
@@ -269,6 +262,18 @@ class PretrainRun:
     def _last_row(self) -> dict[str, Any]:
         rows = [] if self.logger is None else self.logger.rows(STREAM)
         return {key: value for key, value in rows[-1].items() if key != "unix_time_s"} if rows else {}
+
+
+def read_state(run_dir: str | Path, *, resume: bool) -> dict[str, Any] | None:
+    """Return what a run directory's newest checkpoint holds; ``None`` where there is none.
+
+    Raises:
+        CheckpointError: there is one and it is not to be continued, or all are damaged.
+    """
+    checkpoints = CheckpointDir(Path(run_dir) / CHECKPOINTS)
+    if not resume and checkpoints.latest_counter() is not None:
+        raise CheckpointError(f"{run_dir} already holds a run. Choose another directory, or resume it.")
+    return checkpoints.load_latest()
 
 
 def _comp(row: dict[str, float]) -> float | None:
