@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 from crptpro.errors import CRPTproError
@@ -22,13 +24,20 @@ class DirectoryLock:
         error: What is raised.
         is_reentrant: Several re-entrant holders in one process share the lock: the record of a run and its training
             loop.
+        wait: Called with the seconds since the first try while another process holds the directory, which is then tried
+            again; it sleeps, or raises. Without it that is an error.
 
     Raises:
         CRPTproError: (or ``error``) if another process holds the directory, or it cannot be written.
     """
 
     def __init__(
-        self, directory: str | Path, *, error: type[CRPTproError] = CRPTproError, is_reentrant: bool = False
+        self,
+        directory: str | Path,
+        *,
+        error: type[CRPTproError] = CRPTproError,
+        is_reentrant: bool = False,
+        wait: Callable[[float], None] | None = None,
     ):
         path = Path(directory)
         self._handle: int | None = None
@@ -44,17 +53,17 @@ class DirectoryLock:
             self._handle = os.open(path / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as reason:
             raise error(f"{path} cannot be written: {reason}.") from reason
-        try:
-            import fcntl
-
-            fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self.release()
-            raise error(
-                f"Another process is writing to {path}. Wait for it, end it, or choose another directory."
-            ) from None
-        except (ImportError, OSError):  # not POSIX, or a file system without locks: go on unguarded
-            pass
+        began = time.monotonic()
+        while not _take(self._handle):
+            try:
+                if wait is None:
+                    raise error(
+                        f"Another process is writing to {path}. Wait for it, end it, or choose another directory."
+                    )
+                wait(time.monotonic() - began)
+            except BaseException:
+                self.release()
+                raise
         if is_reentrant:
             _held[key] = (self._handle, 1, os.getpid())
             self._handle, self._shared_as = None, key
@@ -78,3 +87,16 @@ class DirectoryLock:
 
     def __exit__(self, *_: object) -> None:
         self.release()
+
+
+def _take(handle: int) -> bool:
+    """Take the lock unless another process has it."""
+    try:
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except (ImportError, OSError):  # not POSIX, or a file system without locks: go on unguarded
+        pass
+    return True

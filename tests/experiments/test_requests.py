@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -46,7 +48,25 @@ def test_what_was_asked_for_before_is_kept(tmp_path: Path) -> None:
     crptpro = [goal for goal in before if goal.label == "crptpro"]
     assert [described(goal, store) for goal in asked.goals] == [*after, *crptpro]
     assert asked.request["methods"] == ["drq", "atc"]
-    assert [path.name for path in (tmp_path / "experiments").iterdir()] == ["seen-tiny.json"]
+    assert [path.name for path in (tmp_path / "experiments").glob("*.json")] == ["seen-tiny.json"]
+
+
+def test_a_method_that_changed_takes_the_place_of_what_it_was(tmp_path: Path) -> None:
+    store, request = Store(tmp_path), Request(TINY, groups=("A",), tasks=("walker_run",))
+    first, second, *others = seen(request)
+    write_request(store, "seen", request, [first, second, *others])
+    changed = replace(first, piece=second.piece)
+    asked = write_request(store, "seen", request, [changed])
+    assert [described(goal, store) for goal in asked.goals] == [changed, second, *others]
+
+
+def test_two_commands_that_ask_at_the_same_time_lose_nothing(tmp_path: Path) -> None:
+    store, request = Store(tmp_path), Request(TINY, groups=("A",), tasks=("walker_run",))
+    goals = seen(request)
+    with ThreadPoolExecutor() as several:
+        list(several.map(lambda goal: write_request(store, "seen", request, [goal]), goals))
+    asked = read_request(request_path(tmp_path, "seen", "tiny"))
+    assert {described(goal, store) for goal in asked.goals} == set(goals)
 
 
 def test_asking_again_changes_nothing(tmp_path: Path) -> None:

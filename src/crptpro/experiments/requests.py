@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from crptpro.cards import read_json, write_json
+from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import RecordError
 from crptpro.experiments.goals import Goal, Request
 from crptpro.experiments.pieces import Settings, settings
 from crptpro.experiments.store import Store
 
 EXPERIMENTS_DIRECTORY = "experiments"
+
+_RETRY_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,9 @@ def request_path(root: Path, experiment: str, scale: str) -> Path:
 def write_request(store: Store, experiment: str, request: Request, goals: Iterable[Goal]) -> Record:
     """Write down what is asked for, without losing what was asked for before; every goal's piece is described.
 
+    What is asked for takes the place of what stood there: a method that has other numbers since is another piece, and
+    a table that had both would average them.
+
     Args:
         store: of the reproduction.
         experiment: its name.
@@ -70,16 +77,19 @@ def write_request(store: Store, experiment: str, request: Request, goals: Iterab
         store.describe(goal.piece)
         new.append(AskedGoal(goal.label, goal.piece.key, goal.place))
     path = request_path(store.root, experiment, request.scale.name)
-    before = read_request(path).goals if path.exists() else ()
-    merged = dict.fromkeys([*new, *before])
-    asked = Record(experiment, request.scale.name, _plain(request), tuple(merged))
-    content = {
-        "experiment": asked.experiment,
-        "scale": asked.scale,
-        "request": asked.request,
-        "goals": [{"label": g.label, "key": g.key, "place": dict(g.place)} for g in asked.goals],
-    }
-    write_json(path, content)
+    with DirectoryLock(path.parent, error=RecordError, wait=lambda _: time.sleep(_RETRY_S)):
+        before = read_request(path).goals if path.exists() else ()
+        taken = {(goal.label, goal.place) for goal in new}
+        kept = [goal for goal in before if (goal.label, goal.place) not in taken]
+        merged = dict.fromkeys([*new, *kept])
+        asked = Record(experiment, request.scale.name, _plain(request), tuple(merged))
+        content = {
+            "experiment": asked.experiment,
+            "scale": asked.scale,
+            "request": asked.request,
+            "goals": [{"label": g.label, "key": g.key, "place": dict(g.place)} for g in asked.goals],
+        }
+        write_json(path, content)
     return asked
 
 

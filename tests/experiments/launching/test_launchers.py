@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from fake_pieces import PLUGIN, FakePiece, attempts, counted, plan_of
 
+from crptpro.cards import write_json
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import CRPTproError
 from crptpro.experiments.building import JobSettings
@@ -32,7 +33,7 @@ from crptpro.experiments.launching import (
 )
 from crptpro.experiments.launching.choice import slurm_parameters
 from crptpro.experiments.launching.submitted import FOLDER, LocalLauncher, SlurmLauncher
-from crptpro.experiments.store import Store
+from crptpro.experiments.store import DONE, Store
 
 SETTINGS = JobSettings(plugins=(PLUGIN,))
 
@@ -110,13 +111,34 @@ def test_a_job_waits_for_the_one_that_it_replaces(store: Store) -> None:
     assert run_pieces(plan_of(store, piece), store, SETTINGS, InlineLauncher()) == []
 
 
-def test_a_job_does_not_wait_for_ever_for_another(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("crptpro.experiments.launching.work.PATIENCE_S", 0.1)
+def test_what_another_process_finishes_meanwhile_is_not_made_again(
+    store: Store, caplog: pytest.LogCaptureFixture
+) -> None:
+    piece = FakePiece("shared")
+    store.describe(piece)
+    plan = plan_of(store, piece)
+    lock = DirectoryLock(store.path(piece))
+
+    def finish() -> None:
+        write_json(store.path(piece) / DONE, {})
+        for output in store.outputs(piece):
+            output.touch()
+        lock.release()
+
+    threading.Timer(1.0, finish).start()
+    assert run_pieces(plan, store, SETTINGS, InlineLauncher()) == []
+    assert attempts(store, piece) == []
+    assert caplog.text.count("Another process is making") == 1
+
+
+def test_a_job_that_waits_for_another_process_can_be_stopped(store: Store) -> None:
     piece = FakePiece("in-use")
     store.describe(piece)
     with DirectoryLock(store.path(piece)):
-        [failure] = run_pieces(plan_of(store, piece), store, SETTINGS, InlineLauncher())
-    assert "Another process is writing" in failure.reason
+        stopper = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
+        stopper.start()
+        with pytest.raises(KeyboardInterrupt):
+            run_pieces(plan_of(store, piece), store, SETTINGS, InlineLauncher())
 
 
 def test_local_jobs_share_gpus_evenly(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import logging
 import os
 import socket
 import sys
@@ -19,12 +20,15 @@ from crptpro.errors import CRPTproError, RecordError, RenderingError
 from crptpro.experiments.building import JobSettings, build
 from crptpro.experiments.store import LOG, PIECES, Store
 from crptpro.plugins import load_plugin
+from crptpro.training.stop_request import StopRequest
+
+logger = logging.getLogger(__name__)
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """What numpy and torch read when they are loaded; a launcher sets them before its job starts."""
 
-PATIENCE_S = 30.0
-"""How long a job waits for another that still writes to its piece: the one that it replaces may be just ending."""
+RETRY_S = 0.5
+"""How often a job that waits for another process to let go of its piece looks again."""
 
 
 @dataclass(frozen=True)
@@ -103,14 +107,21 @@ def _is_final(error: Exception) -> bool:
 
 
 def _lock(directory: Path) -> DirectoryLock:
-    deadline = time.monotonic() + PATIENCE_S
-    while True:
-        try:
-            return DirectoryLock(directory, error=RecordError, is_reentrant=True)
-        except RecordError:
-            if time.monotonic() > deadline:
-                raise
-        time.sleep(0.5)
+    """Take a piece, once nobody else makes it.
+
+    Another command may want it too, and the job of one that was killed goes on to the end of its episode; neither is a
+    reason to give the piece up. What the other finishes is then found finished.
+    """
+    with StopRequest() as stop:
+
+        def wait(waited_s: float) -> None:
+            if waited_s < RETRY_S:
+                logger.warning("Another process is making %s; waiting until it ends.", directory.name)
+            time.sleep(RETRY_S)
+            if stop.signal is not None:
+                stop.leave()
+
+        return DirectoryLock(directory, error=RecordError, is_reentrant=True, wait=wait)
 
 
 @contextlib.contextmanager
