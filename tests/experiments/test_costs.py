@@ -33,10 +33,16 @@ RUN = RunPiece("walker_run", ENCODER, 0, config=settings(env_steps=20_000, batch
 
 
 def finish(
-    store: Store, piece: Piece, seconds: float, device: str = "cpu", made_on: dict[str, Any] | None = None
+    store: Store,
+    piece: Piece,
+    seconds: float,
+    device: str = "cpu",
+    made_on: dict[str, Any] | None = None,
+    threads: int = 1,
 ) -> None:
     store.describe(piece)
-    done = {"seconds": seconds, "job": {"device": device}, "hardware": made_on or hardware()}
+    job = {"device": device, "threads": threads, "workers": threads}
+    done = {"seconds": seconds, "job": job, "hardware": made_on or hardware()}
     write_json(store.path(piece) / DONE, done)
     for path in store.outputs(piece):
         path.parent.mkdir(parents=True)
@@ -127,6 +133,31 @@ def test_pieces_of_another_machine_correct_nothing(tmp_path: Path) -> None:
     assert corrections(store, "cuda") == {}
     finish(store, DatasetPiece("walker", 10_000, 3), 4 * core_seconds(piece), "cuda")
     assert corrections(store, "cuda:1") == {"dataset": pytest.approx(4.0)}
+
+
+def test_a_job_that_had_one_of_several_equal_gpus_corrects_the_estimate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = {**hardware(), "gpus": ["H200", "H200"]}
+    monkeypatch.setattr("crptpro.experiments.costs.hardware", lambda: here)
+    piece = DatasetPiece("walker", 10_000, 0)
+    finish(Store(tmp_path), piece, 2 * core_seconds(piece), "cuda", {**here, "gpus": ["H200"]})
+    assert corrections(Store(tmp_path), "cuda") == {"dataset": pytest.approx(2.0)}
+
+
+def test_jobs_with_other_threads_correct_nothing_and_collecting_processes_are_counted(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    encoder = PretrainedPiece("crptpro", 0, (WALKER,), updates=1_000)
+    finish(store, encoder, core_seconds(encoder) / 3, threads=4)
+    assert corrections(store) == {}
+    assert corrections(store, threads=4) == {"encoder": pytest.approx(1 / 3)}
+    data = DatasetPiece("walker", 10_000, 0)
+    finish(store, data, core_seconds(data) / 2, threads=4)
+    assert corrections(store) == {"dataset": pytest.approx(2.0)}
+
+    plan = make_plan([RUN], store)
+    text = plan_text(plan, estimate(plan, store, jobs=2, threads=4), jobs=2, device="cpu")
+    assert "though each job has 4" in text
 
 
 def test_a_record_that_cannot_be_read_corrects_nothing(tmp_path: Path) -> None:

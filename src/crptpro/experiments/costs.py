@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import json
 import statistics
@@ -11,6 +12,7 @@ from pathlib import Path
 
 from crptpro.cards import hardware
 from crptpro.experiments.piece_costs import core_seconds, stored_bytes, working_bytes
+from crptpro.experiments.pieces import DatasetPiece
 from crptpro.experiments.plan import Plan
 from crptpro.experiments.store import DONE, Store
 
@@ -18,15 +20,17 @@ SHORTEST_S = 60.0
 """Estimate up to which a finished piece says nothing about a longer one."""
 
 
-def corrections(store: Store, device: str = "cpu") -> dict[str, float]:
+def corrections(store: Store, device: str = "cpu", threads: int = 1) -> dict[str, float]:
     """Compare finished pieces with their estimates.
 
     Records that came from another kind of machine say nothing about this one: between two processors that both
-    multiply bfloat16 the same exploration took one hour and three.
+    multiply bfloat16 the same exploration took one hour and three. Nor do those of jobs with other threads. A
+    collection, whose processes have a core each, counts as what it would have taken with one.
 
     Args:
         store: all of its pieces are looked at.
         device: only of jobs on this kind of device.
+        threads: only of jobs with as many.
 
     Returns:
         Kind of piece to the median of measured by estimated seconds; kinds of which none that took more than moments
@@ -39,9 +43,15 @@ def corrections(store: Store, device: str = "cpu") -> dict[str, float]:
             done = json.loads(path.read_text())
             piece = store.described(path.parent.name)
             expected = core_seconds(piece)
-            is_alike = all(done["hardware"][name] == here[name] for name in _deciding(device))
-            if expected > SHORTEST_S and is_alike and _kind(str(done["job"]["device"])) == _kind(device):
-                found.setdefault(piece.kind, []).append(float(done["seconds"]) / expected)
+            job, seconds = done["job"], float(done["seconds"])
+            is_alike = all(_parts(done["hardware"][name]) == _parts(here[name]) for name in _deciding(device))
+            is_alike &= _kind(str(job["device"])) == _kind(device)
+            if isinstance(piece, DatasetPiece):
+                seconds *= job["workers"]
+            elif not piece.is_exclusive:  # that has the threads which are part of what it is
+                is_alike &= job["threads"] == threads
+            if expected > SHORTEST_S and is_alike:
+                found.setdefault(piece.kind, []).append(seconds / expected)
         except Exception:  # of another version, or of a plugin that is not loaded: says nothing about costs
             continue
     return {kind: statistics.median(ratios) for kind, ratios in found.items()}
@@ -57,6 +67,7 @@ class Cost:
         working_bytes: besides, while the largest ``jobs`` of them are made at a time.
         wall_seconds: until all are made.
         corrected: kinds whose estimate follows what was measured here.
+        threads: of each job, which other kinds count as one.
     """
 
     seconds: Mapping[str, float]
@@ -64,6 +75,7 @@ class Cost:
     working_bytes: int
     wall_seconds: float
     corrected: frozenset[str]
+    threads: int = 1
 
     @property
     def disk_bytes(self) -> int:
@@ -71,7 +83,7 @@ class Cost:
         return sum(self.bytes.values()) + self.working_bytes
 
 
-def estimate(plan: Plan, store: Store, *, jobs: int, device: str = "cpu") -> Cost:
+def estimate(plan: Plan, store: Store, *, jobs: int, device: str = "cpu", threads: int = 1) -> Cost:
     """Estimate what the missing pieces of a plan cost.
 
     Args:
@@ -79,13 +91,14 @@ def estimate(plan: Plan, store: Store, *, jobs: int, device: str = "cpu") -> Cos
         store: whose finished pieces correct the estimate.
         jobs: at a time.
         device: of networks.
+        threads: of each job. Until such a job has finished, a piece counts as if it had one.
     """
-    ratios = corrections(store, device)
+    ratios = corrections(store, device, threads)
     seconds = {piece.key: core_seconds(piece) * ratios.get(piece.kind, 1.0) for piece in plan.missing}
     sizes = {piece.key: max(0, stored_bytes(piece) - _size(store.path(piece))) for piece in plan.missing}
     working = sorted(map(working_bytes, plan.missing), reverse=True)[:jobs]
     wall_s = wall_seconds(plan, seconds, jobs)
-    return Cost(seconds, sizes, sum(working), wall_s, frozenset(ratios))
+    return Cost(seconds, sizes, sum(working), wall_s, frozenset(ratios), threads)
 
 
 def wall_seconds(plan: Plan, seconds: Mapping[str, float], jobs: int) -> float:
@@ -115,12 +128,22 @@ def wall_seconds(plan: Plan, seconds: Mapping[str, float], jobs: int) -> float:
 
 
 def _size(directory: Path) -> int:
-    return sum(path.stat().st_size for path in directory.rglob("*") if path.is_file())
+    size = 0
+    with contextlib.suppress(FileNotFoundError):  # a job that is running may replace what was just listed
+        for path in directory.rglob("*"):
+            with contextlib.suppress(FileNotFoundError):
+                size += path.stat().st_size if path.is_file() else 0
+    return size
 
 
 def _deciding(device: str) -> tuple[str, ...]:
-    """What of the hardware decides how long a job takes."""
+    """What of the hardware decides how long a job takes, as :func:`~crptpro.cards.hardware` names it."""
     return ("cpu",) if _kind(device) == "cpu" else ("cpu", "gpus")
+
+
+def _parts(recorded: str | list[str]) -> str | set[str]:
+    """A job is given some of a machine's GPUs: which models there are is compared, not how many."""
+    return set(recorded) if isinstance(recorded, list) else recorded
 
 
 def _kind(device: str) -> str:

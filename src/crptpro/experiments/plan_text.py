@@ -41,7 +41,7 @@ def plan_text(plan: Plan, cost: Cost, *, jobs: int, device: str) -> str:
     order = [kind for kind in KIND_NAMES if kind in kinds]
     order += [kind for kind in kinds if kind not in KIND_NAMES]
     rows = [_row(KIND_NAMES.get(kind, kind), kinds[kind], plan, cost) for kind in order]
-    table = _table([("pieces", "needed", "done", "to do", "core hours", "disk"), *rows])
+    table = _table([("pieces", "needed", "done", "to do", "hours", "disk"), *rows])
     if not plan.missing:
         return table
     lines = [
@@ -96,6 +96,8 @@ def _basis(plan: Plan, cost: Cost, device: str) -> str:
     reference = "estimated from one core of the reference machine (AMD EPYC, Zen 4)"
     if device != "cpu":
         reference += ", which a GPU will beat by far"
+    if cost.threads > 1:
+        reference += f", though each job has {cost.threads}"
     if not measured:
         return f"Hours are {reference}; they follow this machine once pieces of a kind are finished."
     others = ", ".join(kind for kind in kinds if kind not in measured)
