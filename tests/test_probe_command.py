@@ -131,6 +131,13 @@ def test_an_encoder_of_other_images_and_data_without_state_are_refused(
     stateless.next_job()
     stateless.accept(0, random_episode(9, size=SIZE, state=False))
     assert "no physical state" in call("random-encoder", tmp_path / "stateless")[2]
+    # What was measured before it came to the one that is refused is kept.
+    file = tmp_path / "probe.csv"
+    status, out, err = call("random-encoder", dataset, tmp_path / "stateless", "--csv", file)
+    assert status == 1
+    assert "no physical state" in err
+    assert [line[:2] for line in table(out)] == [["random-encoder", "toy"]]
+    assert len(rows(file)) > 4
 
 
 def test_what_the_parser_cannot_read_is_refused(call: Call) -> None:

@@ -61,6 +61,21 @@ def test_a_part_of_an_experiment_has_a_smaller_plan(call: Call, tmp_path: Path) 
     ]  # two methods, two encoders each, two runs on each
 
 
+def test_all_means_the_experiments_that_have_something_of_what_is_asked_for(
+    call: Call, tmp_path: Path
+) -> None:
+    options = ("--scale", "tiny", "--dry-run", "--out", tmp_path)
+    status, out, _ = call("reproduce", "all", "--groups", "B", *options)
+    assert status == 0
+    assert "Nothing of unseen, colors is among" in out
+    assert "\nseen, " in out
+    nothing = ("--methods", "drq", "--groups", "B", "--tasks", "quadruped_run")
+    line = refused(call("reproduce", "all", *nothing, *options))
+    assert "Nothing of seen, unseen" in line
+    line = refused(call("reproduce", "all", "colors", "--groups", "B", *options))
+    assert "Nothing of unseen, colors" in line
+
+
 @pytest.mark.parametrize(("arguments", "message"), [
     (("sen", "--scale", "tiny"), "no experiment 'sen'. Did you mean 'seen'?"),
     (("seen", "--scale", "tiny", "--methods", "atcc"), "'atcc'"),

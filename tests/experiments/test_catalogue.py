@@ -118,8 +118,18 @@ def test_methods_without_the_thing_measured_are_passed_over() -> None:
     request = Request(PAPER, methods=("drq", "random-encoder", "crptpro-finetune"))
     for name in ("efficiency", "prototypes", "coverage", "stability", "visualize"):
         assert EXPERIMENTS[name].goals(request) == []
+    labels = {goal.label for goal in EXPERIMENTS["sensitivity"].goals(request)}
+    assert labels == {f"crptpro-finetune, alpha {alpha:g}" for alpha in {0.0, 5e-3, *PAPER.alphas}}
+    assert EXPERIMENTS["sensitivity"].goals(Request(PAPER, methods=("atc",))) == []
     labels = {goal.label for goal in EXPERIMENTS["probe"].goals(request)}
     assert labels == {"random-encoder", "crptpro-finetune"}
+
+
+def test_fine_tuning_starts_from_an_encoder_with_the_weight_that_its_row_names() -> None:
+    request = Request(PAPER, methods=("crptpro-finetune",), tasks=("walker_run",), seeds=(0,))
+    bases = {goal.label: goal.piece.encoder.base for goal in EXPERIMENTS["sensitivity"].goals(request)}  # type: ignore[attr-defined]
+    assert len(set(bases.values())) == len(bases) > 2
+    assert dict(bases["crptpro-finetune, alpha 0.5"].loss) == {"intr_loss_coef": 0.5}
 
 
 def test_colours_are_reversed_in_the_way_that_the_request_says() -> None:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from report_reading import cell, table_in
 
+from crptpro.experiments.report import study
 from crptpro.experiments.report.blocks import ABSENT, Figure, Paragraph
 from crptpro.experiments.report.diagnostics import diagnostics, left_plateau
 from crptpro.experiments.report.glance import glance
 from crptpro.experiments.report.measurements import Row
-from crptpro.experiments.report.reading import Made, Wanted
+from crptpro.experiments.report.reading import Asked, Made, Wanted
 from crptpro.experiments.report.study import _along
 from crptpro.experiments.report.trials import Trial, changes, readings
 
@@ -165,6 +167,21 @@ def test_a_glance_has_every_value_with_its_change_and_the_untrained_encoder_last
     marks = figure.drawing.axes[0].lines
     assert marks[0].get_xdata()[0] == pytest.approx(0.25)
     assert marks[1].get_xdata()[0] == pytest.approx(0.1)
+
+
+def test_what_encoders_know_at_the_end_is_not_said_of_those_that_are_not_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    at_end = probed("0.1", 0, 300, both(0.2, 0.4))
+    on_the_way = probed("0.05", 0, 100, both(0.7, 0.9))
+    to_come = probed("0.05", 0, 300, both("", ""))[0].goal
+    goals = [at_end[0].goal, on_the_way[0].goal, replace(to_come, piece=replace(to_come.piece, done=None))]
+    monkeypatch.setattr(study, "rows_of", lambda *_: ([*at_end, *on_the_way], []))
+    blocks = study.study(Asked("study", "small", tuple(goals)))
+    table = table_in(blocks, "read from features at the end")
+    assert [line[0].text for line in table.rows] == ["0.1"]
+    along = [block for block in blocks if isinstance(block, Figure) and "along training" in block.caption]
+    assert len(along) == 1
 
 
 def test_there_is_no_glance_where_nothing_is_the_usual_value() -> None:

@@ -52,23 +52,26 @@ class Probe:
         pretrained.encoder.to(self.device)
         if pretrained.projector is not None:
             pretrained.projector.to(self.device)
+        datasets = [FrameDataset.open(path) for path in self.datasets]
         table, measures = [], []
-        for path in self.datasets:
-            dataset = FrameDataset.open(path)
-            for colors in dict.fromkeys(self.colors):
-                found = probe_rows(
-                    pretrained,
-                    dataset,
-                    encoder=self.encoder,
-                    colors=colors,
-                    samples=self.samples,
-                    seed=self.seed,
-                )
-                table += found.table
-                measures += found.measures
-        if self.csv is not None:
-            write_rows(self.csv, COLUMNS, measures)
-        print(markdown_table(table))
+        try:
+            for dataset in datasets:
+                for colors in dict.fromkeys(self.colors):
+                    found = probe_rows(
+                        pretrained,
+                        dataset,
+                        encoder=self.encoder,
+                        colors=colors,
+                        samples=self.samples,
+                        seed=self.seed,
+                    )
+                    table += found.table
+                    measures += found.measures
+                    if self.csv is not None:
+                        write_rows(self.csv, COLUMNS, measures)
+        finally:  # a later dataset may be refused, and writing may fail
+            if table:
+                print(markdown_table(table))
 
     def _load(self, image_size: int, frame_stack: int) -> Pretrained:
         from crptpro.pretrained import load_pretrained, random_pretrained

@@ -99,10 +99,11 @@ class Reproduce:
             jobs_per_gpu=self.jobs_per_gpu,
         )
         request = self._request(resources)
-        wanted = {name: self._goals(name, request) for name in _names(self.experiments)}
+        wanted = self._wanted(request)
         store = Store(self.out)
         plan = make_plan([goal.piece for goals in wanted.values() for goal in goals], store)
-        cost = estimate(plan, store, jobs=resources.jobs, device=self.device)
+        threads = resources.job_settings(self.device).threads
+        cost = estimate(plan, store, jobs=resources.jobs, device=self.device, threads=threads)
         print(f"{', '.join(wanted)} at scale {self.scale} in {self.out}\n")
         print(plan_text(plan, cost, jobs=resources.jobs, device=self.device), flush=True)
         if self.dry_run:
@@ -142,16 +143,23 @@ class Reproduce:
             threads=threads_alone(self.launcher, resources),
         )
 
-    def _goals(self, name: str, request: Request) -> list[Goal]:
+    def _wanted(self, request: Request) -> dict[str, list[Goal]]:
+        """Goals by experiment. One that was named must have some; of all, those that have are meant."""
         from crptpro.errors import CRPTproError
         from crptpro.experiments.catalogue import EXPERIMENTS
 
-        goals = EXPERIMENTS[name].goals(request)
-        if not goals:
+        wanted = {name: EXPERIMENTS[name].goals(request) for name in _names(self.experiments)}
+        empty = [name for name, goals in wanted.items() if not goals]
+        if empty and (
+            ALL not in self.experiments or set(empty) & {*self.experiments} or len(empty) == len(wanted)
+        ):
             raise CRPTproError(
-                f"Nothing of {name} is among these groups, tasks and methods; leave out --groups, --tasks or --methods."
+                f"Nothing of {', '.join(empty)} is among these groups, tasks and methods; "
+                "leave out --groups, --tasks or --methods."
             )
-        return goals
+        if empty:
+            print(f"Nothing of {', '.join(empty)} is among these groups, tasks and methods.\n")
+        return {name: goals for name, goals in wanted.items() if goals}
 
     def _launcher(self, resources: Resources) -> Launcher:
         from crptpro.experiments.launching import SlurmRequest, make_launcher

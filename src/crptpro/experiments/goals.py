@@ -121,6 +121,14 @@ def is_single_domain(method: str) -> bool:
     return exploration is not None and exploration.is_single_domain
 
 
+def has_option(method: str, option: str) -> bool:
+    """Whether the loss that a system's encoder is pre-trained with has an option, ``"intr_loss_coef"`` say."""
+    if method in (DRQ, RANDOM_ENCODER):
+        return False
+    loss_class = get_method("crptpro" if method == FINETUNE else method).loss_class
+    return option in inspect.signature(loss_class.__init__).parameters
+
+
 def dataset(scale: Scale, domain: str, seed: int, *, transitions: int | None = None) -> DatasetPiece:
     """Return a domain's random dataset."""
     return DatasetPiece(
@@ -211,7 +219,7 @@ def encoder_for_task(
     if method == DRQ:
         return None
     if method == FINETUNE:
-        return finetuned(scale, encoder(scale, "crptpro", domains, seed), task, seed)
+        return finetuned(scale, encoder(scale, "crptpro", domains, seed, loss=loss), task, seed)
     if is_single_domain(method):
         domains = (get_domain(task).name,)
     return encoder(scale, method, domains, seed, loss=loss)

@@ -14,6 +14,7 @@ from crptpro.experiments.goals import (
     Request,
     encoder,
     encoder_for_task,
+    has_option,
     in_colors,
     runs,
 )
@@ -79,11 +80,14 @@ def ablation(request: Request) -> list[Goal]:
 
 
 def sensitivity(request: Request) -> list[Goal]:
-    """The weight of the dispersion loss, and the capacity of the random datasets (section IV.F)."""
+    """The weight of the dispersion loss, and the capacity of the random datasets (section IV.F).
+
+    Methods without a dispersion loss have nothing to vary.
+    """
     goals = []
     for group in request.groups or ("A",):
         for task in _tasks(request, GROUPS[group]):
-            for method in request.chosen(("crptpro", "proto-rl-c")):
+            for method in filter(_disperses, request.chosen(("crptpro", "proto-rl-c"))):
                 weights = sorted({0.0, 5e-3, *request.scale.alphas})
                 for weight in weights:
                     label = f"{method}, alpha {weight:g}"
@@ -113,6 +117,10 @@ def _tasks(request: Request, domains: Iterable[str]) -> list[str]:
     if request.tasks:
         return [task for task in request.tasks if get_domain(task).name in domains]
     return [get_domain(domain).task for domain in domains]
+
+
+def _disperses(method: str) -> bool:
+    return has_option(method, "intr_loss_coef")
 
 
 def _elsewhere(request: Request, rows: list[tuple[str, str]]) -> list[Goal]:

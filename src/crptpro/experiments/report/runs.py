@@ -70,6 +70,7 @@ def placed_runs(asked: Asked) -> tuple[list[Placed], list[str]]:
             run = read_run(goal.piece.directory)
             if not run.is_finished:
                 raise RecordError(f"{goal.piece.key} is called finished and has no evaluation at its end.")
+            run = _on_base(run, goal.piece.description)
         except RecordError as reason:
             problems.append(f"Left out: {reason}")
             continue
@@ -79,7 +80,7 @@ def placed_runs(asked: Asked) -> tuple[list[Placed], list[str]]:
         same = (goal.label, spot, varied, goal.piece.key)
         if same not in seen:  # asked for twice, under other seeds
             seen.add(same)
-            found.append(Placed(goal.label, spot, _on_base(run, goal.piece.description), varied))
+            found.append(Placed(goal.label, spot, run, varied))
     return found, problems
 
 

@@ -21,7 +21,14 @@ from crptpro.experiments.report.glance import POSITIONS, VELOCITIES, glance, wor
 from crptpro.experiments.report.measurements import Row, rows_of
 from crptpro.experiments.report.palette import in_order, styles
 from crptpro.experiments.report.reading import Asked, Wanted
-from crptpro.experiments.report.trials import CONTROL, readings, seed_of, trial_of, updates_of
+from crptpro.experiments.report.trials import (
+    CONTROL,
+    last_updates,
+    readings,
+    seed_of,
+    trial_of,
+    updates_of,
+)
 
 
 def study(asked: Asked) -> tuple[Block, ...]:
@@ -33,6 +40,7 @@ def study(asked: Asked) -> tuple[Block, ...]:
     probes, blocks = rows_of(asked, "probe")
     probes = [row for row in probes if not row["coordinate"] and row["measure"] in (POSITIONS, VELOCITIES)]
     records = records_of(asked)
+    ends = last_updates(goal for goal in asked.goals if goal.piece.kind == "probe")
     blocks += glance(readings(probes), records, asked.name)
     trials = dict.fromkeys(trial_of(goal) for goal in asked.finished if goal.piece.kind != "run")
     parts = dict.fromkeys((trial.factor, trial.group) for trial in trials)
@@ -50,17 +58,18 @@ def study(asked: Asked) -> tuple[Block, ...]:
         if own:
             blocks += diagnostics(own, _value, heading, name, of)
         if read:
-            embeddings = dict.fromkeys(row["embedding"] for row in read)
-            blocks += [_probes(read, embedding, heading, of) for embedding in embeddings]
+            ended = [
+                row for row in read if updates_of(row.goal) == ends[trial_of(row.goal), seed_of(row.goal)]
+            ]
+            embeddings = dict.fromkeys(row["embedding"] for row in ended)
+            blocks += [_probes(ended, embedding, heading, of) for embedding in embeddings]
             blocks += _along(read, f"{name}-probe", of)
     return tuple(blocks)
 
 
 def _probes(rows: Sequence[Row], embedding: str, heading: str, of: str) -> Table:
-    """What is read from an embedding at the end, a column per domain."""
-    rows = [row for row in rows if row["embedding"] == embedding]
-    last = {key: max(updates_of(r.goal) for r in rows if _encoder(r) == key) for key in map(_encoder, rows)}
-    ends = [row for row in rows if updates_of(row.goal) == last[_encoder(row)]]
+    """What is read from an embedding of encoders that are at their end, a column per domain."""
+    ends = [row for row in rows if row["embedding"] == embedding]
     ends.sort(key=lambda row: trial_of(row.goal).factor == CONTROL)
     columns = list(dict.fromkeys(_column(row) for row in ends))
     lines = []

@@ -70,6 +70,15 @@ def updates_of(goal: Wanted) -> int:
     return int(goal.place.get("updates", 0))
 
 
+def last_updates(goals: Iterable[Wanted]) -> dict[tuple[Trial, str], int]:
+    """Return how many updates each encoder will have made at its end, by trial and seed, finished or not."""
+    last: dict[tuple[Trial, str], int] = {}
+    for goal in goals:
+        key = trial_of(goal), seed_of(goal)
+        last[key] = max(updates_of(goal), last.get(key, 0))
+    return last
+
+
 def readings(rows: Iterable[Row]) -> list[Reading]:
     """Average probes over domains.
 
