@@ -12,7 +12,7 @@ from torch import nn
 
 from crptpro import artifact
 from crptpro.artifact import read_artifact, write_artifact
-from crptpro.errors import PretrainedError
+from crptpro.errors import CRPTproError, PretrainedError
 
 
 def write(path: Path, value: float = 1.0) -> Path:
@@ -38,6 +38,19 @@ def test_writing_again_replaces_the_artifact_and_leaves_nothing_else(tmp_path: P
     write(tmp_path / "a", 2.0)
     assert read(tmp_path / "a")[1]["layer.weight"][0, 0] == 2
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_what_is_no_artifact_of_this_kind_is_not_replaced(tmp_path: Path) -> None:
+    run_dir = tmp_path / "run"
+    (run_dir / "checkpoints").mkdir(parents=True)
+    with pytest.raises(CRPTproError, match="is no 'test'; it is not replaced"):
+        write(run_dir)
+    assert [path.name for path in run_dir.iterdir()] == ["checkpoints"]
+    write_artifact(tmp_path / "a", {}, card={}, format_name="other", version=1)
+    with pytest.raises(CRPTproError, match="is no 'test'"):
+        write(tmp_path / "a")
+    (tmp_path / "empty").mkdir()
+    assert read(write(tmp_path / "empty"))[0]["task"] == "walker"
 
 
 def test_a_failed_write_keeps_the_old_artifact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ from crptpro.downstream_config import DownstreamConfig, SkillDDPGSettings, drq_s
     (lambda: DownstreamConfig(channels_last="last"), r"`channels_last` must be 'auto', 'on' or 'off', got 'last'"),
     (lambda: DownstreamConfig(cuda_graph="maybe"), r"`cuda_graph` must be 'auto', 'on' or 'off', got 'maybe'"),
     (lambda: DownstreamConfig(algorithm="drq"), r"`intrinsic_reward_coef` is 0\.2, but drq .* drq_settings\(\)"),
+    (lambda: DownstreamConfig(skill_ddpg=SkillDDPGSettings(skill=3)), r"`skill_ddpg` has settings, which rad-sac does"),
     (lambda: SkillDDPGSettings(n_step=0), r"`skill_ddpg\.n_step` must be at least 1, got 0"),
     (lambda: SkillDDPGSettings(noise_clip=-1.0), r"`skill_ddpg\.noise_clip` must not be negative, got -1\.0"),
     (lambda: SkillDDPGSettings(skill=16), r"`skill_ddpg\.skill` must be in 0\.\.15 .*got 16"),

@@ -44,10 +44,14 @@ def write_artifact(
 
     Returns:
         ``path``.
+
+    Raises:
+        CRPTproError: if there is something else at ``path``; it is left alone.
     """
     from safetensors.torch import save_file
 
     path = Path(path)
+    _refuse_foreign(path, format_name)
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(path)
     tensors = {}
@@ -141,6 +145,15 @@ def _read(
         return card, load_file(weights)
     except (SafetensorError, OSError) as reason:
         raise error(f"{weights} cannot be read ({reason}).") from None
+
+
+def _refuse_foreign(path: Path, format_name: str) -> None:
+    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
+        return
+    if not (path / CARD_FILE).exists() or read_json(path / CARD_FILE).get("format") != format_name:
+        raise CRPTproError(
+            f"{path} exists and is no {format_name!r}; it is not replaced. Choose another directory."
+        )
 
 
 def _sha256(path: Path) -> str:

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import functools
+import logging
 import os
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 from crptpro.errors import CRPTproError
+
+logger = logging.getLogger(__name__)
 
 _held: dict[Path, tuple[int, int, int]] = {}
 """Re-entrant locks of this process: handle, holders, and the process that took it (a fork inherits this table)."""
@@ -97,6 +101,15 @@ def _take(handle: int) -> bool:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
-    except (ImportError, OSError):  # not POSIX, or a file system without locks: go on unguarded
-        pass
+    except (ImportError, OSError) as reason:  # not POSIX, or a file system without locks: go on unguarded
+        _warn_unguarded(str(reason))
     return True
+
+
+@functools.cache
+def _warn_unguarded(reason: str) -> None:
+    """Say once what nobody will prevent."""
+    logger.warning(
+        "Directories cannot be locked here (%s): see to it that no two processes write to the same one.",
+        reason,
+    )

@@ -148,6 +148,11 @@ class SACSettings:
                 f"`replay_capacity` ({self.replay_capacity}) must hold the {self.random_agent_steps} transitions "
                 "of `random_agent_steps`, or no update would ever start."
             )
+        if self.algorithm != "skill-ddpg" and self.skill_ddpg != SkillDDPGSettings():
+            raise ValueError(
+                f"`skill_ddpg` has settings, which {self.algorithm} does not read: leave them out, or choose the "
+                "algorithm skill-ddpg."
+            )
         if self.algorithm != "rad-sac" and self.intrinsic_reward_coef:
             raise ValueError(
                 f"`intrinsic_reward_coef` is {self.intrinsic_reward_coef}, but {self.algorithm} has no bonus: set it "

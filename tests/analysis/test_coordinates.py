@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -71,6 +74,21 @@ def test_gymnasiums_mujoco_worlds_have_joints() -> None:
     joints = joints_of("gymnasium:InvertedPendulum-v5")
     assert joints is not None
     assert [(joint.name, joint.kind) for joint in joints] == [("slider", "slide"), ("hinge", "hinge")]
+
+
+def test_joints_of_the_suite_are_known_where_nothing_renders() -> None:
+    script = (
+        "from crptpro.analysis.coordinates import joints_of; print(len(joints_of('walker')))\n"
+        "from crptpro.errors import RenderingError\n"
+        "try: joints_of('reach_duplo')\n"
+        "except RenderingError: print('refused')"
+    )
+    environment = {**os.environ, "MUJOCO_GL": "disable"}
+    environment.pop("CRPTPRO_GL_PROOF", None)
+    said = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True
+    )
+    assert said.stdout.split() == ["9", "refused"]
 
 
 @pytest.mark.gl

@@ -68,6 +68,14 @@ def test_a_dataset_that_follows_the_global_generator_still_does_afterwards() -> 
     assert torch.equal(*draws)
 
 
+@pytest.mark.gpu
+def test_a_dataset_on_a_gpu_is_drawn_from_there() -> None:
+    storage = LazyTensorStorage(10, device="cuda")
+    buffer = ReplayBuffer(storage=storage, batch_size=4)
+    buffer.extend(dataset(10).sample(10).select("pixels").to("cuda"))
+    assert embed_samples(Brightness().cuda(), {"a": buffer})["a"].device.type == "cuda"
+
+
 def test_pixels_are_encoded_where_the_encoder_lives() -> None:
     encoder = Brightness().to("meta")
     assert embed_samples(encoder, {"a": dataset(0)})["a"].device.type == encoder.seen == "meta"

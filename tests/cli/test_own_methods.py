@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from command import SIZE, SMALL, TASK, Call, refused, rows
 
+from crptpro.cli.request import explored_domains
+from crptpro.errors import CRPTproError
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import SimCLRLoss, get_method, methods, registry
 from crptpro.pretrained import load_pretrained
@@ -44,6 +46,17 @@ def test_a_request_that_cannot_be_met_leaves_nothing_behind(
     line = refused(call(*arguments, "--out", tmp_path / "out"))
     assert re.search(message, line), line
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_is_called_like_a_domain_is_not_in_its_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "walker").mkdir()
+    (tmp_path / "mine").mkdir()
+    assert explored_domains(["walker"], "apt-s") == ["walker"]
+    with pytest.raises(CRPTproError, match="mine is a path"):
+        explored_domains(["mine"], "apt-s")
 
 
 def test_pretrain_trains_other_methods_on_datasets(call: Call, dataset: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import logging
+import multiprocessing.connection
 import os
 import random
 import signal
@@ -152,6 +153,15 @@ def test_a_dying_process_gives_one_clear_error(tmp_path):
     with pytest.raises(
         CRPTproError, match=r"episode 0 of toy-dying.* exited with status 7.*run the same command"
     ):
+        collect_random(DYING, tmp_path, transitions=50, **SMALL)
+
+
+def test_a_process_that_dies_in_the_middle_of_a_message_gives_one_clear_error(tmp_path, monkeypatch):
+    def torn(connection):
+        raise OSError("got end of file during message")
+
+    monkeypatch.setattr(multiprocessing.connection.Connection, "recv", torn)
+    with pytest.raises(CRPTproError, match="Every finished episode is kept: run the same command again"):
         collect_random(DYING, tmp_path, transitions=50, **SMALL)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -14,12 +15,14 @@ from pathlib import Path
 
 import pytest
 from toy_gymnasium import PAINTER
-from toy_world import FAILING, FIXED, data_bytes, run_in_order, variable_length
+from toy_world import FAILING, FIXED, data_bytes, random_episode, run_in_order, variable_length
 from toy_world import collection_request as request
 
 from crptpro.data import FrameDataset, collect_group, collect_random
+from crptpro.data import collection as collection_module
 from crptpro.data.collection import DomainCollection
 from crptpro.data.layout import CARD_FILE, COLLECTION_FILE
+from crptpro.directory_lock import DirectoryLock
 from crptpro.domains import Domain
 from crptpro.envs import rendering
 from crptpro.errors import CRPTproError, DatasetError, DiskSpaceError
@@ -42,6 +45,37 @@ def test_an_environment_that_failed_does_not_block_the_repaired_one(tmp_path):
     card = FrameDataset.open(path).card
     assert card["camera"] == 0
     assert len(card["sessions"]) == 1  # the failed one contributed nothing
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_a_full_disk_is_named_and_what_was_kept_goes_on(tmp_path, monkeypatch, index):
+    """Whether an episode is appended or, come before its turn, kept aside."""
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    collection = DomainCollection(tmp_path, request())
+    collection.next_job(), collection.next_job()
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(DiskSpaceError, match="is full after 0 transitions"):
+            collection.accept(index, random_episode(10, size=8))
+    collection.close()
+    assert not list(tmp_path.glob(".incoming/*"))
+    run_in_order(DomainCollection(tmp_path, request()), 0)
+    assert len(FrameDataset.open(tmp_path)) == 27
+
+
+def test_what_another_process_finished_just_before_the_lock_was_free_is_taken(tmp_path, monkeypatch):
+    def finished_by_another(*arguments: object, **options: object) -> DirectoryLock:
+        with monkeypatch.context() as patched:
+            patched.setattr(collection_module, "DirectoryLock", DirectoryLock)
+            run_in_order(DomainCollection(tmp_path, request()), 0)
+        return DirectoryLock(*arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(collection_module, "DirectoryLock", finished_by_another)
+    assert DomainCollection(tmp_path, request()).is_complete
+    DirectoryLock(tmp_path).release()
 
 
 def test_an_accepted_episode_fixes_the_request(tmp_path):

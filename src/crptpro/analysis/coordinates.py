@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
 
 from crptpro.domains import GYMNASIUM_PREFIX, Domain, get_domain
-from crptpro.errors import UnknownNameError
+from crptpro.errors import RenderingError, UnknownNameError
+
+if TYPE_CHECKING:
+    import dm_env
 
 JointKind = Literal["free", "ball", "slide", "hinge", "turning"]
 
@@ -38,17 +42,16 @@ def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
 
     Returns:
         ``None`` where they are not known: worlds of your own, and those without a MuJoCo model.
+
+    Raises:
+        RenderingError: for the manipulation tasks, which cannot even be loaded where nothing renders.
     """
     try:
         domain = get_domain(domain)
     except UnknownNameError:  # a world of one's own that is not registered in this process
         return None
     if domain.source in ("suite", "manipulation"):
-        from crptpro.envs.dm_stack import load_dm_env
-        from crptpro.envs.rendering import select_backend
-
-        select_backend()  # importing dm_control fixes it
-        env = load_dm_env(domain)
+        env = _load_undrawn(domain)
         model = env.physics.model.ptr
     elif domain.source == "gymnasium":
         import gymnasium
@@ -61,6 +64,26 @@ def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
         return None if model is None else _joints(model)
     finally:
         env.close()
+
+
+def _load_undrawn(domain: Domain) -> dm_env.Environment:
+    """Load a dm_control world for its model alone: one of the suite where nothing renders, too."""
+    from crptpro.envs.dm_stack import load_dm_env
+    from crptpro.envs.rendering import select_backend
+
+    try:
+        select_backend()  # importing dm_control fixes it
+    except RenderingError:
+        if domain.source != "suite":
+            raise
+        before = os.environ.get("MUJOCO_GL")
+        os.environ["MUJOCO_GL"] = "disable"
+        try:
+            return load_dm_env(domain)
+        finally:
+            del os.environ["MUJOCO_GL"]
+            os.environ.update({} if before is None else {"MUJOCO_GL": before})
+    return load_dm_env(domain)
 
 
 def _joints(model: object) -> tuple[Joint, ...]:

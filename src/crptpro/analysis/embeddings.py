@@ -25,7 +25,10 @@ def sample_pixels(dataset: ReplayBuffer, samples: int, *, seed: int) -> Tensor:
         ``[B, C, H, W]``, dtype and device as the dataset has them.
     """
     before = getattr(dataset, "_rng", None)  # TorchRL has a setter but no getter
-    dataset.set_rng(torch.Generator("cpu" if before is None else before.device).manual_seed(seed))
+    device = getattr(dataset.storage, "device", "cpu") if before is None else before.device
+    if not isinstance(device, torch.device):
+        device = torch.device("cpu")  # "auto": nobody has said
+    dataset.set_rng(torch.Generator(device).manual_seed(seed))
     try:
         return dataset.sample(samples)["pixels"]
     finally:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -89,6 +89,7 @@ class Reproduce:
 
         if self.attempts < 1:
             raise CRPTproError(f"--attempts must be at least 1, got {self.attempts}.")
+        self._refuse_options_of_others()
         if self.launcher in ("local", "inline"):
             usable_device(self.device)
         resources = divide(
@@ -125,6 +126,31 @@ class Reproduce:
                 print(failures_text(failures), flush=True)
                 raise SystemExit(1)
         print(f"\nAll of it is there. Tables and figures: crptpro report {self.out}", flush=True)
+
+    def _refuse_options_of_others(self) -> None:
+        """An option that the launcher does not read was meant for another one."""
+        from crptpro.errors import CRPTproError
+
+        defaults = {field.name: field.default for field in fields(self)}
+        given = {name for name, usual in defaults.items() if getattr(self, name) != usual}
+        read_by = {
+            "partition": ("slurm",), "hours": ("slurm",), "memory_gb": ("slurm",), "sbatch": ("slurm",),
+            "ray_address": ("ray",), "jobs_per_gpu": ("local", "ray"),
+        }  # fmt: skip
+        for name, launchers in read_by.items():
+            if name in given and self.launcher not in launchers:
+                raise CRPTproError(
+                    f"--{name.replace('_', '-')} is for --launcher {' or '.join(launchers)}; "
+                    f"--launcher {self.launcher} does not read it."
+                )
+        if self.launcher == "inline" and (self.jobs or 1) > 1:
+            raise CRPTproError(f"--launcher inline makes one piece at a time, not --jobs {self.jobs}.")
+        if "jobs_per_gpu" in given and not self.device.startswith("cuda"):
+            raise CRPTproError(f"--jobs-per-gpu is for --device cuda, not {self.device}.")
+        if self.launcher in ("slurm", "ray") and self.device.startswith("cuda:"):
+            raise CRPTproError(
+                f"--launcher {self.launcher} gives each job a GPU of its own: write --device cuda, not {self.device}."
+            )
 
     def _request(self, resources: Resources) -> Request:
         from crptpro.experiments.goals import Request

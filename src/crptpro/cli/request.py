@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from crptpro.domains import GROUPS, GYMNASIUM_PREFIX, PAPER_DOMAINS, TASKS, get_domain
+from crptpro.domains import GROUPS, GYMNASIUM_PREFIX, PAPER_DOMAINS, TASKS, get_domain, known_names
 from crptpro.errors import CRPTproError, DatasetError, UnknownNameError
 from crptpro.loggers import RunLogger, WandbOptions
 
@@ -62,7 +62,7 @@ def explored_domains(names: Sequence[str], method: str) -> list[str]:
     """
     for name in names:
         is_path = Path(name).is_dir() or ("/" in name and not name.startswith(GYMNASIUM_PREFIX))
-        if is_path and name not in GROUPS:
+        if is_path and name not in (*GROUPS, *known_names()):  # a folder may be called walker
             raise CRPTproError(
                 f"{method} explores and collects its own data; {name} is a path. Name domains, tasks or groups "
                 f"({', '.join(GROUPS)}), or choose a method that learns from datasets."

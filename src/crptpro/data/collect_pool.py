@@ -103,7 +103,7 @@ class WorkerPool:
             if worker.connection in ready:
                 try:
                     kind, domain, payload = worker.connection.recv()
-                except (EOFError, ConnectionResetError):
+                except (EOFError, OSError):  # also in the middle of a message
                     raise self._death(worker) from None
                 worker.heard_s = time.monotonic()
                 if kind == "error":

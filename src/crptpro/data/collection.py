@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import time
 from pathlib import Path
@@ -24,7 +25,7 @@ from crptpro.data.layout import (
 )
 from crptpro.directory_lock import DirectoryLock
 from crptpro.domains import LONGEST_EPISODE_AGENT_STEPS
-from crptpro.errors import DatasetError
+from crptpro.errors import DatasetError, DiskSpaceError
 from crptpro.seeding import derive_seed
 
 logger = logging.getLogger(__name__)
@@ -67,6 +68,11 @@ class DomainCollection:
         require_free(path)
         self._lock = DirectoryLock(path, error=DatasetError)
         try:
+            if (path / CARD_FILE).exists():  # another process has finished it just now
+                require_request(path, read_card(path).get("request", {}), request, "holds a dataset")
+                self.is_complete = True
+                self.close()
+                return
             self._resume()
         except BaseException:
             self.close()
@@ -137,10 +143,22 @@ class DomainCollection:
 
         Raises:
             DiskSpaceError: if the disk is full; everything appended before is kept.
+            DatasetError: if it cannot be written for another reason.
         """
         self._running.pop(index, None)
         if self.is_complete:
             return
+        try:
+            self._take(index, episode)
+        except OSError as reason:
+            if reason.errno not in (errno.ENOSPC, errno.EDQUOT):
+                raise DatasetError(f"{self.path} cannot be written: {reason}.") from reason
+            raise DiskSpaceError(
+                f"The disk under {self.path} is full after {self.transitions} transitions, which are kept. Free space "
+                "and run the same command again."
+            ) from reason
+
+    def _take(self, index: int, episode: Episode) -> None:
         if not episode.is_cut:
             self._seen_lengths.add(len(episode))
         if self._writer is None:

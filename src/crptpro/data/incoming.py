@@ -28,11 +28,15 @@ def write_incoming(root: Path, index: int, episode: Episode) -> None:
     arrays = {name: getattr(episode, name) for name in _ARRAYS}
     arrays |= {f"state_{name}": values for name, values in episode.state.items()}
     temporary = path.with_suffix(".new")
-    with open(temporary, "wb") as file:
-        np.savez(file, is_cut=np.array(episode.is_cut), **arrays)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    try:
+        with open(temporary, "wb") as file:
+            np.savez(file, is_cut=np.array(episode.is_cut), **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def read_incoming(root: Path) -> Iterator[tuple[int, Episode]]:
