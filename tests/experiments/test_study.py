@@ -25,7 +25,7 @@ from crptpro.experiments.pieces import (
 from crptpro.experiments.plan import make_plan
 from crptpro.experiments.scales import PAPER, SMALL, TINY
 from crptpro.experiments.store import DONE, Store
-from crptpro.experiments.study import factors, factors_of, study, temperatures
+from crptpro.experiments.study import factors, factors_of, finalists, study, temperatures
 from crptpro.pretrained import load_pretrained
 
 
@@ -125,12 +125,40 @@ def test_a_factor_changes_one_number_and_all_share_the_baseline() -> None:
         assert (goal.piece.updates, goal.piece.datasets) == (baseline.updates, baseline.datasets)
 
 
+def test_finalists_are_full_length_trials_of_both_learning_rates_at_both_temperatures() -> None:
+    goals = finalists(Request(SMALL))
+    encoders = of(goals, PretrainedPiece)
+    found = {
+        dict(g.place)["value"]: (
+            effective(g.piece)["learning_rate"],
+            dict(g.piece.loss).get("assignment_temperature", 0.1),
+        )
+        for g in encoders
+    }
+    assert found == {
+        "1e-4 and 0.1": (1e-4, 0.1),
+        "1e-4 and 0.05": (1e-4, 0.05),
+        "3e-4 and 0.05": (3e-4, 0.05),
+        "3e-4 and 0.1": (3e-4, 0.1),
+    }
+    assert {dict(g.place)["usual"] for g in encoders} == {"1e-4 and 0.1"}
+    assert len(pieces(goals, PretrainedPiece)) == len(pieces(goals, RunPiece)) == 4 * 2 * 2
+    slow = {g.piece for g in encoders if dict(g.place)["value"].startswith("1e-4")}
+    assert slow < pieces(temperatures(Request(SMALL)), PretrainedPiece)  # made once for both
+    for group in "AC":
+        plain = [
+            g.piece for g in encoders if dict(g.place) == {**dict(g.place), "group": group, "encoder_seed": 0}
+        ]
+        assert len({(p.updates, p.snapshots, p.datasets) for p in plain}) == 1
+
+
 def test_nothing_is_asked_for_twice(small: list[Goal]) -> None:
     assert len(small) == len(set(small))
-    assert len(pieces(small, PretrainedPiece)) == 12 + 17
-    assert len(pieces(small, RunPiece)) == 12
-    # At 6 points of each temperature and 2 of each factor on 4 domains; 2 untrained encoders on the 6 of both groups.
-    assert len(pieces(small, ProbePiece)) == (12 * 6 + 17 * 2) * 4 + 2 * 6
+    assert len(pieces(small, PretrainedPiece)) == 12 + 8 + 17
+    assert len(pieces(small, RunPiece)) == 12 + 8
+    # At 6 points of each full-length encoder and 2 of each factor's on 4 domains; 2 untrained ones on the 6 of both
+    # groups.
+    assert len(pieces(small, ProbePiece)) == ((12 + 8) * 6 + 17 * 2) * 4 + 2 * 6
 
 
 def test_the_papers_scale_has_its_batch_and_updates() -> None:

@@ -1,13 +1,14 @@
-"""Can CRPTpro's pre-training be bettered? The temperature of its targets, and one factor at a time.
+"""Can CRPTpro's pre-training be bettered? The temperature of its targets, one factor at a time, then the best of both.
 
-Every encoder is judged by the state probe, along its training and at its end, and those of the temperatures by
-reinforcement learning as well. This is a study of pre-training: at ``small`` it has the paper's 512 prototypes, whose
-plateau lies at ln M = 6.238, where the other experiments of that scale have as many prototypes as rows. Its downstream
-runs compare its encoders with each other, not with other experiments.
+Every encoder is judged by the state probe, along its training and at its end, and those of full length (of the
+temperatures and of the finalists) by reinforcement learning as well. This is a study of pre-training: at ``small`` it
+has the paper's 512 prototypes, whose plateau lies at ln M = 6.238, where the other experiments of that scale have as
+many prototypes as rows. Its downstream runs compare its encoders with each other, not with other experiments.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -28,12 +29,14 @@ from crptpro.objectives import get_method
 METHOD = "crptpro"
 PROTOTYPES = {"small": 512}
 """By scale, where it differs from the scale's."""
-TEMPERATURE_UPDATES = {"small": 10_000}
-"""Encoder updates of the temperatures by scale, where they differ from the scale's."""
+FULL_UPDATES = {"small": 10_000}
+"""Encoder updates of full-length trials by scale, where they differ from the scale's."""
 SNAPSHOTS = (500, 1_000, 2_000, 3_000, 5_000, 10_000, 20_000)
-"""Updates after which the encoders of the temperatures are probed, besides at their end."""
+"""Updates after which the encoders of full-length trials are probed, besides at their end."""
 FACTOR_SNAPSHOTS = (1_000,)
 """Likewise those of the factors."""
+SHARP = {"assignment_temperature": 0.05}
+FAST = {"learning_rate": 3e-4}
 
 
 @dataclass(frozen=True)
@@ -54,35 +57,55 @@ class Factor:
 
 
 def study(request: Request) -> list[Goal]:
-    """Temperatures of the targets on two groups and two seeds, then one-factor trials on one of each."""
+    """Temperatures of the targets on two groups and two seeds, one-factor trials on one of each, then the finalists."""
     if METHOD not in request.chosen((METHOD,)):
         return []
-    return list(dict.fromkeys([*temperatures(request), *factors(request)]))  # both have the control
+    # They share encoders and the control.
+    return list(dict.fromkeys([*temperatures(request), *factors(request), *finalists(request)]))
 
 
 def temperatures(request: Request) -> list[Goal]:
-    """The targets' temperature: the paper's 0.1, half of it, and moving from the half to the paper's over the run.
+    """The targets' temperature: the paper's 0.1, half of it, and moving from the half to the paper's over the run."""
+    annealed = {**SHARP, "annealing_updates": _full_updates(request.scale)}
+    variants = {"0.1": {}, "0.05": {"loss": SHARP}, "annealed": {"loss": annealed}}
+    return _full_length(request, "assignment_temperature", "0.1", variants)
+
+
+def finalists(request: Request) -> list[Goal]:
+    """The learning rate that one-factor trials favour, at either temperature, beside the usual one."""
+    variants = {
+        "1e-4 and 0.1": {},
+        "1e-4 and 0.05": {"loss": SHARP},
+        "3e-4 and 0.05": {"training": FAST, "loss": SHARP},
+        "3e-4 and 0.1": {"training": FAST},
+    }
+    return _full_length(request, "learning_rate_and_temperature", "1e-4 and 0.1", variants)
+
+
+def _full_length(
+    request: Request, factor: str, usual: str, variants: Mapping[str, Mapping[str, Any]]
+) -> list[Goal]:
+    """Variants on two groups and two encoder seeds, with a run of each.
 
     Where the request has one encoder seed, the next one is taken too: one run tells nothing of a difference.
     """
     first, *more = request.encoder_seeds
-    updates = TEMPERATURE_UPDATES.get(request.scale.name, request.scale.updates)
-    sharp = {"assignment_temperature": 0.05}
-    variants: dict[str, dict[str, Any]] = {
-        "0.1": {},
-        "0.05": sharp,
-        "annealed": {**sharp, "annealing_updates": updates},
-    }
+    updates = _full_updates(request.scale)
     found: list[Goal] = []
     for group in request.groups or ("A", "C"):
         for seed in (first, *(more or (first + 1,))):
-            for value, loss in variants.items():
-                place = {"factor": "assignment_temperature", "value": value, "usual": "0.1", "group": group}
-                piece = _trial(request.scale, group, seed, updates, SNAPSHOTS, loss=loss)
-                found += _judged(request.scale, f"{METHOD}, assignment_temperature {value}", piece, place)
-                found += _learned(request, f"{METHOD}, assignment_temperature {value}", piece, place)
+            for value, changed in variants.items():
+                label = f"{METHOD}, {factor} {value}"
+                place = {"factor": factor, "value": value, "usual": usual, "group": group}
+                piece = _trial(request.scale, group, seed, updates, SNAPSHOTS, **changed)
+                found += _judged(request.scale, label, piece, place)
+                found += _learned(request, label, piece, place)
             found += _control(request, group, seed)
     return found
+
+
+def _full_updates(scale: Scale) -> int:
+    return FULL_UPDATES.get(scale.name, scale.updates)
 
 
 def factors(request: Request) -> list[Goal]:
