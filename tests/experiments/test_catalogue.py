@@ -31,27 +31,28 @@ def counted(goals: list[Goal], root: Path) -> tuple[int, int, int, int]:
 
 # name: goals, and then different runs, measurements, encoders, datasets.
 AT_PAPER_SCALE = {
-    # 12 rows x 10 methods x 3 seeds; DrQ, the random encoder and the two (S) methods know no groups, and of the 8
-    # tasks 4 stand in two. 5 cross-domain methods in 4 groups, 12 fine-tuned encoders, 2 x 8 (S) ones, a random one.
-    "seen": (360, 6 * 36 + 4 * 24, 0, 20 + 12 + 16 + 1, 8),
-    # 10 rows x 6 methods x 3 seeds; the random encoder has 8 tasks, 2 of them twice. 5 methods on 2 groups.
-    "unseen": (180, 5 * 30 + 24, 0, 11, 6),
-    "colors": (54, 54, 0, 6, 3),
-    # 5 domains x 5 methods x 3 seeds; of the group's domains, quadruped is not among the five.
-    "finetune": (75, 75, 0, 1 + 5 + 5 + 5, 6),
-    # 6 tasks x 6 variants x 3 seeds; two variants of two methods for two groups and of one for six domains.
-    "ablation": (108, 108, 0, 8 + 12, 6),
+    # 12 rows x 11 methods x 3 seeds; DrQ, the random encoder and the two (S) methods know no groups, and of the 8
+    # tasks 4 stand in two. 6 cross-domain methods in 4 groups, 12 fine-tuned encoders, 2 x 8 (S) ones, a random one.
+    "seen": (396, 7 * 36 + 4 * 24, 0, 24 + 12 + 16 + 1, 8),
+    # 10 rows x 7 methods x 3 seeds; the random encoder has 8 tasks, 2 of them twice. 6 methods on 2 groups.
+    "unseen": (210, 6 * 30 + 24, 0, 13, 6),
+    "colors": (63, 63, 0, 7, 3),
+    # 5 domains x 6 methods x 3 seeds; of the group's domains, quadruped is not among the five.
+    "finetune": (90, 90, 0, 2 + 5 + 5 + 5, 6),
+    # 6 tasks x 7 variants x 3 seeds; two variants of two methods and the preset for two groups, two variants of one
+    # method for six domains.
+    "ablation": (126, 126, 0, 10 + 12, 6),
     # 3 tasks x 3 seeds x (2 methods x 5 weights + 3 capacities), of which one is the default both times.
     "sensitivity": (117, 108, 0, 5 + 5 + 2, 9),
-    # 7 methods x 3 numbers of domains; each (S) method has three encoders timed, and two sums. No encoder is made.
-    "efficiency": (21, 0, 5 * 3 + 2 * 5, 0, 3),
-    "prototypes": (6, 0, 6, 6, 3),
+    # 8 methods x 3 numbers of domains; each (S) method has three encoders timed, and two sums. No encoder is made.
+    "efficiency": (24, 0, 6 * 3 + 2 * 5, 0, 3),
+    "prototypes": (7, 0, 7, 7, 3),
     "coverage": (1, 0, 1, 2, 3),
-    "stability": (3, 0, 0, 3, 3),
+    "stability": (4, 0, 0, 4, 3),
     # Groups B and C share manipulation.
     "visualize": (2, 0, 2, 4, 5),
-    # 8 encoders x 5 domains x 2 colours; the reversed ones of each domain are drawn once.
-    "probe": (80, 0, 80 + 5, 8, 5),
+    # 9 encoders x 5 domains x 2 colours; the reversed ones of each domain are drawn once.
+    "probe": (90, 0, 90 + 5, 9, 5),
 }
 
 
@@ -139,7 +140,7 @@ def test_colours_are_reversed_in_the_way_that_the_request_says() -> None:
         assert {run.colors for run in runs if isinstance(run, RunPiece)} == {colors}
         probes = [goal.piece for goal in EXPERIMENTS["probe"].goals(request)]
         assert {piece.colors for piece in probes if isinstance(piece, ProbePiece)} == {"normal", colors}
-    assert len(EXPERIMENTS["probe"].goals(Request(PAPER, colors="normal"))) == 40
+    assert len(EXPERIMENTS["probe"].goals(Request(PAPER, colors="normal"))) == 45
 
 
 def test_efficiency_adds_the_encoders_of_single_domain_methods_up() -> None:
@@ -171,7 +172,7 @@ def test_a_timing_of_a_small_scale_knows_the_papers_budget() -> None:
 
 def test_stability_differs_in_its_data_alone() -> None:
     goals = {goal.label: goal.piece for goal in EXPERIMENTS["stability"].goals(Request(PAPER))}
-    assert list(goals) == ["crptpro", "crptpro without dispersion", "proto-rl-c"]
+    assert list(goals) == ["crptpro", "crptpro without dispersion", "crptpro-fast", "proto-rl-c"]
     random, active = goals["crptpro without dispersion"], goals["proto-rl-c"]
     assert isinstance(random, PretrainedPiece)
     assert isinstance(active, ExploredPiece)

@@ -203,7 +203,11 @@ def test_downstream_seeds_are_the_scales_unless_given() -> None:
     [
         (lambda: Request(PAPER, methods=("crtpro",)), UnknownNameError, "crptpro"),
         (lambda: Request(PAPER, methods=("crptpro-fine",)), UnknownNameError, "crptpro-finetune"),
-        (lambda: Request(PAPER, methods=("foo",)), UnknownNameError, "becl, crptpro, crptpro-finetune, drq"),
+        (
+            lambda: Request(PAPER, methods=("foo",)),
+            UnknownNameError,
+            "becl, crptpro, crptpro-fast, crptpro-finetune, drq",
+        ),
         (lambda: Request(PAPER, groups=("E",)), UnknownNameError, "'E'; choose from A, B, C, D"),
         (lambda: Request(PAPER, tasks=("walker_rum",)), UnknownNameError, "walker_run"),
         (lambda: get_scale("huge"), UnknownNameError, "'huge'; choose tiny, small, paper"),

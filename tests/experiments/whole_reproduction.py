@@ -19,8 +19,8 @@ from crptpro.experiments.scales import SMALL
 from crptpro.training.video import write_video
 
 LEVEL = {
-    "crptpro": 400, "crptpro-finetune": 420, "proto-rl-c": 300, "proto-rl-s": 330, "atc": 200, "apt-c": 180,
-    "apt-s": 210, "becl": 150, "drq": 350, "random-encoder": 120,
+    "crptpro": 400, "crptpro-fast": 410, "crptpro-finetune": 420, "proto-rl-c": 300, "proto-rl-s": 330, "atc": 200,
+    "apt-c": 180, "apt-s": 210, "becl": 150, "drq": 350, "random-encoder": 120,
 }  # fmt: skip
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from loss_cases import proto, small_encoder
@@ -52,6 +54,15 @@ def test_released_code_is_a_preset_with_its_own_width_and_updates() -> None:
     assert loss.predictor.config == {"latent_dim": 4, "hidden_dim": 512}
     assert method_defaults(loss).updates == 49_998
     assert method_defaults(type(loss)).updates == 50_000
+
+
+def test_crptpro_fast_is_crptpro_but_for_its_learning_rate_and_the_temperature_of_its_targets() -> None:
+    assert "crptpro-fast" in set(methods(presets=True)) - set(methods())
+    fast, usual = get_method("crptpro-fast"), get_method("crptpro")
+    loss = fast.build(small_encoder(), num_prototypes=8, latent_dim=4, hidden_dim=7)
+    assert (float(loss.assignment_temperature), float(loss.temperature)) == (0.05, 0.1)
+    assert fast.defaults == replace(usual.defaults, lr=3e-4)
+    assert fast.describe() | {"loss_options": {}, "defaults": None} == usual.describe() | {"defaults": None}
 
 
 def test_options_override_those_of_the_preset() -> None:

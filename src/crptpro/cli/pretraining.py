@@ -79,8 +79,8 @@ class Pretrain(PretrainingOptions):
     sources: Annotated[Positional[tuple[str, ...]], arg(help_behavior_hint="(required)")]
     """dataset directories, e.g. data/walker data/cartpole; for exploring methods domains, tasks or group letters"""
     method: str = "crptpro"
-    """a registered method: crptpro, atc (on datasets), proto-rl-c, proto-rl-s, apt-c, apt-s, becl (exploring), or one
-    of your own with --plugin FILE.py"""
+    """a registered method: crptpro, atc (on datasets), proto-rl-c, proto-rl-s, apt-c, apt-s, becl (exploring), a preset
+    such as crptpro-fast, or one of your own with --plugin FILE.py"""
     updates: int | None = None
     """encoder updates over all domains (default: the method's; crptpro 50,000); for exploring methods
     --explore.env-steps instead"""

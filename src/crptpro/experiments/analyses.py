@@ -8,6 +8,7 @@ from crptpro.colors import Colors
 from crptpro.domains import GROUPS, get_domain
 from crptpro.experiments.goals import (
     DRQ,
+    FAST,
     FINETUNE,
     METHODS,
     RANDOM_ENCODER,
@@ -114,6 +115,7 @@ def stability(request: Request) -> list[Goal]:
     """
     variants = {
         "crptpro": (("crptpro", ()), ("crptpro without dispersion", NO_DISPERSION)),
+        FAST: ((FAST, ()),),
         "proto-rl-c": (("proto-rl-c", ()),),
     }
     goals = []

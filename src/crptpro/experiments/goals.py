@@ -26,9 +26,9 @@ from crptpro.experiments.pieces import (
 from crptpro.experiments.scales import Scale
 from crptpro.objectives import Method, get_method
 
-FINETUNE, DRQ, RANDOM_ENCODER = "crptpro-finetune", "drq", "random-encoder"
+FAST, FINETUNE, DRQ, RANDOM_ENCODER = "crptpro-fast", "crptpro-finetune", "drq", "random-encoder"
 METHODS = (
-    "crptpro", FINETUNE, "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-s", "becl", DRQ, RANDOM_ENCODER,
+    "crptpro", FAST, FINETUNE, "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-s", "becl", DRQ, RANDOM_ENCODER,
 )  # fmt: skip
 """Every system of the comparison, in the order of tables."""
 

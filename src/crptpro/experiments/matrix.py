@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from crptpro.domains import GROUPS, get_domain
 from crptpro.experiments.goals import (
     DRQ,
+    FAST,
     FINETUNE,
     METHODS,
     RANDOM_ENCODER,
@@ -21,7 +22,7 @@ from crptpro.experiments.goals import (
 from crptpro.experiments.pieces import EncoderPiece, Settings, settings
 from crptpro.experiments.published import COLORS, FINETUNE_UPDATES, UNSEEN
 
-CROSS_DOMAIN = ("crptpro", "proto-rl-c", "atc", "apt-c", "becl", RANDOM_ENCODER)
+CROSS_DOMAIN = ("crptpro", FAST, "proto-rl-c", "atc", "apt-c", "becl", RANDOM_ENCODER)
 """Methods whose one encoder serves several domains, with the control."""
 
 DISPERSION = settings(intr_loss_coef=5e-3)
@@ -29,10 +30,11 @@ DISPERSION = settings(intr_loss_coef=5e-3)
 NO_DISPERSION = settings(intr_loss_coef=0.0)
 VARIANTS: dict[str, tuple[tuple[str, Settings], ...]] = {
     "crptpro": (("crptpro", ()), ("crptpro without dispersion", NO_DISPERSION)),
+    FAST: ((FAST, ()),),
     "proto-rl-c": (("proto-rl-c with dispersion", DISPERSION), ("proto-rl-c", ())),
     "proto-rl-s": (("proto-rl-s with dispersion", DISPERSION), ("proto-rl-s", ())),
 }
-"""Methods with prototypes, each with and without the dispersion loss: label and options of the loss."""
+"""Methods with prototypes, the paper's with and without the dispersion loss: label and options of the loss."""
 
 
 def seen(request: Request) -> list[Goal]:
@@ -60,7 +62,7 @@ def finetune(request: Request) -> list[Goal]:
     goals = []
     for group in request.groups or ("A",):
         for task in _tasks(request, FINETUNE_UPDATES):
-            for method in request.chosen(("crptpro", FINETUNE, "proto-rl-s", "apt-s", DRQ)):
+            for method in request.chosen(("crptpro", FAST, FINETUNE, "proto-rl-s", "apt-s", DRQ)):
                 goals += _cell(request, method, group, task)
     return goals
 

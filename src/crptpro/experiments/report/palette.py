@@ -24,6 +24,7 @@ class Style:
 # Of Okabe and Ito's and of Tol's colour-blind-safe sets, those of a middle lightness: a page may be light or dark.
 _STYLES = {
     "crptpro": Style("#0b80c3", "o"),
+    "crptpro-fast": Style("#3d74d8", "p", "-."),
     "crptpro-finetune": Style("#2fa7e0", "D", "--"),
     "proto-rl-c": Style("#d9640a", "s"),
     "proto-rl-s": Style("#e69f00", "P", "--"),
