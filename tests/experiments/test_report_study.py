@@ -11,6 +11,7 @@ from report_reading import cell, table_in
 from crptpro.experiments.report import study
 from crptpro.experiments.report.blocks import ABSENT, Figure, Paragraph
 from crptpro.experiments.report.diagnostics import diagnostics, left_plateau
+from crptpro.experiments.report.each_encoder import each_encoder
 from crptpro.experiments.report.glance import glance
 from crptpro.experiments.report.measurements import Row
 from crptpro.experiments.report.reading import Asked, Made, Wanted
@@ -186,3 +187,27 @@ def test_what_encoders_know_at_the_end_is_not_said_of_those_that_are_not_there(
 
 def test_there_is_no_glance_where_nothing_is_the_usual_value() -> None:
     assert glance([reading for reading in FOUND if not reading.trial.is_usual], [], "study") == []
+
+
+def test_every_encoder_has_a_line_of_its_own_along_its_training_and_the_untrained_the_same_number_in_each() -> (
+    None
+):
+    of_group = [reading for reading in FOUND if reading.trial.group == "A"]
+    goal = probed("0.05", 0, 300, both(0.3, 0.6))[0].goal
+    records = [(goal, record(1.0, 0.9))]
+    (table,) = each_encoder(of_group, records, "tau", "tau, group A: ")
+    assert table.caption.startswith("Tau, group A: velocities read from features of each encoder")
+    assert table.columns == ("tau", "encoder seed", "left the plateau at", "100", "300")
+    assert [[cell.text for cell in line] for line in table.rows] == [
+        ["0.1", "0", ABSENT, "0.150", "0.300"],
+        ["0.1", "1", ABSENT, ABSENT, "0.400"],
+        ["0.05", "0", "200", "0.400", "0.450"],
+        ["0.05", "1", ABSENT, ABSENT, "0.350"],
+        ["0.05", "2", ABSENT, ABSENT, "0.900"],
+        ["untrained", "0", ABSENT, "0.050", "0.050"],
+    ]
+
+
+def test_encoders_that_were_probed_at_their_end_alone_have_no_table_along_training() -> None:
+    ends = [reading for reading in FOUND if reading.updates != 100]
+    assert each_encoder(ends, [], "tau", "") == []

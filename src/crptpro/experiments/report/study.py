@@ -17,6 +17,7 @@ from crptpro.experiments.report.blocks import (
     sentence,
 )
 from crptpro.experiments.report.diagnostics import diagnostics, records_of
+from crptpro.experiments.report.each_encoder import each_encoder
 from crptpro.experiments.report.glance import POSITIONS, VELOCITIES, glance, words
 from crptpro.experiments.report.measurements import Row, rows_of
 from crptpro.experiments.report.palette import in_order, styles
@@ -41,7 +42,8 @@ def study(asked: Asked) -> tuple[Block, ...]:
     probes = [row for row in probes if not row["coordinate"] and row["measure"] in (POSITIONS, VELOCITIES)]
     records = records_of(asked)
     ends = last_updates(goal for goal in asked.goals if goal.piece.kind == "probe")
-    blocks += glance(readings(probes), records, asked.name)
+    found = readings(probes)
+    blocks += glance(found, records, asked.name)
     trials = dict.fromkeys(trial_of(goal) for goal in asked.finished if goal.piece.kind != "run")
     parts = dict.fromkeys((trial.factor, trial.group) for trial in trials)
     for factor, group in parts:
@@ -63,6 +65,8 @@ def study(asked: Asked) -> tuple[Block, ...]:
             ]
             embeddings = dict.fromkeys(row["embedding"] for row in ended)
             blocks += [_probes(ended, embedding, heading, of) for embedding in embeddings]
+            mine = [r for r in found if r.trial.factor in (factor, CONTROL) and r.trial.group == group]
+            blocks += each_encoder(mine, own, heading, of)
             blocks += _along(read, f"{name}-probe", of)
     return tuple(blocks)
 
