@@ -32,6 +32,23 @@ def test_a_gpu_with_a_broken_driver_is_recorded_and_stops_nothing(monkeypatch: p
     assert found["gpus"] == ["Some GPU", "unusable: CUDA driver version is insufficient"]
 
 
+@pytest.mark.parametrize(
+    ("bf16", "amx", "named"),
+    [
+        (False, False, "AVX512"),
+        (True, False, "AVX512, AVX512-BF16"),
+        (True, True, "AVX512, AVX512-BF16, AMX"),
+    ],
+)
+def test_processors_of_one_name_are_told_apart_by_what_torch_computes_with(
+    monkeypatch: pytest.MonkeyPatch, bf16: bool, amx: bool, named: str
+) -> None:
+    monkeypatch.setattr(cards.torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
+    monkeypatch.setattr(cards.torch.cpu, "_is_avx512_bf16_supported", lambda: bf16)
+    monkeypatch.setattr(cards.torch.cpu, "_is_amx_tile_supported", lambda: amx)
+    assert cards.hardware.__wrapped__()["cpu_instructions"] == named
+
+
 @pytest.mark.parametrize("is_tracked", [True, False])
 def test_only_a_repository_that_tracks_this_package_names_its_revision(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_tracked: bool

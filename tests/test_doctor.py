@@ -122,7 +122,13 @@ def test_a_backend_that_mujoco_gl_names_and_nobody_tried_is_not_ok() -> None:
 
 
 def test_a_gpu_that_torch_cannot_use_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    machine = {"cpu": "x", "cpu_cores": 2, "ram_bytes": 16e9, "gpus": ["unusable: driver too old"]}
+    machine = {
+        "cpu": "x",
+        "cpu_instructions": "AVX2",
+        "cpu_cores": 2,
+        "ram_bytes": 16e9,
+        "gpus": ["unusable: driver too old"],
+    }
     monkeypatch.setattr(doctor.cards, "hardware", lambda: machine)
     report = run_doctor(["cartpole"])
     assert report.ok
@@ -145,7 +151,13 @@ def test_little_memory_or_disk_is_reported(
 
 
 def test_a_software_renderer_beside_a_gpu_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    machine = {"cpu": "x", "cpu_cores": 2, "ram_bytes": 16e9, "gpus": ["Some GPU"]}
+    machine = {
+        "cpu": "x",
+        "cpu_instructions": "AVX2",
+        "cpu_cores": 2,
+        "ram_bytes": 16e9,
+        "gpus": ["Some GPU"],
+    }
     monkeypatch.setattr(doctor.cards, "hardware", lambda: machine)
     report = run_doctor(["cartpole"])
     assert report.ok

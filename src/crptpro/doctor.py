@@ -72,7 +72,7 @@ class DoctorReport:
         gpus = ", ".join(self.hardware["gpus"]) or "none"
         total = self.hardware["ram_bytes"]
         lines += [
-            f"  CPU   {self.hardware['cpu']}, {self.hardware['cpu_cores']} cores",
+            f"  CPU   {self.hardware['cpu']} ({self.hardware['cpu_instructions']}), {self.hardware['cpu_cores']} cores",
             f"  GPU   {gpus}",
             f"  RAM   {self.free_ram_bytes / _GB:.1f} GB free of {total / _GB:.1f} GB",
             f"  disk  {self.free_disk_bytes / _GB:.1f} GB free at {self.disk}",

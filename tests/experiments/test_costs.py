@@ -116,6 +116,12 @@ def test_pieces_of_another_machine_correct_nothing(tmp_path: Path) -> None:
     piece = DatasetPiece("walker", 10_000, 0)
     finish(store, piece, 1e6, made_on={**here, "cpu": "another"})
     assert corrections(store) == {}
+    # Two of one name, or a record from before that was written down.
+    finish(store, DatasetPiece("walker", 10_000, 4), 1e6, made_on={**here, "cpu_instructions": "SSE"})
+    assert corrections(store) == {}
+    older = {name: here[name] for name in here if name != "cpu_instructions"}
+    finish(store, DatasetPiece("walker", 10_000, 5), 1e6, made_on=older)
+    assert corrections(store) == {}
     finish(
         store,
         DatasetPiece("walker", 10_000, 1),

@@ -138,7 +138,8 @@ def _size(directory: Path) -> int:
 
 def _deciding(device: str) -> tuple[str, ...]:
     """What of the hardware decides how long a job takes, as :func:`~crptpro.cards.hardware` names it."""
-    return ("cpu",) if _kind(device) == "cpu" else ("cpu", "gpus")
+    cpu = ("cpu", "cpu_instructions")
+    return cpu if _kind(device) == "cpu" else (*cpu, "gpus")
 
 
 def _parts(recorded: str | list[str]) -> str | set[str]:

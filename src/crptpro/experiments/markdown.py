@@ -76,7 +76,8 @@ def write_report(
     installed = ", ".join(f"{name} {version}" for name, version in versions().items())
     parts += [
         "## Made with",
-        f"{machine['cpu']}, {machine['cpu_cores']} cores, {machine['ram_bytes'] / 2**30:.0f} GiB RAM, {gpus}.\n\n"
+        f"{machine['cpu']} ({machine['cpu_instructions']}), {machine['cpu_cores']} cores, "
+        f"{machine['ram_bytes'] / 2**30:.0f} GiB RAM, {gpus}.\n\n"
         f"{installed}; source revision {git_revision()}.",
     ]
     temporary = path.with_suffix(".tmp")

@@ -172,7 +172,9 @@ def machine(hardware: Mapping[str, Any]) -> str:
         return "not recorded"
     gpus: Sequence[str] = hardware.get("gpus") or ()
     ram = float(hardware.get("ram_bytes") or 0) / 2**30
-    return f"{hardware.get('cpu')}, {hardware.get('cpu_cores')} cores, {ram:.0f} GiB, {', '.join(gpus) or 'no GPU'}"
+    instructions = f" ({there})" if (there := hardware.get("cpu_instructions")) else ""
+    cores = f"{hardware.get('cpu')}{instructions}, {hardware.get('cpu_cores')} cores"
+    return f"{cores}, {ram:.0f} GiB, {', '.join(gpus) or 'no GPU'}"
 
 
 def number(row: Mapping[str, str], column: str) -> float | None:
