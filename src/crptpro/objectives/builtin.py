@@ -13,8 +13,8 @@ from crptpro.objectives.simclr import SimCLRLoss
 
 # The first method of a class is what a loss of that class built by hand is trained like.
 register_method("crptpro", ProtoLoss, MethodDefaults())
-# Deviation: targets at half the student's temperature and three times the learning rate. At 10,000 updates of 128 its
-# features read more velocities than the paper's setting in each of four pairs of encoders (docs/study.md).
+# Deviation: targets at half the student's temperature, which leave the plateau at ln M sooner, and three times the
+# learning rate, which gets further once it is left (docs/study.md).
 register_method(
     "crptpro-fast",
     ProtoLoss,
