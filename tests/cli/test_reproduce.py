@@ -33,8 +33,8 @@ def test_a_dry_run_prints_the_plan_and_makes_nothing(call: Call, tmp_path: Path)
     status, out, err = call("reproduce", "seen", "--scale", "tiny", "--dry-run", "--out", tmp_path / "root")
     assert (status, err) == (0, "")
     assert numbers(out, "datasets of random transitions") == ["8", "0", "8"]
-    # Twelve tasks and ten methods, of which four do not ask for the group that four tasks are in twice.
-    assert numbers(out, "downstream runs") == [str(12 * 10 - 4 * 4), "0", str(12 * 10 - 4 * 4)]
+    # Twelve tasks and eleven methods, of which four do not ask for the group that four tasks are in twice.
+    assert numbers(out, "downstream runs") == [str(12 * 11 - 4 * 4), "0", str(12 * 11 - 4 * 4)]
     assert "at a time" in out
     assert list(tmp_path.iterdir()) == []
 

@@ -159,7 +159,7 @@ def test_coverage_probe_stability_and_study_have_their_numbers(page: Page) -> No
     assert cell(finals, "comparative loss [nats]", "crptpro").text == f"{last:.4g}"
     tried = blocks_of(page, "study-small")
     assert cell(table_in(tried, "diagnostics at the end"), "encoders", "0.05").text == "2"
-    probed = cell(table_in(tried, "read from features"), "walker", "annealed")
+    probed = cell(table_in(tried, "velocities read from features at the end"), "walker", "annealed")
     assert (probed.text, probed.beside) == ("0.700 / 0.400", "± 0.000 / 0.000, n = 2")
     gained = cell(
         table_in(tried, "at a glance"), "velocities, features", "assignment temperature", "annealed"

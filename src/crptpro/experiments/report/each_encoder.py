@@ -42,7 +42,8 @@ def each_encoder(found: Sequence[Reading], records: Sequence[Record], heading: s
             number = _number(control.values.get((VELOCITIES, embedding)))
             if number.text != ABSENT:
                 # Of no updates, it stands beside every number of them.
-                lines.append(cells(control.trial.value, control.seed, ABSENT, *[number] * len(places)))
+                seed = control.seed or ABSENT
+                lines.append(cells(control.trial.value, seed, ABSENT, *[number] * len(places)))
         caption = (
             f"{of}velocities read from {embedding} of each encoder after so many updates, held-out R2, mean over "
             "coordinates and domains."
