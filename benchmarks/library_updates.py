@@ -21,8 +21,9 @@ from crptpro.objectives import ProtoLoss, method_defaults
 from crptpro.pretrained import Pretrained
 from crptpro.training.downstream_parts import build_parts, worth_keeping_projections
 from crptpro.training.frozen_features import dense_slots
+from crptpro.training.pretrain.augmenter import Augmenter
 from crptpro.training.pretrain.learner import Learner
-from crptpro.training.pretrain.sources import Augmenter, keys_read, open_sources
+from crptpro.training.pretrain.sources import keys_read, open_sources
 from crptpro.transforms import choose_feature_mode, dense_shift_geometry
 
 #: Of the cheetah.

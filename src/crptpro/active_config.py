@@ -57,7 +57,7 @@ class ExplorationSettings:
     agent_learning_rate: float = 1e-4
     """of the agents' Adam optimisers"""
     initial_temperature: float = 0.1
-    """SAC's alpha at the start"""
+    """SAC's alpha at the start; skill-ddpg has none"""
     critic_tau: float = 0.01
     """share of the critic that enters its target at each target update"""
     shift_pad: int = 4

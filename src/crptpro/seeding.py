@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import random
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -60,6 +62,26 @@ def set_global_rng_state(state: dict[str, Any]) -> None:
     torch.set_rng_state(state["torch"].cpu())
     for device in range(min(len(state.get("cuda", ())), torch.cuda.device_count())):
         torch.cuda.set_rng_state(state["cuda"][device].cpu(), device)
+
+
+@contextmanager
+def kept_global_rng() -> Iterator[None]:
+    """Leave the global generators as they were found, whatever is seeded and drawn inside.
+
+    Examples:
+        >>> seed_everything(0)
+        >>> with kept_global_rng():
+        ...     seed_everything(1)
+        >>> inside = random.random()
+        >>> seed_everything(0)
+        >>> random.random() == inside
+        True
+    """
+    state = global_rng_state()
+    try:
+        yield
+    finally:
+        set_global_rng_state(state)
 
 
 def _plain(value: Any) -> Any:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from loss_cases import proto, small_encoder
+from torch import nn
 from torchrl.objectives import LossModule
 
 from crptpro.errors import UnknownNameError
@@ -108,6 +109,17 @@ def test_an_unregistered_loss_gets_generic_defaults_and_no_target_rate_without_t
 
 
 # The paper's methods ----------------------------------------------------------------------------------------------
+
+
+def test_targets_added_to_a_method_without_any_move_at_the_generic_rate() -> None:
+    class WithTargets(SimCLRLoss):
+        def __init__(self, encoder: PixelEncoder) -> None:
+            super().__init__(encoder, latent_dim=4)
+            self.convert_to_functional(nn.Linear(2, 2), "extra", create_target_params=True)
+
+    encoder = PixelEncoder(3, channels=(4,), strides=(2,), image_size=16)
+    assert method_defaults(SimCLRLoss(encoder, latent_dim=4)).encoder_tau is None
+    assert method_defaults(WithTargets(encoder)).encoder_tau == 0.05
 
 
 def test_every_pretraining_method_of_the_paper_has_its_name() -> None:

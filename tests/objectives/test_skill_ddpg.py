@@ -152,3 +152,15 @@ def test_what_does_not_fit_is_refused_with_its_value() -> None:
         skill_ddpg(noise_clip=-0.1)
     with pytest.raises(ValueError, match="3 skills, 0 to 2; got skill 3"):
         FixedSkillActor(actor, 3)
+
+
+def test_priority_weights_scale_rows() -> None:
+    td = skill_batch()
+    weighted = td.copy()
+    weights = torch.zeros(td.batch_size)
+    weights[3] = 1.0
+    weighted["priority_weight"] = weights
+    rows = skill_ddpg(reduction="none", generator=generator())(td)
+    loss = skill_ddpg(reduction="sum", generator=generator())(weighted)
+    torch.testing.assert_close(loss["loss_qvalue"], rows["loss_qvalue"][3])
+    torch.testing.assert_close(loss["loss_actor"], rows["loss_actor"][3])

@@ -8,7 +8,7 @@ import torch
 from test_downstream import SMALL, small_pretrained, train
 
 from crptpro.errors import PretrainedError
-from crptpro.modules import SquashedGaussianActor
+from crptpro.modules import DeterministicActor, SquashedGaussianActor
 from crptpro.pretrained import Pretrained, load_pretrained, save_pretrained
 from crptpro.training.actor_transfer import transferred_actor
 from crptpro.training.downstream_run import DownstreamRun
@@ -44,6 +44,11 @@ def test_it_can_be_left_out_or_asked_for() -> None:
     assert transferred_actor("toy", explored("another"), asked, action_dim=2) is not None
     with pytest.raises(PretrainedError, match="has no actor"):
         transferred_actor("toy", small_pretrained(), asked, action_dim=2)
+    skilled = explored()
+    skilled.actor = DeterministicActor(skilled.encoder.feature_dim, 2, skill_dim=4, hidden_dim=8)
+    assert transferred_actor("toy", skilled, SMALL, action_dim=2) is None
+    with pytest.raises(PretrainedError, match="its actor is a DeterministicActor"):
+        transferred_actor("toy", skilled, asked, action_dim=2)
     with pytest.raises(PretrainedError, match="its actor has 3 actions, toy has 2"):
         transferred_actor("toy", explored(action_dim=3), asked, action_dim=2)
     assert transferred_actor("toy", explored(action_dim=3), SMALL, action_dim=2) is None

@@ -4,16 +4,18 @@ import csv
 import logging
 import math
 import os
+import random
 import signal
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
-from pretrain_world import SETTINGS, make_dataset, make_datasets, make_loss, same_state
+from pretrain_world import SETTINGS, SIZE, make_dataset, make_datasets, make_loss, same_state
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
@@ -22,8 +24,9 @@ from torchrl.objectives import LossModule
 from crptpro.errors import CheckpointError, DatasetError, NonFiniteError
 from crptpro.loggers import RunLogger
 from crptpro.modules import PixelEncoder
-from crptpro.objectives import MethodDefaults, registry
+from crptpro.objectives import ATCLoss, MethodDefaults, ProtoLoss, SimCLRLoss, registry
 from crptpro.pretrained import finetune, save_pretrained
+from crptpro.seeding import seed_everything
 from crptpro.training import pretrain
 from crptpro.training.pretrain import learner
 from crptpro.training.pretrain import run as pretrain_run
@@ -332,6 +335,29 @@ def test_a_dead_run_is_announced_and_written_into_the_training_record(
     assert any(level == "ERROR" and "DEAD RUN" in text for level, text in messages)
 
 
+def test_a_finished_run_started_again_judges_its_last_row_by_that_rows_cosine(tmp_path: Path) -> None:
+    class Late(ATCLoss):
+        """Its embeddings are all alike from the twelfth update on."""
+
+        def __init__(self, *args: Any, **options: Any) -> None:
+            super().__init__(*args, **options)
+            self.register_buffer("count", torch.zeros(()))
+
+        def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+            out = super().forward(tensordict)
+            self.count += 1
+            out["embedding_cosine"] = (self.count > 11).float()
+            return out
+
+    def once() -> Any:
+        loss = Late(PixelEncoder(3, channels=(4,), strides=(2,), image_size=SIZE), latent_dim=4, hidden_dim=8)
+        return run(loss, 15, run_dir=tmp_path, log_interval=11, patience_updates=8)
+
+    first, again = once(), once()
+    assert first.collapse["cosine"] == {"dark": 1.0, "bright": 1.0}
+    assert again.collapse == first.collapse
+
+
 def test_without_a_run_directory_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     result = run(make_loss(), 5)
@@ -460,6 +486,50 @@ def test_a_missing_entry_is_named_with_its_dataset() -> None:
 def test_two_datasets_of_one_domain_get_two_names() -> None:
     result = run(make_loss(), 4, [Spy("walker", make_dataset(i), []) for i in range(2)])
     assert {"cosine/walker", "cosine/walker_2"} <= set(result.metrics)
+
+
+def test_outputs_that_come_and_go_are_refused(tmp_path: Path) -> None:
+    class Moody(ProtoLoss):
+        drops: str | None = None
+        calls = 0
+
+        def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+            out = super().forward(tensordict)
+            self.calls += 1
+            if self.calls == 3 and self.drops is None:
+                out["loss_extra"] = torch.full((), torch.nan)
+            return out if self.drops is None or self.calls < 3 else out.exclude(self.drops)
+
+    for drops, message in (
+        (None, "returned loss_extra at update 3"),
+        ("assignment_entropy", "did not return assignment_entropy at update 3"),
+    ):
+        encoder = PixelEncoder(3, channels=(4,), strides=(2,), image_size=SIZE)
+        loss = Moody(encoder, num_prototypes=8, latent_dim=8, hidden_dim=16)
+        loss.drops = drops
+        with pytest.raises(ValueError, match=message):
+            run(loss, 5)
+
+
+def test_the_rate_of_targets_is_refused_where_there_are_none() -> None:
+    loss = SimCLRLoss(PixelEncoder(3, channels=(4,), strides=(2,), image_size=SIZE), latent_dim=4)
+    with pytest.raises(ValueError, match=r"`encoder_tau` 0\.5 is the rate of target networks"):
+        run(loss, 2, encoder_tau=0.5)
+
+
+def draws() -> tuple[float, float, float]:
+    """One of each global generator."""
+    return random.random(), float(np.random.rand()), float(torch.rand(()))  # noqa: NPY002
+
+
+def test_the_callers_generators_are_left_as_they_were_when_a_run_is_continued(tmp_path: Path) -> None:
+    run(make_loss(), 4, run_dir=tmp_path)
+    loss = make_loss()
+    seed_everything(5)
+    expected = draws()
+    seed_everything(5)
+    run(loss, 8, run_dir=tmp_path)
+    assert draws() == expected
 
 
 def test_impossible_numbers_are_refused() -> None:

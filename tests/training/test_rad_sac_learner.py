@@ -226,3 +226,15 @@ def test_compiled_losses_agree_with_eager_ones(monkeypatch: pytest.MonkeyPatch) 
         torch.testing.assert_close(found, expected)
     for one, two in zip(plain.loss.parameters(), compiled.loss.parameters()):
         torch.testing.assert_close(one, two, rtol=0, atol=1e-4)
+
+
+def test_a_captured_update_reads_weights_and_masks_too() -> None:
+    weighted = batch(0)
+    weighted["priority_weight"] = torch.linspace(0, 1, ROWS)
+    weighted["shifted_valid"] = torch.arange(ROWS) != 2
+    losses = []
+    for captures in (False, True):
+        losses.append(make_learner(captures=captures).update(weighted, agent_step=0)["loss_qvalue"])
+    unweighted = make_learner().update(batch(0), agent_step=0)["loss_qvalue"]
+    assert torch.equal(*losses)
+    assert not torch.isclose(losses[0], unweighted)

@@ -3,12 +3,14 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import NestedKey, TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import ToTensorImage
 
 from crptpro.data import FrameDataset, FrameStorage
 from crptpro.errors import DatasetError
 from crptpro.seeding import derive_seed
-from crptpro.training.pretrain.sources import Augmenter, Source
+from crptpro.training.pretrain.augmenter import Augmenter
+from crptpro.training.pretrain.sources import Source
 from crptpro.transforms.random_shift import draw_offsets, random_shift
 
 EPISODES, LENGTH, SIZE = 4, 6, 12
@@ -143,3 +145,37 @@ def test_a_view_of_an_entry_that_the_dataset_lacks_names_that_entry() -> None:
         augmenter = Augmenter(augment, seed=0, views={"wide_view": "wide"})
         with pytest.raises(DatasetError, match="reads 'wide', which the dataset 'toy' lacks"):
             augmenter.sample(source, 4, ["pixels", "wide_view"])
+
+
+def test_images_that_are_no_bytes_are_not_shifted_which_is_said_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    floats = Source("floats", make_dataset(transform=ToTensorImage(in_keys=["pixels"])), seed=0)
+    bytes_of = Source("bytes", make_dataset(collate_fn=lambda batch: batch), seed=0)
+    augmenter = Augmenter("random_shift", seed=7)
+    plain = Source("floats", make_dataset(transform=ToTensorImage(in_keys=["pixels"])), seed=0)
+    for _ in range(2):
+        batch = augmenter.sample(floats, 20, ["pixels", NEXT])
+        expected = plain.sample(20, ["pixels", NEXT])
+        assert torch.equal(batch["pixels"], expected["pixels"])
+        assert not torch.equal(batch[NEXT], expected[NEXT])
+    assert len([r for r in caplog.records if "'pixels' (torch.float32)" in r.message]) == 1
+    # What one dataset holds decides nothing for the next.
+    expected = Source("bytes", make_dataset(), seed=0).sample(20, ["pixels"])
+    assert not torch.equal(augmenter.sample(bytes_of, 20, ["pixels"])["pixels"], expected["pixels"])
+
+
+def test_prefetching_is_said_to_end_in_other_numbers(caplog: pytest.LogCaptureFixture) -> None:
+    Source("eager", make_dataset(prefetch=1, batch_size=2), seed=0)
+    assert "'eager' prefetches" in caplog.text
+    caplog.clear()
+    Source("plain", make_dataset(), seed=0)
+    assert not caplog.records
+
+
+def test_which_rows_count_comes_with_the_batch() -> None:
+    data = TensorDict({"pixels": torch.zeros(6, 3, 4, 4), "shifted_valid": torch.arange(6) > 2}, [6])
+    buffer = ReplayBuffer(storage=LazyTensorStorage(6), batch_size=4)
+    buffer.extend(data)
+    batch = Source("masked", buffer, seed=0).sample(4, ["pixels"])
+    assert set(batch.keys()) == {"pixels", "shifted_valid"}

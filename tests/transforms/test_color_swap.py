@@ -31,3 +31,8 @@ def test_a_batch_that_lacks_a_key_keeps_what_it_has() -> None:
 def test_keys_must_pair_up() -> None:
     with pytest.raises(ValueError, match="pair"):
         ColorSwap(in_keys=["pixels"], out_keys=["a", "b"])
+
+
+def test_a_named_key_that_a_batch_lacks_is_an_error() -> None:
+    with pytest.raises(KeyError, match="found no 'pixel' among"):
+        ColorSwap(in_keys=["pixel"])(TensorDict({"pixels": torch.zeros(1, 3, 2, 2)}, batch_size=[1]))

@@ -149,6 +149,12 @@ class PretrainingLoss(OutKeys, LossModule):
         return rows.sum() if self.reduction == "sum" else rows.sum() / max(rows.numel(), 1)
 
 
+def mask_keys(loss: LossModule) -> tuple[NestedKey, ...]:
+    """Entries that say which rows of a batch count, where it has them."""
+    names = loss.loss_mask_key
+    return AUTO_LOSS_MASK_KEYS if names == "auto" else () if names is None else (names,)
+
+
 def valid_rows(loss: LossModule, tensordict: TensorDictBase) -> Tensor | None:
     """Which rows of a batch count, from the mask entries that ``loss.loss_mask_key`` names.
 
@@ -159,9 +165,8 @@ def valid_rows(loss: LossModule, tensordict: TensorDictBase) -> Tensor | None:
     Returns:
         Flat bool ``[B]`` over all batch dimensions, or None if the batch has no mask.
     """
-    names = loss.loss_mask_key
     valid = None
-    for key in AUTO_LOSS_MASK_KEYS if names == "auto" else [] if names is None else [names]:
+    for key in mask_keys(loss):
         mask = tensordict.get(key, None)
         if mask is not None:
             valid = mask.reshape(-1) if valid is None else valid & mask.reshape(-1)

@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import inspect
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from torch import nn
@@ -216,19 +216,23 @@ def method_defaults(loss: LossModule | type[LossModule]) -> MethodDefaults:
     """Training defaults of a loss, its class, or the nearest registered base class.
 
     A loss built by name has that method's defaults. A user's own, unregistered loss gets the generic ones,
-    with ``encoder_tau`` None if it has no target networks.
+    with ``encoder_tau`` None if it has no target networks; one of a class that adds target networks to
+    those of a method without any gets the generic rate for them.
     """
     named = _named(loss)
     if named is not None:
         return named.defaults
     loss_class = loss if isinstance(loss, type) else type(loss)
-    for base in loss_class.__mro__:
-        for method in _methods_of(base):
-            return method.defaults
+    generic = MethodDefaults()
+    inherited = next((method.defaults for base in loss_class.__mro__ for method in _methods_of(base)), None)
     if isinstance(loss, type):
-        return MethodDefaults()
+        return inherited or generic
     has_targets = any(name.startswith("target_") for name, _ in loss.named_children())
-    return MethodDefaults() if has_targets else MethodDefaults(encoder_tau=None)
+    if inherited is None:
+        return generic if has_targets else replace(generic, encoder_tau=None)
+    if has_targets and inherited.encoder_tau is None and not _methods_of(loss_class):
+        return replace(inherited, encoder_tau=generic.encoder_tau)
+    return inherited
 
 
 def method_name_of(loss: LossModule) -> str:

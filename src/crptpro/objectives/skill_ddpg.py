@@ -79,7 +79,7 @@ class SkillDDPGLoss(OutKeys, LossModule):
         action: NestedKey = "action"
         reward: NestedKey = "reward"
         discount: NestedKey = "discount"
-        priority_weight: NestedKey = "_weight"
+        priority_weight: NestedKey = "priority_weight"
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys

@@ -12,6 +12,7 @@ from crptpro.artifact import CARD_FILE, read_artifact
 from crptpro.cards import read_json
 from crptpro.errors import PretrainedError
 from crptpro.modules import (
+    DeterministicActor,
     PixelEncoder,
     Predictor,
     Projector,
@@ -23,7 +24,15 @@ from crptpro.pretrained.bundle import ACTOR, FORMAT, QUEUE, REST, ROLES, TARGET_
 
 _KNOWN_CLASSES: dict[str, type[nn.Module]] = {
     cls.__name__: cls
-    for cls in (PixelEncoder, Projector, Predictor, Prototypes, SkillHead, SquashedGaussianActor)
+    for cls in (
+        PixelEncoder,
+        Projector,
+        Predictor,
+        Prototypes,
+        SkillHead,
+        SquashedGaussianActor,
+        DeterministicActor,
+    )
 }
 
 

@@ -39,7 +39,9 @@ def transferred_actor(
         reason = f"{config.algorithm} has an actor of another kind"
     elif pretrained.actor is None:
         reason = f"the artifact ({pretrained.method}) has no actor"
-    elif (found := pretrained.actor.config["action_dim"]) != action_dim:  # type: ignore[index]
+    elif not isinstance(pretrained.actor, SquashedGaussianActor):
+        reason = f"its actor is a {type(pretrained.actor).__name__}"
+    elif (found := pretrained.actor.config["action_dim"]) != action_dim:
         reason = f"its actor has {found} actions, {task} has {action_dim}"
     if reason is None and config.transfer_actor is None and explored != _domain(task):
         reason = f"its actor explored {explored}"

@@ -17,6 +17,7 @@ from crptpro.loggers import RunLogger
 from crptpro.modules import usable_device
 from crptpro.objectives import Method, get_method, methods
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
+from crptpro.seeding import kept_global_rng
 from crptpro.training.action_repeat import action_repeat_of
 from crptpro.training.agent import PixelAgent
 from crptpro.training.checkpoint import CheckpointDir
@@ -88,6 +89,7 @@ def train_downstream(
     artifact = _artifact(pretrained, config)
     config = dataclasses.replace(config, replay_capacity=_replay_capacity(artifact, config))
     with contextlib.ExitStack() as stack:
+        stack.enter_context(kept_global_rng())
         directory = Path(run_dir or stack.enter_context(tempfile.TemporaryDirectory(prefix="crptpro-")))
         stack.enter_context(DirectoryLock(directory, error=CheckpointError, is_reentrant=True))
         records = logger or stack.enter_context(

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
 from crptpro.objectives import RADSACLoss
+from crptpro.objectives.base import mask_keys
 from crptpro.training.captured import CapturedCall, portable_state, prepare_optimizer
 from crptpro.training.compiled import Compiled
 
@@ -92,7 +93,12 @@ class RADSACLearner:
             self._captured[kind] = CapturedCall(
                 lambda batch: self._advance(batch, *kind), generators=generators
             )
-        return self._captured[kind](td.select(*self.loss.in_keys))
+        weighting = [
+            key
+            for key in (self.loss.tensor_keys.priority_weight, *mask_keys(self.loss))
+            if key in td.keys(True)
+        ]
+        return self._captured[kind](td.select(*self.loss.in_keys, *weighting))
 
     def _advance(self, td: TensorDictBase, with_actor: bool, with_target: bool) -> dict[str, Tensor]:
         losses = self._learn(self._critic_loss, td, {"critic": "loss_qvalue"})

@@ -63,10 +63,20 @@ class ColorSwap(OnRootKeys, Transform):
             raise ValueError(f"in_keys {read} and out_keys {written} must pair up.")
         super().__init__(in_keys=read, out_keys=written)
         self._pairs: list[KeyPair] = list(zip(read, written))
+        self._may_lack = in_keys is None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Swap what a batch has of the keys."""
-        return self._apply_to(tensordict, [pair for pair in self._pairs if pair[0] in tensordict.keys(True)])
+        """Swap the keys of a batch; of the default ones, those that it has.
+
+        Raises:
+            KeyError: a named key is missing.
+        """
+        held = tensordict.keys(True)
+        pairs = [pair for pair in self._pairs if pair[0] in held]
+        if not self._may_lack and len(pairs) < len(self._pairs):
+            lacking = [read for read, _ in self._pairs if read not in held]
+            raise KeyError(f"ColorSwap found no {lacking[0]!r} among {list(tensordict.keys(True, True))}.")
+        return self._apply_to(tensordict, pairs)
 
     def _apply_to(self, tensordict: TensorDictBase, pairs: list[KeyPair]) -> TensorDictBase:
         for read, written in pairs:

@@ -1,18 +1,23 @@
 from __future__ import annotations
 
 import csv
+import random
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from active_world import explore, make_loss, toy_env
+from tensordict import TensorDictBase
 
 from crptpro.errors import CheckpointError, CRPTproError, NonFiniteError
 from crptpro.modules import is_channels_last
 from crptpro.pretrained import load_pretrained, save_pretrained
+from crptpro.seeding import seed_everything
 from crptpro.training.explore.member import Member
 from crptpro.training.explore.run import ActiveRun
+from crptpro.training.rad_sac_learner import RADSACLearner
 
 
 def same_state(one: torch.nn.Module, two: torch.nn.Module) -> bool:
@@ -407,3 +412,48 @@ def test_names_that_are_no_directories_or_columns_are_refused() -> None:
     for name in ("../outside", "", "a,b"):
         with pytest.raises(CRPTproError, match="cannot name a directory and a column"):
             explore(None, (name,), env_factory=lambda domain, **settings: toy_env("even", **settings))
+
+
+def test_delays_within_an_agent_count_its_own_updates(monkeypatch: pytest.MonkeyPatch) -> None:
+    actor_updates: list[bool] = []
+    original = RADSACLearner._advance
+
+    def spy(learner: RADSACLearner, td: TensorDictBase, with_actor: bool, with_target: bool) -> dict:
+        actor_updates.append(with_actor)
+        return original(learner, td, with_actor, with_target)
+
+    monkeypatch.setattr(RADSACLearner, "_advance", spy)
+    for interval in (1, 2):
+        actor_updates.clear()
+        explore(None, ("even",), loss=make_loss("proto-rl-s"), agent_update_interval=interval)
+        assert sum(actor_updates) == pytest.approx(len(actor_updates) / 2, abs=1)
+
+
+def test_settings_that_nothing_reads_are_said(caplog: pytest.LogCaptureFixture) -> None:
+    explore(None, loss=make_loss("apt-c"), per_domain_queue=True, knn_k=3)
+    assert "`per_domain_queue` True changes nothing: neither the reward particle nor" in caplog.text
+    assert "`queue_size` 16 changes nothing" in caplog.text
+    assert "knn_k" not in caplog.text
+
+
+def draws() -> tuple[float, float, float]:
+    """One of each global generator."""
+    return random.random(), float(np.random.rand()), float(torch.rand(()))  # noqa: NPY002
+
+
+def test_the_callers_generators_are_left_as_they_were(tmp_path: Path) -> None:
+    losses = [make_loss() for _ in range(3)]
+    explore(tmp_path, loss=losses[0], env_steps=120)
+    seed_everything(5)
+    expected = draws()
+    seed_everything(5)
+    explore(tmp_path, loss=losses[1], env_steps=120)
+    explore(None, loss=losses[2], env_steps=120)
+    assert draws() == expected
+
+
+def test_the_actor_of_a_skill_explorer_is_loaded_again(tmp_path: Path) -> None:
+    loss, result = explore(None, ("even",), loss=make_loss("becl"))
+    save_pretrained(loss, tmp_path / "encoder", actor=result.actors["even"])
+    actor = load_pretrained(tmp_path / "encoder").actor
+    assert all(torch.equal(a, b) for a, b in zip(actor.parameters(), result.actors["even"].parameters()))

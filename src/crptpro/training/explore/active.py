@@ -38,13 +38,13 @@ from crptpro.objectives import (
     method_name_of,
     methods,
 )
-from crptpro.seeding import derive_seed
+from crptpro.seeding import derive_seed, kept_global_rng
 from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.explore.assemble import assemble, fingerprint
 from crptpro.training.explore.checkpoint import action_sizes
 from crptpro.training.explore.plan import resolve
 from crptpro.training.explore.replays import DIRECTORY
-from crptpro.training.explore.request import domain_names, require_explorable
+from crptpro.training.explore.request import domain_names, require_explorable, warn_of_unread
 from crptpro.training.fingerprint import precision_to_continue, require_same
 from crptpro.training.pretrain.result import PretrainResult, training_record
 
@@ -120,11 +120,13 @@ def pretrain_active(
     defaults, exploration = method_defaults(loss), exploration_defaults(loss)
     config = resolve(config, exploration, defaults)
     _warn_of_another_encoder(loss)
+    warn_of_unread(config, exploration)
     named = domain_names(loss, domains, exploration)
     cuda = [device.index or 0] if device.type == "cuda" else []
     loss.to(device).train()
     with contextlib.ExitStack() as stack:
         stack.enter_context(torch.random.fork_rng(devices=cuda))
+        stack.enter_context(kept_global_rng())
         require_explorable(loss, domains, config)
         torch.manual_seed(derive_seed(config.seed, "active", "loss"))
         directory = Path(run_dir or stack.enter_context(tempfile.TemporaryDirectory(prefix="crptpro-")))

@@ -99,7 +99,7 @@ class SACExplorer:
         return self.actor.sample(features, generator=self.generator)[0]
 
     def update(self, batch: TensorDictBase, *, agent_step: int) -> dict[str, Tensor]:
-        """Step critic, and every second time actor, temperature and target."""
+        """Step critic, and every second update actor, temperature and target."""
         return self.learner.update(batch, agent_step=agent_step)
 
     def state_dict(self) -> dict[str, Any]:

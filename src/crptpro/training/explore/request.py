@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Sequence
 
@@ -16,6 +17,18 @@ from crptpro.training.action_repeat import action_repeat_of
 from crptpro.training.explore.agents import require_agent
 from crptpro.training.explore.plan import make_plan, resolve
 from crptpro.training.explore.rewards import build_reward
+
+logger = logging.getLogger(__name__)
+
+_READ_BY = {
+    "knn_k": ("prototype", "particle"),
+    "queue_size": ("prototype",),
+    "per_domain_queue": ("prototype",),
+    "skill_dim": ("skill-contrast", "skill-ddpg"),
+    "skill_agent_steps": ("skill-contrast", "skill-ddpg"),
+    "initial_temperature": ("rad-sac", "averaged-sac"),
+}
+"""Settings that only some of the library's own rewards and agents read; one of a caller's own may read any."""
 
 _PLAIN_NAME = re.compile(r"\w[\w.:+-]*")
 
@@ -84,3 +97,23 @@ def require_explorable(
     if config.reward == "skill-contrast" and config.skill_dim is None:
         raise CRPTproError("The reward skill-contrast needs skills; set skill_dim (BeCL: 16).")
     build_reward(config.reward or "", loss, config, torch.Generator())
+
+
+def warn_of_unread(config: ActiveConfig, exploration: ExplorationDefaults) -> None:
+    """Say which settings neither reward nor explorer looks at; one configuration may serve several methods.
+
+    Args:
+        config: resolved.
+        exploration: how the method explores.
+    """
+    own = {name for readers in _READ_BY.values() for name in readers}
+    if not {config.reward, config.agent} <= own:
+        return
+    for name, readers in _READ_BY.items():
+        value = getattr(config, name)
+        usual = (getattr(ActiveConfig, name), getattr(exploration, name, None))
+        if value not in usual and not {config.reward, config.agent} & set(readers):
+            logger.warning(
+                "`%s` %s changes nothing: neither the reward %s nor the explorer %s reads it, only %s.",
+                name, value, config.reward, config.agent, " and ".join(readers),
+            )  # fmt: skip

@@ -186,7 +186,9 @@ class ActiveRun:
             if not (trains_encoder and self.encodes_before_update):
                 encode(batch, self.loss.encoder, keys)
             metrics = {"intrinsic_reward": self.rewards[index].pay(batch)}
-            metrics |= member.agent.update(batch, agent_step=member.agent_steps)
+            # Delays within an agent count its own updates.
+            step = member.agent_steps // self.plan.agent_update_interval
+            metrics |= member.agent.update(batch, agent_step=step)
             for key, value in metrics.items():
                 self.sums[index][key] = self.sums[index].get(key, 0) + value.detach()
                 self.counts[index][key] = self.counts[index].get(key, 0) + 1

@@ -112,6 +112,7 @@ class Learner:
         out = self._evaluate(batch)
         if not self.names:
             self._name_outputs(out)
+        self._require_same_outputs(out)
         terms = [out.get(name) for name in self.names]
         total = sum(terms[: self._loss_count])
         values = torch.stack([term.detach().reshape(()).float() for term in terms]).double()
@@ -166,7 +167,7 @@ class Learner:
     def _name_outputs(self, out: TensorDictBase) -> None:
         """Loss terms first, then diagnostics; both must be scalars."""
         keys = [key for key in out.keys(include_nested=False) if isinstance(key, str)]
-        terms = [key for key in keys if key.startswith("loss")]
+        terms = _terms(out)
         if not terms:
             raise ValueError(
                 f"{type(self.loss).__name__} returned no `loss_*` entry, only {keys}; nothing to minimise."
@@ -177,6 +178,19 @@ class Learner:
                 raise ValueError(f"{term} has shape {shape}; build the loss with a reduction to a scalar.")
         rest = [key for key in keys if key not in terms and getattr(out.get(key), "numel", lambda: 0)() == 1]
         self.names, self._loss_count = [*terms, *rest], len(terms)
+
+    def _require_same_outputs(self, out: TensorDictBase) -> None:
+        """Refuse a term that would be left out of the sum, and an output that comes and goes."""
+        held = list(out.keys())
+        extra = [key for key in _terms(out) if key not in self.names]
+        missing = [name for name in self.names if name not in held]
+        if extra or missing:
+            what = f"returned {', '.join(extra)}" if extra else f"did not return {', '.join(missing)}"
+            raise ValueError(
+                f"{type(self.loss).__name__} {what} at update {int(self._index) + 1}, unlike at its first one: every "
+                "output must come at every update, a loss term as 0 and a diagnostic as NaN where it has nothing to "
+                "say."
+            )
 
     def _watch(self, values: Tensor, domain: str) -> None:
         finite = torch.isfinite(values)
@@ -230,6 +244,11 @@ def warmup_cosine(index: int, warmup_updates: int, updates: int) -> float:
         return index / warmup_updates
     progress = (index - warmup_updates) / max(updates - warmup_updates, 1)
     return (1 + math.cos(math.pi * min(progress, 1.0))) / 2
+
+
+def _terms(out: TensorDictBase) -> list[str]:
+    keys = list(out.keys())
+    return [key for key in keys if isinstance(key, str) and key.startswith("loss")]
 
 
 def has_targets(loss: LossModule) -> bool:

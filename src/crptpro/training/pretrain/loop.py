@@ -22,20 +22,19 @@ from crptpro.modules import (
 )
 from crptpro.modules.precision import Precision
 from crptpro.objectives import method_defaults
-from crptpro.seeding import derive_seed
+from crptpro.seeding import derive_seed, kept_global_rng
 from crptpro.switches import Switch
 from crptpro.training.captured import resolve_cuda_graph
 from crptpro.training.compiled import Compiled, resolve_compile
 from crptpro.training.fingerprint import precision_to_continue
+from crptpro.training.pretrain.augmenter import Augment, Augmenter
 from crptpro.training.pretrain.device_batches import DeviceBatches
-from crptpro.training.pretrain.learner import Learner
+from crptpro.training.pretrain.learner import Learner, has_targets
 from crptpro.training.pretrain.moments import read_moments
 from crptpro.training.pretrain.result import PretrainResult
 from crptpro.training.pretrain.run import PretrainRun, read_state
 from crptpro.training.pretrain.sources import (
     SHIFT_PAD,
-    Augment,
-    Augmenter,
     Source,
     keys_read,
     open_sources,
@@ -100,7 +99,8 @@ def pretrain(
             evenly as possible (the first datasets get the remainder) and each part augmented by itself. The record
             has no columns per domain then, the collapse is judged over the whole batch, and a GPU makes batches
             without its fast way. Deviation: the paper takes one domain after the other, which ``"cycle"`` gives.
-        seed: seeds sampling, shifts, and what the loss draws; torch's global generator is left as it was.
+        seed: seeds sampling, shifts, and what the loss draws; the global generators (torch, NumPy,
+            Python) are left as they were.
         augment: ``"random_shift"`` (4 pixels, replicated border; independent per image and per sample),
             ``"none"``, or a function of a batch and a generator. Entries that the loss names in ``views`` are
             the same images, shifted once more (copies for ``"none"`` and a function).
@@ -169,6 +169,11 @@ def pretrain(
         raise ValueError(f"`learning_rate` must be positive, got {learning_rate}.")
     if encoder_tau is not None and not 0 <= encoder_tau <= 1:
         raise ValueError(f"`encoder_tau` must be in [0, 1], got {encoder_tau}.")
+    if encoder_tau is not None and not has_targets(loss):
+        raise ValueError(
+            f"`encoder_tau` {encoder_tau} is the rate of target networks, which {type(loss).__name__} does not have; "
+            "leave it out."
+        )
     device = usable_device(device)
     puts_channels_last = resolve_channels_last(channels_last)
     compiled = Compiled(is_on=resolve_compile(compile))
@@ -177,6 +182,7 @@ def pretrain(
     loss.to(device).train()
     with contextlib.ExitStack() as stack:
         stack.enter_context(torch.random.fork_rng(devices=cuda))
+        stack.enter_context(kept_global_rng())
         torch.manual_seed(derive_seed(seed, "pretrain", "loss"))
         sources = open_sources(datasets, seed=seed, device=device)
         for source in sources:

@@ -1,27 +1,27 @@
-"""The datasets of a pre-training run: named, seeded one by one, and augmented."""
+"""The datasets of a pre-training run: named and seeded one by one."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.objectives import LossModule
+from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
 from crptpro.data import FrameDataset
 from crptpro.errors import DatasetError
 from crptpro.seeding import derive_seed
-from crptpro.transforms.random_shift import draw_offsets, random_shift, shifted_stacks
+from crptpro.transforms.random_shift import draw_offsets, shifted_stacks
 
 _LOG = logging.getLogger(__name__)
 
-Augment = Literal["random_shift", "none"] | Callable[[TensorDictBase, torch.Generator], TensorDictBase]
 SHIFT_PAD = 4
 _CARD_FACTS = (
     "domain", "task", "transitions", "episodes", "frame_stack", "action_repeat", "image_size", "seed",
@@ -49,6 +49,12 @@ class Source:
             dataset.set_rng(self.generator)
         else:
             _LOG.warning("The dataset %r has no set_rng: its samples are not reproducible.", name)
+        if getattr(dataset, "_prefetch", False):
+            _LOG.warning(
+                "The dataset %r prefetches: what it drew ahead is lost when a run stops, so that a resumed run differs "
+                "from one that was not stopped. Open it without prefetch for the same numbers.",
+                name,
+            )
 
     def sample(self, batch_size: int, keys: Sequence[NestedKey] | None) -> TensorDictBase:
         """Draw a batch, reduced to the entries the loss reads.
@@ -112,7 +118,10 @@ class Source:
                 raise DatasetError(
                     f"The loss reads {key!r}, which the dataset {self.name!r} lacks; it has {names}."
                 )
-        return batch.select(*keys)
+        masks = [
+            key for key in AUTO_LOSS_MASK_KEYS if key in held
+        ]  # of rows that do not count, where there are some
+        return batch.select(*keys, *masks)
 
     def facts(self) -> dict[str, Any]:
         """Return what belongs into the card of the trained artifact."""
@@ -163,80 +172,6 @@ class Source:
         return dict(state) if isinstance(state, Mapping) else {}
 
 
-class Augmenter:
-    """Random shift of every image entry, each with its own offsets, from its own generator.
-
-    Args:
-        augment: ``"random_shift"``, ``"none"``, or ``f(batch, generator) -> batch``; a function gets the views as
-            copies of what they are views of.
-        seed: seeds the generator (on the CPU, so that every device sees the same shifts).
-        views: entries that the loss reads as a second view of another one: ``{"pixels_view": "pixels"}``. They
-            are made of the same images, shifted once more.
-    """
-
-    def __init__(
-        self, augment: Augment, *, seed: int, views: Mapping[NestedKey, NestedKey] | None = None
-    ) -> None:
-        if augment not in ("random_shift", "none") and not callable(augment):
-            raise ValueError(f"`augment` must be 'random_shift', 'none' or a function, got {augment!r}.")
-        self.augment = augment
-        self.views = dict(sorted((views or {}).items(), key=lambda item: str(item[0])))
-        self.generator = torch.Generator().manual_seed(derive_seed(seed, "pretrain", "augment"))
-        self._keys: list[NestedKey] | None = None
-
-    @property
-    def name(self) -> str:
-        """For cards and fingerprints."""
-        return self.augment if isinstance(self.augment, str) else getattr(self.augment, "__name__", "own")
-
-    def sample(
-        self,
-        source: Source,
-        batch_size: int,
-        keys: Sequence[NestedKey] | None,
-        device: torch.device | str = "cpu",
-    ) -> TensorDictBase:
-        """Draw an augmented batch, the same one whichever way is open.
-
-        Args:
-            source: where to draw.
-            batch_size: transitions.
-            keys: entries that the loss reads, views included; all of the dataset if ``None``.
-            device: where the batch is returned.
-
-        Raises:
-            DatasetError: if the dataset lacks one of the keys, or what a view is made of.
-        """
-        if keys is not None and self.views:
-            # No dataset holds a view; it holds what the view is made of.
-            keys = list(dict.fromkeys(self.views.get(key, key) for key in keys))
-        if self.augment == "random_shift" and source.is_shifted_when_read:
-            return source.sample_shifted(batch_size, keys, self.generator, self.views).to(device)
-        return self(source.sample(batch_size, keys).to(device))
-
-    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Augment a batch of a dataset's entries and add the views, in place for the built-in shift."""
-        seen = {view: batch.get(key) for view, key in self.views.items()}
-        if self.augment != "random_shift":
-            for view, pixels in seen.items():
-                batch.set(view, pixels.clone())
-            return batch if isinstance(self.augment, str) else self.augment(batch, self.generator)
-        if self._keys is None:
-            entries = sorted(batch.items(True, True), key=lambda item: str(item[0]))
-            self._keys = [key for key, value in entries if value.ndim >= 4 and value.dtype == torch.uint8]
-        for key in self._keys:
-            batch.set(key, self._shift(batch.get(key)))
-        for view, pixels in seen.items():
-            # Images that the dataset has transformed in its own way are not shifted, nor is a view of them.
-            batch.set(view, self._shift(pixels) if self.views[view] in self._keys else pixels.clone())
-        return batch
-
-    def _shift(self, pixels: Tensor) -> Tensor:
-        images = pixels.reshape(-1, *pixels.shape[-3:])
-        offsets = draw_offsets(images.shape[0], SHIFT_PAD, self.generator, images.device)
-        return random_shift(images, offsets, pad=SHIFT_PAD).reshape(pixels.shape)
-
-
 def open_sources(datasets: Any, *, seed: int, device: torch.device) -> list[Source]:
     """Open and name the datasets of a run.
 
@@ -282,7 +217,9 @@ def keys_read(loss: LossModule) -> list[NestedKey] | None:
         keys = loss.in_keys
     except (AttributeError, NotImplementedError):
         return None
-    return list(keys) if keys else None
+    mask = getattr(loss, "loss_mask_key", None)  # "auto" looks for usual names, which no dataset need have
+    named = [] if mask in (None, "auto") else [mask]
+    return [*keys, *named] if keys else None
 
 
 def views_read(loss: LossModule) -> dict[NestedKey, NestedKey]:

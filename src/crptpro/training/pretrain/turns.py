@@ -10,8 +10,9 @@ from tensordict import NestedKey, TensorDictBase
 
 from crptpro.errors import DatasetError
 from crptpro.seeding import derive_seed
+from crptpro.training.pretrain.augmenter import Augmenter
 from crptpro.training.pretrain.device_batches import DeviceBatches
-from crptpro.training.pretrain.sources import Augmenter, Source
+from crptpro.training.pretrain.sources import Source
 
 DomainSchedule = Literal["cycle", "random", "mixed"]
 
