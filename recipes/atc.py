@@ -21,7 +21,7 @@ from crptpro.console import run_main
 from crptpro.data import collect_group
 from crptpro.domains import GROUPS, get_domain
 from crptpro.loggers import RunLogger, WandbOptions
-from crptpro.modules import PixelEncoder
+from crptpro.modules import PixelEncoder, usable_device
 from crptpro.objectives import ATCLoss
 from crptpro.pretrained import save_pretrained
 from crptpro.seeding import seed_everything
@@ -86,6 +86,7 @@ def main(config: Config) -> None:
     tasks = config.tasks or [get_domain(domain).task for domain in domains]
     for task in tasks:
         get_domain(task)  # an unknown name ends the recipe here, not hours later
+    usable_device(config.device)
     name = f"atc_group_{config.group}"
     wandb = None if config.wandb == "off" else WandbOptions(group=name, tags=("atc",), mode=config.wandb)
 

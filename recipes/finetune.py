@@ -19,7 +19,8 @@ import tyro
 from crptpro.console import run_main
 from crptpro.data import collect_random
 from crptpro.domains import get_domain
-from crptpro.pretrained import finetune, save_pretrained
+from crptpro.modules import usable_device
+from crptpro.pretrained import finetune, load_pretrained, save_pretrained
 from crptpro.seeding import seed_everything
 from crptpro.training import SACSettings, train_downstream
 
@@ -60,8 +61,10 @@ class Config:
 
 def main(config: Config) -> None:
     """Collect, fine-tune, learn; what is finished is found again."""
-    if config.task is not None:
-        get_domain(config.task)  # an unknown name ends the recipe here, not hours later
+    task = config.task or get_domain(config.domain).task
+    get_domain(task)  # what is wrong ends the recipe here, not hours later
+    usable_device(config.device)
+    pretrained = load_pretrained(config.pretrained)
     seed_everything(config.seed)
     dataset = collect_random(
         config.domain,
@@ -73,7 +76,7 @@ def main(config: Config) -> None:
     )
     run_dir = config.out / f"finetune_{config.domain}"
     loss, _ = finetune(
-        config.pretrained,
+        pretrained,
         dataset,
         updates=config.updates,
         batch_size=config.batch_size,
@@ -84,7 +87,6 @@ def main(config: Config) -> None:
         run_dir=run_dir,
     )
     encoder = save_pretrained(loss, run_dir / "encoder")
-    task = config.task or get_domain(config.domain).task
     train_downstream(
         task,
         encoder,

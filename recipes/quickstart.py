@@ -24,6 +24,7 @@ from crptpro.analysis.embeddings import embed_samples
 from crptpro.cards import read_json, write_json
 from crptpro.console import run_main
 from crptpro.data import FrameDataset, collect_group
+from crptpro.domains import get_domain
 from crptpro.envs import make_env
 from crptpro.experiments.markdown import write_report
 from crptpro.experiments.plots import plot_embeddings, plot_learning_curves, plot_pretraining, plot_stacks
@@ -32,7 +33,7 @@ from crptpro.modules import PixelEncoder
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.seeding import derive_seed, seed_everything
-from crptpro.training import evaluate, pretrain, summarize, train_downstream, uniform_policy
+from crptpro.training import DownstreamConfig, evaluate, pretrain, summarize, train_downstream, uniform_policy
 
 logger = logging.getLogger("crptpro.quickstart")
 
@@ -100,6 +101,20 @@ def main(config: Config) -> None:
         return
     (out / "report.md").unlink(missing_ok=True)
     seed_everything(config.seed)
+    get_domain(config.task)  # what is wrong with the last stages ends the recipe here
+    learning = DownstreamConfig(
+        env_steps=config.env_steps,
+        action_repeat=config.action_repeat,
+        replay_capacity=config.replay_capacity,
+        random_agent_steps=config.random_agent_steps,
+        batch_size=config.batch_size,
+        learning_rate=config.learning_rate,
+        eval_interval_env_steps=max(1, config.env_steps // 2),
+        eval_episodes=2,
+        checkpoint_interval_env_steps=4_000,
+        quality=config.quality,
+        seed=config.seed,
+    )
 
     # 1. a uniform random policy fills one dataset per domain
     logger.info(
@@ -141,22 +156,7 @@ def main(config: Config) -> None:
     # 3. frozen, it serves SAC on a task
     logger.info("3/5 learn %s on the frozen encoder: %s env steps", config.task, f"{config.env_steps:,}")
     pretrained = load_pretrained(out / "encoder")
-    result = train_downstream(
-        config.task,
-        pretrained,
-        run_dir=out / "downstream",
-        env_steps=config.env_steps,
-        action_repeat=config.action_repeat,
-        replay_capacity=config.replay_capacity,
-        random_agent_steps=config.random_agent_steps,
-        batch_size=config.batch_size,
-        learning_rate=config.learning_rate,
-        eval_interval_env_steps=max(1, config.env_steps // 2),
-        eval_episodes=2,
-        checkpoint_interval_env_steps=4_000,
-        quality=config.quality,
-        seed=config.seed,
-    )
+    result = train_downstream(config.task, pretrained, run_dir=out / "downstream", config=learning)
 
     # 4. the trained agent against chance, on the same episodes
     logger.info("4/5 evaluate: %d episodes of the agent and of the uniform random policy", config.episodes)

@@ -129,6 +129,7 @@ class ActiveConfig(ExplorationSettings):
         for name in ("batch_size", "log_interval", "patience_updates"):
             _require(self, name, "at least 1", lambda value: value >= 1)
         _require(self, "learning_rate", "positive", lambda value: value > 0)
+        _require(self, "seed", f"from 0 to {2**32 - 1}", lambda value: 0 <= value < 2**32)
 
 
 def _require(

@@ -220,6 +220,8 @@ class DownstreamConfig(SACSettings):
             ValueError: naming the setting, its value and what is allowed.
         """
         super().__post_init__()
+        if not 0 <= self.seed < 2**32:
+            raise ValueError(f"`seed` must be from 0 to {2**32 - 1}, got {self.seed}.")
         if self.eval_workers is not None and self.eval_workers < 0:
             raise ValueError(f"`eval_workers` must not be negative, got {self.eval_workers}.")
         for name in ("channels_last", "compile", "cuda_graph"):

@@ -11,6 +11,18 @@ from typing import Any
 import numpy as np
 import torch
 
+from crptpro.errors import CRPTproError
+
+
+def require_seed(seed: int, name: str = "seed") -> None:
+    """Refuse a seed that no generator takes.
+
+    Raises:
+        CRPTproError: outside [0, 2**32), NumPy's range.
+    """
+    if not 0 <= seed < 2**32:
+        raise CRPTproError(f"`{name}` must be from 0 to {2**32 - 1}, got {seed}.")
+
 
 def derive_seed(seed: int, *path: str | int) -> int:
     """Derive a seed in ``[0, 2**31)`` from ``seed`` and a path of names, stable across processes.
@@ -29,7 +41,12 @@ def derive_seed(seed: int, *path: str | int) -> int:
 
 
 def seed_everything(seed: int) -> None:
-    """Seed Python's, NumPy's and torch's global generators (all devices)."""
+    """Seed Python's, NumPy's and torch's global generators (all devices).
+
+    Raises:
+        CRPTproError: a seed outside [0, 2**32).
+    """
+    require_seed(seed)
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002 - dm_control and gymnasium read the legacy global generator
     torch.manual_seed(seed)

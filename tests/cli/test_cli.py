@@ -109,6 +109,9 @@ def test_what_the_parser_cannot_read_is_named_with_status_2(
     (("collect",), r"Name at least one domain"),
     (("collect", "gymnasium:HalfChetah-v5"), r"HalfChetah.*Nearest: gymnasium:HalfCheetah"),
     (("collect", "cartpole", "--transitions", "0"), r"at least 1, got 0"),
+    (("collect", "cartpole", "--action-repeat", "0"), r"action_repeat must be at least 1, got 0"),
+    (("collect", "cartpole", "--seed", "-1"), r"`seed` must be from 0 to 4294967295, got -1"),
+    (("drq", TASK, "--seed", str(2**32)), r"`seed` must be from 0 to 4294967295, got 4294967296"),
     (("pretrain",), r"at least one dataset directory"),
     (("pretrain", "absent"), r"absent"),
     (("finetune", "absent", "absent"), r"absent"),
@@ -116,8 +119,7 @@ def test_what_the_parser_cannot_read_is_named_with_status_2(
     (("downstream", TASK, "--pretrained", "absent"), r"absent does not exist"),
     (("downstream", TASK, "--pretrained", "random-encoder", "--device", "abacus"), r"'abacus' cannot be used"),
     (("downstream", TASK, "--pretrained", "random-encoder", "--discount", "2"), r"discount.*got 2"),
-    (("downstream", TASK, "--pretrained", "random-encoder", "--algorithm", "drq", "--intrinsic-reward-coef", "0"),
-     r"crptpro drq toy-fixed_go --out"),
+    (("downstream", TASK, "--pretrained", "random-encoder", "--algorithm", "drq"), r"crptpro drq toy-fixed_go --out"),
     (("drq", "walker_rum"), r"'walker_rum'\. Nearest: walker_run"),
 ])  # fmt: skip
 def test_a_request_that_cannot_be_met_leaves_nothing_behind(
@@ -134,6 +136,7 @@ def test_a_request_that_cannot_be_met_leaves_nothing_behind(
     (("absent",), "absent does not exist"),
     (("random-policy", "--task", "walker_rum"), "Nearest: walker_run"),
     (("random-policy", "--task", TASK, "--episodes", "0"), "at least 1, got 0"),
+    (("random-policy", "--task", TASK, "--seed", "-1"), "`seed` must be from 0 to 4294967295, got -1"),
     (("random-policy", "--task", TASK, "--colors", "reversed_background"), "colors='reversed_image'"),
 ])  # fmt: skip
 def test_an_evaluation_that_cannot_run_says_why(
@@ -142,6 +145,12 @@ def test_an_evaluation_that_cannot_run_says_why(
     monkeypatch.chdir(tmp_path)
     assert message in refused(call("evaluate", *arguments, "--csv", "out/returns.csv"))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_table_that_cannot_be_written_is_refused_before_any_episode(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for path, message in ((tmp_path, "is a directory"), (tmp_path / "file" / "x.csv", "file is a file")):
+        assert message in refused(call("evaluate", "random-policy", "--task", TASK, "--csv", path))
 
 
 def test_a_truncated_dataset_is_named(call: Call, dataset: Path, tmp_path: Path) -> None:
@@ -159,6 +168,7 @@ def test_a_truncated_dataset_is_named(call: Call, dataset: Path, tmp_path: Path)
     ("--log-interval", "0", "log_interval.*0"),
     ("--assignment-temperature", "0", "temperature.*0"),
     ("--annealing-updates", "9", "needs an assignment_temperature"),
+    ("--seed", "-1", "`seed`.*got -1"),
 ])  # fmt: skip
 def test_a_setting_that_pretraining_refuses_is_one_line(
     call: Call, dataset: Path, tmp_path: Path, flag: str, value: str, message: str

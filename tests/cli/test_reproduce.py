@@ -61,6 +61,26 @@ def test_a_part_of_an_experiment_has_a_smaller_plan(call: Call, tmp_path: Path) 
     ]  # two methods, two encoders each, two runs on each
 
 
+def test_what_an_experiment_does_not_read_is_said(call: Call, tmp_path: Path) -> None:
+    options = ("--scale", "tiny", "--groups", "A", "--dry-run", "--out", tmp_path)
+
+    def idle(*arguments: object) -> str:
+        status, out, _ = call("reproduce", *arguments, *options)
+        assert status == 0
+        return "".join(line for line in out.splitlines() if line.startswith("Without effect on "))
+
+    named = idle("seen", "--tasks", "walker_run", "hopper_hop", "--methods", "crptpro")
+    assert named == "Without effect on seen: --tasks hopper_hop."
+    named = idle("prototypes", "--methods", "atc", "crptpro", "--seeds", 5)
+    assert named == "Without effect on prototypes: --methods atc, --seeds 5."
+    assert idle("efficiency", "--tasks", "hopper_hop").endswith("--tasks hopper_hop.")
+    assert idle("seen", "--colors-by", "image", "--seeds", 3).endswith("seen: --colors-by image.")
+    # What one of several reads has an effect.
+    assert (
+        idle("seen", "prototypes", "--methods", "atc", "crptpro", "--tasks", "walker_run", "--seeds", 0) == ""
+    )
+
+
 def test_all_means_the_experiments_that_have_something_of_what_is_asked_for(
     call: Call, tmp_path: Path
 ) -> None:
@@ -89,6 +109,9 @@ def test_all_means_the_experiments_that_have_something_of_what_is_asked_for(
     (("seen", "--scale", "tiny", "--jobs", "0"), "--jobs must be at least 1, got 0"),
     (("seen", "--scale", "tiny", "--attempts", "0"), "--attempts must be at least 1, got 0"),
     (("seen", "--scale", "tiny", "--device", "cuda:99"), "cuda:99"),
+    (("seen", "--scale", "tiny", "--launcher", "slurm", "--hours", "0"), "--hours must be at least a minute"),
+    (("seen", "--scale", "tiny", "--launcher", "slurm", "--memory-gb", "0.1"), "--memory-gb must be at least 1"),
+    (("seen", "--scale", "tiny", "--launcher", "slurm", "--sbatch", "qos"), "--sbatch qos: write key=value"),
 ])  # fmt: skip
 def test_a_request_that_cannot_be_met_leaves_nothing_behind(
     call: Call, tmp_path: Path, arguments: tuple[str, ...], message: str
@@ -135,8 +158,9 @@ def test_colours_are_reversed_by_background_or_image(
     monkeypatch.setitem(EXPERIMENTS, "colors", replace(usual, goals=goals))
     part = ("--methods", "random-encoder", "--scale", "tiny")
     for by in ("background", "image"):
+        asked.clear()
         assert call("reproduce", "colors", *part, "--colors-by", by, "--dry-run", "--out", tmp_path)[0] == 0
-    assert asked == [{"reversed_background"}, {"reversed_image"}]
+        assert asked[0] == {f"reversed_{by}"}
 
 
 # --- an experiment that takes seconds -----------------------------------------------------------------------------

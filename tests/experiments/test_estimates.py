@@ -178,7 +178,9 @@ def test_methods_are_compared_on_the_same_tasks_and_level_only() -> None:
         estimate_improvement(runs(2), runs(2), encoders={TASKS[0]: ["a", "b"]})
 
 
-@pytest.mark.parametrize(("name", "value"), [("confidence", 1.0), ("confidence", 0.0), ("replicates", 0)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("confidence", 1.0), ("confidence", 0.0), ("replicates", 0), ("seed", -1)]
+)
 def test_a_bootstrap_that_cannot_be_is_refused(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"`{name}` must be"):
         Bootstrap(**{name: value})

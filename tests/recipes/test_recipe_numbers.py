@@ -6,11 +6,13 @@ import dataclasses
 import importlib.util
 import inspect
 import sys
+from pathlib import Path
 from types import ModuleType
 
 import pytest
 from recipe_process import RECIPES
 
+from crptpro.errors import CRPTproError
 from crptpro.objectives import get_method
 from crptpro.training import ActiveConfig, SACSettings, drq_settings
 from crptpro.training.explore.plan import make_plan, resolve
@@ -92,3 +94,25 @@ def test_a_recipe_names_as_many_encoder_updates_as_there_will_be(
     known = get_method(method)
     plan = make_plan(resolve(ActiveConfig(**settings), known.exploration, known.defaults), [2] * domains)
     assert f"{plan.encoder_updates:,}" in (RECIPES / f"{recipe}.py").read_text()
+
+
+@pytest.mark.parametrize(
+    ("recipe", "changes", "message"),
+    [
+        ("crptpro", {"device": "abacus"}, "'abacus' cannot be used"),
+        ("atc", {"device": "abacus"}, "'abacus' cannot be used"),
+        ("finetune", {"pretrained": Path("absent")}, "absent does not exist"),
+        ("finetune", {"pretrained": Path("absent"), "device": "abacus"}, "'abacus' cannot be used"),
+        ("finetune", {"pretrained": Path("absent"), "domain": "walkr"}, "Nearest: walker"),
+        ("quickstart", {"task": "walkr"}, "Nearest: walker"),
+        ("quickstart", {"env_steps": 0}, "env_steps"),
+    ],
+)
+def test_what_a_later_stage_would_refuse_ends_a_recipe_before_it_collects(
+    recipe: str, changes: dict[str, object], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = load(recipe)
+    for collect in ("collect_group", "collect_random"):
+        monkeypatch.setattr(module, collect, lambda *_, **__: pytest.fail("it collects"), raising=False)
+    with pytest.raises((CRPTproError, ValueError), match=message):
+        module.main(module.Config(out=tmp_path, **changes))

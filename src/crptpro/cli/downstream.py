@@ -38,7 +38,11 @@ def settings_asked_for(arguments: Sequence[str]) -> DownstreamConfig:
     """
     words = " ".join(arguments).replace("=", " ").split()
     named = [after for word, after in itertools.pairwise(words) if word == "--algorithm"]
-    return skill_ddpg_settings() if named[-1:] == ["skill-ddpg"] else DownstreamConfig()
+    of = {
+        "skill-ddpg": skill_ddpg_settings,
+        "drq": drq_settings,
+    }  # DrQ's, so that the refusal is of it, not of them
+    return of.get(named[-1] if named else "", DownstreamConfig)()
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 if TYPE_CHECKING:
     from crptpro.experiments.goals import Goal, Request
-    from crptpro.experiments.launching import Launcher, Resources
+    from crptpro.experiments.launching import Launcher, Resources, SlurmRequest
 
 ALL = "all"
 _ITS_OWN = arg(help_behavior_hint="(default: the experiment's)")
@@ -79,17 +79,19 @@ class Reproduce:
         from crptpro.cards import require_disk
         from crptpro.errors import CRPTproError
         from crptpro.experiments.costs import estimate
-        from crptpro.experiments.launching import divide, run_pieces
+        from crptpro.experiments.launching import SlurmRequest, divide, run_pieces
         from crptpro.experiments.plan import make_plan
         from crptpro.experiments.plan_text import failures_text, plan_text
         from crptpro.experiments.requests import write_request
         from crptpro.experiments.store import Store
+        from crptpro.experiments.unread import unread
         from crptpro.modules import usable_device
         from crptpro.plugins import loaded_plugins
 
         if self.attempts < 1:
             raise CRPTproError(f"--attempts must be at least 1, got {self.attempts}.")
         self._refuse_options_of_others()
+        slurm = SlurmRequest(self.partition, self.hours, self.memory_gb, self.sbatch)
         if self.launcher in ("local", "inline"):
             usable_device(self.device)
         resources = divide(
@@ -107,11 +109,13 @@ class Reproduce:
         cost = estimate(plan, store, jobs=resources.jobs, device=self.device, threads=threads)
         print(f"{', '.join(wanted)} at scale {self.scale} in {self.out}\n")
         print(plan_text(plan, cost, jobs=resources.jobs, device=self.device), flush=True)
+        if idle := unread(request, lambda other: _goals(wanted, other)):
+            print(f"\nWithout effect on {', '.join(wanted)}: {', '.join(idle)}.", flush=True)
         if self.dry_run:
             return
         require_disk(self.out, cost.disk_bytes, "What this plan has yet to make")
         # What a launcher lacks is said before anything is written.
-        launcher = self._launcher(resources) if plan.missing else None
+        launcher = self._launcher(resources, slurm) if plan.missing else None
         for name, goals in wanted.items():
             write_request(store, name, request, goals)
         if launcher is not None:
@@ -187,13 +191,18 @@ class Reproduce:
             print(f"Nothing of {', '.join(empty)} is among these groups, tasks and methods.\n")
         return {name: goals for name, goals in wanted.items() if goals}
 
-    def _launcher(self, resources: Resources) -> Launcher:
-        from crptpro.experiments.launching import SlurmRequest, make_launcher
+    def _launcher(self, resources: Resources, slurm: SlurmRequest) -> Launcher:
+        from crptpro.experiments.launching import make_launcher
 
-        slurm = SlurmRequest(self.partition, self.hours, self.memory_gb, self.sbatch)
         return make_launcher(
             self.launcher, resources, device=self.device, slurm=slurm, ray_address=self.ray_address
         )
+
+
+def _goals(names: Iterable[str], request: Request) -> list[Goal]:
+    from crptpro.experiments.catalogue import EXPERIMENTS
+
+    return [goal for name in names for goal in EXPERIMENTS[name].goals(request)]
 
 
 def _names(experiments: Sequence[str]) -> list[str]:

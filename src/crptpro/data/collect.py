@@ -21,6 +21,7 @@ from crptpro.data.incoming import dataset_path
 from crptpro.domains import Domain, get_domain
 from crptpro.errors import DatasetError
 from crptpro.quality import Quality
+from crptpro.seeding import require_seed
 
 logger = logging.getLogger(__name__)
 
@@ -116,6 +117,7 @@ def collect_group(
     """
     if transitions < 1 or workers < 1:
         raise DatasetError(f"transitions and workers must be at least 1, got {transitions} and {workers}.")
+    require_seed(seed)
     # Imported late: nothing that reads datasets needs the simulators.
     from crptpro.envs import episode_length, make_env, needs_gl, resolve_action_repeat
     from crptpro.envs.rendering import select_backend

@@ -16,6 +16,7 @@ from crptpro.envs.pixel_env import PixelEnv
 from crptpro.envs.rendering import backend_card, first_frame_watchdog, select_backend
 from crptpro.errors import CRPTproError
 from crptpro.quality import QUALITIES, Quality
+from crptpro.seeding import require_seed
 
 
 def make_env(
@@ -63,6 +64,7 @@ def make_env(
     """
     domain = get_domain(task)
     action_repeat = resolve_action_repeat(domain, action_repeat)
+    require_seed(seed)
     _check_options(
         quality, colors, image_size=image_size, action_repeat=action_repeat, frame_stack=frame_stack
     )
@@ -96,7 +98,13 @@ def make_env(
 
 
 def resolve_action_repeat(task: str | Domain, action_repeat: int | None = None) -> int:
-    """Return the env steps of one agent step: as asked, or the domain's; 1 if your own world repeats nothing."""
+    """Return the env steps of one agent step: as asked, or the domain's; 1 if your own world repeats nothing.
+
+    Raises:
+        CRPTproError: asked for less than one.
+    """
+    if action_repeat is not None:
+        _require_count("action_repeat", action_repeat)
     domain = get_domain(task)
     if domain.source == "own" and not repeats_actions(domain):
         return 1
@@ -127,12 +135,16 @@ def needs_gl(task: str | Domain) -> bool:
 
 def _check_options(quality: str, colors: str, **counts: int) -> None:
     for name, value in counts.items():
-        if value < 1:
-            raise CRPTproError(f"{name} must be at least 1, got {value}.")
+        _require_count(name, value)
     if quality not in QUALITIES:
         raise CRPTproError(f"quality must be {' or '.join(map(repr, QUALITIES))}, got {quality!r}.")
     if colors not in COLORS:
         raise CRPTproError(f"colors must be {', '.join(map(repr, COLORS))}, got {colors!r}.")
+
+
+def _require_count(name: str, value: int) -> None:
+    if value < 1:
+        raise CRPTproError(f"{name} must be at least 1, got {value}.")
 
 
 def _make_dm_env(

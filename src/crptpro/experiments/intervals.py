@@ -108,6 +108,8 @@ class Bootstrap:
             raise ValueError(f"`confidence` must be between 0 and 1, got {self.confidence}.")
         if self.replicates < 1:
             raise ValueError(f"`replicates` must be at least 1, got {self.replicates}.")
+        if self.seed < 0:
+            raise ValueError(f"`seed` must be 0 or more, got {self.seed}.")
 
 
 def _count(number: int, noun: str) -> str:

@@ -31,7 +31,6 @@ from crptpro.experiments.launching import (
     run_pieces,
     threads_alone,
 )
-from crptpro.experiments.launching.choice import slurm_parameters
 from crptpro.experiments.launching.submitted import FOLDER, LocalLauncher, SlurmLauncher
 from crptpro.experiments.store import DONE, Store
 
@@ -345,4 +344,4 @@ def test_a_number_below_one_is_refused() -> None:
 
 def test_an_option_of_sbatch_that_says_nothing_is_refused() -> None:
     with pytest.raises(CRPTproError, match="write key=value"):
-        slurm_parameters(SlurmRequest(sbatch=("qos",)), has_gpu=False)
+        SlurmRequest(sbatch=("qos",))

@@ -105,12 +105,26 @@ class SlurmRequest:
         hours: after which Slurm ends a job; it is queued again and continues.
         memory_gb: of each job.
         sbatch: further options as ``key=value``.
+
+    Raises:
+        CRPTproError: no time, no memory, or an option that is not ``key=value``.
     """
 
     partition: str | None = None
     hours: float = 24.0
     memory_gb: float = 16.0
     sbatch: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        """Refuse what Slurm would read as something else."""
+        if not self.hours * 60 >= 1:
+            raise CRPTproError(f"--hours must be at least a minute (0.017), got {self.hours:g}.")
+        if not self.memory_gb >= 1:
+            raise CRPTproError(f"--memory-gb must be at least 1, got {self.memory_gb:g}.")
+        for option in self.sbatch:
+            key, equals, _ = option.partition("=")
+            if not key or not equals:
+                raise CRPTproError(f"--sbatch {option}: write key=value, e.g. qos=high or account=robots.")
 
 
 def make_launcher(
@@ -146,15 +160,12 @@ def make_launcher(
 def slurm_parameters(request: SlurmRequest, *, has_gpu: bool) -> dict[str, Any]:
     """Translate a request into parameters of submitit's Slurm executor.
 
-    Raises:
-        CRPTproError: for an option that is not ``key=value``.
-
     Examples:
         >>> slurm_parameters(SlurmRequest("short", hours=2, memory_gb=8, sbatch=("qos=high",)), has_gpu=False)
         {'time': 120, 'mem': '8192M', 'partition': 'short', 'additional_parameters': {'qos': 'high'}}
     """
     parameters: dict[str, Any] = {
-        "time": max(1, round(request.hours * 60)),
+        "time": round(request.hours * 60),
         "mem": f"{round(request.memory_gb * 1024)}M",
     }
     if request.partition is not None:
@@ -163,9 +174,7 @@ def slurm_parameters(request: SlurmRequest, *, has_gpu: bool) -> dict[str, Any]:
         parameters["gpus_per_node"] = 1
     further = {}
     for option in request.sbatch:
-        key, equals, value = option.partition("=")
-        if not key or not equals:
-            raise CRPTproError(f"--sbatch {option}: write key=value, e.g. qos=high or account=robots.")
+        key, _, value = option.partition("=")
         further[key.lstrip("-")] = value
     if further:
         parameters["additional_parameters"] = further

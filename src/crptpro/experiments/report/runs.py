@@ -135,8 +135,8 @@ def tables_of(
 def published(spot: Spot, label: str) -> Score | None:
     """Return what the paper printed for a system at a place; ``None`` where it printed nothing.
 
-    Its tables have no control and no (S) methods. DrQ trains its own encoder, so that its score belongs to a task
-    whatever the group.
+    Its tables have no control, no (S) methods, no fine-tuned encoder and no preset. DrQ trains its own encoder, so that
+    its score belongs to a task whatever the group.
     """
     if label == "drq" and spot.colors == "normal":
         return next((row.scores["drq"] for row in SEEN if row.task == spot.task), None)
