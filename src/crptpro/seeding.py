@@ -14,14 +14,14 @@ import torch
 from crptpro.errors import CRPTproError
 
 
-def require_seed(seed: int, name: str = "seed") -> None:
+def require_seed(seed: int) -> None:
     """Refuse a seed that no generator takes.
 
     Raises:
         CRPTproError: outside [0, 2**32), NumPy's range.
     """
     if not 0 <= seed < 2**32:
-        raise CRPTproError(f"`{name}` must be from 0 to {2**32 - 1}, got {seed}.")
+        raise CRPTproError(f"`seed` must be from 0 to {2**32 - 1}, got {seed}.")
 
 
 def derive_seed(seed: int, *path: str | int) -> int:

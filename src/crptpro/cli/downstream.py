@@ -38,10 +38,8 @@ def settings_asked_for(arguments: Sequence[str]) -> DownstreamConfig:
     """
     words = " ".join(arguments).replace("=", " ").split()
     named = [after for word, after in itertools.pairwise(words) if word == "--algorithm"]
-    of = {
-        "skill-ddpg": skill_ddpg_settings,
-        "drq": drq_settings,
-    }  # DrQ's, so that the refusal is of it, not of them
+    # DrQ's, too: what is refused then is DrQ itself, not settings that it does not read.
+    of = {"skill-ddpg": skill_ddpg_settings, "drq": drq_settings}
     return of.get(named[-1] if named else "", DownstreamConfig)()
 
 
