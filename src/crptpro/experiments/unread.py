@@ -8,8 +8,6 @@ from dataclasses import replace
 from crptpro.domains import GROUPS, get_domain
 from crptpro.experiments.goals import SEEDS, Goal, Request
 
-_NORMAL = "reversed_background"
-
 
 def unread(request: Request, goals_of: Callable[[Request], list[Goal]]) -> list[str]:
     """Name what was asked for and makes no difference: a method that nothing measures, seeds where nothing runs.
@@ -40,6 +38,6 @@ def unread(request: Request, goals_of: Callable[[Request], list[Goal]]) -> list[
         unused = next(seed for seed in range(SEEDS) if seed not in request.seeds)
         if changes_nothing(seeds=(unused,)):
             said.append(f"--seeds {' '.join(map(str, request.seeds))}")
-    if request.colors != _NORMAL and changes_nothing(colors=_NORMAL):
+    if request.colors != Request.colors and changes_nothing(colors=Request.colors):
         said.append("--colors-by image")
     return said

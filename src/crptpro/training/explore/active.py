@@ -122,10 +122,8 @@ def pretrain_active(
     _warn_of_another_encoder(loss)
     warn_of_unread(config, exploration)
     named = domain_names(loss, domains, exploration)
-    cuda = [device.index or 0] if device.type == "cuda" else []
     loss.to(device).train()
     with contextlib.ExitStack() as stack:
-        stack.enter_context(torch.random.fork_rng(devices=cuda))
         stack.enter_context(kept_global_rng())
         require_explorable(loss, domains, config)
         torch.manual_seed(derive_seed(config.seed, "active", "loss"))

@@ -187,8 +187,8 @@ class ActiveRun:
                 encode(batch, self.loss.encoder, keys)
             metrics = {"intrinsic_reward": self.rewards[index].pay(batch)}
             # Delays within an agent count its own updates.
-            step = member.agent_steps // self.plan.agent_update_interval
-            metrics |= member.agent.update(batch, agent_step=step)
+            own = member.agent_steps // self.plan.agent_update_interval
+            metrics |= member.agent.update(batch, agent_step=own)
             for key, value in metrics.items():
                 self.sums[index][key] = self.sums[index].get(key, 0) + value.detach()
                 self.counts[index][key] = self.counts[index].get(key, 0) + 1

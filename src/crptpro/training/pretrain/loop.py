@@ -178,10 +178,8 @@ def pretrain(
     puts_channels_last = resolve_channels_last(channels_last)
     compiled = Compiled(is_on=resolve_compile(compile))
     captures = resolve_cuda_graph(cuda_graph, device)
-    cuda = [device.index or 0] if device.type == "cuda" else []
     loss.to(device).train()
     with contextlib.ExitStack() as stack:
-        stack.enter_context(torch.random.fork_rng(devices=cuda))
         stack.enter_context(kept_global_rng())
         torch.manual_seed(derive_seed(seed, "pretrain", "loss"))
         sources = open_sources(datasets, seed=seed, device=device)

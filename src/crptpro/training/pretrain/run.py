@@ -222,9 +222,8 @@ class PretrainRun:
             # back.
             row = self._log() if not self.is_repeated else self._last_row()
             if self.is_repeated:
-                self.window.row(
-                    self.learner.names
-                )  # the checkpoint was written before this row measured cosines
+                # The checkpoint was written before this row measured its cosines.
+                self.window.row(self.learner.names)
                 self.monitor.observe(self.done, comp=_comp(row), cosine=self.window.cosines or None)
         else:
             row = self.history[-1] if self.history else self._last_row()

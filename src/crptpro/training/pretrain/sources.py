@@ -118,9 +118,8 @@ class Source:
                 raise DatasetError(
                     f"The loss reads {key!r}, which the dataset {self.name!r} lacks; it has {names}."
                 )
-        masks = [
-            key for key in AUTO_LOSS_MASK_KEYS if key in held
-        ]  # of rows that do not count, where there are some
+        # Which rows count comes along where the dataset says it.
+        masks = [key for key in AUTO_LOSS_MASK_KEYS if key in held]
         return batch.select(*keys, *masks)
 
     def facts(self) -> dict[str, Any]:
