@@ -6,12 +6,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from crptpro.cards import hardware, write_json
+from crptpro.experiments.catalogue import EXPERIMENTS
 from crptpro.experiments.costs import corrections, estimate, wall_seconds
 from crptpro.experiments.goals import Request
 from crptpro.experiments.matrix import seen
 from crptpro.experiments.measurements import ProbePiece
+from crptpro.experiments.pace import network_pace
 from crptpro.experiments.piece_costs import core_seconds, stored_bytes, working_bytes
 from crptpro.experiments.pieces import (
     DatasetPiece,
@@ -69,6 +72,30 @@ def test_seconds_follow_decisions_updates_and_batch(piece: Piece, seconds: float
     assert core_seconds(piece) == pytest.approx(seconds)
 
 
+def test_the_pace_of_networks_moves_their_part_of_a_piece_alone() -> None:
+    assert core_seconds(WALKER, 5.0) == core_seconds(WALKER)
+    assert core_seconds(ENCODER, 5.0) == pytest.approx(10 + 5 * 100 * 512 * 2.9e-3)
+    acting, evaluating = 0.03 + 5 * (0.02 + 128 * 0.5e-3), 0.03 + 5 * 0.01
+    assert core_seconds(RUN, 5.0) == pytest.approx(10 + 10_000 * acting + 3 * 10 * 500 * evaluating)
+    explored = ExploredPiece(
+        "apt-s", 0, ("walker",), explore=settings(env_steps=2_000, random_agent_steps=100, batch_size=64)
+    )
+    exploring = 0.03 + 5 * (0.02 + 64 * 3.5e-3)
+    assert core_seconds(explored, 5.0) == pytest.approx(10 + 1_000 * exploring + 5 * 450 * 64 * 2.9e-3)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+@pytest.mark.parametrize("name", sorted(EXPERIMENTS))
+def test_no_piece_gets_cheaper_where_networks_are_slower(name: str, scale: str, tmp_path: Path) -> None:
+    plan = make_plan(
+        [goal.piece for goal in EXPERIMENTS[name].goals(Request(SCALES[scale]))], Store(tmp_path)
+    )
+    for piece in plan.pieces:
+        without, usual, slow = (core_seconds(piece, pace) for pace in (0.0, 1.0, 3.0))
+        assert without <= usual <= slow
+        assert slow - usual == pytest.approx(2 * (usual - without))
+
+
 def test_disk_follows_what_is_kept() -> None:
     assert stored_bytes(DatasetPiece("walker", 100_000, 0)) == pytest.approx(2.24e9, rel=0.01)
     few, many, more = (
@@ -109,6 +136,51 @@ def test_finished_pieces_correct_the_estimate_of_their_kind(tmp_path: Path) -> N
     assert cost.seconds[WALKER.key] == pytest.approx(3 * core_seconds(WALKER))
     assert cost.seconds[ENCODER.key] == pytest.approx(core_seconds(ENCODER))
     assert cost.corrected == {"dataset"}
+
+
+def test_networks_are_timed_here_where_nothing_finished_tells_their_pace(tmp_path: Path) -> None:
+    store, asked = Store(tmp_path), []
+
+    def four_times(threads: int) -> float:
+        asked.append(threads)
+        return 4.0
+
+    plan = make_plan([RUN], store)
+    cost = estimate(plan, store, jobs=2, threads=3, time_networks=four_times)
+    assert asked == [3]
+    assert cost.seconds == {piece.key: core_seconds(piece, 4.0) for piece in (WALKER, ENCODER, RUN)}
+    assert cost.wall_seconds == pytest.approx(sum(cost.seconds.values()))
+    text = plan_text(plan, cost, jobs=2, device="cpu")
+    assert "times 4 for networks, as just timed here" in text
+    assert "though each job has" not in text
+
+    finish(store, RUN, 2 * core_seconds(RUN))
+    other = RunPiece("walker_run", ENCODER, 1, config=RUN.config)
+    cost = estimate(make_plan([other], store), store, jobs=2, time_networks=four_times)
+    assert cost.seconds[other.key] == pytest.approx(
+        2 * core_seconds(other)
+    )  # a finished run has the pace in it
+    assert asked == [3]  # and the encoder's few updates are not worth seconds of timing
+    assert cost.pace is None
+
+
+def test_what_hardly_computes_networks_or_runs_elsewhere_is_not_timed(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+
+    def refuse(threads: int) -> float:
+        raise AssertionError("timed")
+
+    data = make_plan([DatasetPiece("walker", 100_000, 0)], store)
+    assert estimate(data, store, jobs=2, time_networks=refuse).pace is None
+    assert estimate(make_plan([RUN], store), store, jobs=2).pace is None
+
+
+def test_the_pace_of_networks_is_measured_without_a_trace() -> None:
+    threads, state = torch.get_num_threads(), torch.get_rng_state()
+    pace = network_pace(1)
+    assert 0.01 < pace < 1_000
+    assert torch.get_num_threads() == threads
+    assert torch.equal(torch.get_rng_state(), state)
 
 
 def test_pieces_of_another_machine_correct_nothing(tmp_path: Path) -> None:

@@ -80,6 +80,7 @@ class Reproduce:
         from crptpro.errors import CRPTproError
         from crptpro.experiments.costs import estimate
         from crptpro.experiments.launching import SlurmRequest, divide, run_pieces
+        from crptpro.experiments.pace import network_pace
         from crptpro.experiments.plan import make_plan
         from crptpro.experiments.plan_text import failures_text, plan_text
         from crptpro.experiments.requests import write_request
@@ -106,7 +107,15 @@ class Reproduce:
         store = Store(self.out)
         plan = make_plan([goal.piece for goals in wanted.values() for goal in goals], store)
         threads = resources.job_settings(self.device).threads
-        cost = estimate(plan, store, jobs=resources.jobs, device=self.device, threads=threads)
+        is_here = self.launcher in ("local", "inline") and self.device == "cpu"
+        cost = estimate(
+            plan,
+            store,
+            jobs=resources.jobs,
+            device=self.device,
+            threads=threads,
+            time_networks=network_pace if is_here else None,
+        )
         print(f"{', '.join(wanted)} at scale {self.scale} in {self.out}\n")
         print(plan_text(plan, cost, jobs=resources.jobs, device=self.device), flush=True)
         if idle := unread(request, lambda other: _goals(wanted, other)):

@@ -6,18 +6,20 @@ import contextlib
 import heapq
 import json
 import statistics
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from crptpro.cards import hardware
 from crptpro.experiments.piece_costs import core_seconds, stored_bytes, working_bytes
-from crptpro.experiments.pieces import DatasetPiece
+from crptpro.experiments.pieces import DatasetPiece, Piece
 from crptpro.experiments.plan import Plan
 from crptpro.experiments.store import DONE, Store
 
 SHORTEST_S = 60.0
 """Estimate up to which a finished piece says nothing about a longer one."""
+WORTH_TIMING_S = 600.0
+"""What networks would take on the reference machine from which a few seconds are spent on timing them here."""
 
 
 def corrections(store: Store, device: str = "cpu", threads: int = 1) -> dict[str, float]:
@@ -68,6 +70,8 @@ class Cost:
         wall_seconds: until all are made.
         corrected: kinds whose estimate follows what was measured here.
         threads: of each job, which other kinds count as one.
+        pace: time that networks take here by what they take on the reference machine, as the estimate of other kinds
+            has it; ``None`` if it was not measured.
     """
 
     seconds: Mapping[str, float]
@@ -76,6 +80,7 @@ class Cost:
     wall_seconds: float
     corrected: frozenset[str]
     threads: int = 1
+    pace: float | None = None
 
     @property
     def disk_bytes(self) -> int:
@@ -83,7 +88,15 @@ class Cost:
         return sum(self.bytes.values()) + self.working_bytes
 
 
-def estimate(plan: Plan, store: Store, *, jobs: int, device: str = "cpu", threads: int = 1) -> Cost:
+def estimate(
+    plan: Plan,
+    store: Store,
+    *,
+    jobs: int,
+    device: str = "cpu",
+    threads: int = 1,
+    time_networks: Callable[[int], float] | None = None,
+) -> Cost:
     """Estimate what the missing pieces of a plan cost.
 
     Args:
@@ -92,13 +105,25 @@ def estimate(plan: Plan, store: Store, *, jobs: int, device: str = "cpu", thread
         jobs: at a time.
         device: of networks.
         threads: of each job. Until such a job has finished, a piece counts as if it had one.
+        time_networks: measures how long networks take here by what they take on the reference machine, with so many
+            threads (:func:`~crptpro.experiments.pace.network_pace`). Called if much of the plan is the work of
+            networks and finished pieces do not tell it; ``None`` if jobs will run elsewhere.
     """
     ratios = corrections(store, device, threads)
-    seconds = {piece.key: core_seconds(piece) * ratios.get(piece.kind, 1.0) for piece in plan.missing}
+    untold = [piece for piece in plan.missing if piece.kind not in ratios]
+    networks_s = sum(core_seconds(piece, 1.0) - core_seconds(piece, 0.0) for piece in untold)
+    pace = time_networks(threads) if time_networks is not None and networks_s > WORTH_TIMING_S else None
+    seconds = {piece.key: _seconds(piece, ratios, pace or 1.0) for piece in plan.missing}
     sizes = {piece.key: max(0, stored_bytes(piece) - _size(store.path(piece))) for piece in plan.missing}
     working = sorted(map(working_bytes, plan.missing), reverse=True)[:jobs]
     wall_s = wall_seconds(plan, seconds, jobs)
-    return Cost(seconds, sizes, sum(working), wall_s, frozenset(ratios), threads)
+    return Cost(seconds, sizes, sum(working), wall_s, frozenset(ratios), threads, pace)
+
+
+def _seconds(piece: Piece, ratios: Mapping[str, float], pace: float) -> float:
+    """A measured ratio has the machine's networks in it; elsewhere their pace is the next best."""
+    ratio = ratios.get(piece.kind)
+    return core_seconds(piece, pace) if ratio is None else ratio * core_seconds(piece)
 
 
 def wall_seconds(plan: Plan, seconds: Mapping[str, float], jobs: int) -> float:

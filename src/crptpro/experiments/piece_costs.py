@@ -1,7 +1,8 @@
 """What one piece costs: seconds on a core of the reference machine, and bytes on disk.
 
 Times were measured on one core of an AMD EPYC (Zen 4 with AVX512-BF16). They are good enough to plan with and for
-nothing else.
+nothing else. Those of networks can be corrected by how fast networks are here
+(:func:`~crptpro.experiments.pace.network_pace`): processors of one decade differ ninefold.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ USUAL_DECISION_S = 0.03
 """One decision: the simulator, and a picture with exact pixels."""
 ENCODER_ROW_S = 2.9e-3
 """An encoder update, for each row of its batch."""
-ACT_S, EVALUATE_S = 0.05, 0.04
-"""A decision of an agent: picture, features, action; while it learns, and while it is evaluated."""
+ACT_NETWORKS_S, EVALUATE_NETWORKS_S = 0.02, 0.01
+"""A decision of an agent besides simulator and picture: features and action; while it learns, and is evaluated."""
 AGENT_ROW_S, DRQ_ROW_S = 0.5e-3, 6.9e-3
 """An agent's update for each row: on stored features, and on two views of pixels with its encoder."""
 EXPLORER_ROW_S = {"averaged-sac": 3.5e-3, "skill-ddpg": 2.7e-3}
@@ -63,10 +64,14 @@ OTHER_BYTES = 1_000_000
 
 
 @functools.singledispatch
-def core_seconds(piece: Piece) -> float:
+def core_seconds(piece: Piece, pace: float = 1.0) -> float:
     """Estimate the seconds that a piece takes on one core of the reference machine.
 
     A kind without a way of its own is taken for a measurement of a minute.
+
+    Args:
+        piece: to be made.
+        pace: time that networks take by what they take on the reference machine.
     """
     return MEASUREMENT_S
 
@@ -89,7 +94,7 @@ register_working: Callable[..., Any] = working_bytes.register
 
 
 @register_seconds
-def _(piece: DatasetPiece) -> float:
+def _(piece: DatasetPiece, pace: float = 1.0) -> float:
     return START_S + piece.transitions * DECISION_S.get(piece.domain, USUAL_DECISION_S)
 
 
@@ -99,7 +104,7 @@ def _(piece: DatasetPiece) -> int:
 
 
 @register_seconds
-def _(piece: RedrawnPiece) -> float:
+def _(piece: RedrawnPiece, pace: float = 1.0) -> float:
     return START_S + _redrawn_frames(piece) * DECISION_S.get(piece.dataset.domain, USUAL_DECISION_S)
 
 
@@ -113,54 +118,54 @@ def _redrawn_frames(piece: RedrawnPiece) -> int:
 
 
 @register_seconds
-def _(piece: ProbePiece) -> float:
-    return START_S + piece.samples * PROBE_SAMPLE_S + piece.samples**2 * PROBE_PAIR_S
+def _(piece: ProbePiece, pace: float = 1.0) -> float:
+    return START_S + pace * (piece.samples * PROBE_SAMPLE_S + piece.samples**2 * PROBE_PAIR_S)
 
 
 # --- encoders -----------------------------------------------------------------------------------------------------
 
 
 @register_seconds
-def _(piece: UntrainedPiece) -> float:
+def _(piece: UntrainedPiece, pace: float = 1.0) -> float:
     return START_S
 
 
 @register_seconds
-def _(piece: PretrainedPiece) -> float:
-    return START_S + piece.updates * _batch_size(piece.method, piece.training) * ENCODER_ROW_S
+def _(piece: PretrainedPiece, pace: float = 1.0) -> float:
+    return START_S + pace * piece.updates * _batch_size(piece.method, piece.training) * ENCODER_ROW_S
 
 
 @register_seconds
-def _(piece: FinetunedPiece) -> float:
-    return START_S + piece.updates * _batch_size(piece.base.method, piece.training) * ENCODER_ROW_S
+def _(piece: FinetunedPiece, pace: float = 1.0) -> float:
+    return START_S + pace * piece.updates * _batch_size(piece.base.method, piece.training) * ENCODER_ROW_S
 
 
 @register_seconds
-def _(piece: ExploredPiece) -> float:
+def _(piece: ExploredPiece, pace: float = 1.0) -> float:
     plan = exploration_plan(piece)
     updates_s = plan.encoder_updates * _batch_size(piece.method, piece.explore) * ENCODER_ROW_S
-    return START_S + plan.decisions * _exploring_s(piece) + updates_s
+    return START_S + plan.decisions * _exploring_s(piece, pace) + pace * updates_s
 
 
 @register_seconds
-def _(piece: TimingPiece) -> float:
+def _(piece: TimingPiece, pace: float = 1.0) -> float:
     if len(piece.encoders) > 1:
         return 1.0  # a sum
-    spent = _timing_s(piece.encoders[0], piece.updates)
+    spent = _timing_s(piece.encoders[0], piece.updates, pace)
     if piece.paper_timed and piece.paper != piece.encoders:
-        spent += _timing_s(piece.paper[0], piece.paper_timed)
+        spent += _timing_s(piece.paper[0], piece.paper_timed, pace)
     return spent
 
 
-def _timing_s(encoder: EncoderPiece, timed: int) -> float:
+def _timing_s(encoder: EncoderPiece, timed: int, pace: float) -> float:
     updates = 2 * timed
     if not isinstance(encoder, ExploredPiece):
         batch = _batch_size(encoder.method, getattr(encoder, "training", ()))
-        return START_S + updates * batch * ENCODER_ROW_S
+        return START_S + pace * updates * batch * ENCODER_ROW_S
     plan = exploration_plan(encoder)
     decisions = updates * plan.encoder_update_interval / plan.encoder_updates_each
     batch = _batch_size(encoder.method, encoder.explore)
-    return START_S + decisions * _exploring_s(encoder) + updates * batch * ENCODER_ROW_S
+    return START_S + decisions * _exploring_s(encoder, pace) + pace * updates * batch * ENCODER_ROW_S
 
 
 @register_stored
@@ -195,14 +200,16 @@ def _(piece: ExploredPiece) -> int:
 
 
 @register_seconds
-def _(piece: RunPiece) -> float:
+def _(piece: RunPiece, pace: float = 1.0) -> float:
     config = run_config(piece)
     repeat = action_repeat_of(piece.task, config.action_repeat)
     row_s = DRQ_ROW_S if config.algorithm == "drq" else AGENT_ROW_S
     episode = get_domain(piece.task).episode_env_steps or USUAL_EPISODE_ENV_STEPS
     evaluations = config.env_steps // config.eval_interval_env_steps + 1
-    learning_s = config.env_steps / repeat * (ACT_S + row_s * config.batch_size)
-    return START_S + learning_s + evaluations * config.eval_episodes * episode / repeat * EVALUATE_S
+    acting_s = USUAL_DECISION_S + pace * (ACT_NETWORKS_S + row_s * config.batch_size)
+    evaluating_s = USUAL_DECISION_S + pace * EVALUATE_NETWORKS_S
+    decisions, evaluated = config.env_steps / repeat, evaluations * config.eval_episodes * episode / repeat
+    return START_S + decisions * acting_s + evaluated * evaluating_s
 
 
 @register_stored
@@ -228,11 +235,12 @@ def _batch_size(method: str, options: Settings) -> int:
     return dict(options).get("batch_size") or get_method(method).defaults.batch_size
 
 
-def _exploring_s(piece: ExploredPiece) -> float:
+def _exploring_s(piece: ExploredPiece, pace: float) -> float:
     """A decision of an explorer, with its share of the agent's updates."""
     interval = exploration_plan(piece).agent_update_interval
     row_s = EXPLORER_ROW_S.get(exploration_config(piece).agent or "", USUAL_EXPLORER_ROW_S)
-    return ACT_S + row_s * _batch_size(piece.method, piece.explore) / interval
+    updates_s = row_s * _batch_size(piece.method, piece.explore) / interval
+    return USUAL_DECISION_S + pace * (ACT_NETWORKS_S + updates_s)
 
 
 def _replay_capacity(encoder: EncoderPiece | None) -> int:

@@ -94,9 +94,11 @@ def _basis(plan: Plan, cost: Cost, device: str) -> str:
     if measured and len(measured) == len(kinds):
         return "Estimated from what finished pieces took on this kind of machine."
     reference = "estimated from one core of the reference machine (AMD EPYC, Zen 4)"
-    if device != "cpu":
+    if cost.pace is not None:
+        reference += f", times {cost.pace:.2g} for networks, as just timed here"
+    elif device != "cpu":
         reference += ", which a GPU will beat by far"
-    if cost.threads > 1:
+    if cost.threads > 1 and cost.pace is None:
         reference += f", though each job has {cost.threads}"
     if not measured:
         return f"Hours are {reference}; they follow this machine once pieces of a kind are finished."
