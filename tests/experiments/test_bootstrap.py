@@ -83,8 +83,8 @@ def test_rows_of_the_same_runs_are_redrawn_alike() -> None:
 @pytest.mark.parametrize("count", COVERAGE)
 def test_intervals_of_few_runs_hold_the_truth_as_seldom_as_the_report_says(count: int) -> None:
     generator = rng()
-    samples = generator.normal(size=(2_000, count))
-    drawn = generator.integers(0, count, size=(400, 2_000, count))
+    samples = generator.normal(size=(6_000, count))
+    drawn = generator.integers(0, count, size=(400, 6_000, count))
     means = np.take_along_axis(samples[None], drawn, axis=-1).mean(axis=-1)
     low, high = np.percentile(means, [2.5, 97.5], axis=0)
-    assert np.mean((low <= 0) & (high >= 0)) == pytest.approx(COVERAGE[count], abs=0.03)
+    assert np.mean((low <= 0) & (high >= 0)) == pytest.approx(COVERAGE[count], abs=0.02)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from report_reading import cell, table_in
+from report_reading import cell, table_in, words
 
 from crptpro.experiments.report.blocks import Block, Figure
 from crptpro.experiments.report.probes import probes
@@ -59,6 +59,19 @@ def test_one_number_of_encoders_is_said_once_and_several_in_every_cell(tmp_path:
     assert cell(table, "walker", "atc", "A").beside == "seen, n = 2"
     assert cell(table, "walker", "atc", "A").text == "0.500 ± 0.141"
     assert cell(table, "cheetah", "atc", "A").beside == "seen, n = 1"
+
+
+def test_a_page_says_what_was_held_out_and_how_means_are_made(tmp_path: Path) -> None:
+    goal = probed(tmp_path, "atc", "walker", 0.4)
+    path = goal.piece.directory / "probe.csv"
+    rows = path.read_text().replace(HEADER.strip(), HEADER.strip() + ",samples,held_out_episodes")
+    path.write_text(
+        "".join(f"{line},2000,10\n" if i else f"{line}\n" for i, line in enumerate(rows.splitlines()))
+    )
+    told = words(blocks_of(goal))
+    assert "2,000 observations per probe, 10 episodes of them held out" in told
+    assert "counts a negative one as 0" in told
+    assert "may have seen these very observations" in told
 
 
 def test_the_figure_has_every_encoder_in_every_row_and_leaves_gaps(tmp_path: Path) -> None:

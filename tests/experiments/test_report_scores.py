@@ -90,7 +90,7 @@ def test_aggregates_are_those_of_the_runs_beside_the_papers_on_the_same_rows(blo
 
 def test_intervals_of_few_runs_are_called_too_narrow(blocks: tuple) -> None:
     assert "Tasks have as few as 4 runs" in words(blocks)
-    assert "2: 51%" in words(blocks)
+    assert "2: 50%" in words(blocks)
 
 
 def test_intervals_over_encoders_stand_where_runs_share_several(blocks: tuple, tmp_path: Path) -> None:
@@ -101,7 +101,28 @@ def test_intervals_over_encoders_stand_where_runs_share_several(blocks: tuple, t
     assert float(low) < float(high)
     alone = blocks_of(page_of(fill(tmp_path, encoder_seeds=(0,)).root), "seen-small")
     assert not [t for t in tables_in(alone) if "share encoders" in t.caption]
-    assert "speak of these encoders" in words(alone)
+    # DrQ's runs have encoders of their own: intervals over them speak of the method.
+    assert "The intervals of crptpro, atc are over runs alone, and speak of these encoders" in words(alone)
+    assert "speak of these encoders" not in words(blocks)
+
+
+def test_wider_intervals_are_those_over_encoders_also_against_drq_and_of_curves(blocks: tuple) -> None:
+    over_runs, over_encoders = (
+        table_in(blocks, caption) for caption in ("Over the 2 tasks", "where runs share encoders")
+    )
+    for column in ("mean score", "mean / DrQ here"):
+        one, other = (ends(cell(table, column, "crptpro").beside) for table in (over_runs, over_encoders))
+        assert other[1] - other[0] > one[1] - one[0] > 0
+    assert cell(over_encoders, "mean / DrQ here", "crptpro").text == "0.500"  # 250 / 500 and 100 / 200
+    curves = next(b for b in blocks if isinstance(b, Figure) and b.name == "seen-small-curves")
+    assert "over encoders where runs of a panel share several" in curves.caption
+    band = curves.drawing.axes[0].collections[0].get_paths()[0].vertices[:, 1]
+    # Encoders of (100, 200) and (300, 400): a replicate of one of them has runs of 100 to 200 or of 300 to 400.
+    assert band.max() > 350
+
+
+def ends(interval: str) -> list[float]:
+    return [float(end) for end in interval.strip("[]").split(", ")]
 
 
 def test_improvement_compares_every_pair_of_runs(blocks: tuple) -> None:
@@ -262,6 +283,33 @@ def test_curves_are_compared_where_all_runs_were_evaluated(tmp_path: Path) -> No
     assert returns[0].tolist() == returns[1].tolist() == pytest.approx([0, 10, 20, 30])
 
 
+def test_runs_of_other_settings_are_not_taken_for_seeds_of_each_other(tmp_path: Path) -> None:
+    for seed, (budget, score) in enumerate(((20_000, 60), (20_000, 80), (10_000, 20))):
+        write_run(
+            tmp_path / f"{seed}", method="crptpro", task="walker_run", score=score, seed=seed, budget=budget
+        )
+    write_run(tmp_path / "cheetah", method="crptpro", task="cheetah_run", score=5, budget=10_000)
+    write_run(tmp_path / "atc", method="atc", task="walker_run", score=40)
+    table = table_in(blocks_of(page_of(tmp_path), "scores"), FINAL)
+    assert cell(table, "crptpro, env_steps 20000", "walker_run").text == "70 ± 14"
+    assert cell(table, "crptpro, env_steps 10000", "walker_run").text == "20"
+    assert cell(table, "crptpro, env_steps 10000", "cheetah_run").text == "5.0"
+    assert cell(table, "atc", "walker_run").text == "40"
+
+
+def test_the_paper_s_means_over_all_of_its_tasks_are_those_that_it_printed(tmp_path: Path) -> None:
+    made = Reproduction(tmp_path)
+    goals = seen(Request(SMALL, methods=("apt-c",), seeds=(0,)))
+    made.ask("seen", goals)
+    for goal in goals:
+        made.run(goal, 100)
+    blocks = blocks_of(page_of(tmp_path), "seen-small")
+    table = table_in(blocks, "Over the 12 tasks")
+    assert cell(table, "mean score", "apt-c").published == "191"
+    assert cell(table, "mean / DrQ", "apt-c").published == "0.412"  # its cells give 0.420
+    assert "what its cells for these tasks give" not in table.caption
+
+
 def test_any_directory_of_runs_gives_scores_and_curves(tmp_path: Path) -> None:
     for seed in (0, 1):
         write_run(
@@ -277,6 +325,7 @@ def test_any_directory_of_runs_gives_scores_and_curves(tmp_path: Path) -> None:
         blocks_of(page, "contents")
     )
     blocks = blocks_of(page, "scores")
+    assert "It has numbers for CRPTpro" not in words(blocks)
     assert cell(table_in(blocks, FINAL), "crptpro", "walker_run").text == "250 ± 71"
     assert cell(table_in(blocks, FINAL), "crptpro", "walker_run").published == ""
     assert cell(table_in(blocks, FINAL), "drq", "walker_run").published == "485 ± 181"

@@ -168,6 +168,7 @@ def test_a_glance_has_every_value_with_its_change_and_the_untrained_encoder_last
     marks = figure.drawing.axes[0].lines
     assert marks[0].get_xdata()[0] == pytest.approx(0.25)
     assert marks[1].get_xdata()[0] == pytest.approx(0.1)
+    assert [label.get_text() for label in figure.drawing.axes[0].get_yticklabels()] == ["tau 0.05 (3 pairs)"]
 
 
 def test_what_encoders_know_at_the_end_is_not_said_of_those_that_are_not_there(

@@ -9,6 +9,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from crptpro.cli.request import require_writable
 from crptpro.colors import Colors
 from crptpro.errors import CRPTproError
 from crptpro.quality import Quality
@@ -49,7 +50,7 @@ class Evaluate:
                 "The random policy has no task of its own; name one with --task, e.g. --task walker_run."
             )
         if self.csv is not None:
-            _require_writable(self.csv)  # before an hour of episodes
+            require_writable(self.csv)  # before an hour of episodes
         agent, card = (None, {}) if is_random else load_agent(self.agent)
         task = self.task or card["task"]
         trained_with = card.get("config", {})
@@ -97,12 +98,3 @@ class Evaluate:
             partial.replace(self.csv)
         if self.video is not None:
             write_video(videos[0], self.video)
-
-
-def _require_writable(path: Path) -> None:
-    """Refuse what no file can become, and make nothing yet."""
-    if path.is_dir():
-        raise CRPTproError(f"--csv {path} is a directory; name a file in it.")
-    there = next(parent for parent in path.absolute().parents if parent.exists())
-    if not there.is_dir():
-        raise CRPTproError(f"--csv {path} cannot be written: {there} is a file.")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from crptpro.cli.downstream import RANDOM_ENCODER
-from crptpro.cli.request import image_format
+from crptpro.cli.request import image_format, require_writable
 from crptpro.colors import Colors
 
 if TYPE_CHECKING:
@@ -46,6 +46,8 @@ class Probe:
 
         if self.samples < 1:
             raise CRPTproError(f"--samples must be at least 1, got {self.samples}.")
+        if self.csv is not None:
+            require_writable(self.csv)  # before minutes of probing
         usable_device(self.device)
         image_size, frame_stack = image_format(self.datasets)
         pretrained = self._load(image_size, frame_stack)

@@ -97,3 +97,20 @@ def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
         listed = ", ".join(f"{path} has {size} px, {stack} frames" for path, (size, stack) in sizes.items())
         raise DatasetError(f"One encoder needs images of one size and stack: {listed}.")
     return next(iter(sizes.values()))
+
+
+def require_writable(path: Path, option: str = "--csv") -> None:
+    """Refuse what no file can become, and make nothing yet.
+
+    Args:
+        path: of the file to be.
+        option: by which it was asked for.
+
+    Raises:
+        CRPTproError: it is a directory, or lies below a file.
+    """
+    if path.is_dir():
+        raise CRPTproError(f"{option} {path} is a directory; name a file in it.")
+    there = next(parent for parent in path.absolute().parents if parent.exists())
+    if not there.is_dir():
+        raise CRPTproError(f"{option} {path} cannot be written: {there} is a file.")

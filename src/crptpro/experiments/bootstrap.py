@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 Indices = NDArray[np.int64]
 
 ENOUGH_DRAWS = 10
-COVERAGE = {2: 0.51, 3: 0.74, 4: 0.79, 5: 0.83, 6: 0.86, 8: 0.89, 10: 0.90}
+COVERAGE = {2: 0.50, 3: 0.75, 4: 0.79, 5: 0.84, 6: 0.86, 8: 0.89, 10: 0.90}
 """How often a 95 % percentile interval of the mean of so many draws of a normal law holds its mean: an interval of two
 runs is their range, whatever it is called."""
 

@@ -61,6 +61,7 @@ def estimate_relative(
     scores: Scores,
     references: Scores,
     *,
+    encoders: Encoders | None = None,
     runs: Runs | None = None,
     reference_runs: Runs | None = None,
     bootstrap: Bootstrap | None = None,
@@ -72,13 +73,15 @@ def estimate_relative(
 
     Args:
         scores: task to one score per run.
-        references: the same for the reference; numbers of runs may differ.
+        references: the same for the reference; numbers of runs may differ. Its own runs are redrawn, whatever
+            ``encoders`` are: DrQ's share none.
+        encoders: as of :func:`estimate`, for ``scores``.
         runs: as of :func:`estimate`, for ``scores``.
         reference_runs: the same for ``references``.
         bootstrap: how the interval is made.
 
     Returns:
-        The estimate; the interval is over runs.
+        The estimate.
 
     Raises:
         ValueError: as of :func:`estimate`, tasks that only one method has (named), or a run of the reference with a
@@ -93,7 +96,7 @@ def estimate_relative(
     if wrong:
         raise ValueError(f"A run of the reference scored 0 or less on {', '.join(sorted(wrong))}: no ratio.")
     how = bootstrap or Bootstrap()
-    samples = [Sample.of(scores, None, runs), Sample.of(references, None, reference_runs)]
+    samples = [Sample.of(scores, encoders, runs), Sample.of(references, None, reference_runs)]
 
     def ratio(parts: list[list[Array]]) -> Array:
         each = [own.mean(axis=-1) / other.mean(axis=-1) for own, other in zip(*parts)]

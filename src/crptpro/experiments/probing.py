@@ -58,7 +58,6 @@ def probe_rows(
     Raises:
         DatasetError: if there is no physical state, or too little data to split.
     """
-    logger.info("%s, %s: %s samples", dataset.domain, colors, f"{samples:,}")
     observed = probe_samples(
         dataset,
         samples=samples,
@@ -68,6 +67,7 @@ def probe_rows(
         frame_stack=pretrained.encoder.in_channels // 3,
         drawn=drawn,
     )
+    logger.info("%s, %s: %s samples", dataset.domain, colors, f"{len(observed.pixels):,}")
     about = {
         "encoder": encoder,
         "method": pretrained.label,

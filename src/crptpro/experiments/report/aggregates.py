@@ -15,7 +15,7 @@ from crptpro.experiments.estimates import (
     estimate_relative,
 )
 from crptpro.experiments.intervals import Bootstrap, Estimate
-from crptpro.experiments.published import EXPERT_SCORES
+from crptpro.experiments.published import EXPERT_SCORES, SEEN, SEEN_MEAN, SEEN_NORMALIZED_MEAN
 from crptpro.experiments.report import drawing
 from crptpro.experiments.report.blocks import Block, Cell, Figure, Paragraph, Table, cells, counted
 from crptpro.experiments.report.palette import styles
@@ -79,9 +79,7 @@ def _tables(tables: Mapping[str, ScoreTable], shared: Sequence[Spot], bootstrap:
         row.append(_with_interval(found, ".0f", _paper_mean(shared, label)))
         row += _normalized_cells(table, normalizable, label, bootstrap, None)
         if here:
-            row.append(
-                _against_drq(table, tables[DRQ], bootstrap) if label != DRQ else Cell("1", "by definition")
-            )
+            row.append(_against_drq(table, tables[DRQ], bootstrap) if label != DRQ else _BY_DEFINITION)
         rows.append(cells(*row))
     columns = ["method", "tasks", "runs", "mean score", *(_NORMALIZED if normalizable else ())]
     columns += ["mean / DrQ here"] * bool(here)
@@ -90,6 +88,8 @@ def _tables(tables: Mapping[str, ScoreTable], shared: Sequence[Spot], bootstrap:
         f"runs, {how}. A task counts once per group and colours, a run of several once. Normalised scores are divided "
         "by the paper's DrQ."
     )
+    if any(label in SEEN_MEAN for label in tables) and set(shared) != _SEEN_SPOTS:
+        caption += " “paper” is what its cells for these tasks give."
     if here:
         caption += " DrQ here has few runs itself: they are redrawn with the others', so that the intervals know of it."
     blocks: list[Block] = [Table(caption, tuple(columns), tuple(rows))]
@@ -102,7 +102,7 @@ def _tables(tables: Mapping[str, ScoreTable], shared: Sequence[Spot], bootstrap:
                 "note",
             )
         )
-    blocks += _over_encoders(tables, normalizable, bootstrap, how)
+    blocks += _over_encoders(tables, shared, bootstrap, how)
     fewest = min(len(scores) for table in tables.values() for scores in table.scores.values())
     if fewest < ENOUGH_DRAWS:
         held = "; ".join(f"{count}: {share:.0%}" for count, share in COVERAGE.items())
@@ -116,6 +116,8 @@ def _tables(tables: Mapping[str, ScoreTable], shared: Sequence[Spot], bootstrap:
 
 
 _NORMALIZED = ("mean / DrQ", "IQM / DrQ", "median / DrQ", "optimality gap")
+_BY_DEFINITION = Cell("1", "by definition")
+_SEEN_SPOTS = {Spot(row.group, row.task) for row in SEEN}
 
 
 def _normalized_cells(
@@ -133,29 +135,38 @@ def _normalized_cells(
 
 
 def _over_encoders(
-    tables: Mapping[str, ScoreTable], spots: Sequence[Spot], bootstrap: Bootstrap, how: str
+    tables: Mapping[str, ScoreTable], shared: Sequence[Spot], bootstrap: Bootstrap, how: str
 ) -> list[Block]:
     """The same numbers with wider intervals, for methods whose runs share encoders."""
-    if not spots:
-        return []
+    spots = [spot for spot in shared if spot.task in EXPERT_SCORES]
+    here = _measures_against_drq(tables)
     rows = []
     for label, table in tables.items():
-        own = table.only(spots)
-        told = own.encoders
-        if told is None or not own.shares_encoders:
+        told = table.encoders
+        if told is None or not table.shares_encoders:
             continue
         count = len({encoder for encoders in told.values() for encoder in encoders})
-        rows.append(cells(label, str(count), *_normalized_cells(table, spots, label, bootstrap, told)))
-    if not rows:
-        text = (
-            "Intervals are over runs, and speak of these encoders: no method has runs on two encoders or more that "
-            "runs share on every task, which an interval over encoders would need."
+        found = estimate(table.scores, mean, encoders=told, runs=table.runs, bootstrap=bootstrap)
+        row: list[str | Cell] = [label, str(count), _with_interval(found, ".0f")]
+        row += _normalized_cells(table, spots, label, bootstrap, {spot: told[spot] for spot in spots})
+        if here:
+            row.append(_against_drq(table, tables[DRQ], bootstrap, told))
+        rows.append(cells(*row))
+    blocks: list[Block] = []
+    if rows:
+        caption = (
+            f"The same where runs share encoders: {bootstrap.confidence:.0%} intervals over encoders, {how}."
         )
-        return [Paragraph(text, "note")]
-    caption = (
-        f"The same where runs share encoders: {bootstrap.confidence:.0%} intervals over encoders, {how}."
-    )
-    return [Table(caption, ("method", "encoders", *_NORMALIZED), tuple(rows))]
+        columns = ("method", "encoders", "mean score", *(_NORMALIZED if spots else ()))
+        blocks.append(Table(caption, (*columns, *["mean / DrQ here"] * here), tuple(rows)))
+    of_these = [t for t, table in tables.items() if table.is_about_its_encoders and not table.shares_encoders]
+    if of_these:
+        text = (
+            f"The intervals of {', '.join(of_these)} are over runs alone, and speak of these encoders: one that speaks "
+            "of the method needs two encoders or more on every task."
+        )
+        blocks.append(Paragraph(text, "note"))
+    return blocks
 
 
 def _improvement(tables: Mapping[str, ScoreTable], name: str, bootstrap: Bootstrap) -> list[Block]:
@@ -224,20 +235,32 @@ def _measures_against_drq(tables: Mapping[str, ScoreTable]) -> bool:
     return DRQ in tables and all(float(np.min(scores)) > 0 for scores in tables[DRQ].scores.values())
 
 
-def _against_drq(table: ScoreTable, drq: ScoreTable, bootstrap: Bootstrap) -> Cell:
+def _against_drq(
+    table: ScoreTable, drq: ScoreTable, bootstrap: Bootstrap, encoders: Mapping | None = None
+) -> Cell:
     found = estimate_relative(
-        table.scores, drq.scores, runs=table.runs, reference_runs=drq.runs, bootstrap=bootstrap
+        table.scores,
+        drq.scores,
+        encoders=encoders,
+        runs=table.runs,
+        reference_runs=drq.runs,
+        bootstrap=bootstrap,
     )
     return _with_interval(found, ".3f")
 
 
 def _paper_mean(spots: Sequence[Spot], label: str) -> str:
+    if set(spots) == _SEEN_SPOTS and label in SEEN_MEAN:
+        return f"{SEEN_MEAN[label]:g}"
     found = [published(spot, label) for spot in spots]
     scores = [score.mean for score in found if score is not None]
     return f"{np.mean(scores):.0f}" if len(scores) == len(spots) else ""
 
 
 def _paper_normalized(spots: Sequence[Spot], label: str) -> str:
+    """What the paper printed for all of its tasks; for a part of them, what its cells give."""
+    if set(spots) == _SEEN_SPOTS and label in SEEN_NORMALIZED_MEAN:
+        return f"{SEEN_NORMALIZED_MEAN[label]:.3f}"
     found = [(published(spot, label), EXPERT_SCORES[spot.task]) for spot in spots]
     ratios = [score.mean / expert for score, expert in found if score is not None]
     return f"{np.mean(ratios):.3f}" if len(ratios) == len(spots) else ""

@@ -43,7 +43,8 @@ def _timed_on(where: str, rows: Sequence[Row], name: str) -> list[Block]:
     methods, counts = in_order(method for method, _ in found), sorted({count for _, count in found})
     text = (
         f"Timed on {where} (hardware below). Hours are those of pre-training proper: environments that explore are "
-        "part of it, the collection of random datasets, which is done once for all, has its own column. Hours of the "
+        "part of it, the collection of random datasets, which is done once for all, has its own column: what it had "
+        "taken when this was timed. Hours of the "
         "paper's budget follow updates with the paper's batches and decisions, which were timed for themselves."
     )
     return [

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from crptpro.experiments.report import drawing
-from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Figure, Paragraph, Table, cells
+from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Figure, Paragraph, Table, cells, counted
 from crptpro.experiments.report.diagnostics import Record, plateau
 from crptpro.experiments.report.palette import styles
 from crptpro.experiments.report.trials import CONTROL, Reading, Trial, at_end, changes, trial_of
@@ -123,7 +123,9 @@ def _drawn(
     caption = (
         "What each value changed against the usual one: mean over pairs of encoders of one group and seed."
     )
-    names = [f"{words(factor)} {value}".strip() for factor, value in rows]
+    first, places = next(iter(GLANCE.values())), points.values()
+    pairs = {row: max((len(changes(found, own[row], at, first)) for at in places), default=0) for row in rows}
+    names = [f"{words(row[0])} {row[1]}".strip() + f" ({counted(pairs[row], 'pair')})" for row in rows]
     return [Figure(f"{name}-changes", caption, drawing.dots(names, panels, mark=0.0))]
 
 

@@ -16,6 +16,7 @@ from crptpro.experiments.report.palette import Style, styles
 from crptpro.experiments.report.reading import number
 from crptpro.experiments.report.runs import Placed, Spot, labels_of, spots_of
 from crptpro.experiments.row_files import read_rows
+from crptpro.experiments.score_table import score_tables
 from crptpro.experiments.statistics import Array, evaluation_means, mean
 
 PAUSE_S, PAUSE_FACTOR = 600.0, 20.0
@@ -46,7 +47,10 @@ def learning_curves(placed: Sequence[Placed], name: str, bootstrap: Bootstrap) -
         here = {label: grouped[spot, label] for label in labels if grouped[spot, label]}
         by_env_steps.append(_panel(spot, "env steps", here, look, named, bootstrap))
         by_hours.append(_panel(spot, "hours", here, look, named, bootstrap))
-    band = f"{bootstrap.confidence:.0%} bootstrap intervals over runs where there are two or more"
+    band = (
+        f"{bootstrap.confidence:.0%} bootstrap intervals, over encoders where runs of a panel share several, else over "
+        "runs where there are two or more"
+    )
     return [
         Figure(
             f"{name}-curves",
@@ -117,7 +121,9 @@ def _panel(
         env_steps, returns = common_curve(own)
         if not len(env_steps):
             continue
-        found = estimate_curve(env_steps, {spot: returns}, mean, bootstrap=bootstrap)
+        (table,) = score_tables(own, key=lambda _: spot).values()
+        encoders = table.encoders if table.shares_encoders else None
+        found = estimate_curve(env_steps, {spot: returns}, mean, encoders=encoders, bootstrap=bootstrap)
         x = env_steps
         if unit == "hours":
             x = np.mean([[active_seconds(run)[int(at)] / 3600 for at in env_steps] for run in own], axis=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -37,15 +38,22 @@ class Row:
         return self.cells.get(column) or ""
 
 
-def rows_of(asked: Asked, kind: str) -> tuple[list[Row], list[Block]]:
+def rows_of(asked: Asked, kind: str, *, once: bool = False) -> tuple[list[Row], list[Block]]:
     """Read ``<kind>.csv`` of every finished piece of a kind.
+
+    Args:
+        asked: the experiment.
+        kind: of pieces.
+        once: leave out the further goals of a piece that stands in several places, e.g. of an (S) method's in two
+            groups.
 
     Returns:
         All rows, and a warning for what cannot be read.
     """
-    rows, problems = [], []
+    rows, problems, read = [], [], set()
     for goal in asked.finished:
-        if goal.piece.kind == kind:
+        if goal.piece.kind == kind and not (once and goal.piece.key in read):
+            read.add(goal.piece.key)
             try:
                 rows += [Row(goal, row) for row in read_rows(goal.piece.directory / f"{kind}.csv")]
             except RecordError as reason:
@@ -55,7 +63,7 @@ def rows_of(asked: Asked, kind: str) -> tuple[list[Row], list[Block]]:
 
 def prototypes(asked: Asked) -> tuple[Block, ...]:
     """How far prototypes spread: at the end beside the paper's, and along training."""
-    rows, blocks = rows_of(asked, "prototypes")
+    rows, blocks = rows_of(asked, "prototypes", once=True)
     runs: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
         runs.setdefault(_variant(row), {}).setdefault(row.goal.piece.key, []).append(row)
@@ -68,7 +76,8 @@ def prototypes(asked: Asked) -> tuple[Block, ...]:
         printed = paper.get(label)
         told = {} if printed is None else {"kne_3": printed.kne, "ane": printed.ane, "intr": printed.intr}
         updates = " or ".join(f"{at:,.0f}" for at in sorted({row.number("updates") or 0 for row in ends}))
-        groups = ", ".join(sorted({str(row.goal.place.get("group", ABSENT)) for row in ends}))
+        places = [goal.place for goal in asked.finished if goal.piece.key in runs[label]]
+        groups = ", ".join(sorted({str(place.get("group", ABSENT)) for place in places}))
         numbers = [
             Cell(mean_of(ends, column), published=f"{told[column] * 1e4:.3f}" if column in told else "")
             for column in SPREAD
@@ -96,12 +105,13 @@ def prototypes(asked: Asked) -> tuple[Block, ...]:
 
 def coverage(asked: Asked) -> tuple[Block, ...]:
     """How much of a domain the data covers along pre-training: random policy against explorers."""
-    rows, blocks = rows_of(asked, "coverage")
+    rows, blocks = rows_of(asked, "coverage", once=True)
     by_piece: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
         label = RANDOM if row["source"] == "random" else f"{row['method']} explorer"
         by_piece.setdefault((row["domain"], label, row.goal.piece.key), []).append(row)
-    # Several explorers stand beside the same random data: what is equal is one curve.
+    # Several explorers stand beside the same random data: what is equal is one curve, and windows of another length
+    # are another curve of the same data.
     curves: dict[tuple[str, str], dict[tuple, list[Row]]] = {}
     for (domain, label, _), own in by_piece.items():
         numbers = tuple((row["env_steps"], row["coverage"]) for row in own)
@@ -117,18 +127,23 @@ def coverage(asked: Asked) -> tuple[Block, ...]:
             found = list(curves.get((domain, label), {}).values())
             if not found:
                 continue
-            name = f"{label} (n = {len(found)} per domain)"
+            count = len({_data(own[0], label) for own in found})
+            name = f"{label} (n = {count} per domain)"
             drawn += [_line(own, "env_steps", "coverage", name, look[label]) for own in found]
             ends = [own[-1] for own in found]
             samples = " or ".join(sorted({row["samples"] for row in ends}))
             steps = " or ".join(f"{at:,.0f}" for at in sorted({row.number("env_steps") or 0 for row in ends}))
             end = mean_of(ends, "coverage", 1, ".4f")
-            lines.append(cells(domain, label, str(len(found)), steps, samples, end))
-        panels.append(drawing.Panel(domain, "env steps of the explorer", "particle estimate", drawn))
+            lines.append(cells(domain, label, str(count), steps, samples, end))
+        panels.append(
+            drawing.Panel(domain, "env steps of the explorer, all domains", "particle estimate", drawn)
+        )
     caption = (
-        "Coverage at the end: particle estimate over sampled observations, mean over runs; higher is wider."
+        "Coverage at the end: particle estimate over observations sampled from the last window of the training, which "
+        "is cut into up to ten of equal length, and from as many decisions of the random policy; mean over runs; "
+        "higher is wider."
     )
-    columns = ("domain", "data", "runs", "env steps", "samples", "coverage")
+    columns = ("domain", "data", "runs", "explorer's env steps, all domains", "samples", "coverage")
     blocks.append(Table(caption, columns, tuple(lines), labels=2))
     caption = (
         "Coverage along pre-training, a line per run; estimates of other numbers of samples do not compare."
@@ -139,7 +154,7 @@ def coverage(asked: Asked) -> tuple[Block, ...]:
 
 def embeddings(asked: Asked) -> tuple[Block, ...]:
     """Embeddings of several sources in their first three principal components."""
-    rows, blocks = rows_of(asked, "embeddings")
+    rows, blocks = rows_of(asked, "embeddings", once=True)
     by_piece: dict[str, list[Row]] = {}
     for row in rows:
         by_piece.setdefault(row.goal.piece.key, []).append(row)
@@ -165,6 +180,15 @@ def _components(goal: Wanted) -> list[str]:
         return [f"component {i + 1} ({ratio:.0%} of variance)" for i, ratio in enumerate(ratios[:3])]
     except (RecordError, KeyError, TypeError, ValueError):
         return [f"component {i}" for i in (1, 2, 3)]
+
+
+def _data(row: Row, label: str) -> str:
+    """What a curve of coverage stands on: an explorer, or a dataset, beside which several explorers may stand."""
+    description = row.goal.piece.description
+    if label == RANDOM:
+        found = [data for data in description.get("datasets") or () if data.get("domain") == row["domain"]]
+        return json.dumps(found, sort_keys=True)
+    return json.dumps(description.get("explorer"), sort_keys=True)
 
 
 def _variant(row: Row) -> str:

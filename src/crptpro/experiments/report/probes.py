@@ -7,7 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from crptpro.experiments.report import drawing
-from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Figure, Table, cells, numbered
+from crptpro.experiments.report.blocks import (
+    ABSENT,
+    Block,
+    Cell,
+    Figure,
+    Paragraph,
+    Table,
+    cells,
+    numbered,
+)
 from crptpro.experiments.report.measurements import Row, rows_of
 from crptpro.experiments.report.palette import in_order, styles
 from crptpro.experiments.report.reading import Asked
@@ -15,7 +24,7 @@ from crptpro.experiments.report.reading import Asked
 MEASURES = {
     "r2_position": ("R2 of positions", ".3f"),
     "r2_velocity": ("R2 of velocities", ".3f"),
-    "effective_rank": ("Effective rank", ".1f"),
+    "effective_rank": ("Effective rank (at most the number of observations)", ".1f"),
     "mean_cosine": ("Mean pairwise cosine", ".4f"),
 }
 """Measure of a probe's table to what it is and how it is printed."""
@@ -32,6 +41,8 @@ def probes(asked: Asked) -> tuple[Block, ...]:
     """Report state probes: one table per measure and embedding, a column per domain and colours, and a figure."""
     rows, blocks = rows_of(asked, "probe")
     means = [row for row in rows if not row["coordinate"]]
+    if means:
+        blocks.append(held_out(rows))
     drawn = [row for row in means if row["embedding"] == "features" and row["measure"] in DRAWN]
     if drawn:
         blocks.append(_figure(f"{asked.name}-features", drawn))
@@ -41,6 +52,24 @@ def probes(asked: Asked) -> tuple[Block, ...]:
             if part:
                 blocks.append(_table(part, measure, embedding))
     return tuple(blocks)
+
+
+def held_out(rows: Sequence[Row]) -> Paragraph:
+    """Say what R2 was measured on, and from what it was held out."""
+    samples, episodes = (_numbers(rows, column) for column in ("samples", "held_out_episodes"))
+    counts = f": {samples} observations per probe, {episodes} episodes of them held out" if samples else ""
+    return Paragraph(
+        f"R2 is that of held-out episodes{counts}. A mean over coordinates counts a negative one as 0. Episodes are "
+        "held out from the regression: an encoder that learned from a domain's random data may have seen these very "
+        "observations, without their states; one that explored or is untrained has not, and of unseen domains none "
+        "has.",
+        "note",
+    )
+
+
+def _numbers(rows: Sequence[Row], column: str) -> str:
+    known = {at for row in rows if (at := row.number(column)) is not None}
+    return " or ".join(f"{at:,.0f}" for at in sorted(known))
 
 
 def _figure(name: str, rows: Sequence[Row]) -> Figure:

@@ -17,6 +17,13 @@ from crptpro.experiments.score_table import ScoreTable, score_tables
 
 LAST = 10
 """Evaluations at the end that a steadier score averages over."""
+NOT_TOLD_APART = frozenset({
+    "seed", "task", "colors", "device", "precision", "channels_last", "compile", "cuda_graph", "eval_workers",
+    "render_ahead", "features", "video_episodes", "checkpoint_interval_env_steps", "log_interval_env_steps",
+    "eval_interval_env_steps",
+})  # fmt: skip
+"""Settings of a run that do not make it another method's: its seed, where it stands, how and where it computed, when
+it wrote."""
 
 
 class Spot(NamedTuple):
@@ -94,13 +101,42 @@ def _on_base(run: Run, description: Mapping[str, Any]) -> Run:
 
 
 def unplaced_runs(runs: Iterable[Run]) -> list[Placed]:
-    """Give runs that no experiment asked for their own method as label; their group is not known."""
+    """Give runs that no experiment asked for their own method as label; their group is not known.
+
+    Runs of one method on one task are seeds of each other only if they agree in everything else: where they do not,
+    the label of all of the method's runs names what differs, as in ``"crptpro, env_steps 20000"``.
+    """
+    runs = list(runs)
+    settings = {id(run): _settings(run) for run in runs}
+    alike: dict[tuple[str, Spot], list[Run]] = {}
+    for run in runs:
+        alike.setdefault((run.method, _spot(settings[id(run)], run)), []).append(run)
+    differing: dict[str, dict[str, None]] = {}
+    for (method, _), own in alike.items():
+        told = [settings[id(run)] for run in own]
+        for name in dict.fromkeys(name for one in told for name in one):
+            if any(one.get(name) != told[0].get(name) for one in told):
+                differing.setdefault(method, {})[name] = None
     placed = []
     for run in runs:
-        outer = run.config.get("config", {})
-        inner = outer.get("config", outer)
-        placed.append(Placed(run.method, Spot("", run.task, str(inner.get("colors", "normal"))), run))
+        own_settings = settings[id(run)]
+        words = [f"{name} {own_settings.get(name, 'usual')}" for name in differing.get(run.method, ())]
+        placed.append(Placed(", ".join([run.method, *words]), _spot(own_settings, run), run))
     return placed
+
+
+def _spot(settings: Mapping[str, Any], run: Run) -> Spot:
+    return Spot("", run.task, str(settings.get("colors", "normal")))
+
+
+def _settings(run: Run) -> dict[str, Any]:
+    """What a run was told, but for its seed and for how and where it ran; nested settings under dotted names."""
+    outer = run.config.get("config", {})
+    flat: dict[str, Any] = {}
+    for name, value in outer.get("config", outer).items():
+        parts = value.items() if isinstance(value, Mapping) else [("", value)]
+        flat |= {f"{name}.{part}".rstrip("."): content for part, content in parts}
+    return {name: value for name, value in flat.items() if name not in NOT_TOLD_APART}
 
 
 def labels_of(placed: Iterable[Placed]) -> list[str]:

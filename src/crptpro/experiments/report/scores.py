@@ -113,9 +113,10 @@ def _budgets(placed: Sequence[Placed]) -> Paragraph:
     here = " or ".join(f"{budget:,}" for budget in budgets)
     text = (
         f"Runs of {here} env steps here. A second line says how many runs a number stands on; “paper” is what it "
-        f"printed, after {ENV_STEPS:,} env steps (DrQ: {DRQ_ENV_STEPS:,}). It has numbers for CRPTpro, ATC, APT(C), "
-        "Proto-RL(C), BeCL and, on seen domains, DrQ in these tables."
+        f"printed, after {ENV_STEPS:,} env steps (DrQ: {DRQ_ENV_STEPS:,})."
     )
+    if any(p.spot.group for p in placed):
+        text += " It has numbers for CRPTpro, ATC, APT(C), Proto-RL(C), BeCL and, on seen domains, DrQ in these tables."
     if any(budget < ENV_STEPS for budget in budgets):
         text += " Scores of a smaller budget do not compare with the paper's."
     return Paragraph(text, "note")

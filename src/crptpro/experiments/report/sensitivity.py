@@ -50,8 +50,9 @@ def sensitivity(placed: Sequence[Placed], name: str, bootstrap: Bootstrap) -> li
             "", NAMES.get(varied, varied), "mean score / the paper's DrQ", curves, ticks=values
         )
         caption = (
-            f"Mean expert-normalised score against {NAMES.get(varied, varied)}, {bootstrap.confidence:.0%} intervals "
-            "over runs; n counts runs of all values and tasks. Values with different tasks finished do not compare."
+            f"Mean expert-normalised score against {NAMES.get(varied, varied)}, {bootstrap.confidence:.0%} intervals, "
+            "over encoders where a value has several that its runs share, else over runs; n counts runs of all values "
+            "and tasks. Values with different tasks finished do not compare."
         )
         blocks.append(Figure(f"{name}-{varied}", caption, drawing.lines([panel])))
     return blocks
@@ -65,7 +66,13 @@ def _method(placed: Placed) -> str:
 def _estimate(placed: Sequence[Placed], bootstrap: Bootstrap) -> Estimate:
     (table,) = tables_of(placed).values()
     experts = {spot: EXPERT_SCORES[spot.task] for spot in table.scores}
-    return estimate(expert_normalized(table.scores, experts), mean, bootstrap=bootstrap)
+    return estimate(
+        expert_normalized(table.scores, experts),
+        mean,
+        encoders=table.encoders if table.shares_encoders else None,
+        runs=table.runs,
+        bootstrap=bootstrap,
+    )
 
 
 def _size(value: str) -> tuple[float, str]:

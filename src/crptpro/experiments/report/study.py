@@ -21,6 +21,7 @@ from crptpro.experiments.report.each_encoder import each_encoder
 from crptpro.experiments.report.glance import POSITIONS, VELOCITIES, glance, words
 from crptpro.experiments.report.measurements import Row, rows_of
 from crptpro.experiments.report.palette import in_order, styles
+from crptpro.experiments.report.probes import held_out
 from crptpro.experiments.report.reading import Asked, Wanted
 from crptpro.experiments.report.trials import (
     CONTROL,
@@ -43,6 +44,8 @@ def study(asked: Asked) -> tuple[Block, ...]:
     records = records_of(asked)
     ends = last_updates(goal for goal in asked.goals if goal.piece.kind == "probe")
     found = readings(probes)
+    if probes:
+        blocks.append(held_out(probes))
     blocks += glance(found, records, asked.name)
     trials = dict.fromkeys(trial_of(goal) for goal in asked.finished if goal.piece.kind != "run")
     parts = dict.fromkeys((trial.factor, trial.group) for trial in trials)
