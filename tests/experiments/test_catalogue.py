@@ -39,9 +39,9 @@ AT_PAPER_SCALE = {
     "colors": (63, 63, 0, 7, 3),
     # 5 domains x 6 methods x 3 seeds; of the group's domains, quadruped is not among the five.
     "finetune": (90, 90, 0, 2 + 5 + 5 + 5, 6),
-    # 6 tasks x 7 variants x 3 seeds; two variants of two methods and the preset for two groups, two variants of one
-    # method for six domains.
-    "ablation": (126, 126, 0, 10 + 12, 6),
+    # 6 tasks x 5 variants and 2 tasks x 2, x 3 seeds; two variants of two methods and the preset for two groups, two
+    # variants of one method for two domains.
+    "ablation": (102, 102, 0, 10 + 4, 6),
     # 3 tasks x 3 seeds x (2 methods x 5 weights + 3 capacities), of which one is the default both times.
     "sensitivity": (117, 108, 0, 5 + 5 + 2, 9),
     # 8 methods x 3 numbers of domains; each (S) method has three encoders timed, and two sums. No encoder is made.
@@ -60,6 +60,39 @@ AT_PAPER_SCALE = {
 def test_an_experiment_has_as_many_pieces_as_counted_by_hand(name: str, tmp_path: Path) -> None:
     goals = EXPERIMENTS[name].goals(Request(PAPER))
     assert (len(goals), *counted(goals, tmp_path)) == AT_PAPER_SCALE[name]
+
+
+def test_the_ablation_of_a_single_domain_method_has_the_papers_weights_and_env_steps() -> None:
+    def weights_and_env_steps(request: Request) -> dict[str, set[tuple[object, ...]]]:
+        found: dict[str, set[tuple[object, ...]]] = {}
+        for goal in EXPERIMENTS["ablation"].goals(request):
+            encoder = goal.piece.encoder  # type: ignore[attr-defined]
+            weight, env_steps = (
+                dict(given).get(name, "usual")
+                for given, name in ((encoder.loss, "intr_loss_coef"), (encoder.explore, "env_steps"))
+            )
+            found.setdefault(goal.label, set()).add((*encoder.domains, weight, env_steps))
+        return found
+
+    with_dispersion, without = "proto-rl-s with dispersion", "proto-rl-s"
+    assert weights_and_env_steps(Request(PAPER, methods=("proto-rl-s",))) == {
+        with_dispersion: {("cheetah", 1e-3, 200_000), ("hopper", 5e-4, 200_000)},
+        without: {("cheetah", "usual", 200_000), ("hopper", "usual", 200_000)},
+    }
+    asked = weights_and_env_steps(Request(PAPER, methods=("proto-rl-s",), tasks=("walker_run",)))
+    assert asked[with_dispersion] == {("walker", 5e-3, 200_000)}
+    assert weights_and_env_steps(Request(SMALL, methods=("proto-rl-s",), tasks=("walker_run",)))[without] == {
+        ("walker", "usual", 40_000)
+    }
+
+
+def test_what_has_seen_the_task_s_domain_is_not_called_unseen() -> None:
+    methods = ("crptpro", "crptpro-finetune", "proto-rl-s")
+    labels = {
+        name: {goal.label for goal in EXPERIMENTS[name].goals(Request(SMALL, methods=methods))}
+        for name in ("unseen", "colors")
+    }
+    assert labels == {"unseen": {"crptpro"}, "colors": {"crptpro", "proto-rl-s"}}
 
 
 def test_two_levels_of_seeds_multiply(tmp_path: Path) -> None:

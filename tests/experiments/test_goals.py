@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
+from crptpro.domains import Domain, register_domain
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.experiments.budgets import budget
 from crptpro.experiments.goals import (
@@ -152,6 +154,8 @@ def test_a_domains_name_stands_for_its_task() -> None:
     assert Request(PAPER, tasks=("walker", "walker_run", "quadruped_walk", "hopper")).tasks == (
         "walker_run", "quadruped_walk", "hopper_hop",
     )  # fmt: skip
+    spelled = ("manip_reach_duplo", "manipulation_reach_duplo", "reach_duplo", "manip_lift_brick_vision")
+    assert Request(PAPER, tasks=spelled).tasks == ("reach_duplo", "lift_brick")
 
 
 def test_a_users_method_is_another_piece_when_it_is_registered_otherwise(
@@ -170,6 +174,40 @@ def test_a_users_method_is_another_piece_when_it_is_registered_otherwise(
     piece = encoder(SMALL, "atc", A, 0)
     assert isinstance(piece, PretrainedPiece)
     assert piece.definition == ""
+
+
+def stands_for(option: object) -> object:
+    return option
+
+
+def test_a_function_among_a_users_options_is_called_by_its_name_and_never_by_its_address(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
+    register_method("mine", ATCLoss, loss_options={"latent_dim": stands_for})
+    assert f"{__name__}.stands_for" in encoder(SMALL, "mine", A, 0).definition  # type: ignore[attr-defined]
+    register_method("mine", ATCLoss, loss_options={"latent_dim": object()})
+    with pytest.raises(CRPTproError, match="called otherwise in every process"):
+        encoder(SMALL, "mine", A, 0)
+
+
+def test_a_users_domain_is_another_piece_when_it_is_registered_otherwise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("crptpro.domains._registered", {})
+
+    def keys(**options: Any) -> tuple[str, ...]:
+        register_domain(Domain("mine", "mine_task", **{"make": stands_for, **options}))
+        explorer = encoder(SMALL, "proto-rl-s", ("mine",), 0)
+        return dataset(SMALL, "mine", 0).key, explorer.key, run(SMALL, "mine_task", None, 0).key
+
+    first = keys()
+    assert keys() == first
+    bound = {"make": functools.partial(stands_for, option=1)}
+    for changed in (keys(camera=1), keys(action_repeat=4), keys(make=keys), keys(**bound)):
+        assert not set(changed) & set(first)
+    assert keys(**bound) == keys(make=functools.partial(stands_for, option=1))
+    assert dataset(SMALL, "walker", 0).definition == run(SMALL, "walker_run", None, 0).definition == ""
 
 
 @pytest.mark.parametrize("is_single", [False, True])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 from crptpro.colors import Colors
 from crptpro.domains import GROUPS, get_domain
 from crptpro.errors import CRPTproError, UnknownNameError
+from crptpro.experiments.definitions import domain_definition, method_definition
 from crptpro.experiments.pieces import (
     DatasetPiece,
     EncoderPiece,
@@ -91,8 +91,12 @@ class Request:
             if group not in GROUPS:
                 raise UnknownNameError(f"There is no group {group!r}; choose from {', '.join(GROUPS)}.")
         # A domain's name stands for its task: a run called "walker" would be another piece than "walker_run".
+        # So would one that is spelled otherwise, as dm_control's manipulation tasks may be.
         named = [(task, get_domain(task)) for task in self.tasks]
-        tasks = (domain.task if task == domain.name else task for task, domain in named)
+        tasks = (
+            domain.task if task == domain.name or domain.source == "manipulation" else task
+            for task, domain in named
+        )
         object.__setattr__(self, "tasks", tuple(dict.fromkeys(tasks)))
         for name, given in (("encoder_seeds", self.encoder_seeds), ("seeds", self.downstream_seeds)):
             if not given or len(set(given)) != len(given):
@@ -132,7 +136,11 @@ def has_option(method: str, option: str) -> bool:
 def dataset(scale: Scale, domain: str, seed: int, *, transitions: int | None = None) -> DatasetPiece:
     """Return a domain's random dataset."""
     return DatasetPiece(
-        get_domain(domain).name, transitions or scale.transitions, seed, quality=scale.quality
+        get_domain(domain).name,
+        transitions or scale.transitions,
+        seed,
+        quality=scale.quality,
+        definition=domain_definition(domain),
     )
 
 
@@ -144,6 +152,7 @@ def encoder(
     *,
     transitions: int | None = None,
     loss: Settings = (),
+    explore: Settings = (),
 ) -> EncoderPiece:
     """Return the encoder that a method trains on domains.
 
@@ -154,6 +163,7 @@ def encoder(
         seed: of data and training.
         transitions: of each domain, instead of the scale's.
         loss: options of the loss, instead of or besides the scale's.
+        explore: settings of exploring, likewise.
 
     Raises:
         UnknownNameError: if there is no such method.
@@ -163,9 +173,7 @@ def encoder(
         return UntrainedPiece(method, seed)
     registered = get_method(method)
     options = _departures(registered, {**dict(scale.loss_options(registered)), **dict(loss)})
-    definition = (
-        "" if registered.is_builtin else json.dumps(registered.describe(), sort_keys=True, default=repr)
-    )
+    definition = method_definition(registered)
     batch = {} if scale.batch_size is None else {"batch_size": scale.batch_size}
     if registered.exploration is None:
         datasets = tuple(dataset(scale, name, seed, transitions=transitions) for name in names)
@@ -178,11 +186,18 @@ def encoder(
             loss=options,
             definition=definition,
         )
-    explore = {**dict(scale.exploration(registered)), **batch}
+    exploring = {**dict(scale.exploration(registered)), **batch, **dict(explore)}
     if scale.quality != "exact":
-        explore["quality"] = scale.quality
+        exploring["quality"] = scale.quality
+    of_domains = tuple(domain_definition(name) for name in names)
     return ExploredPiece(
-        method, seed, domains=names, explore=settings(**explore), loss=options, definition=definition
+        method,
+        seed,
+        domains=names,
+        explore=settings(**exploring),
+        loss=options,
+        definition=definition,
+        domain_definitions=of_domains if any(of_domains) else (),
     )
 
 
@@ -210,7 +225,14 @@ def finetuned(scale: Scale, base: EncoderPiece, domain: str, seed: int) -> Finet
 
 
 def encoder_for_task(
-    scale: Scale, method: str, domains: Iterable[str], task: str, seed: int, *, loss: Settings = ()
+    scale: Scale,
+    method: str,
+    domains: Iterable[str],
+    task: str,
+    seed: int,
+    *,
+    loss: Settings = (),
+    explore: Settings = (),
 ) -> EncoderPiece | None:
     """Return the encoder that a task of a group is learned on; ``None`` for DrQ, which trains its own.
 
@@ -222,7 +244,7 @@ def encoder_for_task(
         return finetuned(scale, encoder(scale, "crptpro", domains, seed, loss=loss), task, seed)
     if is_single_domain(method):
         domains = (get_domain(task).name,)
-    return encoder(scale, method, domains, seed, loss=loss)
+    return encoder(scale, method, domains, seed, loss=loss, explore=explore)
 
 
 def run(scale: Scale, task: str, on: EncoderPiece | None, seed: int) -> RunPiece:
@@ -230,7 +252,7 @@ def run(scale: Scale, task: str, on: EncoderPiece | None, seed: int) -> RunPiece
     config = {**dict(scale.run), **(dict(scale.drq) if on is None else {})}
     if scale.quality != "exact":
         config["quality"] = scale.quality
-    return RunPiece(task, on, seed, config=settings(**config))
+    return RunPiece(task, on, seed, config=settings(**config), definition=domain_definition(task))
 
 
 def runs(

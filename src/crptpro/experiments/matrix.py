@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from crptpro.domains import GROUPS, get_domain
 from crptpro.experiments.goals import (
@@ -17,6 +17,7 @@ from crptpro.experiments.goals import (
     encoder_for_task,
     has_option,
     in_colors,
+    is_single_domain,
     runs,
 )
 from crptpro.experiments.pieces import EncoderPiece, Settings, settings
@@ -28,13 +29,16 @@ CROSS_DOMAIN = ("crptpro", FAST, "proto-rl-c", "atc", "apt-c", "becl", RANDOM_EN
 DISPERSION = settings(intr_loss_coef=5e-3)
 """CRPTpro's weight of the dispersion loss, for a method that has none of its own."""
 NO_DISPERSION = settings(intr_loss_coef=0.0)
+SINGLE_DISPERSION = {"cheetah": 1e-3, "hopper": 5e-4}
+"""Proto-RL(S)'s weight of the dispersion loss in the paper's ablation, which has these two domains."""
 VARIANTS: dict[str, tuple[tuple[str, Settings], ...]] = {
     "crptpro": (("crptpro", ()), ("crptpro without dispersion", NO_DISPERSION)),
     FAST: ((FAST, ()),),
     "proto-rl-c": (("proto-rl-c with dispersion", DISPERSION), ("proto-rl-c", ())),
     "proto-rl-s": (("proto-rl-s with dispersion", DISPERSION), ("proto-rl-s", ())),
 }
-"""Methods with prototypes, the paper's with and without the dispersion loss: label and options of the loss."""
+"""Methods with prototypes, the paper's with and without the dispersion loss: label and options of the loss. Proto-RL(S)
+has a weight of its own where the paper has: :data:`SINGLE_DISPERSION`."""
 
 
 def seen(request: Request) -> list[Goal]:
@@ -48,13 +52,22 @@ def seen(request: Request) -> list[Goal]:
 
 
 def unseen(request: Request) -> list[Goal]:
-    """Tasks of domains that the encoder never saw (section IV.C)."""
-    return _elsewhere(request, [(row.group, row.task) for row in UNSEEN])
+    """Tasks of domains that the encoder never saw (section IV.C).
+
+    Methods that would be trained on the task's own domain have no place here: fine-tuned encoders, and those of one
+    domain.
+    """
+    rows = [(row.group, row.task) for row in UNSEEN]
+    return _elsewhere(request, rows, lambda method: method == FINETUNE or is_single_domain(method))
 
 
 def colors(request: Request) -> list[Goal]:
-    """Tasks whose background colours are reversed, or whole images if the request says so (section IV.C)."""
-    return in_colors(_elsewhere(request, [(row.group, row.task) for row in COLORS]), request.colors)
+    """Tasks whose background colours are reversed, or whole images if the request says so (section IV.C).
+
+    Nothing is fine-tuned.
+    """
+    rows = [(row.group, row.task) for row in COLORS]
+    return in_colors(_elsewhere(request, rows, lambda method: method == FINETUNE), request.colors)
 
 
 def finetune(request: Request) -> list[Goal]:
@@ -70,14 +83,28 @@ def finetune(request: Request) -> list[Goal]:
 def ablation(request: Request) -> list[Goal]:
     """With and without the dispersion loss, with and without random data (section IV.F).
 
-    Proto-RL(C) with the dispersion loss is CRPTpro without its decoupled collection.
+    Proto-RL(C) with the dispersion loss is CRPTpro without its decoupled collection. Unless tasks are asked for,
+    Proto-RL(S) has the two of the paper's.
     """
     goals = []
     for group in request.groups or ("A", "C"):
         for task in _tasks(request, GROUPS[group]):
             for method in request.chosen(VARIANTS):
-                for label, loss in VARIANTS.get(method, ((method, ()),)):
-                    goals += _cell(request, method, group, task, label=label, loss=loss)
+                goals += _ablated(request, method, group, task)
+    return goals
+
+
+def _ablated(request: Request, method: str, group: str, task: str) -> list[Goal]:
+    explore, weight = (), None
+    if is_single_domain(method):
+        explore, weight = request.scale.single_ablation, SINGLE_DISPERSION.get(get_domain(task).name)
+        if weight is None and not request.tasks:
+            return []
+    goals = []
+    for label, loss in VARIANTS.get(method, ((method, ()),)):
+        if loss == DISPERSION and weight is not None:
+            loss = settings(intr_loss_coef=weight)
+        goals += _cell(request, method, group, task, label=label, loss=loss, explore=explore)
     return goals
 
 
@@ -125,7 +152,7 @@ def _disperses(method: str) -> bool:
     return has_option(method, "intr_loss_coef")
 
 
-def _elsewhere(request: Request, rows: list[tuple[str, str]]) -> list[Goal]:
+def _elsewhere(request: Request, rows: list[tuple[str, str]], left_out: Callable[[str], bool]) -> list[Goal]:
     wanted = [
         (group, task)
         for group, task in rows
@@ -134,7 +161,8 @@ def _elsewhere(request: Request, rows: list[tuple[str, str]]) -> list[Goal]:
     goals = []
     for group, task in wanted:
         for method in request.chosen(CROSS_DOMAIN):
-            goals += _cell(request, method, group, task)
+            if not left_out(method):
+                goals += _cell(request, method, group, task)
     return goals
 
 
@@ -146,13 +174,16 @@ def _cell(
     *,
     label: str | None = None,
     loss: Settings = (),
+    explore: Settings = (),
     transitions: int | None = None,
     **place: str,
 ) -> list[Goal]:
     encoders: dict[int, EncoderPiece | None] = {}
     for seed in request.encoder_seeds:
         if transitions is None:
-            encoders[seed] = encoder_for_task(request.scale, method, GROUPS[group], task, seed, loss=loss)
+            encoders[seed] = encoder_for_task(
+                request.scale, method, GROUPS[group], task, seed, loss=loss, explore=explore
+            )
         else:
             encoders[seed] = encoder(request.scale, method, GROUPS[group], seed, transitions=transitions)
     return runs(request, label or method, task, encoders, group=group, **place)

@@ -118,7 +118,7 @@ def _piece_or_value(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class DatasetPiece(Piece):
-    """Random transitions of one domain; they lie in ``<piece>/<domain>``."""
+    """Random transitions of a domain, in ``<piece>/<domain>``; ``definition`` as for :class:`RunPiece`."""
 
     kind = "dataset"
     domain: str
@@ -126,6 +126,7 @@ class DatasetPiece(Piece):
     seed: int
     quality: Quality = "exact"
     colors: Colors = "normal"
+    definition: str = ""
 
     @property
     def title(self) -> str:
@@ -213,6 +214,7 @@ class ExploredPiece(EncoderPiece):
         explore: settings of :class:`crptpro.training.ActiveConfig`.
         loss: options of the method's loss.
         definition: what a user's own method was registered with, as JSON; empty for those of the library.
+        domain_definitions: the same of each domain; empty if none is the user's own.
     """
 
     kind = "explored"
@@ -220,6 +222,7 @@ class ExploredPiece(EncoderPiece):
     explore: Settings = ()
     loss: Settings = ()
     definition: str = ""
+    domain_definitions: tuple[str, ...] = ()
 
     @property
     def domain_names(self) -> tuple[str, ...]:
@@ -275,6 +278,7 @@ class RunPiece(Piece):
         seed: of this stage, the second of the two seed levels.
         colors: of the task's world.
         config: settings of :class:`crptpro.training.DownstreamConfig` that differ from the algorithm's.
+        definition: what a user's own domain was registered with, as JSON; empty for others.
     """
 
     kind = "run"
@@ -284,6 +288,7 @@ class RunPiece(Piece):
     seed: int
     colors: Colors = "normal"
     config: Settings = ()
+    definition: str = ""
 
     @property
     def title(self) -> str:

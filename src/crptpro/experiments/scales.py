@@ -25,6 +25,7 @@ class Scale:
         loss: options of a method's loss, by method; a variant of a method, which has its loss, takes them too.
         explore: settings of active pre-training, by method; budgets and schedules are in here. An exploring method
             that is not named takes Proto-RL's, with the encoder updates that it makes every time.
+        single_ablation: settings of exploring that an (S) method has in ``ablation``, instead of those in ``explore``.
         finetune_updates: encoder updates of fine-tuning, by domain; others take the largest.
         run: settings of every downstream run.
         drq: settings of DrQ's, besides ``run``.
@@ -47,6 +48,7 @@ class Scale:
     batch_size: int | None = None
     loss: Mapping[str, Settings] = field(default_factory=dict)
     explore: Mapping[str, Settings] = field(default_factory=dict)
+    single_ablation: Settings = (("env_steps", 200_000),)
     finetune_updates: Mapping[str, int] = field(default_factory=lambda: FINETUNE_UPDATES)
     run: Settings = ()
     drq: Settings = ()
@@ -114,6 +116,7 @@ SMALL = Scale(
         settings(env_steps=40_000, random_agent_steps=2_000, checkpoint_interval_env_steps=2_000),
         interval=6,
     ),
+    single_ablation=(),  # its exploring is cut down already
     finetune_updates={domain: updates * 3_000 // 50_000 for domain, updates in FINETUNE_UPDATES.items()},
     run=settings(
         env_steps=20_000,
@@ -150,6 +153,7 @@ TINY = Scale(
         _TINY_EXPLORER,
         interval=2,
     ),
+    single_ablation=(),
     finetune_updates=dict.fromkeys(FINETUNE_UPDATES, 2),
     run=settings(
         env_steps=60,

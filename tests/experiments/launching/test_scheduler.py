@@ -146,6 +146,30 @@ def test_an_explorer_without_its_replays_is_no_finished_piece_to_the_job_that_ex
     assert done_at_start == [False, True]  # the explorer is made again, then what reads it
 
 
+def test_what_another_command_has_finished_since_the_plan_was_made_stays(store: Store) -> None:
+    data = DatasetPiece("walker", 10, 0)
+    encoder = PretrainedPiece("crptpro", 0, (data,), updates=1)
+    plan = plan_of(store, encoder)
+    for piece in (data, encoder):
+        store.describe(piece)
+        write_json(store.path(piece) / DONE, {"seconds": 7.0})
+        for path in store.outputs(piece):
+            path.parent.mkdir(parents=True)
+            path.write_text("made by another")
+
+    class Idle(FakeLauncher):
+        def start(self, work: Work, *, is_exclusive: bool) -> FakeJob:
+            assert store.is_done(store.described(work.key))  # its job finds nothing to do
+            job = super().start(work, is_exclusive=is_exclusive)
+            job.stops = 1  # which the fake takes for: leaves nothing
+            return job
+
+    assert run_pieces(plan, store, JobSettings(), Idle(), jobs=2, poll_s=0.0) == []
+    for piece in (data, encoder):
+        assert store.seconds(piece) == 7.0
+        assert [path.read_text() for path in store.outputs(piece)] == ["made by another"]
+
+
 def test_a_lost_job_is_started_again(store: Store, caplog: pytest.LogCaptureFixture) -> None:
     launcher = FakeLauncher({"p": [LOST, LOST]})
     assert run(store, launcher, FakePiece("p")) == []

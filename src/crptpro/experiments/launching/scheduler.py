@@ -96,9 +96,14 @@ def run_pieces(
     """
     for piece in plan.pieces:
         store.describe(piece)
-    for piece in plan.missing:
-        if store.is_done(piece):  # but not all that a reader needs: its job would find nothing to do
-            store.forget(piece)
+    missing = {piece.key for piece in plan.missing}
+    for reader in plan.missing:
+        for needed in reader.needs:
+            # Finished, but without what this reader needs of it: its job would find nothing to do. What is finished
+            # otherwise was finished by another command since the plan was made.
+            is_lacking = store.is_done(needed) and not store.is_done(needed, for_piece=reader)
+            if needed.key in missing and is_lacking:
+                store.forget(needed)
     scheduler = _Scheduler(plan, store, settings, launcher, jobs, attempts)
     shown = tqdm(total=len(plan.pieces), initial=len(plan.done), desc="pieces", unit="piece", disable=None)
     announcement = "Stopping at the next checkpoints; press Ctrl-C again to stop at once."
