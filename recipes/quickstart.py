@@ -99,7 +99,6 @@ def main(config: Config) -> None:
     if is_reported and read_json(out / "scores.json")["config"] == settings:
         logger.info("Already done: %s. Choose another --out to run again.", out / "report.md")
         return
-    (out / "report.md").unlink(missing_ok=True)
     seed_everything(config.seed)
     get_domain(config.task)  # what is wrong with the last stages ends the recipe here
     learning = DownstreamConfig(
@@ -159,6 +158,7 @@ def main(config: Config) -> None:
     result = train_downstream(config.task, pretrained, run_dir=out / "downstream", config=learning)
 
     # 4. the trained agent against chance, on the same episodes
+    (out / "report.md").unlink(missing_ok=True)  # one of other settings; none stands while this one is made
     logger.info("4/5 evaluate: %d episodes of the agent and of the uniform random policy", config.episodes)
     world = {"seed": config.seed, "action_repeat": config.action_repeat}
     env = make_env(config.task, quality=config.quality, **world)

@@ -12,6 +12,7 @@ import pytest
 from crptpro import doctor
 from crptpro.doctor import check_versions, run_doctor
 from crptpro.envs import gl_process, render_check
+from crptpro.errors import UnknownNameError
 
 ALIVE = {"domain": "cartpole", "reset_ms": 200.0, "agent_step_ms": 15.0, "alive": True, "error": ""}
 PROBE = """import json, os
@@ -111,6 +112,31 @@ def test_dead_pixels_are_not_ok(
     report = run_doctor(["cartpole"])
     assert not report.ok
     assert words in report.text()
+
+
+def test_what_a_world_lacks_is_not_blamed_on_the_backend(monkeypatch: pytest.MonkeyPatch) -> None:
+    failed = {"alive": False, "agent_step_ms": None, "reset_ms": None, "error": "No module named 'pygame'"}
+    for is_drawing in (True, False):
+        entry = {**ALIVE, **failed, "is_drawing": is_drawing}
+        monkeypatch.setattr(render_check, "render_domains", lambda *_, entry=entry: (entry,))
+        assert ("Try another backend" in run_doctor(["cartpole"]).text()) == is_drawing
+
+
+def test_letters_are_domains_and_unknown_names_are_refused_before_anything_is_drawn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = []
+    monkeypatch.setattr(render_check, "render_domains", lambda names, *_: asked.append(names) or ())
+    run_doctor(["D"])
+    assert set(asked) == {("walker", "pendulum", "hopper")}
+    with pytest.raises(UnknownNameError, match="walkr"):
+        run_doctor(["walkr"])
+
+
+def test_a_backend_that_there_is_not_is_an_error_with_its_name() -> None:
+    report = run_doctor(["cartpole"], backends=["vulkan"])
+    assert not report.ok
+    assert "vulkan is not a GL backend" in report.text()
 
 
 def test_a_backend_that_mujoco_gl_names_and_nobody_tried_is_not_ok() -> None:

@@ -7,7 +7,16 @@ import sys
 import pytest
 
 from crptpro import domains
-from crptpro.domains import GROUPS, PAPER_DOMAINS, TASKS, Domain, get_domain, known_names, register_domain
+from crptpro.domains import (
+    GROUPS,
+    PAPER_DOMAINS,
+    TASKS,
+    Domain,
+    expand_groups,
+    get_domain,
+    known_names,
+    register_domain,
+)
 from crptpro.errors import CRPTproError, UnknownNameError
 
 
@@ -91,6 +100,25 @@ def test_a_registered_domain_is_found_by_name_and_by_task() -> None:
     assert "lander" in known_names()
     with pytest.raises(UnknownNameError, match="lander"):
         get_domain("landr")
+
+
+def test_tasks_of_one_own_domain_stay_known_beside_each_other() -> None:
+    soft = register_domain(Domain("lander", "lander_soft", make=make_nothing))
+    hard = register_domain(Domain("lander", "lander_hard", make=make_nothing))
+    assert get_domain("lander_soft") is soft
+    assert get_domain("lander_hard") is get_domain("lander") is hard
+    again = register_domain(Domain("lander", "lander_soft", camera=1, make=make_nothing))
+    assert get_domain("lander_soft") is again
+
+
+def test_letters_stand_for_the_domains_of_their_group() -> None:
+    assert expand_groups(["A", "D", "finger_spin"]) == [
+        "cheetah", "walker", "quadruped", "pendulum", "hopper", "finger_spin",
+    ]  # fmt: skip
+    with pytest.raises(UnknownNameError, match="at least one"):
+        expand_groups([])
+    with pytest.raises(UnknownNameError, match="'E'"):
+        expand_groups(["E"])
 
 
 def test_a_domain_is_its_own_name() -> None:

@@ -14,7 +14,7 @@ import psutil
 from packaging.requirements import Requirement
 
 from crptpro import cards
-from crptpro.domains import PAPER_DOMAINS
+from crptpro.domains import PAPER_DOMAINS, expand_groups
 from crptpro.errors import CRPTproError, RenderingError
 
 #: Outside their declared range these are known to break; others are merely untested.
@@ -102,12 +102,16 @@ def run_doctor(
     """Check versions and hardware, and render every domain with every backend, each in a process of its own.
 
     Args:
-        domains: Names that :func:`crptpro.domains.get_domain` knows; by default the paper's eight domains.
+        domains: Names that :func:`crptpro.domains.get_domain` knows, or letters of the paper's groups; by default the
+            paper's eight domains.
         backends: By default EGL, OSMesa, the one that ``MUJOCO_GL`` names, and GLFW where there is a display.
         root: Where data would be written; its disk is looked at.
         timeout_s: Seconds per backend; by default 60 for the first frame and 20 more for each domain.
+
+    Raises:
+        UnknownNameError: for a domain that nobody knows.
     """
-    names = tuple(domains) if domains is not None else tuple(PAPER_DOMAINS)
+    names = tuple(expand_groups(domains if domains is not None else PAPER_DOMAINS))
     disk = _existing(Path(root))
     free_disk = shutil.disk_usage(disk).free
     free_ram = psutil.virtual_memory().available
@@ -198,9 +202,11 @@ def _check_rendering(
     from crptpro.envs.rendering import default_timeout_s, explain, platform_candidates
 
     requested = canonical_backend(os.environ["MUJOCO_GL"]) if "MUJOCO_GL" in os.environ else None
-    if requested == "off":
+    if requested == "off" or "off" in (backends or ()):
         raise RenderingError("MUJOCO_GL switches rendering off; unset it, or set it to egl or osmesa.")
-    if backends is None:
+    if backends is not None:
+        backends = tuple(map(canonical_backend, backends))
+    else:
         backends = tuple(dict.fromkeys([*([requested] if requested else []), *platform_candidates()]))
     first_frame_s = default_timeout_s() if timeout_s is None else timeout_s
     checks: list[BackendCheck] = []
@@ -251,8 +257,10 @@ def _failed(explanation: str, *, is_requested: bool) -> Finding:
 def _dead(entry: dict[str, Any], backend: str, is_chosen: bool) -> Finding:
     remedy = "" if is_chosen else f"Nothing, as long as MUJOCO_GL={backend} is not set."
     what = f"{entry['domain']} with {backend}: {entry['error'] or 'its pixels are constant or do not change'}"
-    if is_chosen:
+    if is_chosen and entry.get("is_drawing", True):
         remedy = "Try another backend: MUJOCO_GL=osmesa or MUJOCO_GL=egl."
+    elif is_chosen:
+        remedy = "The message says what the world lacks; no other backend would help."
     return Finding("error" if is_chosen else "note", what, remedy)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import logging
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -143,6 +143,9 @@ _registered: dict[str, Domain] = {}
 def register_domain(domain: Domain) -> Domain:
     """Make a domain known by its name and by its task's name, in this process; returns it.
 
+    Further tasks of a domain are registered under its name with their own ``task``: all stay known, and the domain's
+    name stands for the one registered last. A task that is registered again takes the place of the former.
+
     A spawned worker process starts with an empty registry. Either pass the ``Domain`` itself where a name is
     accepted (it is pickled with the job), or call ``register_domain`` at the top level of the module that
     defines ``make``: unpickling ``make`` imports that module, which registers the domain again.
@@ -166,7 +169,8 @@ def register_domain(domain: Domain) -> Domain:
             "Domain %r cannot be sent to worker processes (%s); define its make at a module's top level.",
             domain.name, reason,
         )  # fmt: skip
-    _registered[domain.name] = domain
+    for key in (domain.task, domain.name):
+        _registered[key] = domain
     return domain
 
 
@@ -191,9 +195,6 @@ def get_domain(name: str | Domain) -> Domain:
         return name
     if name in _registered:
         return _registered[name]
-    for domain in _registered.values():
-        if name == domain.task:
-            return domain
     if name in PAPER_DOMAINS:
         return PAPER_DOMAINS[name]
     if name in TASKS:
@@ -213,11 +214,28 @@ def get_domain(name: str | Domain) -> Domain:
     raise UnknownNameError(_unknown(name))
 
 
+def expand_groups(names: Iterable[str]) -> list[str]:
+    """Replace group letters by their domains, keeping order and dropping repeats.
+
+    Raises:
+        UnknownNameError: if no name is given, or one that nobody knows.
+
+    Examples:
+        >>> expand_groups(["D", "walker", "finger"])
+        ['walker', 'pendulum', 'hopper', 'finger']
+    """
+    expanded = [domain for name in names for domain in GROUPS.get(name, (name,))]
+    if not expanded:
+        raise UnknownNameError(f"Name at least one domain, task or group ({', '.join(GROUPS)}).")
+    for name in expanded:
+        get_domain(name)
+    return list(dict.fromkeys(expanded))
+
+
 def known_names() -> list[str]:
     """Return every name :func:`get_domain` accepts, ``gymnasium:<id>`` and prefixed aliases excepted."""
     suite = {task for tasks in SUITE_TASKS.values() for task in tasks}
-    own = {name for domain in _registered.values() for name in (domain.name, domain.task)}
-    return sorted({*PAPER_DOMAINS, *SUITE_TASKS, *suite, *MANIPULATION_TASKS, *own})
+    return sorted({*PAPER_DOMAINS, *SUITE_TASKS, *suite, *MANIPULATION_TASKS, *_registered})
 
 
 def _suite_domain(domain_name: str, task: str) -> Domain:

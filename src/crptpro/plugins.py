@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 from crptpro.errors import CRPTproError
@@ -46,6 +47,16 @@ def load_plugin(name: str) -> None:
     kept = str(path.resolve()) if is_file else name
     if kept not in _loaded:
         _loaded.append(kept)
+
+
+def load_plugins(names: Iterable[str]) -> None:
+    """Load what another process had loaded (:func:`loaded_plugins`) before it started this one.
+
+    Raises:
+        CRPTproError: as of :func:`load_plugin`.
+    """
+    for name in names:
+        load_plugin(name)
 
 
 def loaded_plugins() -> tuple[str, ...]:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -137,7 +138,14 @@ def test_what_the_disk_cannot_hold_is_refused_before_anything_is_written(tmp_pat
 
 def test_two_tasks_of_one_domain_are_not_mixed(tmp_path):
     with pytest.raises(DatasetError, match="Two of the domains"):
-        collect_group([FIXED, FIXED], tmp_path, transitions=5, **SMALL)
+        collect_group([FIXED, replace(FIXED, task="toy_other")], tmp_path, transitions=5, **SMALL)
+
+
+def test_what_two_letters_share_is_collected_once(tmp_path, monkeypatch):
+    letters = {"X": (FIXED,), "Y": (FIXED, VARIABLE)}
+    monkeypatch.setattr("crptpro.data.collect.GROUPS", letters)
+    paths = collect_group(["X", "Y"], tmp_path, transitions=5, **SMALL)
+    assert list(paths) == [FIXED.name, VARIABLE.name]
 
 
 def test_a_domain_name_makes_a_safe_directory(tmp_path):

@@ -12,7 +12,7 @@ from crptpro.data.collect_worker import EpisodeRoller
 from crptpro.data.collection import DomainCollection
 from crptpro.data.drawn_frames import DrawnFrames
 from crptpro.data.redraw import redraw
-from crptpro.domains import Domain, get_domain
+from crptpro.domains import Domain, get_domain, register_domain
 from crptpro.envs import make_env
 from crptpro.errors import DatasetError
 
@@ -89,9 +89,8 @@ def test_frames_that_their_state_does_not_explain_are_refused(tmp_path):
 
 
 def test_worlds_without_a_known_background_say_so(tmp_path, monkeypatch):
-    from crptpro import domains
-
-    monkeypatch.setattr(domains, "_registered", {FIXED.name: FIXED})
+    monkeypatch.setattr("crptpro.domains._registered", {})
+    register_domain(FIXED)
     dataset = collect_here(FIXED, tmp_path, 5)
     with pytest.raises(DatasetError, match="dm_control"):
         redraw(dataset, torch.arange(3), colors="reversed_background")

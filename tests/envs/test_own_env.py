@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from torchrl.envs.transforms import DTypeCastTransform, ExcludeTransform, Permut
 
 from crptpro.data.collect_worker import EpisodeJob, EpisodeRoller
 from crptpro.domains import Domain
-from crptpro.envs import make_env
+from crptpro.envs import make_env, resolve_action_repeat
 from crptpro.envs.pixel_env import PixelEnv
 from crptpro.errors import CRPTproError
 
@@ -48,6 +49,28 @@ def test_other_keys_are_dropped_and_the_physics_state_is_kept_on_request() -> No
     full = make_env(own(make_chw), seed=0, image_size=8, physics_state=True, frame_stack=1)
     assert set(full.observation_spec.keys()) == {"pixels", "qpos", "qvel"}
     check_env_specs(full)
+
+
+def test_what_a_partial_has_bound_is_decided() -> None:
+    given: dict[str, Any] = {}
+
+    def make(image_size: int, action_repeat: int, camera: str) -> EnvBase:
+        given.update(action_repeat=action_repeat, camera=camera)
+        return make_chw(0, image_size)
+
+    domain = own(functools.partial(make, action_repeat=4, camera="side"))
+    make_env(domain, seed=0, image_size=8)
+    assert given == {"action_repeat": 4, "camera": "side"}
+    assert resolve_action_repeat(domain) == 4
+
+
+def test_an_option_that_make_does_not_take_is_said_to_do_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        make_env(own(make_chw), seed=0, image_size=8, action_repeat=1)
+        assert caplog.text == ""
+        make_env(own(make_chw), seed=0, image_size=8, action_repeat=4, quality="fast")
+    assert "a decision is 1 env step(s), not 4" in caplog.text
+    assert "takes no quality" in caplog.text
 
 
 def test_make_is_given_what_its_signature_names() -> None:

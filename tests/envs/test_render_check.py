@@ -8,7 +8,7 @@ import pytest
 
 from crptpro.envs import render_check
 from crptpro.envs.render_check import check_domain, render_domains
-from crptpro.errors import CRPTproError
+from crptpro.errors import CRPTproError, RenderingError
 
 
 def answer(*names: str) -> str:
@@ -47,6 +47,18 @@ def test_a_domain_that_fails_is_reported(
     monkeypatch.setattr(render_check, "make_env", make_env)
     entry = check_domain("walker")
     assert (entry["domain"], entry["alive"], entry["error"]) == ("walker", False, error)
+
+
+def test_a_missing_module_is_not_the_backends_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    reasons = iter(
+        [ModuleNotFoundError("pygame"), CRPTproError("no camera 7"), RenderingError("black"), OSError()]
+    )
+
+    def make_env(*_: Any, **__: Any) -> None:
+        raise next(reasons)
+
+    monkeypatch.setattr(render_check, "make_env", make_env)
+    assert [check_domain("walker")["is_drawing"] for _ in range(4)] == [False, False, True, True]
 
 
 def test_domains_after_one_that_ended_the_process_are_checked_by_another(

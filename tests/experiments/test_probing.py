@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from crptpro.experiments.probing import domains_seen
+import torch
+
+from crptpro.experiments.probing import _untrained_projector, domains_seen
 from crptpro.pretrained import Pretrained, random_pretrained
 
 
@@ -26,3 +28,16 @@ def test_a_fine_tuned_encoder_has_seen_those_of_the_one_it_started_from_too() ->
         "walker",
         "hopper",
     }
+
+
+def test_the_untrained_control_has_a_projector_that_its_seed_decides() -> None:
+    def weights(seed: int) -> torch.Tensor:
+        state = torch.get_rng_state()
+        projector = _untrained_projector(random_pretrained(seed, channels=(4,), strides=(2,), image_size=16))
+        assert torch.equal(torch.get_rng_state(), state)
+        assert not any(parameter.requires_grad for parameter in projector.parameters())
+        return projector.linear.weight
+
+    assert weights(1).shape == (128, 4 * 7 * 7)
+    assert torch.equal(weights(1), weights(1))
+    assert not torch.equal(weights(1), weights(2))

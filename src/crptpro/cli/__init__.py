@@ -20,10 +20,10 @@ from crptpro.cli.pretraining import Finetune, Pretrain
 from crptpro.cli.probe import Probe
 from crptpro.cli.report import Report
 from crptpro.cli.reproduce import Reproduce
-from crptpro.cli.request import expand_groups
 from crptpro.cli.trim import Trim
 from crptpro.colors import Colors
 from crptpro.console import run_main
+from crptpro.domains import expand_groups
 from crptpro.quality import Quality
 
 logger = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ class Doctor:
     """Check that this machine can run crptpro: render every domain, print versions, say what to fix."""
 
     domains: Annotated[tuple[str, ...], arg(help_behavior_hint="(default: the paper's eight)")] = ()
-    """only these domains"""
+    """only these domains, tasks or groups"""
 
     def run(self) -> None:
         """Print the report; exit status 1 unless a run would work."""

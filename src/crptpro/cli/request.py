@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from crptpro.domains import GROUPS, GYMNASIUM_PREFIX, PAPER_DOMAINS, TASKS, get_domain, known_names
-from crptpro.errors import CRPTproError, DatasetError, UnknownNameError
+from crptpro.domains import GROUPS, GYMNASIUM_PREFIX, PAPER_DOMAINS, TASKS, expand_groups, known_names
+from crptpro.errors import CRPTproError, DatasetError
 from crptpro.loggers import RunLogger, WandbOptions
 
 
@@ -37,20 +37,6 @@ class Logging:
                 project=self.wandb_project, group=self.wandb_group, tags=self.wandb_tags, mode=self.wandb
             )
         return RunLogger(run_dir, config=config, wandb=options, tensorboard=self.tensorboard)
-
-
-def expand_groups(names: Sequence[str]) -> list[str]:
-    """Replace group letters by their domains, keeping order and dropping repeats.
-
-    Raises:
-        UnknownNameError: if no name is given, or one that nobody knows.
-    """
-    expanded = [domain for name in names for domain in GROUPS.get(name, (name,))]
-    if not expanded:
-        raise UnknownNameError(f"Name at least one domain, task or group ({', '.join(GROUPS)}).")
-    for name in expanded:
-        get_domain(name)
-    return list(dict.fromkeys(expanded))
 
 
 def explored_domains(names: Sequence[str], method: str) -> list[str]:

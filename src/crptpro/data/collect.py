@@ -18,7 +18,7 @@ from crptpro.data.collect_pool import Worker, WorkerPool
 from crptpro.data.collect_progress import CollectProgress
 from crptpro.data.collection import DomainCollection
 from crptpro.data.incoming import dataset_path
-from crptpro.domains import Domain, get_domain
+from crptpro.domains import GROUPS, Domain, get_domain
 from crptpro.errors import DatasetError
 from crptpro.quality import Quality
 from crptpro.seeding import require_seed
@@ -92,7 +92,8 @@ def collect_group(
     The environments live in spawned processes, so a script needs the usual ``if __name__ == "__main__":``.
 
     Args:
-        domains: Domain names, task names, ``gymnasium:<id>``, or :class:`~crptpro.domains.Domain` objects.
+        domains: Domain names, task names, letters of the paper's groups, ``gymnasium:<id>``, or
+            :class:`~crptpro.domains.Domain` objects.
         root: A directory ``root/<domain name>`` is made for each domain.
         transitions: Transitions per domain (agent steps; 21 KB each at 84 x 84).
         seed: See above.
@@ -128,7 +129,7 @@ def collect_group(
     factories: dict[str, Callable[[], EnvBase]] = {}
     with ExitStack() as stack:
         collections: dict[str, DomainCollection] = {}
-        for domain in map(get_domain, domains):
+        for domain in map(get_domain, _expanded(domains)):
             path = dataset_path(root, domain.name)
             if path in paths.values():
                 raise DatasetError(f"Two of the domains would be collected into {path}; collect them apart.")
@@ -160,6 +161,12 @@ def collect_group(
                 select_backend(processes=workers)
             _run(missing, factories, workers, stall_timeout_s, progress)
     return paths
+
+
+def _expanded(domains: Iterable[str | Domain]) -> list[str | Domain]:
+    """Replace group letters by their domains; a domain that two groups have is collected once."""
+    names = [(domain,) if isinstance(domain, Domain) else GROUPS.get(domain, (domain,)) for domain in domains]
+    return list(dict.fromkeys(name for several in names for name in several))
 
 
 def _announce(collections: dict[str, DomainCollection], root: Path) -> None:

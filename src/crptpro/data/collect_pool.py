@@ -18,6 +18,7 @@ from torchrl.envs import EnvBase
 
 from crptpro.data.collect_worker import EpisodeJob, worker_main
 from crptpro.errors import CRPTproError, RenderingError, error_named
+from crptpro.plugins import loaded_plugins
 from crptpro.suspension import SuspensionWatch
 
 logger = logging.getLogger(__name__)
@@ -67,7 +68,10 @@ class WorkerPool:
             for index in range(workers):
                 ours, theirs = context.Pipe()
                 process = context.Process(
-                    target=worker_main, args=(theirs, factories), name=f"collect-{index}", daemon=True
+                    target=worker_main,
+                    args=(theirs, factories, loaded_plugins()),
+                    name=f"collect-{index}",
+                    daemon=True,
                 )
                 with _interrupts_ignored():
                     process.start()

@@ -22,6 +22,7 @@ from torchrl.modules import RandomPolicy
 
 from crptpro.data.episode import Episode
 from crptpro.errors import error_name
+from crptpro.plugins import load_plugins
 
 HEARTBEAT_S = 1.0
 POLLING = 25
@@ -160,8 +161,17 @@ def episode_from_rollout(rollout: TensorDictBase, *, is_cut: bool = False) -> Ep
     )
 
 
-def worker_main(connection: Connection, factories: dict[str, Callable[[], EnvBase]]) -> None:
-    """Serve jobs until told to stop. Messages back: (kind, domain, payload), see ``WorkerPool``."""
+def worker_main(
+    connection: Connection, factories: dict[str, Callable[[], EnvBase]], plugins: tuple[str, ...] = ()
+) -> None:
+    """Serve jobs until told to stop. Messages back: (kind, domain, payload), see ``WorkerPool``.
+
+    Args:
+        connection: to the parent.
+        factories: of environments, by domain.
+        plugins: that the parent has loaded: what they register in other libraries, a world of Gymnasium's say, has no
+            name in this process yet.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
     # One software-rendering thread per process is faster than several; it must be set before GL loads.
     os.environ.setdefault("LP_NUM_THREADS", "1")
@@ -170,6 +180,7 @@ def worker_main(connection: Connection, factories: dict[str, Callable[[], EnvBas
     roller: EpisodeRoller | None = None
     domain = ""
     try:
+        load_plugins(plugins)
         while (job := connection.recv()) is not None:
             if not isinstance(job, EpisodeJob):
                 continue  # a cancellation that arrived after its episode had ended

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 from torchrl.envs import CatFrames, EnvBase
@@ -11,12 +12,14 @@ from crptpro.domains import GYMNASIUM_PREFIX, LONGEST_EPISODE_AGENT_STEPS, Domai
 from crptpro.envs.dm_stack import FAST_SHADOW_SIZE, DmControlSimulator, SceneCamera, load_dm_env
 from crptpro.envs.episode_limit import EpisodeLimit
 from crptpro.envs.gymnasium_env import GymnasiumSimulator
-from crptpro.envs.own_env import make_own_env, repeats_actions, with_transform
+from crptpro.envs.own_env import fixed_action_repeat, make_own_env, repeats_actions, with_transform
 from crptpro.envs.pixel_env import PixelEnv
 from crptpro.envs.rendering import backend_card, first_frame_watchdog, select_backend
 from crptpro.errors import CRPTproError
 from crptpro.quality import QUALITIES, Quality
 from crptpro.seeding import require_seed
+
+logger = logging.getLogger(__name__)
 
 
 def make_env(
@@ -98,7 +101,10 @@ def make_env(
 
 
 def resolve_action_repeat(task: str | Domain, action_repeat: int | None = None) -> int:
-    """Return the env steps of one agent step: as asked, or the domain's; 1 if your own world repeats nothing.
+    """Return the env steps of one agent step: as asked, or the domain's.
+
+    A world of your own whose ``make`` takes no ``action_repeat`` has 1, or what a ``partial`` of it binds; asked for
+    another number, it warns.
 
     Raises:
         CRPTproError: asked for less than one.
@@ -107,7 +113,13 @@ def resolve_action_repeat(task: str | Domain, action_repeat: int | None = None) 
         _require_count("action_repeat", action_repeat)
     domain = get_domain(task)
     if domain.source == "own" and not repeats_actions(domain):
-        return 1
+        fixed = fixed_action_repeat(domain)
+        if action_repeat not in (None, fixed):
+            logger.warning(
+                "The make of domain %r takes no action_repeat: a decision is %d env step(s), not %d.",
+                domain.name, fixed, action_repeat,
+            )  # fmt: skip
+        return fixed
     return domain.action_repeat if action_repeat is None else action_repeat
 
 

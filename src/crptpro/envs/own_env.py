@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
+import logging
 from typing import Any
 
 import torch
@@ -13,6 +15,8 @@ from torchrl.envs.transforms import SelectTransform
 
 from crptpro.domains import Domain
 from crptpro.errors import CRPTproError
+
+logger = logging.getLogger(__name__)
 
 _OFFERED = ("seed", "image_size", "action_repeat", "camera", "quality", "physics_state")
 
@@ -45,7 +49,13 @@ def make_own_env(domain: Domain, **settings: Any) -> EnvBase:
     make = domain.make
     if make is None:
         raise CRPTproError(f"Domain {domain.name!r} has no make, the function that builds its environment.")
-    env = make(**_accepted(make, settings))
+    accepted = _accepted(make, settings)
+    if settings.get("quality", "exact") != "exact" and "quality" not in accepted:
+        logger.warning(
+            "The make of domain %r takes no quality: it draws as ever, not with quality=%r.",
+            domain.name, settings["quality"],
+        )  # fmt: skip
+    env = make(**accepted)
     layout = _check(domain, env, image_size=settings["image_size"])
     state = ("qpos", "qvel") if settings["physics_state"] else ()
     kept = [key for key in ("pixels", *state) if key in env.observation_spec.keys(True, True)]
@@ -74,14 +84,28 @@ def with_transform(env: EnvBase, transform: Transform) -> EnvBase:
 
 
 def repeats_actions(domain: Domain) -> bool:
-    """Whether the domain's ``make`` takes ``action_repeat``; otherwise an agent step is an env step."""
+    """Whether the domain's ``make`` takes ``action_repeat``; otherwise its agent steps are of one length."""
     return domain.make is None or "action_repeat" in _accepted(domain.make, dict.fromkeys(_OFFERED))
 
 
+def fixed_action_repeat(domain: Domain) -> int:
+    """Return the env steps of an agent step where ``make`` does not ask: what a ``partial`` of it binds, or 1."""
+    return int(_bound(domain.make).get("action_repeat", 1))
+
+
+def _bound(make: Any) -> dict[str, Any]:
+    return make.keywords if isinstance(make, functools.partial) else {}
+
+
 def _accepted(make: Any, settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings that ``make`` names; what a ``partial`` has bound is decided and not asked for again."""
     parameters = inspect.signature(make).parameters
     takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
-    return {name: settings[name] for name in _OFFERED if takes_all or name in parameters}
+    return {
+        name: settings[name]
+        for name in _OFFERED
+        if (takes_all or name in parameters) and name not in _bound(make)
+    }
 
 
 def _check(domain: Domain, env: Any, *, image_size: int) -> str:

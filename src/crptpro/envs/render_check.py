@@ -11,12 +11,17 @@ import sys
 import time
 from typing import Any
 
+import gymnasium
+
 from crptpro.envs.factory import make_env
 from crptpro.envs.gl_process import run_isolated
-from crptpro.errors import CRPTproError
+from crptpro.errors import CRPTproError, RenderingError
+from crptpro.plugins import FLAG, load_plugin, loaded_plugins
 
 WARM_UP_AGENT_STEPS = 2
 TIMED_AGENT_STEPS = 6
+_NO_FAULT = (ModuleNotFoundError, gymnasium.error.DependencyNotInstalled)
+"""What a world lacks, whatever draws it."""
 
 
 def check_domain(name: str) -> dict[str, Any]:
@@ -25,7 +30,8 @@ def check_domain(name: str) -> dict[str, Any]:
     Returns:
         ``domain``; ``reset_ms`` (the first reset, which makes the render context) and ``agent_step_ms``
         (physics and one image), wall-clock milliseconds; ``alive``: the images have content and change when
-        the world is stepped; ``error``: why they could not be had, otherwise empty.
+        the world is stepped; ``error``: why they could not be had, otherwise empty; ``is_drawing``: what is wrong,
+        if anything, may be the fault of the backend.
     """
     try:
         env = make_env(name, seed=0, frame_stack=1)
@@ -41,9 +47,9 @@ def check_domain(name: str) -> dict[str, Any]:
         finally:
             env.close()
     except CRPTproError as reason:
-        return _dead(name, str(reason))
+        return _dead(name, str(reason), is_drawing=isinstance(reason, RenderingError))
     except Exception as reason:  # whatever one domain does, those that follow are checked too
-        return _dead(name, f"{type(reason).__name__}: {reason}")
+        return _dead(name, f"{type(reason).__name__}: {reason}", is_drawing=not isinstance(reason, _NO_FAULT))
     has_content = first["pixels"].unique().numel() > 1
     has_changed = not first["pixels"].equal(last["pixels"])
     return {
@@ -52,6 +58,7 @@ def check_domain(name: str) -> dict[str, Any]:
         "agent_step_ms": round(agent_step_s * 1e3, 2),
         "alive": has_content and has_changed,
         "error": "",
+        "is_drawing": True,
     }
 
 
@@ -69,7 +76,8 @@ def render_domains(names: tuple[str, ...], backend: str, timeout_s: float) -> tu
     entries: list[dict[str, Any]] = []
     deadline = time.monotonic() + timeout_s
     while len(entries) < len(names):
-        command = (sys.executable, "-m", "crptpro.envs.render_check", *names[len(entries) :])
+        plugins = [part for name in loaded_plugins() for part in (FLAG, name)]
+        command = (sys.executable, "-m", "crptpro.envs.render_check", *plugins, *names[len(entries) :])
         left_s = max(0.0, deadline - time.monotonic())
         ((returncode, stdout, stderr),) = run_isolated([command], backend, timeout_s=left_s)
         lines = stdout.splitlines()
@@ -83,11 +91,22 @@ def render_domains(names: tuple[str, ...], backend: str, timeout_s: float) -> tu
     return tuple(entries)
 
 
-def _dead(name: str, error: str) -> dict[str, Any]:
-    return {"domain": name, "reset_ms": None, "agent_step_ms": None, "alive": False, "error": error}
+def _dead(name: str, error: str, *, is_drawing: bool = True) -> dict[str, Any]:
+    return {
+        "domain": name,
+        "reset_ms": None,
+        "agent_step_ms": None,
+        "alive": False,
+        "error": error,
+        "is_drawing": is_drawing,
+    }
 
 
 if __name__ == "__main__":
-    for domain_name in sys.argv[1:]:
+    arguments = sys.argv[1:]
+    while arguments[:1] == [FLAG]:
+        load_plugin(arguments[1])
+        arguments = arguments[2:]
+    for domain_name in arguments:
         sys.stdout.write(json.dumps(check_domain(domain_name)) + "\n")
         sys.stdout.flush()

@@ -6,12 +6,18 @@ import logging
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import torch
+
 from crptpro.analysis.coordinates import joints_of
 from crptpro.analysis.probe import ProbeResult, probe, probe_samples
 from crptpro.colors import Colors
 from crptpro.data import FrameDataset
 from crptpro.data.drawn_frames import DrawnFrames
+from crptpro.experiments.goals import RANDOM_ENCODER
+from crptpro.modules import Projector
+from crptpro.modules.placement import device_of
 from crptpro.pretrained import Pretrained
+from crptpro.seeding import derive_seed
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +53,8 @@ def probe_rows(
     """Probe an encoder on a dataset in some colours.
 
     Args:
-        pretrained: whose features, and projections if it has a projector, are read, where it lives.
+        pretrained: whose features, and projections if it has a projector, are read, where it lives. The untrained
+            control is given an untrained projector, so that z has one too.
         dataset: with physical state.
         encoder: what the encoder is called in the rows.
         colors: in which the observations are drawn, whatever the dataset's own.
@@ -77,13 +84,25 @@ def probe_rows(
     }
     counts = {"samples": len(observed.pixels), "held_out_episodes": observed.held_out_episodes, "seed": seed}
     found = ProbeRows([], [])
-    for embedding, result in probe(observed, pretrained.encoder, pretrained.projector).items():
+    projector = pretrained.projector
+    if pretrained.method == RANDOM_ENCODER:
+        projector = _untrained_projector(pretrained)
+    for embedding, result in probe(observed, pretrained.encoder, projector).items():
         named = {**about, "embedding": embedding}
         found.table.append(_table_row(named, result))
         found.measures.extend({**named, **measure, **counts} for measure in _measures(result))
         if result.left_out:
             logger.info("%s: left out as constant: %s", dataset.domain, ", ".join(result.left_out))
     return found
+
+
+def _untrained_projector(pretrained: Pretrained) -> Projector:
+    """A projector at its initialisation, which the encoder's seed decides."""
+    seed = derive_seed(int(pretrained.card.get("seed", 0)), "untrained_projector")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        projector = Projector(pretrained.encoder.feature_dim)
+    return projector.requires_grad_(False).eval().to(device_of(pretrained.encoder) or "cpu")
 
 
 def domains_seen(pretrained: Pretrained) -> set[str]:

@@ -24,6 +24,7 @@ from torchrl.envs import EnvBase
 from crptpro.errors import CRPTproError, RenderingError, error_named
 from crptpro.modules import resolve_precision, set_compute_dtype
 from crptpro.modules.placement import device_of
+from crptpro.plugins import loaded_plugins
 from crptpro.suspension import SuspensionWatch
 from crptpro.training.agent import PixelAgent
 from crptpro.training.evaluate import Episode, episode_seed
@@ -166,6 +167,7 @@ class EvaluationPool:
                 theirs.close()
             worker = _Worker(process, ours)
             self._workers.append(worker)
+        self._send(worker, loaded_plugins())
         self._send(worker, self._make_env)
 
     def _receive(self) -> dict[int, tuple[Episode, Tensor | None]]:

@@ -23,6 +23,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from crptpro.errors import error_name
+from crptpro.plugins import load_plugins
 from crptpro.training.evaluate import Policy, run_episode
 
 HEARTBEAT_S = 1.0
@@ -75,13 +76,14 @@ def receive(connection: Connection) -> Any:
 
 
 def serve(connection: Connection) -> None:
-    """Receive the environment's factory, then jobs until the other end closes.
+    """Receive the parent's plugins, the environment's factory, then jobs until the other end closes.
 
     Messages back: ``("alive", None)`` about once a second, ``("episode", (Episode, pictures or None))``, and
     ``("error", (name of our error or "", message, traceback))`` as the last one.
     """
     env: EnvBase | None = None
     try:
+        load_plugins(receive(connection))
         make_env: Callable[[], EnvBase] = receive(connection)
         while True:
             job: EvaluationJob = receive(connection)
