@@ -148,7 +148,7 @@ def make_launcher(
 
         return LocalLauncher(resources.gpus)
     if name == "slurm":
-        from crptpro.experiments.launching.submitted import SlurmLauncher
+        from crptpro.experiments.launching.slurm import SlurmLauncher
 
         return SlurmLauncher(slurm_parameters(slurm or SlurmRequest(), has_gpu=has_gpu))
     from crptpro.experiments.launching.ray_cluster import RayLauncher

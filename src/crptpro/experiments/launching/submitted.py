@@ -1,4 +1,4 @@
-"""Jobs through submitit: processes of this machine, or a Slurm cluster; what they run is the same."""
+"""Jobs through submitit, wherever they run, and those that are processes of this machine."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import contextlib
 import os
 import shutil
 import signal
-import subprocess
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
@@ -24,8 +23,6 @@ FOLDER = "jobs"
 """Below ROOT: what submitit keeps of a job while it runs."""
 
 ENDLESS_MINUTES = 60 * 24 * 365
-MAX_REQUEUES = 1_000
-"""How often a Slurm job goes on after its time was up. Each time it has got further."""
 
 
 @dataclass(frozen=True)
@@ -106,15 +103,8 @@ class SubmittedJob:
 
     def stop(self) -> None:
         """Pass SIGTERM on; the stages write a checkpoint when it arrives, and leave at once at the second."""
-        process = getattr(self.job, "_process", None)
         with contextlib.suppress(OSError):
-            if process is not None:
-                process.send_signal(signal.SIGTERM)  # submitit's controller hands it to the job
-            elif self.is_asked_to_stop:
-                subprocess.call(["scancel", self.job.job_id])
-            else:
-                subprocess.call(["scancel", "--state=PENDING", self.job.job_id])
-                subprocess.call(["scancel", "--signal=TERM", self.job.job_id])
+            self.job._process.send_signal(signal.SIGTERM)  # submitit's controller hands it to the job
         self.is_asked_to_stop = True
 
 
@@ -145,7 +135,7 @@ class LocalLauncher:
         if self.gpus:
             seen = min(self.gpus, key=lambda gpu: sum(job.work.gpus == gpu for job in self._jobs))
         work = Work(work.root, work.key, work.settings, gpus=seen)
-        folder = _new_folder(work)
+        folder = new_folder(work)
         executor = LocalExecutor(folder)
         executor.update_parameters(timeout_min=ENDLESS_MINUTES)
         with _environment_of_jobs(work.settings.threads):
@@ -153,58 +143,6 @@ class LocalLauncher:
         submitted._results_timeout_s = 0  # the result is on this machine's disk when the process has ended
         self._jobs.append(SubmittedJob(submitted, folder, work))
         return self._jobs[-1]
-
-    def close(self) -> None:
-        """Nothing is held."""
-
-
-class SlurmLauncher:
-    """A Slurm cluster, whose nodes share ROOT and the environment of this process.
-
-    Args:
-        parameters: of submitit's executor: ``partition``, ``time`` (minutes), ``mem``, ``gpus_per_node``, ...
-
-    Raises:
-        CRPTproError: without submitit, or where there is no Slurm.
-    """
-
-    is_one_machine = False
-
-    def __init__(self, parameters: dict[str, Any]) -> None:
-        require_submitit("slurm")
-        if shutil.which("srun") is None or shutil.which("sbatch") is None:
-            raise CRPTproError(
-                "--launcher slurm needs sbatch and srun, which are not here: call it on a login node of the cluster, "
-                "or choose --launcher local."
-            )
-        self.parameters = parameters
-
-    def start(self, work: Work, *, is_exclusive: bool) -> SubmittedJob:
-        """Queue a job; an exclusive one asks for a node of its own."""
-        from submitit.slurm.slurm import SlurmExecutor
-
-        folder = _new_folder(work)
-        executor = SlurmExecutor(folder, max_num_timeout=MAX_REQUEUES)
-        threads = str(work.settings.threads)
-        parameters = {
-            "job_name": work.key,
-            "cpus_per_task": work.settings.threads,
-            "setup": [f"export {name}={threads}" for name in THREAD_VARIABLES],
-            **self.parameters,
-        }
-        if is_exclusive:
-            parameters["exclusive"] = True
-        executor.update_parameters(**parameters)
-        try:
-            submitted: Any = executor.submit(SubmittedWork(work))
-        except Exception as reason:
-            if type(reason).__name__ != "FailedJobError":
-                raise
-            said = (str(reason).strip().splitlines() or ["it gave no reason"])[-1]
-            raise CRPTproError(
-                f"sbatch refused a job: {said} Change --partition, --hours or --sbatch."
-            ) from reason
-        return SubmittedJob(submitted, folder, work)
 
     def close(self) -> None:
         """Nothing is held."""
@@ -225,7 +163,7 @@ def require_submitit(launcher: str) -> None:
         ) from None
 
 
-def _new_folder(work: Work) -> Path:
+def new_folder(work: Work) -> Path:
     """A directory for one submission: submitit names its files by process ids, which come again."""
     parent = Path(work.root) / FOLDER
     parent.mkdir(parents=True, exist_ok=True)
