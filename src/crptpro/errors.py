@@ -39,6 +39,10 @@ class NonFiniteError(CRPTproError):
     """A loss or a gradient became NaN or infinite."""
 
 
+class SubmissionError(CRPTproError):
+    """A cluster's queue refused a job, which it may take another time."""
+
+
 class CompileError(CRPTproError):
     """``torch.compile`` was asked for and does not work on this machine, or not for this loss."""
 

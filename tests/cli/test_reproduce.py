@@ -16,8 +16,11 @@ import pytest
 from command import Call, refused
 
 import crptpro
+from crptpro.errors import CRPTproError
 from crptpro.experiments.catalogue import EXPERIMENTS
 from crptpro.experiments.goals import Goal, Request
+from crptpro.experiments.launching import Failure
+from crptpro.experiments.plan import Plan
 
 MAIN = "from crptpro.cli import main; main()"
 FAKE_EXPERIMENT = Path(__file__).parents[1] / "experiments" / "launching" / "fake_experiment.py"
@@ -132,6 +135,22 @@ def test_without_the_extra_nothing_is_written(
     assert "downstream runs" in out
     assert "pip install 'crptpro[ray]'" in err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_failures_are_listed_also_where_an_error_ends_the_command(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ended(plan: Plan, *_: object, failures: list[Failure], **__: object) -> None:
+        failures.append(Failure(plan.missing[0], "it will never do", tmp_path / "log.txt", 1))
+        raise CRPTproError("There is no queue any more.")
+
+    monkeypatch.setattr("crptpro.experiments.launching.run_pieces", ended)
+    options = ("--scale", "tiny", "--groups", "A", "--launcher", "inline", "--out", tmp_path / "root")
+    status, out, err = call("reproduce", "seen", *options)
+    assert status == 1
+    assert "1 failed:" in out
+    assert "it will never do" in out
+    assert "There is no queue any more." in err
 
 
 def test_a_plan_that_the_disk_cannot_hold_is_refused(

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 if TYPE_CHECKING:
     from crptpro.experiments.goals import Goal, Request
-    from crptpro.experiments.launching import Launcher, Resources, SlurmRequest
+    from crptpro.experiments.launching import Failure, Launcher, Resources, SlurmRequest
 
 ALL = "all"
 _ITS_OWN = arg(help_behavior_hint="(default: the experiment's)")
@@ -129,14 +129,17 @@ class Reproduce:
             write_request(store, name, request, goals)
         if launcher is not None:
             settings = resources.job_settings(self.device, loaded_plugins())
+            failures: list[Failure] = []
             try:
-                failures = run_pieces(
-                    plan, store, settings, launcher, jobs=resources.jobs, attempts=self.attempts
-                )
+                run_pieces(
+                    plan, store, settings, launcher,
+                    jobs=resources.jobs, attempts=self.attempts, failures=failures,
+                )  # fmt: skip
             finally:
                 launcher.close()
+                if failures:  # also where Ctrl-C or an error ended it
+                    print(failures_text(failures), flush=True)
             if failures:
-                print(failures_text(failures), flush=True)
                 raise SystemExit(1)
         print(f"\nAll of it is there. Tables and figures: crptpro report {self.out}", flush=True)
 

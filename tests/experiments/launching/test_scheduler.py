@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_pieces import ExclusivePiece, FakePiece, plan_of
 
 from crptpro.cards import write_json
+from crptpro.errors import SubmissionError
 from crptpro.experiments.building import JobSettings
 from crptpro.experiments.launching import Failure, Outcome, Work, run_pieces
 from crptpro.experiments.measurements import CoveragePiece
@@ -77,7 +80,7 @@ class FakeLauncher:
 
 
 def run(
-    store: Store, launcher: FakeLauncher, *pieces: FakePiece, jobs: int = 2, **options: int
+    store: Store, launcher: FakeLauncher, *pieces: FakePiece, jobs: int = 2, **options: Any
 ) -> list[Failure]:
     plan = plan_of(store, *pieces)
     return run_pieces(plan, store, JobSettings(), launcher, jobs=jobs, poll_s=0.0, **options)
@@ -303,3 +306,57 @@ def test_jobs_are_stopped_when_the_scheduler_itself_fails(store: Store) -> None:
     with pytest.raises(OSError, match="no space"):
         run(store, launcher, FakePiece("a"), FakePiece("b"))
     assert launcher.jobs[0].stops == 1
+
+
+def test_what_has_failed_is_known_also_where_an_error_ends_the_rest(store: Store) -> None:
+    class Full(FakeLauncher):
+        def start(self, work: Work, *, is_exclusive: bool) -> FakeJob:
+            if self.jobs:
+                raise OSError("no space left")
+            return super().start(work, is_exclusive=is_exclusive)
+
+    bad = FakePiece("bad")
+    failures: list[Failure] = []
+    plan = plan_of(store, bad, FakePiece("encoder", (bad,)), FakePiece("good"))
+    with pytest.raises(OSError, match="no space"):
+        run_pieces(plan, store, JobSettings(), Full({"bad": [REFUSED]}), poll_s=0.0, failures=failures)
+    assert [(f.piece.title, f.is_skipped) for f in failures] == [("bad", False), ("encoder", True)]
+
+
+@dataclass
+class Queue(FakeLauncher):
+    """Refuses the jobs that it is told to, by their number."""
+
+    refuses: tuple[int, ...] = ()
+    asked: int = 0
+
+    def start(self, work: Work, *, is_exclusive: bool) -> FakeJob:
+        self.asked += 1
+        if self.asked in self.refuses:
+            raise SubmissionError("sbatch refused a job: the queue is full.")
+        return super().start(work, is_exclusive=is_exclusive)
+
+
+def test_a_piece_that_the_queue_refuses_for_a_while_waits_and_no_attempt_is_counted(
+    store: Store, caplog: pytest.LogCaptureFixture
+) -> None:
+    queue = Queue({"b": [LOST]}, refuses=(2, 3, 5))
+    pieces = [FakePiece("a"), FakePiece("b"), FakePiece("c")]
+    assert run(store, queue, *pieces, attempts=2, refused_s=0) == []
+    assert all(store.is_done(piece) for piece in pieces)
+    assert caplog.text.count("the queue is full") == 1
+
+
+def test_a_queue_that_refused_a_job_is_left_alone_for_a_while(store: Store) -> None:
+    queue = Queue(refuses=(2,))
+    began = time.monotonic()
+    assert run(store, queue, FakePiece("a"), FakePiece("b"), refused_s=0.3) == []
+    assert time.monotonic() - began >= 0.3
+    assert queue.asked == 3
+
+
+def test_a_queue_that_refuses_the_first_job_ends_it(store: Store) -> None:
+    queue = Queue(refuses=(1,))
+    with pytest.raises(SubmissionError, match="the queue is full"):
+        run(store, queue, FakePiece("a"), FakePiece("b"))
+    assert queue.asked == 1

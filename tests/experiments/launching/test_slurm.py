@@ -13,10 +13,11 @@ from pathlib import Path
 import pytest
 from fake_pieces import PLUGIN, FakePiece, attempts, counted, plan_of
 
-from crptpro.errors import CRPTproError
+from crptpro.errors import CRPTproError, SubmissionError
 from crptpro.experiments.building import JobSettings
 from crptpro.experiments.launching import Launcher, SlurmRequest, Work, divide, make_launcher, run_pieces
 from crptpro.experiments.launching.slurm import SlurmLauncher
+from crptpro.experiments.launching.submitted import FOLDER
 from crptpro.experiments.store import Store
 
 SETTINGS = JobSettings(plugins=(PLUGIN,))
@@ -146,8 +147,9 @@ def test_what_sbatch_refuses_is_said_in_a_line(store: Store, slurm: Path) -> Non
     (slurm.parent / "bin" / "sbatch").write_text(
         "#!/bin/bash\necho 'sbatch: error: invalid partition specified: shrt' >&2\nexit 1\n"
     )
-    with pytest.raises(CRPTproError, match=r"invalid partition specified: shrt.*--partition"):
+    with pytest.raises(SubmissionError, match=r"invalid partition specified: shrt.*--partition"):
         slurm_launcher(partition="shrt").start(Work(str(store.root), "p", SETTINGS), is_exclusive=False)
+    assert not list((store.root / FOLDER).iterdir())
 
 
 def test_without_slurm_there_is_one_clear_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

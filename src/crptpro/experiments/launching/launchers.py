@@ -44,6 +44,9 @@ class Launcher(Protocol):
         Args:
             work: what it does.
             is_exclusive: whether nothing of anybody's should run beside it, where that can be asked for.
+
+        Raises:
+            SubmissionError: if a queue does not take it now; nothing was started.
         """
 
     def close(self) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from crptpro.errors import SubmissionError
 from crptpro.experiments.building import JobSettings
 from crptpro.experiments.durations import duration
 from crptpro.experiments.launching.launchers import Job, Launcher, Outcome
@@ -28,6 +29,9 @@ from crptpro.training.stop_request import StopRequest
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.2
+REFUSED_S = 60.0
+"""How long a queue is left alone that refused a job: a controller restarts, or jobs of others end."""
+
 LAST_WAIT_S = 10.0
 """How long jobs have that were told to end at once."""
 
@@ -70,6 +74,8 @@ def run_pieces(
     jobs: int = 1,
     attempts: int = 3,
     poll_s: float = POLL_S,
+    refused_s: float = REFUSED_S,
+    failures: list[Failure] | None = None,
 ) -> list[Failure]:
     """Make every missing piece of a plan.
 
@@ -86,11 +92,14 @@ def run_pieces(
         attempts: jobs that may try a piece whose job was lost or failed. An error of this library is final: the next
             attempt would end with it, too.
         poll_s: seconds between two looks at the jobs.
+        refused_s: seconds until a queue is asked again that refused a job after it took others; no attempt is counted.
+        failures: a list that what was not made is added to, also where an error ends this.
 
     Returns:
         What was not made: failures first, then what depends on them.
 
     Raises:
+        SubmissionError: if a queue refuses the first job.
         KeyboardInterrupt: after Ctrl-C, when all jobs have ended.
         SystemExit: likewise after SIGTERM.
     """
@@ -104,7 +113,7 @@ def run_pieces(
             is_lacking = store.is_done(needed) and not store.is_done(needed, for_piece=reader)
             if needed.key in missing and is_lacking:
                 store.forget(needed)
-    scheduler = _Scheduler(plan, store, settings, launcher, jobs, attempts)
+    scheduler = _Scheduler(plan, store, settings, launcher, jobs, attempts, refused_s)
     shown = tqdm(total=len(plan.pieces), initial=len(plan.done), desc="pieces", unit="piece", disable=None)
     announcement = "Stopping at the next checkpoints; press Ctrl-C again to stop at once."
     with StopRequest(announcement) as stop, _hangup_as_termination(), shown:
@@ -120,6 +129,9 @@ def run_pieces(
         except BaseException:
             scheduler.stop(LAST_WAIT_S)
             raise
+        finally:
+            if failures is not None:
+                failures += scheduler.failures
     return scheduler.failures
 
 
@@ -132,9 +144,10 @@ class _Scheduler:
         launcher: Launcher,
         jobs: int,
         attempts: int,
+        refused_s: float,
     ) -> None:
         self.store, self.settings, self.launcher = store, settings, launcher
-        self.jobs, self.attempts = jobs, attempts
+        self.jobs, self.attempts, self.refused_s = jobs, attempts, refused_s
         self.total = len(plan.pieces)
         self.is_stopping = False
         self.waiting = list(plan.missing)
@@ -143,6 +156,9 @@ class _Scheduler:
         self.tried: Counter[str] = Counter()
         self.failed: dict[str, Failure] = {}
         self.skipped: dict[str, Failure] = {}
+        self.refused: set[str] = set()  # keys of pieces, until they are queued
+        self.refusals: set[str] = set()  # what was said of them
+        self.resumes = -math.inf
 
     @property
     def is_busy(self) -> bool:
@@ -155,6 +171,8 @@ class _Scheduler:
     def start(self) -> bool:
         """Start what can be started, and say whether anything was."""
         self._skip()
+        if time.monotonic() < self.resumes:
+            return False
         ready = [p for p in self.waiting if all(needed.key in self.finished for needed in p.needs)]
         shared = [piece for piece in ready if not piece.is_exclusive]
         alone = [piece for piece in ready if piece.is_exclusive]
@@ -165,8 +183,25 @@ class _Scheduler:
             chosen = alone[:1]
         share = max(1, self.jobs // max(1, len(self.running) + len(chosen)))
         for piece in chosen:
-            self._start(piece, share)
+            try:
+                self._start(piece, share)
+            except SubmissionError as refusal:
+                if not self.tried:
+                    raise  # what is wrong with the first is wrong with all
+                self._pause(piece, refusal)
+                return piece is not chosen[0]
         return bool(chosen)
+
+    def _pause(self, piece: Piece, refusal: SubmissionError) -> None:
+        """Leave the piece waiting and the queue alone for a while, and say so once."""
+        self.resumes = time.monotonic() + self.refused_s
+        self.refused.add(piece.key)
+        if str(refusal) not in self.refusals:
+            self.refusals.add(str(refusal))
+            logger.warning(
+                "%s: %s It waits and is tried again every %g s; what runs goes on.",
+                piece.key, refusal, self.refused_s,
+            )  # fmt: skip
 
     def _start(self, piece: Piece, share: int) -> None:
         settings = self.settings
@@ -174,14 +209,17 @@ class _Scheduler:
             settings = replace(settings, workers=settings.workers * share)
         if self.launcher.is_one_machine and piece.is_exclusive:
             settings = replace(settings, threads=settings.threads * self.jobs)
-        self.waiting.remove(piece)
-        self.tried[piece.key] += 1
-        logger.info("%s: started", piece.key)
+        if piece.key not in self.refused:
+            logger.info("%s: started", piece.key)
         began = time.monotonic()
         work = Work(str(self.store.root.resolve()), piece.key, settings)
-        self.running.append(
-            _Running(piece, self.launcher.start(work, is_exclusive=piece.is_exclusive), began)
-        )
+        job = self.launcher.start(work, is_exclusive=piece.is_exclusive)
+        if piece.key in self.refused:
+            self.refused.remove(piece.key)
+            logger.info("%s: queued after all", piece.key)
+        self.waiting.remove(piece)
+        self.tried[piece.key] += 1
+        self.running.append(_Running(piece, job, began))
 
     def look(self) -> int:
         """Take in what has ended; returns the number of pieces that it finished."""

@@ -8,7 +8,7 @@ import subprocess
 from dataclasses import dataclass
 from typing import Any
 
-from crptpro.errors import CRPTproError
+from crptpro.errors import CRPTproError, SubmissionError
 from crptpro.experiments.launching.submitted import SubmittedJob, SubmittedWork, new_folder, require_submitit
 from crptpro.experiments.launching.work import THREAD_VARIABLES, Work
 
@@ -53,7 +53,11 @@ class SlurmLauncher:
         self.parameters = parameters
 
     def start(self, work: Work, *, is_exclusive: bool) -> SlurmJob:
-        """Queue a job; an exclusive one asks for a node of its own."""
+        """Queue a job; an exclusive one asks for a node of its own.
+
+        Raises:
+            SubmissionError: if sbatch refuses it, for good or because it is busy or the queue is full.
+        """
         from submitit.slurm.slurm import SlurmExecutor
 
         folder = new_folder(work)
@@ -73,8 +77,9 @@ class SlurmLauncher:
         except Exception as reason:
             if type(reason).__name__ != "FailedJobError":
                 raise
+            shutil.rmtree(folder, ignore_errors=True)  # it may be refused every minute of a night
             said = (str(reason).strip().splitlines() or ["it gave no reason"])[-1]
-            raise CRPTproError(
+            raise SubmissionError(
                 f"sbatch refused a job: {said} Change --partition, --hours or --sbatch."
             ) from reason
         return SlurmJob(submitted, folder, work)
