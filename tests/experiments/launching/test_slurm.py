@@ -12,11 +12,20 @@ from pathlib import Path
 
 import pytest
 from fake_pieces import PLUGIN, FakePiece, attempts, counted, plan_of
+from submitit.slurm.slurm import SlurmInfoWatcher
 
 from crptpro.errors import CRPTproError, SubmissionError
 from crptpro.experiments.building import JobSettings
-from crptpro.experiments.launching import Launcher, SlurmRequest, Work, divide, make_launcher, run_pieces
-from crptpro.experiments.launching.slurm import SlurmLauncher
+from crptpro.experiments.launching import (
+    Launcher,
+    Outcome,
+    SlurmRequest,
+    Work,
+    divide,
+    make_launcher,
+    run_pieces,
+)
+from crptpro.experiments.launching.slurm import PREEMPTED_LOOKS, Looks, SlurmJob, SlurmLauncher
 from crptpro.experiments.launching.submitted import FOLDER
 from crptpro.experiments.store import Store
 
@@ -47,7 +56,8 @@ SACCT = """#!/bin/bash
 echo "JobID|State|NodeList"
 for file in "$FAKE_SLURM"/*.sh; do
   id=$(basename "$file" .sh)
-  if [ -e "$FAKE_SLURM/$id.ended" ]; then echo "$id|NODE_FAIL|n1"; else echo "$id|RUNNING|n1"; fi
+  if [ -e "$FAKE_SLURM/$id.ended" ]; then echo "$id|NODE_FAIL|n1"
+  else echo "$id|$(cat "$FAKE_SLURM/$id.state" 2> /dev/null || echo RUNNING)|n1"; fi
 done
 """
 SCONTROL = """#!/bin/bash
@@ -83,7 +93,39 @@ def slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source_path: None) ->
         (programs / name).chmod(0o755 | stat.S_IXUSR)
     monkeypatch.setenv("PATH", f"{programs}{os.pathsep}{os.environ['PATH']}")
     monkeypatch.setenv("FAKE_SLURM", str(state))
+    # Numbers of jobs come again from test to test, and submitit remembers which have ended.
+    monkeypatch.setattr("submitit.slurm.slurm.SlurmJob.watcher", SlurmInfoWatcher(delay_s=600))
     return state
+
+
+@pytest.fixture
+def idle_slurm(slurm: Path) -> Path:
+    """Its jobs do nothing, and are in the state that the test writes for them."""
+    programs = slurm.parent / "bin"
+    (programs / "sbatch").write_text(SBATCH.replace("setsid", "true"))
+    (programs / "scancel").write_text('#!/bin/bash\necho "$*" >> "$FAKE_SLURM/cancelled"\n')
+    (programs / "scancel").chmod(0o755)
+    return slurm
+
+
+def queue(store: Store, slurm: Path, state: str) -> SlurmJob:
+    job = slurm_launcher().start(Work(str(store.root), "p", SETTINGS), is_exclusive=False)
+    assert isinstance(job, SlurmJob)
+    job.looks.pause_s = 0.0
+    job.job._results_timeout_s = 0
+    job.work.log.parent.mkdir(parents=True, exist_ok=True)
+    set_state(slurm, job, state)
+    return job
+
+
+def set_state(slurm: Path, job: SlurmJob, state: str) -> None:
+    (slurm / f"{job.job.job_id}.state").write_text(state)
+
+
+def leave_alone(job: SlurmJob) -> None:
+    """Have submitit believe that no job was queued for hours, and that it has just looked."""
+    watcher = job.job.watcher
+    watcher._start_time, watcher._last_status_check = time.time() - 10_000, time.time()
 
 
 def slurm_launcher(**request: object) -> Launcher:
@@ -119,21 +161,19 @@ def test_slurm_is_asked_for_what_a_job_needs_and_goes_on_after_its_time_was_up(
     assert second["threads"] == "2"
 
 
-def test_an_exclusive_piece_asks_slurm_for_a_node_of_its_own(store: Store, slurm: Path) -> None:
-    (slurm.parent / "bin" / "sbatch").write_text(SBATCH.replace("setsid", "true"))
+def test_an_exclusive_piece_asks_slurm_for_a_node_of_its_own(store: Store, idle_slurm: Path) -> None:
     launcher = slurm_launcher()
     launcher.start(Work(str(store.root), "timing", SETTINGS), is_exclusive=True)
     launcher.start(Work(str(store.root), "other", SETTINGS), is_exclusive=False)
-    scripts = [path.read_text() for path in sorted(slurm.glob("*.sh"))]
+    scripts = [path.read_text() for path in sorted(idle_slurm.glob("*.sh"))]
     assert ["#SBATCH --exclusive\n" in script for script in scripts] == [True, False]
     assert not any("gpus" in script for script in scripts)
 
 
-def test_a_slurm_job_is_asked_to_write_a_checkpoint_before_it_is_cancelled(store: Store, slurm: Path) -> None:
-    programs = slurm.parent / "bin"
-    (programs / "sbatch").write_text(SBATCH.replace("setsid", "true"))
-    (programs / "scancel").write_text('#!/bin/bash\necho "$*" >> "$FAKE_SLURM/cancelled"\n')
-    (programs / "scancel").chmod(0o755)
+def test_a_slurm_job_is_asked_to_write_a_checkpoint_before_it_is_cancelled(
+    store: Store, idle_slurm: Path
+) -> None:
+    slurm = idle_slurm
     job = slurm_launcher().start(Work(str(store.root), "p", SETTINGS), is_exclusive=False)
     [number] = [path.stem for path in slurm.glob("*.sh")]
     job.stop()
@@ -141,6 +181,46 @@ def test_a_slurm_job_is_asked_to_write_a_checkpoint_before_it_is_cancelled(store
     assert (slurm / "cancelled").read_text().splitlines() == asked
     job.stop()
     assert (slurm / "cancelled").read_text().splitlines() == [*asked, number]
+
+
+def test_a_preempted_job_that_is_not_queued_again_was_lost(store: Store, idle_slurm: Path) -> None:
+    jobs = [queue(store, idle_slurm, "PREEMPTED") for _ in range(2)]
+    outcomes = [[job.poll() for job in jobs] for _ in range(PREEMPTED_LOOKS + 1)]
+    assert outcomes[0] == [None, None]
+    assert outcomes[-1] == [Outcome("the job was lost (preempted)")] * 2
+    assert not any(job.folder.exists() for job in jobs)
+
+
+def test_a_preempted_job_that_is_queued_again_goes_on(store: Store, idle_slurm: Path) -> None:
+    job = queue(store, idle_slurm, "PREEMPTED")
+    for state in ("PREEMPTED", "PENDING") * 3:
+        set_state(idle_slurm, job, state)
+        assert [job.poll() for _ in range(PREEMPTED_LOOKS - 1)] == [None] * (PREEMPTED_LOOKS - 1)
+        job.job.watcher.update()
+
+
+def test_slurm_is_asked_about_all_jobs_at_once_and_not_at_every_poll(store: Store, idle_slurm: Path) -> None:
+    jobs = [queue(store, idle_slurm, "PREEMPTED") for _ in range(2)]
+    looks = Looks()
+    for job in jobs:
+        job.looks = looks
+        job.poll()
+    leave_alone(jobs[0])
+    asked = jobs[0].job.watcher.num_calls
+    assert [job.poll() for job in jobs * 5] == [None] * 10
+    assert jobs[0].job.watcher.num_calls - asked <= 1
+
+
+def test_the_end_of_a_job_that_was_stopped_is_noticed_without_waiting_for_submitits_next_look(
+    store: Store, idle_slurm: Path
+) -> None:
+    job = queue(store, idle_slurm, "RUNNING")
+    assert job.poll() is None
+    leave_alone(job)
+    set_state(idle_slurm, job, "CANCELLED by 1000")
+    assert job.poll() is None
+    job.stop()
+    assert job.poll() == Outcome("the job was lost (cancelled by 1000)")
 
 
 def test_what_sbatch_refuses_is_said_in_a_line(store: Store, slurm: Path) -> None:

@@ -78,10 +78,13 @@ class SubmittedJob:
 
     def poll(self) -> Outcome | None:
         """How it ended, or ``None``."""
-        if self.outcome is None and self.job.done():
-            self.outcome = self._read()
+        if self.outcome is None and (outcome := self._look()) is not None:
+            self.outcome = outcome
             shutil.rmtree(self.folder, ignore_errors=True)
         return self.outcome
+
+    def _look(self) -> Outcome | None:
+        return self._read() if self.job.done() else None
 
     def _read(self) -> Outcome:
         failure = self.job.exception()
@@ -92,14 +95,14 @@ class SubmittedJob:
         if type(failure).__name__ != "UncompletedJobError":
             trace = [line for line in lines[:-3] if line.strip(" -")]
             return Outcome(trace[-1].strip() if trace else "it failed")
+        return self._lost(str(self.job.state))
+
+    def _lost(self, state: str) -> Outcome:
         said = (self.job.stderr() or "").strip()
         if said:  # it did not get as far as the piece's log, or the system said why it ended the job
             with open(self.work.log, "a") as log:
                 log.write(said + "\n")
-        return Outcome(f"the job was lost ({self._state()})")
-
-    def _state(self) -> str:
-        return str(self.job.state).lower()
+        return Outcome(f"the job was lost ({state.lower()})")
 
     def stop(self) -> None:
         """Pass SIGTERM on; the stages write a checkpoint when it arrives, and leave at once at the second."""
