@@ -15,6 +15,10 @@ class RenderingError(CRPTproError):
     """No GL backend renders a live frame, or the first frame did not arrive in time."""
 
 
+class WorkerLostError(CRPTproError):
+    """A process that collects or evaluates ended without a word: killed, as a rule, for want of memory."""
+
+
 class DatasetError(CRPTproError):
     """A dataset is missing, truncated, foreign or does not fit its use."""
 

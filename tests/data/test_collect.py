@@ -33,7 +33,7 @@ from crptpro.data import FrameDataset, collect_group, collect_random
 from crptpro.data.collect_worker import EpisodeRoller
 from crptpro.data.collection import DomainCollection
 from crptpro.data.incoming import INCOMING, dataset_path, write_incoming
-from crptpro.errors import CRPTproError, DatasetError, DiskSpaceError, RenderingError
+from crptpro.errors import CRPTproError, DatasetError, DiskSpaceError, RenderingError, WorkerLostError
 from crptpro.seeding import derive_seed
 
 HERE = Path(__file__).parent
@@ -159,7 +159,7 @@ def test_a_failing_environment_gives_one_clear_error(tmp_path):
 
 def test_a_dying_process_gives_one_clear_error(tmp_path):
     with pytest.raises(
-        CRPTproError, match=r"episode 0 of toy-dying.* exited with status 7.*run the same command"
+        WorkerLostError, match=r"episode 0 of toy-dying.* exited with status 7.*run the same command"
     ):
         collect_random(DYING, tmp_path, transitions=50, **SMALL)
 

@@ -17,7 +17,7 @@ from test_downstream import small_pretrained, toy_env
 from torchrl.envs import CatFrames, EnvBase, TransformedEnv
 from toy_world import ToyEnv, make_dying, make_hanging
 
-from crptpro.errors import CRPTproError, RenderingError
+from crptpro.errors import CRPTproError, RenderingError, WorkerLostError
 from crptpro.modules import SquashedGaussianActor
 from crptpro.training import PixelAgent, evaluate
 from crptpro.training.evaluation_pool import EvaluationPool, can_be_sent
@@ -186,7 +186,7 @@ def test_the_callers_directory_does_not_hide_the_standard_library(
         (make_exploding, CRPTproError, "failed: the simulator exploded.*start it again"),
         (make_unreadable, CRPTproError, "failed: the save game ends early"),
         (Unpicklable(), CRPTproError, "failed: No module named 'her_laptop'"),
-        (functools.partial(stacked, make_dying), CRPTproError, "episode 0.* exited with status 7"),
+        (functools.partial(stacked, make_dying), WorkerLostError, "episode 0.* exited with status 7"),
         (
             functools.partial(stacked, make_hanging),
             RenderingError,
@@ -221,7 +221,7 @@ def test_a_process_that_cannot_be_started_is_named(monkeypatch: pytest.MonkeyPat
 def test_a_killed_process_is_named_with_the_signal() -> None:
     pool = EvaluationPool(functools.partial(stacked, make_hanging), workers=1)
     busy_process(pool).kill()
-    with pytest.raises(CRPTproError, match=r"killed by signal 9\. Out of memory"):
+    with pytest.raises(WorkerLostError, match=r"killed by signal 9\. Out of memory"):
         pool.result()
     pool.close()
 

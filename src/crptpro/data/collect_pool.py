@@ -17,7 +17,7 @@ from typing import Any
 from torchrl.envs import EnvBase
 
 from crptpro.data.collect_worker import EpisodeJob, worker_main
-from crptpro.errors import CRPTproError, RenderingError, error_named
+from crptpro.errors import CRPTproError, RenderingError, WorkerLostError, error_named
 from crptpro.plugins import loaded_plugins
 from crptpro.suspension import SuspensionWatch
 
@@ -96,7 +96,9 @@ class WorkerPool:
         """Yield what the workers report: ``("environment" | "progress" | "episode", domain, payload)``.
 
         Raises:
-            CRPTproError: if a worker failed, died or hangs; the message says which, where and what to do.
+            CRPTproError: if a worker failed; the message says which, where and what to do.
+            WorkerLostError: if one died.
+            RenderingError: if one hangs.
         """
         # A worker's death shows as the end of its pipe, after everything it had still sent.
         ready = wait([worker.connection for worker in self.workers], timeout_s)
@@ -154,7 +156,7 @@ class WorkerPool:
             raise self._death(worker) from None
 
     @staticmethod
-    def _death(worker: Worker) -> CRPTproError:
+    def _death(worker: Worker) -> WorkerLostError:
         worker.process.join(2.0)
         code = worker.process.exitcode
         how = (
@@ -167,7 +169,7 @@ class WorkerPool:
                 'A script that collects needs `if __name__ == "__main__":` around its main program, because '
                 "the processes import it; otherwise look at the messages above."
             )
-        return CRPTproError(
+        return WorkerLostError(
             f"{worker.describe()} {how}. {hint} Every finished episode is kept: run the same command again."
         )
 

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from crptpro.errors import CRPTproError, RenderingError, error_named
+from crptpro.errors import CRPTproError, RenderingError, WorkerLostError, error_named
 from crptpro.modules import resolve_precision, set_compute_dtype
 from crptpro.modules.placement import device_of
 from crptpro.plugins import loaded_plugins
@@ -100,7 +100,9 @@ class EvaluationPool:
 
         Raises:
             RuntimeError: none was started.
-            CRPTproError: if a process failed, died or hung; the message says what to do.
+            CRPTproError: if a process failed; the message says what to do.
+            WorkerLostError: if one died.
+            RenderingError: if one hung.
         """
         evaluation, self._evaluation = self._evaluation, None
         if evaluation is None:
@@ -232,14 +234,14 @@ def _name(worker: _Worker) -> str:
     return f"An evaluating process (pid {worker.process.pid}, {job})"
 
 
-def _death(worker: _Worker) -> CRPTproError:
+def _death(worker: _Worker) -> WorkerLostError:
     try:
         code = worker.process.wait(2.0)
         how = f"was killed by signal {-code}" if code < 0 else f"exited with status {code}"
     except subprocess.TimeoutExpired:
         how = "closed its connection"
     hint = " Out of memory is the usual cause." if how.endswith("signal 9") else ""
-    return CRPTproError(f"{_name(worker)} {how}.{hint} {REMEDY}.")
+    return WorkerLostError(f"{_name(worker)} {how}.{hint} {REMEDY}.")
 
 
 def _failure(kind: str, message: str, trace: str) -> CRPTproError:

@@ -14,7 +14,7 @@ from fake_pieces import PLUGIN, FakePiece, attempts, plan_of
 
 from crptpro.cards import write_json
 from crptpro.directory_lock import DirectoryLock
-from crptpro.errors import CRPTproError
+from crptpro.errors import CRPTproError, RenderingError, WorkerLostError
 from crptpro.experiments.building import JobSettings
 from crptpro.experiments.launching import (
     InlineLauncher,
@@ -79,6 +79,20 @@ def test_local_jobs_make_pieces_try_again_what_was_killed_and_keep_logs(
     assert found["after"].is_skipped
     assert "RuntimeError: broken is broken" in store.log(broken).read_text()
     assert not list((store.root / FOLDER).iterdir())
+
+
+@pytest.mark.parametrize("kind", [RenderingError, WorkerLostError])
+def test_what_a_machine_may_do_better_another_time_is_tried_again(
+    store: Store, monkeypatch: pytest.MonkeyPatch, kind: type[CRPTproError]
+) -> None:
+    def fail(*_: object) -> None:
+        raise kind("A collecting process was killed by signal 9.")
+
+    piece = FakePiece("p")
+    store.describe(piece)
+    monkeypatch.setattr("crptpro.experiments.launching.work.build", fail)
+    with pytest.raises(kind):  # what is final is returned
+        Work(str(store.root), piece.key, SETTINGS).run()
 
 
 def test_a_job_waits_for_the_one_that_it_replaces(store: Store) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from crptpro.console import configure_logging, is_expected
 from crptpro.directory_lock import DirectoryLock
-from crptpro.errors import CRPTproError, RecordError, RenderingError
+from crptpro.errors import CRPTproError, RecordError, RenderingError, WorkerLostError
 from crptpro.experiments.building import JobSettings, build
 from crptpro.experiments.store import LOG, PIECES, Store
 from crptpro.plugins import load_plugin
@@ -100,9 +100,12 @@ class Work:
 
 
 def _is_final(error: Exception) -> bool:
-    """Whether the same would happen again; a picture that came too late may come in time."""
+    """Whether the same would happen again.
+
+    A picture that came too late may come in time, and a process that the system killed may find memory another time.
+    """
     if isinstance(error, CRPTproError):
-        return not isinstance(error, RenderingError)
+        return not isinstance(error, (RenderingError, WorkerLostError))
     return isinstance(error, ValueError) and is_expected(error)
 
 
