@@ -205,8 +205,8 @@ class DownstreamConfig(SACSettings):
     """on a GPU, record the learner's updates and replay them, the action noise drawn there; `auto` is off"""
     eval_workers: int | None = None
     """processes that evaluate on the CPU while training goes on, 0.5 GB of memory each, at most one per episode; 0
-    evaluates in between, in the training process. Left to itself a run takes one per core if it has 20 evaluation
-    episodes or more and another process can build its environment"""
+    evaluates in between, in the training process. Left to itself a run takes one per core, and no more than torch has
+    threads, if it has 20 evaluation episodes or more and another process can build its environment"""
     render_ahead: bool | None = None
     """draw the next observation in another thread while the update computes. Left to itself a run does so on a CPU with
     several cores; say no where an environment wants the main thread"""

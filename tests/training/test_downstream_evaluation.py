@@ -105,21 +105,26 @@ def test_the_record_does_not_depend_on_how_long_an_evaluation_takes(
 
 
 @pytest.mark.parametrize(
-    ("asked", "episodes", "cores", "expected"),
+    ("asked", "episodes", "cores", "threads", "expected"),
     [
-        (None, 10, 2, 2),
-        (None, 10, 16, 10),
-        (None, 10, 1, 0),
-        (None, 1, 4, 0),  # 14 episodes in all: starting a process would take longer
-        (0, 10, 4, 0),
-        (3, 10, 1, 3),
-        (3, 2, 4, 2),
+        (None, 10, 2, 2, 2),
+        (None, 10, 16, 16, 10),
+        (None, 10, 64, 4, 4),  # one of several jobs of this machine
+        (None, 10, 2, 1, 1),  # two hardware threads of one core
+        (None, 10, 1, 1, 0),
+        (None, 10, 1, 4, 0),
+        (None, 1, 4, 4, 0),  # 14 episodes in all: starting a process would take longer
+        (0, 10, 4, 4, 0),
+        (3, 10, 1, 1, 3),
+        (3, 10, 4, 2, 3),
+        (3, 2, 4, 4, 2),
     ],
 )
 def test_there_are_as_many_processes_as_asked_or_as_pay(
-    monkeypatch: pytest.MonkeyPatch, asked: int | None, episodes: int, cores: int, expected: int
+    monkeypatch: pytest.MonkeyPatch, asked: int | None, episodes: int, cores: int, threads: int, expected: int
 ) -> None:
     monkeypatch.setattr("crptpro.training.downstream_evaluation.cpu_cores", lambda: cores)
+    monkeypatch.setattr("torch.get_num_threads", lambda: threads)
     config = DownstreamConfig(env_steps=125_000, eval_workers=asked, eval_episodes=episodes)
     assert eval_workers("toy", make_toy, config) == expected
 
@@ -141,6 +146,7 @@ def test_a_gpu_that_does_not_render_in_many_processes_is_used_by_one(
         raise RenderingError("The first frame did not arrive from each of 3 processes.")
 
     monkeypatch.setattr(f"{module}.cpu_cores", lambda: 2)
+    monkeypatch.setattr("torch.get_num_threads", lambda: 2)
     monkeypatch.setattr(f"{module}.backend_card", lambda: {"backend": "egl", "gl_kind": "hardware"})
     monkeypatch.setattr(f"{module}.select_backend", refuse)
     assert eval_workers("walker_walk", make_toy, DownstreamConfig()) == 0

@@ -203,7 +203,7 @@ def _(piece: RunPiece, store: Store, job: JobSettings) -> None:
     from crptpro.pretrained import load_pretrained
     from crptpro.training import train_downstream
 
-    # As above; neither changes a number.
+    # As above; neither changes a number. With several cores a run evaluates in no more processes than it has threads.
     alone: dict[str, Any] = {"eval_workers": 0, "render_ahead": False} if job.threads == 1 else {}
     config = run_config(piece, device=job.device, **alone)
     run_dir = store.path(piece)

@@ -175,6 +175,8 @@ class DownstreamEvaluation:
 def eval_workers(task: str, make_env: Callable[[], EnvBase], config: DownstreamConfig) -> int:
     """Return how many processes evaluate: as asked, or one per core where that works and pays; 0 is this process.
 
+    A run that shares its machine says so by torch's number of threads: left to itself it takes no more processes.
+
     Args:
         task: what is evaluated.
         make_env: builds the environment.
@@ -185,7 +187,8 @@ def eval_workers(task: str, make_env: Callable[[], EnvBase], config: DownstreamC
         RenderingError: processes were asked for, and the GPU's driver does not render in so many at once.
     """
     asked = config.eval_workers
-    workers = min(cpu_cores() if asked is None else asked, config.eval_episodes)
+    own_cores = min(cpu_cores(), torch.get_num_threads())
+    workers = min(own_cores if asked is None else asked, config.eval_episodes)
     evaluations = -(-config.env_steps // config.eval_interval_env_steps) + 1
     pays = cpu_cores() > 1 and evaluations * config.eval_episodes >= WORTH_PROCESSES
     if asked == 0 or (asked is None and not pays):
