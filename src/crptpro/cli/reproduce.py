@@ -56,7 +56,8 @@ class Reproduce:
     launcher: Literal["local", "slurm", "ray", "inline"] = "local"
     """local: processes here; slurm, ray: a cluster whose nodes share ROOT; inline: in this process, one at a time"""
     jobs: int | None = None
-    """most pieces at a time, each with its own memory (default: one per core or GPU; on a cluster 16)"""
+    """most pieces at a time, each with its own memory (default: one per core, or as many as the GPUs take by
+    --jobs-per-gpu, which is also the most here; on a cluster 16)"""
     cores_per_job: int | None = None
     """cores of each job (default: this machine's divided by jobs; on a cluster 1, beside a GPU 4)"""
     jobs_per_gpu: int = 1

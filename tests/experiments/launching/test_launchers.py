@@ -8,6 +8,7 @@ import signal
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_pieces import PLUGIN, FakePiece, attempts, plan_of
@@ -194,9 +195,27 @@ def test_jobs_share_the_gpus_that_this_process_sees(monkeypatch: pytest.MonkeyPa
     assert divide("local", device="cuda", jobs_per_gpu=4) == Resources(8, 2, ("2", "GPU-c"), 4)
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
     assert divide("local", device="cuda").gpus == ("0", "1")
-    assert divide("local", device="cuda:1", jobs=2).gpus == ()
+    assert divide("local", device="cuda", jobs=3, jobs_per_gpu=2) == Resources(3, 5, ("0", "1"), 2)
+    assert divide("local", device="cuda:1", jobs=2, jobs_per_gpu=2).gpus == ()
     assert divide("local", device="cuda:1") == Resources(1, 16)
     assert divide("local", device="cuda:1", jobs_per_gpu=4) == Resources(4, 4, (), 4)
+
+
+@pytest.mark.parametrize(("asked", "message"), [
+    ({"device": "cuda", "jobs": 5, "jobs_per_gpu": 2}, "--jobs 5 are more than 2 GPUs take with --jobs-per-gpu 2: "
+     "ask for --jobs 4, or let more share a GPU with --jobs-per-gpu 3."),
+    ({"device": "cuda:1", "jobs": 4}, "--jobs 4 are more than 1 GPU takes with --jobs-per-gpu 1: "
+     "ask for --jobs 1, or let more share a GPU with --jobs-per-gpu 4."),
+])  # fmt: skip
+def test_more_jobs_than_the_gpus_of_this_machine_take_are_refused(
+    monkeypatch: pytest.MonkeyPatch, asked: dict[str, Any], message: str
+) -> None:
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    with pytest.raises(CRPTproError) as refusal:
+        divide("local", **asked)
+    assert str(refusal.value) == message
+    assert divide("ray", **asked).jobs == asked["jobs"]
 
 
 def test_a_piece_that_is_alone_has_the_threads_of_all_jobs_of_one_machine() -> None:

@@ -67,7 +67,7 @@ def divide(
         jobs_per_gpu: jobs that share a GPU.
 
     Raises:
-        CRPTproError: a number below 1, or no GPU where one is asked for.
+        CRPTproError: a number below 1, no GPU where one is asked for, or more jobs than this machine's GPUs take.
     """
     for name, value in (("jobs", jobs), ("cores-per-job", cores_per_job), ("jobs-per-gpu", jobs_per_gpu)):
         if value is not None and value < 1:
@@ -79,10 +79,22 @@ def divide(
     gpus = _require_gpus() if device == "cuda" else ()
     if launcher == "inline":
         return Resources(1, cores_per_job or cores)
-    if jobs is None:
-        used = len(gpus) if device == "cuda" else int(device.startswith("cuda"))
-        jobs = used * jobs_per_gpu if used else max(1, cores // (cores_per_job or 1))
+    used = len(gpus) if device == "cuda" else int(device.startswith("cuda"))
+    if used:
+        jobs = _jobs_on_gpus(used, jobs, jobs_per_gpu)
+    jobs = jobs or max(1, cores // (cores_per_job or 1))
     return Resources(jobs, cores_per_job or max(1, cores // jobs), gpus, jobs_per_gpu)
+
+
+def _jobs_on_gpus(gpus: int, jobs: int | None, jobs_per_gpu: int) -> int:
+    """As many as were asked for, or as the GPUs take; too many might not find memory on them."""
+    room = gpus * jobs_per_gpu
+    if jobs is not None and jobs > room:
+        raise CRPTproError(
+            f"--jobs {jobs} are more than {gpus} GPU{'s' * (gpus > 1)} take{'s' * (gpus == 1)} with --jobs-per-gpu "
+            f"{jobs_per_gpu}: ask for --jobs {room}, or let more share a GPU with --jobs-per-gpu {-(-jobs // gpus)}."
+        )
+    return jobs or room
 
 
 def _require_gpus() -> tuple[str, ...]:
