@@ -11,7 +11,7 @@ from fake_pieces import PLUGIN, FakePiece, attempts, counted, plan_of
 
 from crptpro.errors import CRPTproError
 from crptpro.experiments.building import JobSettings
-from crptpro.experiments.launching import Work, run_pieces
+from crptpro.experiments.launching import Resources, Work, make_launcher, run_pieces
 from crptpro.experiments.launching.ray_cluster import RayLauncher
 from crptpro.experiments.store import Store
 
@@ -122,3 +122,14 @@ def test_ray_can_be_started_here_for_one_command(
         assert run_pieces(plan_of(store, FakePiece("p")), store, SETTINGS, launcher) == []
     finally:
         launcher.close()
+
+
+def test_a_job_that_no_node_can_take_is_refused_and_the_ray_that_was_started_for_it_ends(
+    source_path: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import ray
+
+    monkeypatch.setenv("RAY_ADDRESS", "local")
+    with pytest.raises(CRPTproError, match=r"asks for 10000 cores and no GPU.*--cores-per-job"):
+        make_launcher("ray", Resources(1, cores_per_job=10_000))
+    assert not ray.is_initialized()

@@ -166,7 +166,7 @@ def make_launcher(
     from crptpro.experiments.launching.ray_cluster import RayLauncher
 
     gpus_per_job = 1 / resources.jobs_per_gpu if has_gpu else 0
-    return RayLauncher(ray_address, gpus_per_job=gpus_per_job)
+    return RayLauncher(ray_address, gpus_per_job=gpus_per_job, cores_per_job=resources.cores_per_job)
 
 
 def slurm_parameters(request: SlurmRequest, *, has_gpu: bool) -> dict[str, Any]:

@@ -5,12 +5,18 @@ from __future__ import annotations
 import logging
 import os
 import socket
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from crptpro.errors import CRPTproError
 from crptpro.experiments.launching.launchers import Outcome
 from crptpro.experiments.launching.work import THREAD_VARIABLES, Work
+
+logger = logging.getLogger(__name__)
+
+NODE_GROUP = "ray.io/node-group"
+"""Label of nodes that `ray up` or KubeRay started, which may start others as they are needed."""
 
 
 @dataclass
@@ -56,14 +62,17 @@ class RayLauncher:
         address: of the cluster's head; ``None`` for ``RAY_ADDRESS``, a cluster that runs on this machine, or a new one;
             ``"local"`` for a new one in any case.
         gpus_per_job: a whole number or a fraction of one.
+        cores_per_job: that every job will ask for.
 
     Raises:
-        CRPTproError: without Ray, or if the cluster cannot be reached.
+        CRPTproError: without Ray, if the cluster cannot be reached, or if none of its nodes can take a job.
     """
 
     is_one_machine = False
 
-    def __init__(self, address: str | None = None, *, gpus_per_job: float = 0) -> None:
+    def __init__(
+        self, address: str | None = None, *, gpus_per_job: float = 0, cores_per_job: int = 1
+    ) -> None:
         try:
             import ray
         except ImportError as reason:
@@ -88,6 +97,11 @@ class RayLauncher:
                 f"The Ray cluster {address or 'of this machine'} cannot be used: {said}. Give the address that "
                 "`ray start --head` printed, as --ray-address HOST:6379, or ray://HOST:10001."
             ) from reason
+        try:
+            require_node(ray.nodes(), cores=cores_per_job, gpus=gpus_per_job)
+        except CRPTproError:
+            ray.shutdown()
+            raise
         # A worker ends with its job, as a process of its own would: nothing of a job is left for the next.
         self._make = ray.remote(max_retries=0, max_calls=1)(_run)
 
@@ -105,6 +119,37 @@ class RayLauncher:
     def close(self) -> None:
         """Leave the cluster; one that was started here ends."""
         self._ray.shutdown()
+
+
+def require_node(nodes: Sequence[Mapping[str, Any]], *, cores: int, gpus: float) -> None:
+    """Make sure that some node can take a job; Ray would let it wait for ever without a word.
+
+    Args:
+        nodes: as ``ray.nodes()`` lists them.
+        cores: of the job.
+        gpus: of the job, a whole number or a fraction of one.
+
+    Raises:
+        CRPTproError: if none can, unless the cluster may start others: then there is a warning.
+    """
+    alive = [node for node in nodes if node["Alive"]]
+    sizes = [(node["Resources"].get("CPU", 0), node["Resources"].get("GPU", 0)) for node in alive]
+    if any(has_cores >= cores and has_gpus >= gpus for has_cores, has_gpus in sizes):
+        return
+    largest = max(sizes, key=lambda size: (size[1] >= gpus, *size), default=(0, 0))
+    lack = (
+        f"A job asks for {_size(cores, gpus)}, and no node of the Ray cluster has as much; the largest has "
+        f"{_size(*largest)}."
+    )
+    remedy = "--cores-per-job, or --device cpu" if gpus else "--cores-per-job"
+    if any(node.get("Labels", {}).get(NODE_GROUP) for node in alive):
+        logger.warning("%s Jobs wait until it starts one that has; if it cannot, change %s.", lack, remedy)
+        return
+    raise CRPTproError(f"{lack} Change {remedy}, or add such a node.")
+
+
+def _size(cores: float, gpus: float) -> str:
+    return f"{cores:g} core{'s' * (cores != 1)} and {f'{gpus:g}' if gpus else 'no'} GPU{'s' * (gpus > 1)}"
 
 
 def _require_answer(address: str | None) -> None:
