@@ -170,6 +170,21 @@ def test_an_exclusive_piece_asks_slurm_for_a_node_of_its_own(store: Store, idle_
     assert not any("gpus" in script for script in scripts)
 
 
+@pytest.mark.parametrize(("given", "cores"), [({}, 2), ({"cpus_per_task": 6}, 6)])
+def test_srun_is_given_the_cores_that_sbatch_was_asked_for(
+    store: Store, idle_slurm: Path, given: dict[str, int], cores: int
+) -> None:
+    launcher = SlurmLauncher({**given, "setup": ["module load cuda", "export OMP_NUM_THREADS=9"]})
+    settings = JobSettings(threads=2, plugins=(PLUGIN,))
+    launcher.start(Work(str(store.root), "p", settings), is_exclusive=False)
+    [script] = [path.read_text() for path in idle_slurm.glob("*.sh")]
+    setup = script[script.index("# setup\n") : script.index("# command\n")].splitlines()
+    assert f"#SBATCH --cpus-per-task={cores}\n" in script
+    assert f"export SRUN_CPUS_PER_TASK={cores}" in setup
+    assert setup.index("export OMP_NUM_THREADS=2") < setup.index("module load cuda")
+    assert setup.index("export OMP_NUM_THREADS=2") < setup.index("export OMP_NUM_THREADS=9")
+
+
 def test_a_slurm_job_is_asked_to_write_a_checkpoint_before_it_is_cancelled(
     store: Store, idle_slurm: Path
 ) -> None:

@@ -96,7 +96,8 @@ class SlurmLauncher:
     """A Slurm cluster, whose nodes share ROOT and the environment of this process.
 
     Args:
-        parameters: of submitit's executor: ``partition``, ``time`` (minutes), ``mem``, ``gpus_per_node``, ...
+        parameters: of submitit's executor: ``partition``, ``time`` (minutes), ``mem``, ``gpus_per_node``, ...; lines of
+            ``setup`` follow those that set the numbers of cores and threads.
 
     Raises:
         CRPTproError: without submitit, or where there is no Slurm.
@@ -124,13 +125,12 @@ class SlurmLauncher:
 
         folder = new_folder(work)
         executor = SlurmExecutor(folder, max_num_timeout=MAX_REQUEUES)
-        threads = str(work.settings.threads)
-        parameters = {
-            "job_name": work.key,
-            "cpus_per_task": work.settings.threads,
-            "setup": [f"export {name}={threads}" for name in THREAD_VARIABLES],
-            **self.parameters,
-        }
+        threads = work.settings.threads
+        parameters = {"job_name": work.key, "cpus_per_task": threads, **self.parameters}
+        # Since Slurm 22.05 srun does not ask for the cores that sbatch was given, and would run the job on one.
+        environment = [f"export {name}={threads}" for name in THREAD_VARIABLES]
+        environment.append(f"export SRUN_CPUS_PER_TASK={parameters['cpus_per_task']}")
+        parameters["setup"] = [*environment, *parameters.get("setup", ())]
         if is_exclusive:
             parameters["exclusive"] = True
         executor.update_parameters(**parameters)
