@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+from pathlib import Path
+
 
 class CRPTproError(RuntimeError):
     """Base of every error this library raises on purpose; the command line prints only its message."""
@@ -65,3 +68,26 @@ def error_named(name: str, message: str) -> CRPTproError | None:
     """
     known = globals().get(name)
     return known(message) if isinstance(known, type) and issubclass(known, CRPTproError) else None
+
+
+def is_disk_full(reason: BaseException) -> bool:
+    """Whether a write failed because the disk, or the quota of it, is full."""
+    if isinstance(reason, OSError):
+        return reason.errno in (errno.ENOSPC, errno.EDQUOT)
+    return isinstance(reason, DiskSpaceError)
+
+
+def writing_error(path: Path, reason: OSError | DiskSpaceError) -> OSError | DiskSpaceError:
+    """Return the error to raise when ``path`` could not be written: it names the path.
+
+    The system names a file that it cannot open; of one that is open it says no more than what went wrong.
+
+    Args:
+        path: what the caller knows it as; a temporary file beside it may be what was being written.
+        reason: why it could not.
+    """
+    if is_disk_full(reason):
+        return DiskSpaceError(f"The disk is full: {path} cannot be written. Free space and start again.")
+    if isinstance(reason, OSError) and reason.errno is not None and reason.filename is None:
+        return OSError(reason.errno, reason.strerror, str(path))
+    return reason

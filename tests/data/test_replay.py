@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 import subprocess
 import sys
@@ -276,3 +277,38 @@ def test_a_disk_that_fills_up_while_rows_are_reserved_keeps_none_of_them(tmp_pat
     assert not any(file.stat().st_size for file in tmp_path.glob("*.memmap"))
     monkeypatch.undo()
     FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
+
+
+def test_rows_are_reserved_where_the_system_has_to_write_them_one_by_one(tmp_path, monkeypatch):
+    """It does so on network file systems that reserve nothing, and not in a file that is appended to."""
+    reserve, refused = os.posix_fallocate, []
+
+    def without_support(file, offset, size):
+        if fcntl.fcntl(file, fcntl.F_GETFL) & os.O_APPEND:
+            refused.append(file)
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        reserve(file, offset, size)
+
+    monkeypatch.setattr(ring_storage.os, "posix_fallocate", without_support)
+    replay = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
+    Driver(replay).write(15)
+    state, content = replay.state_dict(), replay[:]["next", "pixels"].clone()
+    again = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)  # what is there stays
+    again.load_state_dict(state)
+    assert torch.equal(again[:]["next", "pixels"], content)
+    assert not refused
+
+
+@pytest.mark.parametrize(("number", "kind", "message"), [
+    (errno.EDQUOT, DiskSpaceError, "Free space"),
+    (errno.EFBIG, DiskSpaceError, "File too large.*smaller capacity"),
+    (errno.EIO, OSError, "Input/output error"),
+])  # fmt: skip
+def test_an_error_of_reserving_is_named_as_what_it_is(tmp_path, monkeypatch, number, kind, message):
+    def fail(file, offset, size):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(ring_storage.os, "posix_fallocate", fail)
+    with pytest.raises(kind, match=message) as caught:
+        FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
+    assert f"{tmp_path}/" in str(caught.value)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import mmap
 import os
 from collections.abc import Mapping
@@ -17,7 +18,7 @@ from torchrl.data.replay_buffers.checkpointers import StorageCheckpointerBase
 
 from crptpro.data.frame_stacks import gather_stacks, stack_rows
 from crptpro.data.n_step import Reading, n_step_return
-from crptpro.errors import CheckpointError, DiskSpaceError
+from crptpro.errors import CheckpointError, DiskSpaceError, is_disk_full, writing_error
 
 _OWN = ("pixels", "step", "number", "row_of")
 
@@ -280,19 +281,35 @@ class RingStorage(TensorStorage):
             return torch.zeros(rows, *shape, dtype=dtype)
         size = rows * torch.Size(shape).numel() * dtype.itemsize
         path = self.path / f"{name}.memmap"
-        with open(path, "a+b") as file:
-            found = file.seek(0, 2)
+        # Not by open(path, "a+b"): a file system that cannot reserve has glibc write instead, which it refuses to do in
+        # a file that is appended to.
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            found = os.fstat(handle).st_size
             if found not in (0, size):
                 raise CheckpointError(
                     f"{path} has {found:,} bytes, this replay needs {size:,}: it belongs to a replay of another "
                     "size. Use the capacity and slack it was written with, or another directory."
                 )
-            try:
-                # Reserved, not sparse: a disk that fills up later would end the process by a bus error.
-                os.posix_fallocate(file.fileno(), 0, size)
-            except OSError as reason:
-                os.ftruncate(file.fileno(), found)  # what was reserved before the disk was full
-                raise DiskSpaceError(f"{path} needs {size / 1e9:.2f} GB: {reason}. Free space.") from reason
-            mapped = mmap.mmap(file.fileno(), size)
+            self._reserve(handle, path, size)
+            mapped = mmap.mmap(handle, size)
+        finally:
+            os.close(handle)
         self._maps.append(mapped)
         return torch.frombuffer(mapped, dtype=dtype).view(rows, *shape)
+
+    @staticmethod
+    def _reserve(handle: int, path: Path, size: int) -> None:
+        """Reserve the file's bytes: of a sparse one, a disk that fills up later would end the process by a bus error."""
+        found = os.fstat(handle).st_size
+        try:
+            os.posix_fallocate(handle, 0, size)
+        except OSError as reason:
+            os.ftruncate(handle, found)  # what was reserved before the disk was full
+            if is_disk_full(reason):
+                raise DiskSpaceError(f"{path} needs {size / 1e9:.2f} GB: {reason}. Free space.") from reason
+            if reason.errno == errno.EFBIG:
+                raise DiskSpaceError(
+                    f"{path} needs {size / 1e9:.2f} GB: {reason}. Choose another directory or a smaller capacity."
+                ) from reason
+            raise writing_error(path, reason) from reason
