@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import subprocess
@@ -8,11 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import SafetensorError
 from torch import nn
 
 from crptpro import artifact
 from crptpro.artifact import read_artifact, write_artifact
-from crptpro.errors import CRPTproError, PretrainedError
+from crptpro.errors import CRPTproError, DiskSpaceError, PretrainedError
 
 
 def write(path: Path, value: float = 1.0) -> Path:
@@ -53,15 +55,33 @@ def test_what_is_no_artifact_of_this_kind_is_not_replaced(tmp_path: Path) -> Non
     assert read(write(tmp_path / "empty"))[0]["task"] == "walker"
 
 
-def test_a_failed_write_keeps_the_old_artifact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("step", "error", "kind", "message"), [
+    ("crptpro.cards.os.fsync", OSError(errno.ENOSPC, "No space left"), DiskSpaceError, "disk is full: {} cannot"),
+    ("crptpro.cards.os.replace", OSError(errno.EDQUOT, "Quota"), DiskSpaceError, "disk is full: {} cannot"),
+    ("crptpro.artifact.os.fsync", OSError(errno.EIO, "Input/output error"), OSError, "error: '{}'"),
+    ("safetensors.torch.save_file", SafetensorError("I/O error: No space left on device (os error 28)"),
+     DiskSpaceError, "disk is full: {} cannot"),
+    ("safetensors.torch.save_file", SafetensorError("IoError(Os { code: 122, kind: Other, message: 'x' })"),
+     DiskSpaceError, "disk is full: {} cannot"),
+    ("safetensors.torch.save_file", SafetensorError("no tensor"), SafetensorError, "no tensor"),
+])  # fmt: skip
+def test_a_failed_write_keeps_the_old_artifact_and_names_it(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    step: str,
+    error: Exception,
+    kind: type[Exception],
+    message: str,
+) -> None:
     write(tmp_path / "a", 1.0)
 
-    def full_disk(*args: object) -> None:
-        raise OSError(28, "No space left on device")
+    def fail(*args: object) -> None:
+        raise error
 
-    monkeypatch.setattr(artifact, "write_json", full_disk)
-    with pytest.raises(OSError, match="No space left"):
+    monkeypatch.setattr(step, fail)
+    with pytest.raises(kind, match=message.format(tmp_path / "a")):
         write(tmp_path / "a", 2.0)
+    monkeypatch.undo()
     assert read(tmp_path / "a")[1]["layer.weight"][0, 0] == 1
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 

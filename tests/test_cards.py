@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import errno
 import json
+import os
 import subprocess
 from pathlib import Path
 
@@ -72,15 +74,22 @@ def test_json_round_trips_and_leaves_no_temporary_file(tmp_path: Path) -> None:
     assert [p.name for p in (tmp_path / "sub").iterdir()] == ["card.json"]
 
 
-def test_a_write_that_fails_keeps_the_old_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("number", "kind", "message"), [
+    (errno.ENOSPC, DiskSpaceError, r"disk is full: .*/card\.json cannot be written"),
+    (errno.EDQUOT, DiskSpaceError, r"disk is full: .*/card\.json cannot be written"),
+    (errno.EIO, OSError, r"Input/output error: '.*/card\.json'"),
+])  # fmt: skip
+def test_a_write_that_fails_names_the_card_and_keeps_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, kind: type[Exception], message: str
+) -> None:
     path = tmp_path / "card.json"
     cards.write_json(path, {"a": 1})
 
-    def full_disk(descriptor: int) -> None:
-        raise OSError(28, "No space left on device")
+    def fail(descriptor: int) -> None:
+        raise OSError(number, os.strerror(number))  # of an open file, the system says no name
 
-    monkeypatch.setattr(cards.os, "fsync", full_disk)
-    with pytest.raises(OSError, match="No space left"):
+    monkeypatch.setattr(cards.os, "fsync", fail)
+    with pytest.raises(kind, match=message):
         cards.write_json(path, {"a": 2})
     assert cards.read_json(path) == {"a": 1}
     assert [p.name for p in tmp_path.iterdir()] == ["card.json"]

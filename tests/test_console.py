@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import errno
 import logging
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -52,6 +54,19 @@ def test_a_file_that_cannot_be_opened_is_named(tmp_path: Path, capsys: pytest.Ca
     with pytest.raises(SystemExit):
         run_main((tmp_path / "absent").read_text)
     assert str(tmp_path / "absent") in capsys.readouterr().err
+
+
+def test_a_full_disk_is_no_defect_though_the_system_names_no_file(capsys: pytest.CaptureFixture[str]) -> None:
+    def main() -> None:
+        with open("/dev/full", "w") as file:
+            file.write("x")
+
+    with pytest.raises(SystemExit) as stopped:
+        run_main(main)
+    assert stopped.value.code == 1
+    assert capsys.readouterr().err == "error: [Errno 28] No space left on device\n"
+    with pytest.raises(OSError, match="Input/output error"):  # anything else may be one
+        run_main(fails(OSError(errno.EIO, os.strerror(errno.EIO))))
 
 
 @pytest.mark.parametrize("main", [

@@ -192,6 +192,21 @@ def test_a_full_disk_is_one_clear_error_without_half_a_row(
     assert (tmp_path / "metrics.jsonl").read_bytes() == before
 
 
+def test_a_disk_that_is_full_from_the_first_row_on_is_named_and_the_config_written_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(file: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with RunLogger(tmp_path, config={"task": "walker_run"}) as logger:
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "fsync", full)
+            with pytest.raises(DiskSpaceError, match=r"disk is full: .*/config\.json"):
+                logger.log({"loss": 1.0}, stream="train", updates=1)
+        logger.log({"loss": 1.0}, stream="train", updates=1)
+    assert json.loads((tmp_path / "config.json").read_text())["config"] == {"task": "walker_run"}
+
+
 def test_the_config_is_kept_with_versions(tmp_path: Path) -> None:
     @dataclass
     class Config:

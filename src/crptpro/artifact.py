@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import socket
 import tempfile
@@ -15,7 +16,7 @@ import psutil
 from torch import Tensor, nn
 
 from crptpro.cards import read_json, write_json
-from crptpro.errors import CRPTproError
+from crptpro.errors import CRPTproError, DiskSpaceError, writing_error
 
 WEIGHTS_FILE = "weights.safetensors"
 CARD_FILE = "card.json"
@@ -47,9 +48,8 @@ def write_artifact(
 
     Raises:
         CRPTproError: if there is something else at ``path``; it is left alone.
+        DiskSpaceError: if the disk is full; an artifact there is kept.
     """
-    from safetensors.torch import save_file
-
     path = Path(path)
     _refuse_foreign(path, format_name)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -64,7 +64,7 @@ def write_artifact(
     temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f"{_temporary_prefix(path)}{os.getpid()}-"))
     try:
         weights = temporary / WEIGHTS_FILE
-        save_file(tensors, weights)
+        _save_tensors(tensors, weights)
         weights.chmod(0o644)  # safetensors makes files that only their owner can read
         with open(weights, "rb") as file:
             os.fsync(file.fileno())
@@ -73,8 +73,10 @@ def write_artifact(
         write_json(temporary / CARD_FILE, {**card, **facts})
         temporary.chmod(0o755)
         _replace_directory(temporary, path)
-    except BaseException:
+    except BaseException as reason:
         shutil.rmtree(temporary, ignore_errors=True)
+        if isinstance(reason, (OSError, DiskSpaceError)):
+            raise writing_error(path, reason) from reason
         raise
     return path
 
@@ -115,6 +117,19 @@ def identity_of(card: Mapping[str, Any]) -> str | None:
     if "weights_sha256" in card:
         return f"{card.get('method', 'unknown')}:{card['weights_sha256']}"
     return None
+
+
+def _save_tensors(tensors: dict[str, Tensor], path: Path) -> None:
+    from safetensors import SafetensorError
+    from safetensors.torch import save_file
+
+    try:
+        save_file(tensors, path)
+    except SafetensorError as reason:
+        # It says what the system did in words alone: "I/O error: No space left on device (os error 28)".
+        if number := re.search(r"(?:os error|code:) (\d+)", str(reason)):
+            raise OSError(int(number[1]), os.strerror(int(number[1]))) from reason
+        raise
 
 
 def _read(

@@ -16,7 +16,7 @@ from typing import Any
 import psutil
 import torch
 
-from crptpro.errors import CRPTproError, DiskSpaceError
+from crptpro.errors import CRPTproError, DiskSpaceError, writing_error
 
 PACKAGES = (
     "crptpro", "torch", "torchrl", "tensordict", "dm-control", "mujoco", "gymnasium", "numpy", "wandb",
@@ -105,7 +105,11 @@ def provenance() -> dict[str, Any]:
 
 
 def write_json(path: str | Path, content: dict[str, Any]) -> None:
-    """Write JSON beside ``path`` and rename it into place, so that a reader never sees half a card."""
+    """Write JSON beside ``path`` and rename it into place, so that a reader never sees half a card.
+
+    Raises:
+        DiskSpaceError: if the disk is full; what was there before is kept.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -117,8 +121,10 @@ def write_json(path: str | Path, content: dict[str, Any]) -> None:
             os.fsync(file.fileno())
         os.chmod(temporary, 0o644)  # mkstemp makes files that only their owner can read
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as reason:
         Path(temporary).unlink(missing_ok=True)
+        if isinstance(reason, OSError):
+            raise writing_error(path, reason) from reason
         raise
 
 

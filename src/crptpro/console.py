@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from tqdm import tqdm
 
-from crptpro.errors import CRPTproError
+from crptpro.errors import CRPTproError, is_disk_full
 
 
 class _BarFriendlyHandler(logging.Handler):
@@ -54,7 +54,8 @@ def is_expected(error: BaseException) -> bool:
     if isinstance(error, CRPTproError):
         return True
     if isinstance(error, OSError):
-        return error.filename is not None  # the message names the file
+        # The message names the file; of one that it has open, the system tells only that the disk is full.
+        return error.filename is not None or is_disk_full(error)
     # A ValueError that this library's own code raised names a setting; one from below is a defect.
     origin = error.__traceback__
     while origin is not None and origin.tb_next is not None:

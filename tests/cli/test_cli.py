@@ -153,6 +153,18 @@ def test_a_table_that_cannot_be_written_is_refused_before_any_episode(call: Call
         assert message in refused(call("evaluate", "random-policy", "--task", TASK, "--csv", path))
 
 
+def test_a_table_for_which_the_disk_is_full_is_named_below_the_scores(call: Call, tmp_path: Path) -> None:
+    (tmp_path / ".x.csv.partial").symlink_to("/dev/full")
+    asked = ("evaluate", "random-policy", "--task", TASK, "--episodes", 1, "--csv", tmp_path / "x.csv")
+    status, out, err = call(*asked)
+    assert status == 1
+    assert out.startswith(f"{TASK}: ")
+    assert err.splitlines()[-1].startswith(
+        f"error: The disk is full: {tmp_path / 'x.csv'} cannot be written."
+    )
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_truncated_dataset_is_named(call: Call, dataset: Path, tmp_path: Path) -> None:
     file = next(dataset.rglob("pixels.memmap"))
     os.truncate(file, file.stat().st_size - 1)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from crptpro.errors import RecordError
+from crptpro.errors import DiskSpaceError, RecordError
 from crptpro.experiments.row_files import read_rows, write_rows
 
 
@@ -25,6 +25,15 @@ def test_a_file_is_kept_if_its_successor_cannot_be_written(tmp_path: Path) -> No
     with pytest.raises(KeyboardInterrupt):
         write_rows(path, ("x",), interrupted())
     assert read_rows(path) == [{"x": "1"}]
+
+
+def test_a_full_disk_is_named_and_nothing_torn_stays(tmp_path: Path) -> None:
+    path = write_rows(tmp_path / "a.csv", ("x",), [{"x": 1}])
+    (tmp_path / ".a.csv.partial").symlink_to("/dev/full")
+    with pytest.raises(DiskSpaceError, match=r"disk is full: .*/a\.csv cannot be written"):
+        write_rows(path, ("x",), [{"x": 2}])
+    assert read_rows(path) == [{"x": "1"}]
+    assert [file.name for file in tmp_path.iterdir()] == ["a.csv"]
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from crptpro.cards import read_json, write_json
+from crptpro.errors import DiskSpaceError
 from crptpro.experiments.work_clock import WorkClock
 
 
@@ -69,9 +70,12 @@ def test_a_damaged_count_starts_anew_with_a_line(
     assert "earlier attempts is lost" in caplog.text
 
 
-def test_a_full_disk_is_left_to_others_to_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [DiskSpaceError("The disk is full."), OSError(5, "Input/output error")])
+def test_a_full_or_broken_disk_is_left_to_others_to_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
     def refuse(*_: object) -> None:
-        raise OSError(28, "No space left on device")
+        raise error
 
     time_ = Time(monkeypatch)
     monkeypatch.setattr("crptpro.experiments.work_clock.write_json", refuse)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ import pytest
 import torch
 from original_agents import CRPTPRO, PIXELS, URLB, atc_state, module_file, save
 
-from crptpro.errors import PretrainedError
+from crptpro.errors import DiskSpaceError, PretrainedError
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import ATCLoss, BeCLLoss, ProtoLoss
 from crptpro.pretrained import (
@@ -108,16 +109,24 @@ def test_what_another_code_would_read_wrongly_is_refused(tmp_path: Path) -> None
         export_state_dict(random_pretrained(**CHANNELS), "proto")
 
 
-def test_a_write_that_fails_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_fills_up_keeps_the_old_file(tmp_path: Path) -> None:
     file = write_state_dict({"encoder": {}}, tmp_path / "state.pt")
     before = file.read_bytes()
-
-    def fail(content: Any, path: Path) -> None:
-        path.write_bytes(b"half")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(torch, "save", fail)
-    with pytest.raises(OSError, match="No space"):
-        write_state_dict({"encoder": {}}, file)
+    (tmp_path / f".state.pt.{os.getpid()}.partial").symlink_to("/dev/full")
+    with pytest.raises(DiskSpaceError, match=r"disk is full: .*/state\.pt cannot be written"):
+        write_state_dict({"encoder": {"weight": torch.ones(2)}}, file)
     assert file.read_bytes() == before
     assert [child.name for child in tmp_path.iterdir()] == ["state.pt"]
+
+
+def test_a_place_where_no_file_can_be_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match=r"'.*/file'"):
+        write_state_dict({"encoder": {}}, tmp_path / "file" / "state.pt")
+    (tmp_path / "folder").mkdir()
+    monkeypatch.chdir(tmp_path / "folder")
+    for path in (".", tmp_path / "folder"):
+        with pytest.raises(PretrainedError, match="is a directory; name a file in it"):
+            write_state_dict({"encoder": {}}, path)
+    with pytest.raises(OSError, match="name too long: '/"):  # by torch, a RuntimeError of its own
+        write_state_dict({"encoder": {}}, tmp_path / ("x" * 250))

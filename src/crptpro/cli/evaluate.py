@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +40,7 @@ class Evaluate:
     def run(self) -> None:
         """Print mean and deviation, and write what was asked for."""
         from crptpro.envs import make_env
+        from crptpro.experiments.row_files import write_rows
         from crptpro.training import evaluate, load_agent, summarize, uniform_policy
         from crptpro.training.video import write_video
 
@@ -87,14 +87,9 @@ class Evaluate:
             f"({scores['min']:.1f} to {scores['max']:.1f}) over {len(episodes)} episodes"
         )
         if self.csv is not None:
-            self.csv.parent.mkdir(parents=True, exist_ok=True)
-            partial = self.csv.with_name(f".{self.csv.name}.partial")
-            with open(partial, "w", newline="") as file:
-                writer = csv.writer(file)
-                writer.writerow(["task", "agent", "episode", "episode_return", "agent_steps", "seed"])
-                writer.writerows(
-                    [task, self.agent, e.episode, e.episode_return, e.agent_steps, e.seed] for e in episodes
-                )
-            partial.replace(self.csv)
+            about = {"task": task, "agent": self.agent}
+            columns = ("episode", "episode_return", "agent_steps", "seed")
+            rows = ({**about, **{name: getattr(e, name) for name in columns}} for e in episodes)
+            write_rows(self.csv, (*about, *columns), rows)
         if self.video is not None:
             write_video(videos[0], self.video)

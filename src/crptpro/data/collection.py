@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 import time
 from pathlib import Path
@@ -25,7 +24,7 @@ from crptpro.data.layout import (
 )
 from crptpro.directory_lock import DirectoryLock
 from crptpro.domains import LONGEST_EPISODE_AGENT_STEPS
-from crptpro.errors import DatasetError, DiskSpaceError
+from crptpro.errors import DatasetError, DiskSpaceError, is_disk_full
 from crptpro.seeding import derive_seed
 
 logger = logging.getLogger(__name__)
@@ -150,8 +149,8 @@ class DomainCollection:
             return
         try:
             self._take(index, episode)
-        except OSError as reason:
-            if reason.errno not in (errno.ENOSPC, errno.EDQUOT):
+        except (OSError, DiskSpaceError) as reason:
+            if not is_disk_full(reason):
                 raise DatasetError(f"{self.path} cannot be written: {reason}.") from reason
             raise DiskSpaceError(
                 f"The disk under {self.path} is full after {self.transitions} transitions, which are kept. Free space "

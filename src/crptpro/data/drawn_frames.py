@@ -52,6 +52,9 @@ class DrawnFrames:
 
         Args:
             path: to write or replace.
+
+        Raises:
+            DiskSpaceError: if the disk is full; frames there are kept.
         """
         about = {"domain": self.domain, "colors": self.colors, "count": len(self.rows)}
         content = {"drawn": {"rows": self.rows, "frames": self.frames}}

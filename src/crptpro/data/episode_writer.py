@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import logging
 import os
@@ -16,7 +15,7 @@ import numpy as np
 
 from crptpro.data.episode import Episode
 from crptpro.data.layout import CARD_FILE, JOURNAL_FILE, Layout
-from crptpro.errors import DatasetError, DiskSpaceError
+from crptpro.errors import DatasetError, DiskSpaceError, is_disk_full
 
 logger = logging.getLogger(__name__)
 
@@ -168,7 +167,7 @@ class EpisodeWriter:
             yield
         except OSError as reason:
             self._truncate()
-            if reason.errno in (errno.ENOSPC, errno.EDQUOT):
+            if is_disk_full(reason):
                 raise DiskSpaceError(
                     f"The disk under {self.root} is full after {self.transitions} transitions "
                     f"({self.episodes} whole episodes), which are kept. Free space and run the same command "

@@ -300,7 +300,7 @@ class RingStorage(TensorStorage):
 
     @staticmethod
     def _reserve(handle: int, path: Path, size: int) -> None:
-        """Reserve the file's bytes: of a sparse one, a disk that fills up later would end the process by a bus error."""
+        """Reserve the file's bytes: in a sparse one, a disk that fills up later ends the process by a bus error."""
         found = os.fstat(handle).st_size
         try:
             os.posix_fallocate(handle, 0, size)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from crptpro.errors import RecordError
+from crptpro.errors import RecordError, writing_error
 
 
 def write_rows(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> Path:
@@ -20,6 +20,9 @@ def write_rows(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[
 
     Returns:
         ``path``.
+
+    Raises:
+        DiskSpaceError: if the disk is full; what was there before is kept.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -30,8 +33,10 @@ def write_rows(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[
             writer.writeheader()
             writer.writerows(rows)
         partial.replace(path)
-    except BaseException:
+    except BaseException as reason:
         partial.unlink(missing_ok=True)
+        if isinstance(reason, OSError):
+            raise writing_error(path, reason) from reason
         raise
     return path
 

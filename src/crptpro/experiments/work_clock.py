@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 
 from crptpro.cards import read_json, write_json
-from crptpro.errors import RecordError
+from crptpro.errors import DiskSpaceError, RecordError
 
 logger = logging.getLogger(__name__)
 
@@ -65,5 +65,6 @@ class WorkClock:
         passed = now - self._counted_to
         self.seconds += passed if passed < 2 * self.interval_s else self.interval_s
         self._counted_to = now
-        with contextlib.suppress(OSError):  # a full disk is for those to report who lose something by it
+        # A full disk is for those to report who lose something by it.
+        with contextlib.suppress(OSError, DiskSpaceError):
             write_json(self.path, {"seconds": self.seconds, "attempts": self.attempts})

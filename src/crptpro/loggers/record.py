@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import errno
 import io
 import json
 import logging
@@ -14,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from crptpro.errors import DiskSpaceError
+from crptpro.errors import writing_error
 
 _LOG = logging.getLogger(__name__)
 
@@ -186,7 +185,7 @@ class MetricRecord:
             os.replace(partial, path)
         except OSError as reason:
             partial.unlink(missing_ok=True)
-            raise _disk_error(path, reason) from reason
+            raise writing_error(path, reason) from reason
 
     @staticmethod
     def _append_line(path: Path, line: str) -> None:
@@ -197,13 +196,7 @@ class MetricRecord:
         except OSError as reason:
             if path.exists():
                 os.truncate(path, size)
-            raise _disk_error(path, reason) from reason
-
-
-def _disk_error(path: Path, reason: OSError) -> OSError | DiskSpaceError:
-    if reason.errno in (errno.ENOSPC, errno.EDQUOT):
-        return DiskSpaceError(f"The disk is full: {path} cannot be written. Free space and start again.")
-    return reason
+            raise writing_error(path, reason) from reason
 
 
 def _json_row(row: Mapping[str, Any]) -> dict[str, Any]:

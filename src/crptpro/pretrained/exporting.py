@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from crptpro.errors import PretrainedError
+from crptpro.errors import PretrainedError, writing_error
 from crptpro.pretrained.bundle import Pretrained
 from crptpro.pretrained.importing.names import ATC, BECL, PROTO, URLB_PROTO, Head, Layout, LayoutFamily, join
 
@@ -73,13 +74,24 @@ def write_state_dict(state: dict[str, Any], path: str | Path) -> Path:
 
     Returns:
         ``path``.
+
+    Raises:
+        PretrainedError: ``path`` is a directory.
+        DiskSpaceError: if the disk is full; a file there is kept.
     """
     path = Path(path)
+    if path.is_dir():
+        raise PretrainedError(f"{path} is a directory; name a file in it, such as {path / 'state.pt'}.")
+    content = io.BytesIO()
+    torch.save(state, content)  # not into the file: torch hides what the system says of it
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        torch.save(state, partial)
+        with open(partial, "wb") as file:
+            file.write(content.getbuffer())
         partial.replace(path)
+    except OSError as reason:
+        raise writing_error(path, reason) from reason
     finally:
         partial.unlink(missing_ok=True)
     return path

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import errno
 import inspect
 import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from safetensors import SafetensorError
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from crptpro.artifact import CARD_FILE, write_artifact
 from crptpro.cards import provenance, read_json
-from crptpro.errors import DiskSpaceError, PretrainedError
+from crptpro.errors import PretrainedError
 from crptpro.objectives import method_name_of
 from crptpro.pretrained.bundle import ACTOR, FORMAT, QUEUE, REST, ROLES, TARGET_ROLES, VERSION, Pretrained
 from crptpro.pretrained.networks import target_state, unwrap
@@ -96,12 +94,7 @@ def save_pretrained(
         **provenance(),
         **(extra_card or {}),
     }
-    try:
-        return write_artifact(path, states, card=card, format_name=FORMAT, version=VERSION)
-    except (OSError, SafetensorError) as reason:
-        if getattr(reason, "errno", None) == errno.ENOSPC or "No space left" in str(reason):
-            raise DiskSpaceError(f"The disk is full: {path} was not written. Free space first.") from reason
-        raise
+    return write_artifact(path, states, card=card, format_name=FORMAT, version=VERSION)
 
 
 def describe_loss(loss: LossModule) -> dict[str, Any]:

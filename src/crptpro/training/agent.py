@@ -83,6 +83,9 @@ def save_agent(path: str | Path, agent: PixelAgent, *, card: dict[str, Any]) -> 
         path: directory to write or replace.
         agent: what to keep.
         card: what else the reader should know: task, seed, env steps, where the encoder came from.
+
+    Raises:
+        DiskSpaceError: if the disk is full; an agent there is kept.
     """
     modules: dict[str, nn.Module] = {"encoder": agent.encoder, "actor": agent.actor}
     content = {

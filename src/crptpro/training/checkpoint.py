@@ -8,7 +8,6 @@ newest checkpoint instead of falling back to the one before. Runs here promise a
 from __future__ import annotations
 
 import contextlib
-import errno
 import hashlib
 import logging
 import numbers
@@ -20,7 +19,7 @@ from typing import IO, Any, cast
 
 import torch
 
-from crptpro.errors import CheckpointError, DiskSpaceError
+from crptpro.errors import CheckpointError, DiskSpaceError, is_disk_full
 
 CHECKPOINTS = "checkpoints"
 """Where a run keeps them, below its directory."""
@@ -150,7 +149,7 @@ class CheckpointDir:
         return writer.sha256.hexdigest()
 
     def _write_error(self, reason: OSError) -> CheckpointError | DiskSpaceError:
-        if reason.errno in (errno.ENOSPC, errno.EDQUOT):
+        if is_disk_full(reason):
             return DiskSpaceError(
                 f"The disk is full: no checkpoint could be written to {self.path}. Earlier ones are kept; "
                 "free space and start the same command again."
