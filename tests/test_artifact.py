@@ -86,6 +86,39 @@ def test_a_failed_write_keeps_the_old_artifact_and_names_it(
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
+@pytest.mark.parametrize(
+    ("folder", "given"), [("a", "."), ("a", ""), ("a/sub", ".."), ("a/sub", "../sub/..")]
+)
+def test_the_directory_that_one_is_in_is_read_like_any_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, given: str
+) -> None:
+    write(tmp_path / "a", 1.0)
+    (tmp_path / "a" / "sub").mkdir()
+    monkeypatch.chdir(tmp_path / folder)
+    assert read(Path(given))[1]["layer.weight"][0, 0] == 1
+
+
+def test_a_root_that_is_no_artifact_is_named() -> None:
+    with pytest.raises(PretrainedError, match=r"/card\.json does not exist"):
+        read(Path("/"))
+
+
+@pytest.mark.parametrize(("folder", "given"), [("a", "."), ("a", "../a"), ("a/sub", ".."), ("empty", ".")])
+def test_the_directory_that_one_is_in_is_not_replaced_under_ones_feet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, given: str
+) -> None:
+    write(tmp_path / "a", 1.0)
+    for name in ("a/sub", "empty"):
+        (tmp_path / name).mkdir()
+    monkeypatch.chdir(tmp_path / folder)
+    with pytest.raises(CRPTproError, match="is the current directory or around it"):
+        write(Path(given), 2.0)
+    assert read(tmp_path / "a")[1]["layer.weight"][0, 0] == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "empty"]
+    # Where the new one is found again, a run that began there may save.
+    assert read(write(tmp_path / "a", 2.0))[1]["layer.weight"][0, 0] == 2
+
+
 def test_a_kill_between_the_two_renames_loses_nothing(tmp_path: Path) -> None:
     write(tmp_path / "a", 1.0)
     (tmp_path / "a").rename(artifact._previous(tmp_path / "a"))

@@ -47,11 +47,13 @@ def write_artifact(
         ``path``.
 
     Raises:
-        CRPTproError: if there is something else at ``path``; it is left alone.
+        CRPTproError: if there is something else at ``path``, or it leads to the current directory from there; it is
+            left alone.
         DiskSpaceError: if the disk is full; an artifact there is kept.
     """
-    path = Path(path)
+    given, path = Path(path), _with_name(Path(path))
     _refuse_foreign(path, format_name)
+    _refuse_under_foot(given)
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_stale(path)
     tensors = {}
@@ -78,7 +80,7 @@ def write_artifact(
         if isinstance(reason, (OSError, DiskSpaceError)):
             raise writing_error(path, reason) from reason
         raise
-    return path
+    return given
 
 
 def read_artifact(
@@ -92,7 +94,7 @@ def read_artifact(
     Raises:
         CRPTproError: (or ``error``) naming what is missing, damaged, of another kind or too new.
     """
-    path = Path(path)
+    path = _with_name(Path(path))
     while True:
         source = _current(path)
         before = _identity(source)
@@ -171,6 +173,15 @@ def _refuse_foreign(path: Path, format_name: str) -> None:
         )
 
 
+def _refuse_under_foot(path: Path) -> None:
+    """A path from a directory that was renamed and removed leads nowhere; an absolute one leads to the new one."""
+    if not path.is_absolute() and path.exists() and Path.cwd().is_relative_to(path.resolve()):
+        raise CRPTproError(
+            f"{path} is the current directory or around it, which writing would replace as a whole. Go to another "
+            "one first, or name another directory."
+        )
+
+
 def _sha256(path: Path) -> str:
     digest = hashlib.sha256()
     with open(path, "rb") as file:
@@ -179,8 +190,13 @@ def _sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
+def _with_name(path: Path) -> Path:
+    """Return a path that ends in the directory's name, which ``.`` and ``..`` do not: its neighbours are named so."""
+    return path.resolve() if path.name in ("", "..") else path
+
+
 def _previous(path: Path) -> Path:
-    return path.with_name(f".{path.name}.previous")
+    return path.parent / f".{path.name}.previous"  # the root has no name at all
 
 
 def _replace_directory(new: Path, path: Path) -> None:

@@ -219,7 +219,7 @@ def test_a_run_with_other_settings_is_not_continued(call: Call, dataset: Path, t
 
 
 def test_every_command_does_its_part_on_a_world_without_a_simulator(
-    call: Call, dataset: Path, tmp_path: Path
+    call: Call, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = tmp_path / "runs"
     few = ("--updates", 2, "--batch-size", 4, "--log-interval", 1)
@@ -267,6 +267,11 @@ def test_every_command_does_its_part_on_a_world_without_a_simulator(
         (TASK, "0", "10"),
         (TASK, "1", "10"),
     ]
+    with monkeypatch.context() as inside:
+        inside.chdir(runs / "down" / "agent")
+        assert call("evaluate", ".", "--episodes", 2)[:2] == (0, out)
+        inside.chdir(runs / "pretrain" / "encoder")
+        assert call("finetune", ".", dataset, "--out", runs / "again", *few)[0] == 0
     line = refused(
         call("downstream", TASK, "--pretrained", runs / "down" / "agent", "--out", tmp_path / "out")
     )

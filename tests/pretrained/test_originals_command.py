@@ -60,6 +60,23 @@ def test_trimming_is_a_command_that_says_what_it_saved(
     assert trimmed.projector is None
 
 
+def test_an_encoder_can_be_trimmed_from_inside_and_not_where_it_is(
+    call: Callable[..., tuple[int, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    snapshot = save(atc_state(), tmp_path / "params.pkl", is_legacy=True)
+    call("import", snapshot, "--out", tmp_path / "encoder")
+    monkeypatch.chdir(tmp_path / "encoder")
+    status, told = call("trim", ".", "--out", "../trimmed")
+    assert status == 0, told
+    assert load_pretrained(tmp_path / "trimmed").identity() == load_pretrained("").identity()
+    status, told = call("trim", ".", "--out", ".")
+    assert status == 1
+    assert told.startswith("error: . is the current directory or around it")
+    assert told.count("\n") == 1
+    assert load_pretrained(".").projector is not None
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["encoder", "params.pkl", "trimmed"]
+
+
 def test_a_refusal_is_one_line_and_status_one(call: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("hello")
     status, told = call("import", tmp_path / "notes.txt", "--out", tmp_path / "encoder")
