@@ -95,7 +95,8 @@ def ablation(request: Request) -> list[Goal]:
 
 
 def _ablated(request: Request, method: str, group: str, task: str) -> list[Goal]:
-    explore, weight = (), None
+    explore: Settings = ()
+    weight: float | None = None
     if is_single_domain(method):
         explore, weight = request.scale.single_ablation, SINGLE_DISPERSION.get(get_domain(task).name)
         if weight is None and not request.tasks:
