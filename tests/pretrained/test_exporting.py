@@ -29,13 +29,14 @@ def _seed() -> None:
     torch.manual_seed(0)
 
 
-def artifact(kind: str, path: Path) -> Pretrained:
+def artifact(kind: str, path: Path, *, image_size: int = 84) -> Pretrained:
+    shape = {**CHANNELS, "image_size": image_size}
     if kind == "atc":
-        loss: Any = ATCLoss(PixelEncoder(strides=(2, 2, 2, 1), **CHANNELS), latent_dim=8, hidden_dim=12)
+        loss: Any = ATCLoss(PixelEncoder(strides=(2, 2, 2, 1), **shape), latent_dim=8, hidden_dim=12)
     elif kind == "becl":
-        loss = BeCLLoss(PixelEncoder(pixel_offset=0.5, **CHANNELS), skill_dim=6, hidden_dim=10)
+        loss = BeCLLoss(PixelEncoder(pixel_offset=0.5, **shape), skill_dim=6, hidden_dim=10)
     else:
-        encoder = PixelEncoder(pixel_offset=0.5 if kind == "urlb-proto" else 0.0, **CHANNELS)
+        encoder = PixelEncoder(pixel_offset=0.5 if kind == "urlb-proto" else 0.0, **shape)
         coefficient = 0.0 if kind == "urlb-proto" else 5e-3  # URLB's proto has no dispersion loss
         loss = ProtoLoss(encoder, num_prototypes=16, latent_dim=8, hidden_dim=12, intr_loss_coef=coefficient)
     for state in loss.target_state().values():  # targets lag behind
@@ -107,6 +108,13 @@ def test_what_another_code_would_read_wrongly_is_refused(tmp_path: Path) -> None
         export_state_dict(proto, "atc")
     with pytest.raises(PretrainedError, match="no projector"):
         export_state_dict(random_pretrained(**CHANNELS), "proto")
+
+
+@pytest.mark.parametrize(("kind", "layout"), [("proto", "proto"), ("becl", "urlb"), ("atc", "atc")])
+def test_an_encoder_of_other_images_is_refused(kind: str, layout: Any, tmp_path: Path) -> None:
+    large = artifact(kind, tmp_path / kind, image_size=96)
+    with pytest.raises(PretrainedError, match=r"does not fit .*: image_size is 96, theirs 84\.$"):
+        export_state_dict(large, layout)
 
 
 def test_a_disk_that_fills_up_keeps_the_old_file(tmp_path: Path) -> None:

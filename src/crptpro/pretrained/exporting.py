@@ -12,6 +12,7 @@ from torch import Tensor
 
 from crptpro.errors import PretrainedError, writing_error
 from crptpro.pretrained.bundle import Pretrained
+from crptpro.pretrained.importing.architecture import IMAGE_SIZE
 from crptpro.pretrained.importing.names import ATC, BECL, PROTO, URLB_PROTO, Head, Layout, LayoutFamily, join
 
 _SHARED_STRIDES = (2, 1, 1, 1)
@@ -34,7 +35,7 @@ def export_state_dict(pretrained: Pretrained, layout: LayoutFamily) -> dict[str,
         Dicts of tensors that share no memory with the artifact.
 
     Raises:
-        PretrainedError: pixel scaling, strides or heads are not what that repository's code has.
+        PretrainedError: image size, pixel scaling, strides or heads are not what that repository's code has.
     """
     chosen = {"proto": PROTO, "atc": ATC, "urlb": BECL if pretrained.method == "becl" else URLB_PROTO}[layout]
     _require_fit(pretrained, chosen)
@@ -118,7 +119,8 @@ def _write(
 def _require_fit(pretrained: Pretrained, layout: Layout) -> None:
     wrong = []
     config = pretrained.encoder.config
-    for name, theirs in (("pixel_scale", 1 / 255), ("pixel_offset", layout.pixel_offset)):
+    pixels = {"image_size": IMAGE_SIZE, "pixel_scale": 1 / 255, "pixel_offset": layout.pixel_offset}
+    for name, theirs in pixels.items():
         if abs(config[name] - theirs) > 1e-9:
             wrong.append(f"{name} is {config[name]}, theirs {theirs}")
     strides = tuple(config["strides"])
