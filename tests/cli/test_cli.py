@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import os
 import re
 import subprocess
@@ -147,10 +148,41 @@ def test_an_evaluation_that_cannot_run_says_why(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_table_that_cannot_be_written_is_refused_before_any_episode(call: Call, tmp_path: Path) -> None:
+@pytest.mark.parametrize("option", ["--csv", "--video"])
+def test_what_cannot_be_written_is_refused_before_any_episode(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    asked = ("evaluate", "random-policy", "--task", TASK, option)
     (tmp_path / "file").touch()
-    for path, message in ((tmp_path, "is a directory"), (tmp_path / "file" / "x.csv", "file is a file")):
-        assert message in refused(call("evaluate", "random-policy", "--task", TASK, "--csv", path))
+    for path, message in ((tmp_path, "is a directory"), (tmp_path / "file" / "x", "file is a file")):
+        assert f"{option} {path} " in (line := refused(call(*asked, path)))
+        assert message in line
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert f"you may not write to {tmp_path}" in refused(call(*asked, tmp_path / "new" / "x"))
+
+
+def test_a_video_without_the_extra_is_refused_before_any_episode(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *_: None if name == "imageio_ffmpeg" else find(name, *_)
+    )
+    line = refused(call("evaluate", "random-policy", "--task", TASK, "--video", tmp_path / "x.mp4"))
+    assert "--video needs the `video` extra: pip install 'crptpro[video]'" in line
+
+
+def test_a_video_that_could_not_be_written_fails_below_the_scores_and_the_table(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("crptpro.training.video.can_encode", lambda: True)
+    monkeypatch.setattr("crptpro.training.video.write_video", lambda *_: None)
+    asked = ("evaluate", "random-policy", "--task", TASK, "--episodes", 1, "--csv", tmp_path / "x.csv")
+    status, out, err = call(*asked, "--video", tmp_path / "x.mp4")
+    assert status == 1
+    assert out.startswith(f"{TASK}: ")
+    assert len(rows(tmp_path / "x.csv")) == 1
+    assert err.splitlines()[-1].startswith(f"error: --video {tmp_path / 'x.mp4'} was not written")
 
 
 def test_a_table_for_which_the_disk_is_full_is_named_below_the_scores(call: Call, tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ class Evaluate:
         from crptpro.envs import make_env
         from crptpro.experiments.row_files import write_rows
         from crptpro.training import evaluate, load_agent, summarize, uniform_policy
-        from crptpro.training.video import write_video
+        from crptpro.training.video import can_encode, write_video
 
         is_random = self.agent == "random-policy"
         if is_random and self.task is None:
@@ -51,6 +51,10 @@ class Evaluate:
             )
         if self.csv is not None:
             require_writable(self.csv)  # before an hour of episodes
+        if self.video is not None:
+            require_writable(self.video, "--video")
+            if not can_encode():
+                raise CRPTproError("--video needs the `video` extra: pip install 'crptpro[video]'.")
         agent, card = (None, {}) if is_random else load_agent(self.agent)
         task = self.task or card["task"]
         trained_with = card.get("config", {})
@@ -91,5 +95,5 @@ class Evaluate:
             columns = ("episode", "episode_return", "agent_steps", "seed")
             rows = ({**about, **{name: getattr(e, name) for name in columns}} for e in episodes)
             write_rows(self.csv, (*about, *columns), rows)
-        if self.video is not None:
-            write_video(videos[0], self.video)
+        if self.video is not None and write_video(videos[0], self.video) is None:
+            raise CRPTproError(f"--video {self.video} was not written; the warning above says why.")

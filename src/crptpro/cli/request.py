@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,10 +94,12 @@ def require_writable(path: Path, option: str = "--csv") -> None:
         option: by which it was asked for.
 
     Raises:
-        CRPTproError: it is a directory, or lies below a file.
+        CRPTproError: it is a directory, or lies below a file or in a directory that may not be written to.
     """
     if path.is_dir():
         raise CRPTproError(f"{option} {path} is a directory; name a file in it.")
     there = next(parent for parent in path.absolute().parents if parent.exists())
     if not there.is_dir():
         raise CRPTproError(f"{option} {path} cannot be written: {there} is a file.")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise CRPTproError(f"{option} {path} cannot be written: you may not write to {there}.")

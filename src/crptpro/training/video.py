@@ -13,6 +13,11 @@ from torch import Tensor
 logger = logging.getLogger(__name__)
 
 
+def can_encode() -> bool:
+    """Whether the ``video`` extra is installed."""
+    return importlib.util.find_spec("imageio_ffmpeg") is not None
+
+
 def write_video(pictures: Tensor, path: str | Path, *, pictures_per_s: int = 25) -> Path | None:
     """Write an MP4, or say once why not.
 
@@ -24,7 +29,7 @@ def write_video(pictures: Tensor, path: str | Path, *, pictures_per_s: int = 25)
     Returns:
         The file, or ``None`` if the ``video`` extra is missing or encoding failed (a warning says which).
     """
-    if importlib.util.find_spec("imageio_ffmpeg") is None:
+    if not can_encode():
         _warn_once("no video is written: install the extra with `pip install 'crptpro[video]'`.")
         return None
     path = Path(path)
