@@ -288,6 +288,8 @@ def test_runs_of_other_settings_are_not_taken_for_seeds_of_each_other(tmp_path: 
         write_run(
             tmp_path / f"{seed}", method="crptpro", task="walker_run", score=score, seed=seed, budget=budget
         )
+    path = tmp_path / "0" / "config.json"
+    path.write_text(path.read_text().replace('"seed"', '"a_setting_of_later": 1, "seed"'))
     write_run(tmp_path / "cheetah", method="crptpro", task="cheetah_run", score=5, budget=10_000)
     write_run(tmp_path / "atc", method="atc", task="walker_run", score=40)
     table = table_in(blocks_of(page_of(tmp_path), "scores"), FINAL)

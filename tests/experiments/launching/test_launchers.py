@@ -237,3 +237,9 @@ def test_a_number_below_one_is_refused() -> None:
 def test_an_option_of_sbatch_that_says_nothing_is_refused() -> None:
     with pytest.raises(CRPTproError, match="write key=value"):
         SlurmRequest(sbatch=("qos",))
+
+
+@pytest.mark.parametrize("option", ["cpus-per-task=4", "--cpus_per_task=4", "mem=4G", "time=10"])
+def test_an_option_of_sbatch_that_has_one_of_its_own_is_refused(option: str) -> None:
+    with pytest.raises(CRPTproError, match=r"say it by --(cores-per-job|memory-gb|hours)"):
+        SlurmRequest(sbatch=(option,))

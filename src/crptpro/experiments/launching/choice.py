@@ -108,6 +108,15 @@ def _require_gpus() -> tuple[str, ...]:
     return gpus
 
 
+OWN_OPTIONS = {
+    "cpus-per-task": "--cores-per-job",
+    "time": "--hours",
+    "mem": "--memory-gb",
+    "partition": "--partition",
+}
+"""Options of sbatch that every job is given by one of ours."""
+
+
 @dataclass(frozen=True)
 class SlurmRequest:
     """What a Slurm job asks for besides cores and a GPU.
@@ -119,7 +128,7 @@ class SlurmRequest:
         sbatch: further options as ``key=value``.
 
     Raises:
-        CRPTproError: no time, no memory, or an option that is not ``key=value``.
+        CRPTproError: no time, no memory, an option that is not ``key=value``, or one that has an option of its own.
     """
 
     partition: str | None = None
@@ -137,6 +146,8 @@ class SlurmRequest:
             key, equals, _ = option.partition("=")
             if not key or not equals:
                 raise CRPTproError(f"--sbatch {option}: write key=value, e.g. qos=high or account=robots.")
+            if instead := OWN_OPTIONS.get(key.lstrip("-").replace("_", "-")):
+                raise CRPTproError(f"--sbatch {option} would be overruled: say it by {instead}.")
 
 
 def make_launcher(

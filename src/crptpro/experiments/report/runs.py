@@ -20,7 +20,7 @@ LAST = 10
 NOT_TOLD_APART = frozenset({
     "seed", "task", "colors", "device", "precision", "channels_last", "compile", "cuda_graph", "eval_workers",
     "render_ahead", "features", "video_episodes", "checkpoint_interval_env_steps", "log_interval_env_steps",
-    "eval_interval_env_steps",
+    "eval_interval_env_steps", "eval_episodes",
 })  # fmt: skip
 """Settings of a run that do not make it another method's: its seed, where it stands, how and where it computed, when
 it wrote."""
@@ -115,7 +115,8 @@ def unplaced_runs(runs: Iterable[Run]) -> list[Placed]:
     for (method, _), own in alike.items():
         told = [settings[id(run)] for run in own]
         for name in dict.fromkeys(name for one in told for name in one):
-            if any(one.get(name) != told[0].get(name) for one in told):
+            # Records of earlier versions lack what was added since: that is no difference.
+            if len({repr(one[name]) for one in told if name in one}) > 1:
                 differing.setdefault(method, {})[name] = None
     placed = []
     for run in runs:
