@@ -154,7 +154,11 @@ def test_what_cannot_be_written_is_refused_before_any_episode(
 ) -> None:
     asked = ("evaluate", "random-policy", "--task", TASK, option)
     (tmp_path / "file").touch()
-    for path, message in ((tmp_path, "is a directory"), (tmp_path / "file" / "x", "file is a file")):
+    for path, message in (
+        (tmp_path, "is a directory"),
+        (Path("/dev/null"), "no ordinary file"),
+        (tmp_path / "file" / "x", "file is a file"),
+    ):
         assert f"{option} {path} " in (line := refused(call(*asked, path)))
         assert message in line
     monkeypatch.setattr(os, "access", lambda *_: False)

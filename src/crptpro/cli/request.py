@@ -94,10 +94,12 @@ def require_writable(path: Path, option: str = "--csv") -> None:
         option: by which it was asked for.
 
     Raises:
-        CRPTproError: it is a directory, or lies below a file or in a directory that may not be written to.
+        CRPTproError: it is a directory or a device, or lies below a file or in a directory that may not be written to.
     """
     if path.is_dir():
         raise CRPTproError(f"{option} {path} is a directory; name a file in it.")
+    if path.exists() and not path.is_file():  # a finished file takes its place: /dev/stdout would be gone
+        raise CRPTproError(f"{option} {path} is no ordinary file; name one.")
     there = next(parent for parent in path.absolute().parents if parent.exists())
     if not there.is_dir():
         raise CRPTproError(f"{option} {path} cannot be written: {there} is a file.")
