@@ -9,7 +9,7 @@ import pytest
 from command import Call, toy_dataset
 from toy_world import FIXED
 
-from crptpro import domains
+from crptpro import domains, plugins
 from crptpro.cli import main
 from crptpro.domains import register_domain
 
@@ -24,6 +24,7 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
     library = logging.getLogger("crptpro")
     before = library.handlers[:], library.level, library.propagate
     monkeypatch.setattr(domains, "_registered", {})
+    monkeypatch.setattr(plugins, "_loaded", [])  # processes of later tests would load what these have loaded
     register_domain(FIXED)
 
     def run(*arguments: object) -> tuple[int, str, str]:

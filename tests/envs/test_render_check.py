@@ -28,6 +28,7 @@ def runs(monkeypatch: pytest.MonkeyPatch, *results: tuple[int | None, str, str])
         return [left.pop(0)]
 
     monkeypatch.setattr(render_check, "run_isolated", run_isolated)
+    monkeypatch.setattr(render_check, "loaded_plugins", tuple)  # none, whatever other tests have loaded
     return asked
 
 
