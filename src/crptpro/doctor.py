@@ -102,8 +102,7 @@ def run_doctor(
     """Check versions and hardware, and render every domain with every backend, each in a process of its own.
 
     Args:
-        domains: Names that :func:`crptpro.domains.get_domain` knows, or letters of the paper's groups; by default the
-            paper's eight domains.
+        domains: As for :func:`crptpro.domains.expand_groups`; by default the paper's eight domains.
         backends: By default EGL, OSMesa, the one that ``MUJOCO_GL`` names, and GLFW where there is a display.
         root: Where data would be written; its disk is looked at.
         timeout_s: Seconds per backend; by default 60 for the first frame and 20 more for each domain.
@@ -202,12 +201,10 @@ def _check_rendering(
     from crptpro.envs.rendering import default_timeout_s, explain, platform_candidates
 
     requested = canonical_backend(os.environ["MUJOCO_GL"]) if "MUJOCO_GL" in os.environ else None
-    if requested == "off" or "off" in (backends or ()):
+    asked = platform_candidates() if backends is None else map(canonical_backend, backends)
+    backends = tuple(dict.fromkeys([*([requested] if requested and backends is None else []), *asked]))
+    if "off" in (requested, *backends):
         raise RenderingError("MUJOCO_GL switches rendering off; unset it, or set it to egl or osmesa.")
-    if backends is not None:
-        backends = tuple(map(canonical_backend, backends))
-    else:
-        backends = tuple(dict.fromkeys([*([requested] if requested else []), *platform_candidates()]))
     first_frame_s = default_timeout_s() if timeout_s is None else timeout_s
     checks: list[BackendCheck] = []
     findings: list[Finding] = []
@@ -255,7 +252,7 @@ def _failed(explanation: str, *, is_requested: bool) -> Finding:
 
 
 def _dead(entry: dict[str, Any], backend: str, is_chosen: bool) -> Finding:
-    remedy = "" if is_chosen else f"Nothing, as long as MUJOCO_GL={backend} is not set."
+    remedy = f"Nothing, as long as MUJOCO_GL={backend} is not set."
     what = f"{entry['domain']} with {backend}: {entry['error'] or 'its pixels are constant or do not change'}"
     if is_chosen and entry.get("is_drawing", True):
         remedy = "Try another backend: MUJOCO_GL=osmesa or MUJOCO_GL=egl."

@@ -7,7 +7,7 @@ import logging
 import pickle
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from crptpro.errors import CRPTproError, UnknownNameError
 
@@ -136,6 +136,8 @@ MANIPULATION_TASKS = (
     "reach_site",
 )
 
+Named = TypeVar("Named", str, str | Domain)
+
 _MANIPULATION_PREFIXES = ("manipulation_", "manip_")
 _registered: dict[str, Domain] = {}
 
@@ -214,8 +216,11 @@ def get_domain(name: str | Domain) -> Domain:
     raise UnknownNameError(_unknown(name))
 
 
-def expand_groups(names: Iterable[str]) -> list[str]:
+def expand_groups(names: Iterable[Named]) -> list[Named]:
     """Replace group letters by their domains, keeping order and dropping repeats.
+
+    Args:
+        names: of domains, tasks or groups; a :class:`Domain` stands for itself.
 
     Raises:
         UnknownNameError: if no name is given, or one that nobody knows.
@@ -224,7 +229,9 @@ def expand_groups(names: Iterable[str]) -> list[str]:
         >>> expand_groups(["D", "walker", "finger"])
         ['walker', 'pendulum', 'hopper', 'finger']
     """
-    expanded = [domain for name in names for domain in GROUPS.get(name, (name,))]
+    expanded: list[Named] = []
+    for name in names:
+        expanded += GROUPS.get(name, (name,)) if isinstance(name, str) else (name,)
     if not expanded:
         raise UnknownNameError(f"Name at least one domain, task or group ({', '.join(GROUPS)}).")
     for name in expanded:

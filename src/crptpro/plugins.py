@@ -49,7 +49,7 @@ def load_plugin(name: str) -> None:
         _loaded.append(kept)
 
 
-def load_plugins(names: Iterable[str]) -> None:
+def load_again(names: Iterable[str]) -> None:
     """Load what another process had loaded (:func:`loaded_plugins`) before it started this one.
 
     Raises:

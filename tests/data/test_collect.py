@@ -143,7 +143,7 @@ def test_two_tasks_of_one_domain_are_not_mixed(tmp_path):
 
 def test_what_two_letters_share_is_collected_once(tmp_path, monkeypatch):
     letters = {"X": (FIXED,), "Y": (FIXED, VARIABLE)}
-    monkeypatch.setattr("crptpro.data.collect.GROUPS", letters)
+    monkeypatch.setattr("crptpro.domains.GROUPS", letters)
     paths = collect_group(["X", "Y"], tmp_path, transitions=5, **SMALL)
     assert list(paths) == [FIXED.name, VARIABLE.name]
 

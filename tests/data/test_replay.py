@@ -10,7 +10,7 @@ import textwrap
 import pytest
 import torch
 
-from crptpro.data import FrameReplay, ring_storage
+from crptpro.data import FrameReplay, mapped_file
 from crptpro.errors import CheckpointError, DiskSpaceError
 
 
@@ -271,7 +271,7 @@ def test_a_disk_that_fills_up_while_rows_are_reserved_keeps_none_of_them(tmp_pat
         os.ftruncate(file, size // 2)
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(ring_storage.os, "posix_fallocate", half)
+    monkeypatch.setattr(mapped_file.os, "posix_fallocate", half)
     with pytest.raises(DiskSpaceError, match="No space left"):
         FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
     assert not any(file.stat().st_size for file in tmp_path.glob("*.memmap"))
@@ -289,7 +289,7 @@ def test_rows_are_reserved_where_the_system_has_to_write_them_one_by_one(tmp_pat
             raise OSError(errno.EBADF, os.strerror(errno.EBADF))
         reserve(file, offset, size)
 
-    monkeypatch.setattr(ring_storage.os, "posix_fallocate", without_support)
+    monkeypatch.setattr(mapped_file.os, "posix_fallocate", without_support)
     replay = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
     Driver(replay).write(15)
     state, content = replay.state_dict(), replay[:]["next", "pixels"].clone()
@@ -308,7 +308,7 @@ def test_an_error_of_reserving_is_named_as_what_it_is(tmp_path, monkeypatch, num
     def fail(file, offset, size):
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(ring_storage.os, "posix_fallocate", fail)
+    monkeypatch.setattr(mapped_file.os, "posix_fallocate", fail)
     with pytest.raises(kind, match=message) as caught:
         FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
     assert f"{tmp_path}/" in str(caught.value)

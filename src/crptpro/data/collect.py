@@ -18,7 +18,7 @@ from crptpro.data.collect_pool import Worker, WorkerPool
 from crptpro.data.collect_progress import CollectProgress
 from crptpro.data.collection import DomainCollection
 from crptpro.data.incoming import dataset_path
-from crptpro.domains import GROUPS, Domain, get_domain
+from crptpro.domains import Domain, expand_groups, get_domain
 from crptpro.errors import DatasetError
 from crptpro.quality import Quality
 from crptpro.seeding import require_seed
@@ -129,7 +129,7 @@ def collect_group(
     factories: dict[str, Callable[[], EnvBase]] = {}
     with ExitStack() as stack:
         collections: dict[str, DomainCollection] = {}
-        for domain in map(get_domain, _expanded(domains)):
+        for domain in map(get_domain, expand_groups(domains)):
             path = dataset_path(root, domain.name)
             if path in paths.values():
                 raise DatasetError(f"Two of the domains would be collected into {path}; collect them apart.")
@@ -161,12 +161,6 @@ def collect_group(
                 select_backend(processes=workers)
             _run(missing, factories, workers, stall_timeout_s, progress)
     return paths
-
-
-def _expanded(domains: Iterable[str | Domain]) -> list[str | Domain]:
-    """Replace group letters by their domains; a domain that two groups have is collected once."""
-    names = [(domain,) if isinstance(domain, Domain) else GROUPS.get(domain, (domain,)) for domain in domains]
-    return list(dict.fromkeys(name for several in names for name in several))
 
 
 def _announce(collections: dict[str, DomainCollection], root: Path) -> None:

@@ -22,7 +22,7 @@ from torchrl.modules import RandomPolicy
 
 from crptpro.data.episode import Episode
 from crptpro.errors import error_name
-from crptpro.plugins import load_plugins
+from crptpro.plugins import load_again
 
 HEARTBEAT_S = 1.0
 POLLING = 25
@@ -180,7 +180,7 @@ def worker_main(
     roller: EpisodeRoller | None = None
     domain = ""
     try:
-        load_plugins(plugins)
+        load_again(plugins)
         while (job := connection.recv()) is not None:
             if not isinstance(job, EpisodeJob):
                 continue  # a cancellation that arrived after its episode had ended

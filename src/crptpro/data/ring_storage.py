@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import mmap
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,8 +15,9 @@ from torchrl.data import TensorStorage
 from torchrl.data.replay_buffers.checkpointers import StorageCheckpointerBase
 
 from crptpro.data.frame_stacks import gather_stacks, stack_rows
+from crptpro.data.mapped_file import map_file
 from crptpro.data.n_step import Reading, n_step_return
-from crptpro.errors import CheckpointError, DiskSpaceError, is_disk_full, writing_error
+from crptpro.errors import CheckpointError
 
 _OWN = ("pixels", "step", "number", "row_of")
 
@@ -280,36 +279,6 @@ class RingStorage(TensorStorage):
         if self.path is None:
             return torch.zeros(rows, *shape, dtype=dtype)
         size = rows * torch.Size(shape).numel() * dtype.itemsize
-        path = self.path / f"{name}.memmap"
-        # Not by open(path, "a+b"): a file system that cannot reserve has glibc write instead, which it refuses to do in
-        # a file that is appended to.
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            found = os.fstat(handle).st_size
-            if found not in (0, size):
-                raise CheckpointError(
-                    f"{path} has {found:,} bytes, this replay needs {size:,}: it belongs to a replay of another "
-                    "size. Use the capacity and slack it was written with, or another directory."
-                )
-            self._reserve(handle, path, size)
-            mapped = mmap.mmap(handle, size)
-        finally:
-            os.close(handle)
+        mapped = map_file(self.path / f"{name}.memmap", size)
         self._maps.append(mapped)
         return torch.frombuffer(mapped, dtype=dtype).view(rows, *shape)
-
-    @staticmethod
-    def _reserve(handle: int, path: Path, size: int) -> None:
-        """Reserve the file's bytes: in a sparse one, a disk that fills up later ends the process by a bus error."""
-        found = os.fstat(handle).st_size
-        try:
-            os.posix_fallocate(handle, 0, size)
-        except OSError as reason:
-            os.ftruncate(handle, found)  # what was reserved before the disk was full
-            if is_disk_full(reason):
-                raise DiskSpaceError(f"{path} needs {size / 1e9:.2f} GB: {reason}. Free space.") from reason
-            if reason.errno == errno.EFBIG:
-                raise DiskSpaceError(
-                    f"{path} needs {size / 1e9:.2f} GB: {reason}. Choose another directory or a smaller capacity."
-                ) from reason
-            raise writing_error(path, reason) from reason

@@ -74,6 +74,11 @@ class Run:
     config: Mapping[str, Any]
 
     @property
+    def settings(self) -> Mapping[str, Any]:
+        """What its stage was told."""
+        return _stage_settings(self.config)
+
+    @property
     def is_finished(self) -> bool:
         """Whether the evaluation at the end of the budget was made."""
         return self.episodes[-1].env_steps >= self.env_steps
@@ -139,9 +144,7 @@ def read_run(directory: str | Path) -> Run:
     """
     directory = Path(directory)
     config = _read_json(directory / CONFIG_NAME)
-    outer = config.get("config", {})
-    # The command line keeps the stage's settings within its request, a program beside the task.
-    settings = outer.get("config", outer)
+    outer, settings = config.get("config", {}), _stage_settings(config)
     try:
         task, seed, env_steps = str(outer["task"]), int(settings["seed"]), int(settings["env_steps"])
         eval_episodes = int(settings["eval_episodes"])
@@ -153,6 +156,12 @@ def read_run(directory: str | Path) -> Run:
     trains_encoder = settings.get("algorithm") == "drq"
     encoder = None if trains_encoder else _encoder_identity(directory, outer)
     return Run(directory, method, task, seed, encoder, trains_encoder, env_steps, episodes, config)
+
+
+def _stage_settings(config: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The command line keeps the stage's settings within its request, a program beside the task."""
+    outer = config.get("config", {})
+    return outer.get("config", outer)
 
 
 def _candidates(roots: Iterable[str | Path]) -> list[Path]:
@@ -170,8 +179,8 @@ def _candidates(roots: Iterable[str | Path]) -> list[Path]:
 def _is_downstream(path: Path) -> bool:
     """Whether a config without evaluations is that of a run that should have some; other stages have none."""
     try:
-        outer = _read_json(path).get("config", {})
-        return "task" in outer and "eval_episodes" in outer.get("config", outer)
+        config = _read_json(path)
+        return "task" in config.get("config", {}) and "eval_episodes" in _stage_settings(config)
     except (RecordError, AttributeError, TypeError):
         return False
 

@@ -46,6 +46,11 @@ class ScoreTable:
         return self.is_about_its_encoders
 
     @property
+    def shared_encoders(self) -> Mapping[Any, tuple[str, ...]] | None:
+        """The encoders over which an interval is to be had: those of the runs if they share them, else ``None``."""
+        return self.encoders if self.shares_encoders else None
+
+    @property
     def is_about_its_encoders(self) -> bool:
         """Whether an interval over runs speaks of these encoders and not of the method that made them.
 
@@ -92,21 +97,16 @@ def score_tables(
 def _table(method: str, by_key: Mapping[Hashable, list[Run]], score: Callable[[Run], float]) -> ScoreTable:
     scores = {key: np.array([score(run) for run in runs]) for key, runs in by_key.items()}
     names = {key: tuple(str(run.directory) for run in runs) for key, runs in by_key.items()}
-    encoders = {key: encoders_of(runs) for key, runs in by_key.items()}
-    unknown = [run for runs in by_key.values() for run in runs if _is_unknown(run)]
+    unknown = [
+        run for runs in by_key.values() for run in runs if run.encoder is None and not run.trains_encoder
+    ]
     if unknown:
         logger.warning(
             "The encoder of %d run(s) of %s is not recorded, the first in %s: intervals over runs only.",
             len(unknown), method, unknown[0].directory,
         )  # fmt: skip
         return ScoreTable(scores, None, names)
+    encoders = {
+        key: tuple(run.encoder or f"own:{run.directory}" for run in runs) for key, runs in by_key.items()
+    }
     return ScoreTable(scores, encoders, names)
-
-
-def encoders_of(runs: Iterable[Run]) -> tuple[str, ...]:
-    """Return the encoder of each run; one that trains its encoder, or does not tell it, has one of its own."""
-    return tuple(run.encoder or f"own:{run.directory}" for run in runs)
-
-
-def _is_unknown(run: Run) -> bool:
-    return run.encoder is None and not run.trains_encoder

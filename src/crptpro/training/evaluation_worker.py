@@ -23,7 +23,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from crptpro.errors import error_name
-from crptpro.plugins import load_plugins
+from crptpro.plugins import load_again
 from crptpro.training.evaluate import Policy, run_episode
 
 HEARTBEAT_S = 1.0
@@ -83,7 +83,7 @@ def serve(connection: Connection) -> None:
     """
     env: EnvBase | None = None
     try:
-        load_plugins(receive(connection))
+        load_again(receive(connection))
         make_env: Callable[[], EnvBase] = receive(connection)
         while True:
             job: EvaluationJob = receive(connection)

@@ -47,7 +47,7 @@ def require_same(saved: Mapping[str, Any], now: Mapping[str, Any], where: Any) -
     Raises:
         CheckpointError: naming each setting that differs, with both values.
     """
-    old, new = _flatten(saved), _flatten(now)
+    old, new = flatten(saved), flatten(now)
     missing = "absent"
     differing = [
         f"{name} was {old.get(name, missing)!r}, now {new.get(name, missing)!r}"
@@ -62,7 +62,8 @@ def require_same(saved: Mapping[str, Any], now: Mapping[str, Any], where: Any) -
         )
 
 
-def _flatten(value: Any, prefix: str = "") -> dict[str, Any]:
+def flatten(value: Any, prefix: str = "") -> dict[str, Any]:
+    """Return nested settings under dotted names, entries of lists by their index."""
     if isinstance(value, Mapping):
         items = [(str(key), item) for key, item in value.items()]
     elif isinstance(value, (list, tuple)):
@@ -72,5 +73,5 @@ def _flatten(value: Any, prefix: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for key, item in items:
         joiner = "" if key.startswith("[") or not prefix else "."
-        flat.update(_flatten(item, f"{prefix}{joiner}{key}"))
+        flat.update(flatten(item, f"{prefix}{joiner}{key}"))
     return flat

@@ -19,7 +19,7 @@ from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import CRPTproError, RecordError, RenderingError, WorkerLostError
 from crptpro.experiments.building import JobSettings, build
 from crptpro.experiments.store import LOG, PIECES, Store
-from crptpro.plugins import load_plugin
+from crptpro.plugins import load_again
 from crptpro.training.stop_request import StopRequest
 
 logger = logging.getLogger(__name__)
@@ -64,8 +64,7 @@ class Work:
         if self.gpus is not None:
             os.environ["CUDA_VISIBLE_DEVICES"] = self.gpus
         try:
-            for plugin in self.settings.plugins:
-                load_plugin(plugin)
+            load_again(self.settings.plugins)
             store = Store(Path(self.root))
             piece = store.described(self.key)
             with _lock(store.path(piece)):

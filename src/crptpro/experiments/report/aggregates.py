@@ -142,8 +142,8 @@ def _over_encoders(
     here = _measures_against_drq(tables)
     rows = []
     for label, table in tables.items():
-        told = table.encoders
-        if told is None or not table.shares_encoders:
+        told = table.shared_encoders
+        if told is None:
             continue
         count = len({encoder for encoders in told.values() for encoder in encoders})
         found = estimate(table.scores, mean, encoders=told, runs=table.runs, bootstrap=bootstrap)
@@ -214,7 +214,7 @@ def _profiles(tables: Mapping[str, ScoreTable], name: str, bootstrap: Bootstrap)
     look = styles(tables)
     curves = []
     for label, table in tables.items():
-        encoders = table.encoders if table.shares_encoders else None
+        encoders = table.shared_encoders
         found = estimate_profile(
             table.scores, thresholds, encoders=encoders, runs=table.runs, bootstrap=bootstrap
         )

@@ -122,7 +122,7 @@ def _panel(
         if not len(env_steps):
             continue
         (table,) = score_tables(own, key=lambda _: spot).values()
-        encoders = table.encoders if table.shares_encoders else None
+        encoders = table.shared_encoders
         found = estimate_curve(env_steps, {spot: returns}, mean, encoders=encoders, bootstrap=bootstrap)
         x = env_steps
         if unit == "hours":

@@ -14,6 +14,7 @@ from crptpro.experiments.records import Run, read_run
 from crptpro.experiments.report.palette import in_order
 from crptpro.experiments.report.reading import Asked
 from crptpro.experiments.score_table import ScoreTable, score_tables
+from crptpro.training.fingerprint import flatten
 
 LAST = 10
 """Evaluations at the end that a steadier score averages over."""
@@ -132,12 +133,7 @@ def _spot(settings: Mapping[str, Any], run: Run) -> Spot:
 
 def _settings(run: Run) -> dict[str, Any]:
     """What a run was told, but for its seed and for how and where it ran; nested settings under dotted names."""
-    outer = run.config.get("config", {})
-    flat: dict[str, Any] = {}
-    for name, value in outer.get("config", outer).items():
-        parts = value.items() if isinstance(value, Mapping) else [("", value)]
-        flat |= {f"{name}.{part}".rstrip("."): content for part, content in parts}
-    return {name: value for name, value in flat.items() if name not in NOT_TOLD_APART}
+    return {name: value for name, value in flatten(run.settings).items() if name not in NOT_TOLD_APART}
 
 
 def labels_of(placed: Iterable[Placed]) -> list[str]:

@@ -69,7 +69,7 @@ def _estimate(placed: Sequence[Placed], bootstrap: Bootstrap) -> Estimate:
     return estimate(
         expert_normalized(table.scores, experts),
         mean,
-        encoders=table.encoders if table.shares_encoders else None,
+        encoders=table.shared_encoders,
         runs=table.runs,
         bootstrap=bootstrap,
     )
