@@ -161,6 +161,18 @@ def test_generator_decides_the_noise_and_leaves_the_global_one_alone() -> None:
     assert not torch.equal(loss(td)["loss_actor"], first)
 
 
+def test_n_step_transitions_are_discounted_by_gamma_to_the_n() -> None:
+    td, loss = transition_batch(), rad_sac(generator=generator())
+    rows = torch.arange(len(td)) % 3 + 1
+    td["steps_to_next_obs"] = rows.unsqueeze(-1)
+    found = loss._compute_target_v2(td)
+    one_step = rad_sac(generator=generator())
+    one_step.load_state_dict(loss.state_dict())
+    reward = td["next", "reward"].squeeze(-1)
+    value = (one_step._compute_target_v2(td.exclude("steps_to_next_obs")) - reward) / 0.99
+    torch.testing.assert_close(found, reward + 0.99**rows * value)
+
+
 def test_target_follows_the_whole_critic_trunk_included() -> None:
     loss = rad_sac()
     updater = SoftUpdate(loss, tau=0.01)

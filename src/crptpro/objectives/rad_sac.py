@@ -31,10 +31,13 @@ class RADSACLoss(OutKeys, SACLoss):
     * ``loss_actor`` = mean(alpha log pi(a|h) - min(Q1, Q2)(h, a)), gradient to the actor only;
     * ``loss_alpha`` = mean(exp(log_alpha) * sg(-log pi - target_entropy)), gradient to ``log_alpha`` only.
 
+    Of n-step transitions, whose ``steps_to_next_obs`` TorchRL's ``MultiStepTransform`` writes, gamma is raised to n.
+
     Features never receive a gradient. What differs from ``SACLoss``: squared error; the temperature loss of
     the released code (not its logarithm); the log-std squash and pre-tanh log-probability of
     :class:`~crptpro.modules.SquashedGaussianActor`; one trunk under both Q heads, so the critic is one
-    network with two outputs instead of a stack of two; and the separate steps :meth:`critic_loss` and
+    network with two outputs instead of a stack of two; no ``td_error`` is written into the input (prioritised replay
+    sets it from the rows of ``qvalue_v2_loss(td)[1]["td_error"]``); and the separate steps :meth:`critic_loss` and
     :meth:`actor_and_temperature_loss`, because the actor, the temperature and the target are updated every
     second time, against the critic just stepped::
 
@@ -230,7 +233,9 @@ class RADSACLoss(OutKeys, SACLoss):
                 soft_values.append(self._q_values(view, action).amin(-1) - self._alpha * log_prob)
         soft_value = torch.stack(soft_values).mean(0).unsqueeze(-1)
         names = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
-        estimate = tensordict.select(*[unravel_key(("next", name)) for name in names], strict=False)
+        keys = [unravel_key(("next", name)) for name in names]
+        steps_ahead = self.value_estimator.tensor_keys.steps_to_next_obs
+        estimate = tensordict.select(*keys, steps_ahead, strict=False)
         estimate.set(("next", self.value_estimator.tensor_keys.value), soft_value)
         return self.value_estimator.value_estimate(estimate).squeeze(-1)
 

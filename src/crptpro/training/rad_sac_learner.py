@@ -93,12 +93,10 @@ class RADSACLearner:
             self._captured[kind] = CapturedCall(
                 lambda batch: self._advance(batch, *kind), generators=generators
             )
-        weighting = [
-            key
-            for key in (self.loss.tensor_keys.priority_weight, *mask_keys(self.loss))
-            if key in td.keys(True)
-        ]
-        return self._captured[kind](td.select(*self.loss.in_keys, *weighting))
+        steps_ahead = self.loss.value_estimator.tensor_keys.steps_to_next_obs
+        optional = (self.loss.tensor_keys.priority_weight, steps_ahead, *mask_keys(self.loss))
+        present = [key for key in optional if key in td.keys(True)]
+        return self._captured[kind](td.select(*self.loss.in_keys, *present))
 
     def _advance(self, td: TensorDictBase, with_actor: bool, with_target: bool) -> dict[str, Tensor]:
         losses = self._learn(self._critic_loss, td, {"critic": "loss_qvalue"})
