@@ -361,7 +361,7 @@ def test_batches_too_small_for_the_prototypes_are_announced(caplog: pytest.LogCa
     assert not caplog.text
     warn_if_mostly_zero(512, 128, 3)
     assert "512 prototypes draw their candidates from batches of 128" in caplog.text
-    assert "batches of more than 170" in caplog.text
+    assert "batches of more than 192" in caplog.text
 
 
 def test_most_rows_earn_nothing_where_it_is_announced_and_few_at_the_papers_sizes() -> None:

@@ -215,18 +215,20 @@ def warn_if_mostly_zero(num_prototypes: int, batch_size: int, knn_k: int) -> Non
     """Say so where most rows will earn nothing.
 
     Every prototype draws a candidate from the batch: from a small one each row so often that the k nearest candidates
-    of most rows are the row itself. With 512 prototypes, k = 3 and batches of 128 three quarters of the rows get 0.
+    of most rows are the row itself. A row is drawn about Poisson(M / B) times, whose median is k from M / B = k - 1/3
+    on. With 512 prototypes, k = 3 and batches of 128 three quarters of the rows get 0.
 
     Args:
         num_prototypes: M.
         batch_size: B; the paper has B = M.
         knn_k: k.
     """
-    if num_prototypes >= knn_k * batch_size:
+    too_few = int(num_prototypes / (knn_k - 1 / 3))
+    if batch_size <= too_few:
         logger.warning(
             "The prototype reward will mostly be 0: %d prototypes draw their candidates from batches of %d, so that "
             "the %d nearest candidates of a row are the row itself. Take batches of more than %d, or fewer prototypes.",
-            num_prototypes, batch_size, knn_k, num_prototypes // knn_k,
+            num_prototypes, batch_size, knn_k, too_few,
         )  # fmt: skip
 
 

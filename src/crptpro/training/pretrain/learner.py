@@ -94,7 +94,7 @@ class Learner:
         self._index.fill_(index)
         if self._is_settled:
             return self._step(batch, domain)
-        # What fails to compile does so before the optimiser steps, so that nothing has changed yet.
+        # What fails to compile does so before the optimiser steps, so that no weight has changed yet.
         values = self.compiled.attempt(lambda: self._step(batch, domain))
         self._is_settled = True
         return values
