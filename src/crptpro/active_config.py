@@ -109,8 +109,8 @@ class ActiveConfig(ExplorationSettings):
     seed: int = 0
     """seeds agents, environments, exploration, sampling and shifts"""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
-    """arithmetic of the convolutions and big matrix products; `auto` is bf16 where the hardware has it. Deviation: the
-    released code computes in fp32 throughout, which `fp32` gives"""
+    """arithmetic of the convolutions and big matrix products; `auto` is bf16 where the hardware is faster in it.
+    Deviation: the released code computes in fp32 throughout, which `fp32` gives"""
     channels_last: Switch = "auto"
     """memory layout of the encoder's convolutions; changes rounding only (auto: on)"""
     device: str = "cpu"

@@ -195,8 +195,8 @@ class DownstreamConfig(SACSettings):
     colors: Colors = "normal"
     """colours of the task: reversed_background are the paper's unseen ones, reversed_image works everywhere"""
     precision: Literal["auto", "fp32", "bf16"] = "auto"
-    """arithmetic of the big matrix products; `auto` is bf16 where the hardware has it. Deviation: the released code
-    computes in fp32 throughout, which `fp32` gives"""
+    """arithmetic of the big matrix products; `auto` is bf16 where the hardware is faster in it. Deviation: the
+    released code computes in fp32 throughout, which `fp32` gives"""
     channels_last: Switch = "auto"
     """memory layout of the encoder's convolutions, which changes rounding only; `auto` is on"""
     compile: Switch = "auto"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
@@ -29,7 +30,37 @@ def test_named_precisions_are_taken_literally() -> None:
 
 @pytest.mark.parametrize(("capable", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])
 def test_auto_follows_the_cpu(monkeypatch: pytest.MonkeyPatch, capable: bool, dtype: torch.dtype) -> None:
-    monkeypatch.setattr(precision_module, "_cpu_multiplies_bf16", lambda: capable)
+    monkeypatch.setattr(precision_module, "_is_cpu_faster_in_bf16", lambda: capable)
+    assert resolve_precision("auto", "cpu") == dtype
+
+
+@pytest.mark.parametrize(
+    ("flags", "dtype"),
+    [
+        ("GenuineIntel avx512_bf16 avx512_fp16 amx_tile amx_bf16", torch.bfloat16),
+        # A virtual machine that hides AMX: AVX512-BF16 has half the rate of float32 there.
+        ("GenuineIntel avx512_bf16 avx512_fp16", torch.float32),
+        ("GenuineIntel avx512_bf16", torch.bfloat16),
+        ("AuthenticAMD avx512_bf16", torch.bfloat16),
+        ("AuthenticAMD avx512_bf16 avx512_fp16", torch.bfloat16),
+        ("AuthenticAMD avx2", torch.float32),
+        (None, torch.float32),
+    ],
+)
+@pytest.mark.parametrize("is_probed", [True, False])
+def test_auto_is_bf16_on_processors_that_are_faster_in_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, flags: str | None, dtype: torch.dtype, is_probed: bool
+) -> None:
+    cpuinfo = tmp_path / "cpuinfo"
+    if flags is not None:
+        vendor, *features = flags.split()
+        cpuinfo.write_text(f"vendor_id\t: {vendor}\nflags\t\t: {' '.join(features)}\n")
+    monkeypatch.setattr(precision_module, "CPUINFO", cpuinfo)
+    for probe, flag in (("_is_amx_tile_supported", "amx_tile"), ("_is_avx512_bf16_supported", "avx512_bf16")):
+        if is_probed:
+            monkeypatch.setattr(torch.cpu, probe, lambda flag=flag: flag in (flags or ""), raising=False)
+        else:
+            monkeypatch.delattr(torch.cpu, probe, raising=False)
     assert resolve_precision("auto", "cpu") == dtype
 
 

@@ -292,9 +292,9 @@ def test_what_auto_became_must_agree_when_a_run_is_continued(
 def test_a_run_goes_on_in_the_arithmetic_that_it_began_in_on_a_machine_with_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begun_in: str
 ) -> None:
-    monkeypatch.setattr("crptpro.modules.precision._cpu_multiplies_bf16", lambda: begun_in == "bf16")
+    monkeypatch.setattr("crptpro.modules.precision._is_cpu_faster_in_bf16", lambda: begun_in == "bf16")
     train(tmp_path, env_steps=60, precision="auto")
-    monkeypatch.setattr("crptpro.modules.precision._cpu_multiplies_bf16", lambda: begun_in != "bf16")
+    monkeypatch.setattr("crptpro.modules.precision._is_cpu_faster_in_bf16", lambda: begun_in != "bf16")
     assert train(tmp_path, precision="auto").env_steps == 120
     kept = CheckpointDir(tmp_path / "checkpoints").load_latest()
     assert kept is not None

@@ -105,9 +105,9 @@ def test_a_run_goes_on_in_the_arithmetic_that_it_began_in_on_a_machine_with_anot
 ) -> None:
     whole, second = make_loss(), make_loss()
     run(whole, 8, precision=begun_in)
-    monkeypatch.setattr("crptpro.modules.precision._cpu_multiplies_bf16", lambda: begun_in == "bf16")
+    monkeypatch.setattr("crptpro.modules.precision._is_cpu_faster_in_bf16", lambda: begun_in == "bf16")
     assert run(make_loss(), 4, run_dir=tmp_path, precision="auto").precision == begun_in
-    monkeypatch.setattr("crptpro.modules.precision._cpu_multiplies_bf16", lambda: begun_in != "bf16")
+    monkeypatch.setattr("crptpro.modules.precision._is_cpu_faster_in_bf16", lambda: begun_in != "bf16")
     assert run(second, 8, run_dir=tmp_path, precision="auto").precision == begun_in
     assert same_state(whole, second)
     other = "bf16" if begun_in == "fp32" else "fp32"

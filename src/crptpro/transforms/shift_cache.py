@@ -244,9 +244,15 @@ def choose_feature_mode(
             logger.warning("The dense-shift cache was asked for and may not fit: %s.", size)
         return "dense", f"dense-shift cache, as asked ({size})"
     if needed > MEMORY_SHARE * available:
+        in_bf16 = dense_cache_bytes(encoder, slots, torch.bfloat16, pad=pad, latent_dim=latent_dim)
+        remedy = (
+            f"; precision bf16 would need {in_bf16 / 2**30:.1f}"
+            if in_bf16 <= MEMORY_SHARE * available
+            else ""
+        )
         return (
             "reencode",
-            f"re-encoding at every update: too little memory for the dense-shift cache ({size})",
+            f"re-encoding at every update: too little memory for the dense-shift cache ({size}{remedy})",
         )
     return "dense", f"dense-shift cache ({size})"
 

@@ -341,11 +341,11 @@ def test_a_run_goes_on_in_the_arithmetic_that_it_began_in_on_a_machine_with_anot
         original(run, index)
 
     with monkeypatch.context() as patched:
-        patched.setattr("crptpro.modules.precision._cpu_multiplies_bf16", lambda: begun_in == "bf16")
+        patched.setattr("crptpro.modules.precision._is_cpu_faster_in_bf16", lambda: begun_in == "bf16")
         patched.setattr(ActiveRun, "_turn", dies)
         with pytest.raises(Killed):
             explore(tmp_path, precision="auto")
-    monkeypatch.setattr("crptpro.modules.precision._cpu_multiplies_bf16", lambda: begun_in != "bf16")
+    monkeypatch.setattr("crptpro.modules.precision._is_cpu_faster_in_bf16", lambda: begun_in != "bf16")
     resumed, result = explore(tmp_path, precision="auto")
     assert result.resumed_from > 0
     assert result.precision == begun_in

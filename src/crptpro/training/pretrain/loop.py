@@ -104,7 +104,7 @@ def pretrain(
         augment: ``"random_shift"`` (4 pixels, replicated border; independent per image and per sample),
             ``"none"``, or a function of a batch and a generator. Entries that the loss names in ``views`` are
             the same images, shifted once more (copies for ``"none"`` and a function).
-        precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (bf16 where the hardware multiplies it natively; a run
+        precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (bf16 where the hardware is faster in it; a run
             that is continued keeps what it began with).
             Deviation: the released code computes in fp32 throughout, which ``"fp32"`` gives.
         channels_last: ``"on"``, ``"off"`` or ``"auto"`` (on): the memory layout of the convolutions. Changes rounding
