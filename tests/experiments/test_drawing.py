@@ -35,3 +35,29 @@ def test_the_numbers_below_panels_of_dots_are_three_at_least_and_do_not_touch(
         ]
         assert len(labels) >= 3
         assert all(left.x1 + 3 < right.x0 for left, right in itertools.pairwise(labels))
+
+
+def _heights(*furthest: float) -> drawing.Panel:
+    style = styles(["crptpro"])["crptpro"]
+    curves = [drawing.Line(f"curve {end}", style, [0, 1], [0.0, end]) for end in furthest]
+    return drawing.Panel("", "encoder updates", "L_intr", curves, compresses=True)
+
+
+def test_one_curve_far_from_the_others_does_not_press_them_flat() -> None:
+    figure = drawing.lines([_heights(0.0003, 0.0004, 0.0005, -0.01)])
+    axis = figure.axes[0]
+    figure.canvas.draw()
+    low, high = axis.get_window_extent().y0, axis.get_window_extent().y1
+    places = [axis.transData.transform((0, height))[1] for height in (0.0003, 0.0005)]
+    assert (places[1] - places[0]) / (high - low) > 0.05
+    labels = [label.get_text() for label in axis.get_yticklabels()]
+    assert [label.replace("\N{MINUS SIGN}", "-") for label in labels] == ["-0.01", "-0.001", "0"]
+    boxes = [label.get_window_extent() for label in axis.get_yticklabels()]
+    assert all(lower.y1 < upper.y0 for lower, upper in itertools.pairwise(boxes))
+
+
+def test_curves_of_one_size_are_drawn_to_scale() -> None:
+    assert drawing.linear_width([[0, 0.3], [0.4], [-2.9]]) is None
+    assert drawing.linear_width([]) is None
+    assert drawing.linear_width([[0.0], [0.0]]) is None
+    assert drawing.lines([_heights(0.3, 0.4, -2.9)]).axes[0].get_yscale() == "linear"

@@ -47,6 +47,8 @@ class Panel:
         lines: curves.
         marks: heights of dashed lines, with what they say.
         ticks: names of the places 0, 1, ... of the horizontal axis, instead of numbers.
+        compresses: whether heights far from 0 are drawn closer together where a few of them would press all others
+            flat, see :func:`linear_width`.
     """
 
     title: str
@@ -55,6 +57,7 @@ class Panel:
     lines: Sequence[Line]
     marks: Mapping[str, float] = field(default_factory=dict)
     ticks: Sequence[str] = ()
+    compresses: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,6 +96,11 @@ def lines(panels: Sequence[Panel], *, columns: int = 3) -> Any:
                 mark = axis.axhline(height, color=INK, linestyle=(0, (4, 3)), linewidth=0.8)
                 named.setdefault(name, mark)
             axis.set(xlabel=panel.x, ylabel=panel.y, title=panel.title)
+            width = linear_width([line.y for line in panel.lines]) if panel.compresses else None
+            if width is not None:
+                axis.set_yscale("asinh", linear_width=width)
+                axis.set_yticks(_decades(axis.get_ylim(), width))
+                axis.yaxis.set_major_formatter("{x:g}")
             if panel.ticks:
                 axis.set_xticks(range(len(panel.ticks)), panel.ticks)
             largest = max((float(np.max(line.x)) for line in panel.lines if np.size(line.x)), default=0)
@@ -100,6 +108,28 @@ def lines(panels: Sequence[Panel], *, columns: int = 3) -> Any:
                 axis.xaxis.set_major_formatter(lambda value, _: f"{value / 1000:g}k" if value else "0")
         legend(figure, named)
         return figure
+
+
+def linear_width(heights: Sequence[ArrayLike]) -> float | None:
+    """Return up to which distance from 0 heights are drawn to scale, if some lie too far off to be drawn so.
+
+    Args:
+        heights: of each curve.
+
+    Returns:
+        The median of the curves' largest distances; ``None`` where the largest of all is less than ten times that.
+    """
+    furthest = [float(np.max(np.abs(own))) for own in heights if np.size(own)]
+    width = float(np.median(furthest)) if furthest else 0.0
+    return width if width and max(furthest) >= 10 * width else None
+
+
+def _decades(limits: tuple[float, float], width: float) -> list[float]:
+    """0 and the powers of ten on either side that stand apart from it on an axis to scale up to ``width``."""
+    first, last = math.ceil(math.log10(width / 3)), math.floor(math.log10(max(map(abs, limits))))
+    powers = [10.0**exponent for exponent in range(first, last + 1)]
+    ticks = [*(-power for power in reversed(powers)), 0.0, *powers]
+    return [tick for tick in ticks if limits[0] <= tick <= limits[1]]
 
 
 def bars(groups: Sequence[str], series: Mapping[str, Sequence[float | None]], unit: str) -> Any:

@@ -96,9 +96,14 @@ def prototypes(asked: Asked) -> tuple[Block, ...]:
             for label in in_order(runs)
             for own in runs[label].values()
         ]
-        panels.append(drawing.Panel("", "encoder updates", name, [c for c in curves if np.size(c.x)]))
+        drawn = [curve for curve in curves if np.size(curve.x)]
+        panels.append(drawing.Panel("", "encoder updates", name, drawn, compresses=True))
     count = sum(len(pieces) for pieces in runs.values())
     caption = f"Spread of the prototypes along training, a line per encoder; {count} encoders."
+    if any(drawing.linear_width([line.y for line in panel.lines]) for panel in panels):
+        caption += (
+            " Where some lie more than ten times as far from 0 as most, heights are to scale near 0 only."
+        )
     blocks.append(Figure(f"{asked.name}-spread", caption, drawing.lines(panels, columns=2)))
     return tuple(blocks)
 
