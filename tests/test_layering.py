@@ -12,7 +12,7 @@ import crptpro
 PACKAGE = Path(crptpro.__file__).parent
 FOUNDATION = [
     "errors", "quality", "colors", "seeding", "cards", "artifact", "directory_lock", "console", "loggers",
-    "downstream_config", "active_config", "host_memory", "plugins", "suspension", "switches",
+    "downstream_config", "active_config", "host_memory", "plugins", "suspension", "switches", "whole_file",
 ]  # fmt: skip
 ORDER = [
     "domains", "transforms.keys", "transforms.root_keys", "transforms.color_swap", "envs", "data", "modules",

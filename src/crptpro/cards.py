@@ -8,7 +8,6 @@ import os
 import platform
 import shutil
 import subprocess
-import tempfile
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,8 @@ from typing import Any
 import psutil
 import torch
 
-from crptpro.errors import CRPTproError, DiskSpaceError, writing_error
+from crptpro.errors import CRPTproError, DiskSpaceError
+from crptpro.whole_file import write_whole
 
 PACKAGES = (
     "crptpro", "torch", "torchrl", "tensordict", "dm-control", "mujoco", "gymnasium", "numpy", "wandb",
@@ -110,22 +110,7 @@ def write_json(path: str | Path, content: dict[str, Any]) -> None:
     Raises:
         DiskSpaceError: if the disk is full; what was there before is kept.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w") as file:
-            json.dump(content, file, indent=2, sort_keys=True, default=str)
-            file.write("\n")
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)  # mkstemp makes files that only their owner can read
-        os.replace(temporary, path)
-    except BaseException as reason:
-        Path(temporary).unlink(missing_ok=True)
-        if isinstance(reason, OSError):
-            raise writing_error(path, reason) from reason
-        raise
+    write_whole(path, json.dumps(content, indent=2, sort_keys=True, default=str) + "\n")
 
 
 def read_json(path: str | Path, *, error: type[CRPTproError] = CRPTproError) -> dict[str, Any]:

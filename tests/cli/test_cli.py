@@ -190,7 +190,7 @@ def test_a_video_that_could_not_be_written_fails_below_the_scores_and_the_table(
 
 
 def test_a_table_for_which_the_disk_is_full_is_named_below_the_scores(call: Call, tmp_path: Path) -> None:
-    (tmp_path / ".x.csv.partial").symlink_to("/dev/full")
+    (tmp_path / f".x.csv.{os.getpid()}.partial").symlink_to("/dev/full")
     asked = ("evaluate", "random-policy", "--task", TASK, "--episodes", 1, "--csv", tmp_path / "x.csv")
     status, out, err = call(*asked)
     assert status == 1

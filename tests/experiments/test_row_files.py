@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -29,7 +30,7 @@ def test_a_file_is_kept_if_its_successor_cannot_be_written(tmp_path: Path) -> No
 
 def test_a_full_disk_is_named_and_nothing_torn_stays(tmp_path: Path) -> None:
     path = write_rows(tmp_path / "a.csv", ("x",), [{"x": 1}])
-    (tmp_path / ".a.csv.partial").symlink_to("/dev/full")
+    (tmp_path / f".a.csv.{os.getpid()}.partial").symlink_to("/dev/full")
     with pytest.raises(DiskSpaceError, match=r"disk is full: .*/a\.csv cannot be written"):
         write_rows(path, ("x",), [{"x": 2}])
     assert read_rows(path) == [{"x": "1"}]

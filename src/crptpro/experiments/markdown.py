@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from crptpro.cards import git_revision, hardware, versions
+from crptpro.whole_file import write_whole
 
 
 def markdown_table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -49,7 +50,7 @@ def write_report(
     """Write a Markdown report beside its figures, whole or not at all.
 
     Args:
-        path: the ``.md`` file, in an existing directory; figures are linked relative to it.
+        path: the ``.md`` file, figures are linked relative to it.
         title: heading.
         command: what reproduces the run.
         summary: the result in a sentence or two.
@@ -80,7 +81,4 @@ def write_report(
         f"{machine['ram_bytes'] / 2**30:.0f} GiB RAM, {gpus}.\n\n"
         f"{installed}; source revision {git_revision()}.",
     ]
-    temporary = path.with_suffix(".tmp")
-    temporary.write_text("\n\n".join(parts) + "\n")
-    temporary.replace(path)
-    return path
+    return write_whole(path, "\n\n".join(parts) + "\n")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from crptpro.errors import RecordError, writing_error
+from crptpro.errors import RecordError
+from crptpro.whole_file import write_whole
 
 
 def write_rows(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> Path:
@@ -24,21 +26,11 @@ def write_rows(path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[
     Raises:
         DiskSpaceError: if the disk is full; what was there before is kept.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")
-    try:
-        with open(partial, "w", newline="") as file:
-            writer = csv.DictWriter(file, columns, lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-        partial.replace(path)
-    except BaseException as reason:
-        partial.unlink(missing_ok=True)
-        if isinstance(reason, OSError):
-            raise writing_error(path, reason) from reason
-        raise
-    return path
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return write_whole(path, text.getvalue())
 
 
 def read_rows(path: str | Path) -> list[dict[str, str]]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from crptpro.errors import writing_error
+from crptpro.whole_file import write_whole
 
 _LOG = logging.getLogger(__name__)
 
@@ -170,22 +171,10 @@ class MetricRecord:
         for row in rows:
             if row["stream"] == stream:
                 writer.writerow([_cell(row.get(column)) for column in self._columns[stream]])
-        self._write_whole(self.csv_path(stream), text.getvalue())
+        write_whole(self.csv_path(stream), text.getvalue())
 
     def _write_jsonl(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        self._write_whole(self.path, "".join(json.dumps(_json_row(row)) + "\n" for row in rows))
-
-    def _write_whole(self, path: Path, text: str) -> None:
-        partial = path.with_name(f".{path.name}.partial")
-        try:
-            with open(partial, "w", encoding="utf-8") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(partial, path)
-        except OSError as reason:
-            partial.unlink(missing_ok=True)
-            raise writing_error(path, reason) from reason
+        write_whole(self.path, "".join(json.dumps(_json_row(row)) + "\n" for row in rows))
 
     @staticmethod
     def _append_line(path: Path, line: str) -> None:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import io
-import os
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from crptpro.errors import PretrainedError, writing_error
+from crptpro.errors import PretrainedError
 from crptpro.pretrained.bundle import Pretrained
 from crptpro.pretrained.importing.architecture import IMAGE_SIZE
 from crptpro.pretrained.importing.names import ATC, BECL, PROTO, URLB_PROTO, Head, Layout, LayoutFamily, join
+from crptpro.whole_file import write_whole
 
 _SHARED_STRIDES = (2, 1, 1, 1)
 
@@ -85,17 +85,7 @@ def write_state_dict(state: dict[str, Any], path: str | Path) -> Path:
         raise PretrainedError(f"{path} is a directory; name a file in it, such as {path / 'state.pt'}.")
     content = io.BytesIO()
     torch.save(state, content)  # not into the file: torch hides what the system says of it
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        with open(partial, "wb") as file:
-            file.write(content.getbuffer())
-        partial.replace(path)
-    except OSError as reason:
-        raise writing_error(path, reason) from reason
-    finally:
-        partial.unlink(missing_ok=True)
-    return path
+    return write_whole(path, content.getvalue())
 
 
 def _state_of(pretrained: Pretrained, role: str) -> dict[str, Tensor]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from crptpro.experiments.report.canvas import INK, PAPER, RULE, theme
+from crptpro.whole_file import write_whole
 
 
 def save(drawing: Any, folder: Path, name: str) -> tuple[str, bytes]:
@@ -15,14 +16,17 @@ def save(drawing: Any, folder: Path, name: str) -> tuple[str, bytes]:
 
     Returns:
         The SVG as it can stand inside a page, and the PNG.
+
+    Raises:
+        OSError: a file cannot be written; it names the path.
     """
     text, pixels = io.StringIO(), io.BytesIO()
     with theme():
         drawing.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
         drawing.set_layout_engine("none")  # the same places in both files, and the layout is most of the work
         drawing.savefig(pixels, format="png", dpi=144, metadata={"Software": None})
-    (folder / f"{name}.svg").write_text(text.getvalue(), encoding="utf-8")
-    (folder / f"{name}.png").write_bytes(pixels.getvalue())
+    write_whole(folder / f"{name}.svg", text.getvalue())
+    write_whole(folder / f"{name}.png", pixels.getvalue())
     return inline_svg(text.getvalue(), name), pixels.getvalue()
 
 

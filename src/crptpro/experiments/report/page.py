@@ -27,6 +27,7 @@ from crptpro.experiments.report.runs import placed_runs, unplaced_runs
 from crptpro.experiments.report.scores import blocks_of_runs, score_blocks
 from crptpro.experiments.report.spending import spending
 from crptpro.experiments.report.study import study
+from crptpro.whole_file import write_whole
 
 logger = logging.getLogger(__name__)
 
@@ -70,8 +71,8 @@ def build_report(
     for section in page.sections:
         for figure in figures_of(section.blocks):
             figures[figure.name] = Saved(*save(figure.drawing, folder / "figures", figure.name))
-    _write(folder / "report.md", markdown_page(page))
-    return _write(folder / "index.html", html_page(page, figures))
+    write_whole(folder / "report.md", markdown_page(page))
+    return write_whole(folder / "index.html", html_page(page, figures))
 
 
 def make_page(source: Source, bootstrap: Bootstrap) -> Page:
@@ -126,11 +127,3 @@ def _experiment(asked: Asked, source: Source, bootstrap: Bootstrap) -> Section:
         logger.warning("%s: %s", asked.name, reason)
         blocks += (Paragraph(f"The rest of this section cannot be made: {reason}", "warning"),)
     return Section(title, blocks, asked.name)
-
-
-def _write(path: Path, text: str) -> Path:
-    """A reader never sees half a page."""
-    temporary = path.with_name(f".{path.name}.partial")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
-    return path
