@@ -274,7 +274,8 @@ def test_a_disk_that_fills_up_while_rows_are_reserved_keeps_none_of_them(tmp_pat
     monkeypatch.setattr(mapped_file.os, "posix_fallocate", half)
     with pytest.raises(DiskSpaceError, match="No space left"):
         FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
-    assert not any(file.stat().st_size for file in tmp_path.glob("*.memmap"))
+    assert not list(tmp_path.glob("*.memmap*"))
+    assert not list(tmp_path.glob(".*"))
     monkeypatch.undo()
     FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
 
@@ -297,6 +298,23 @@ def test_rows_are_reserved_where_the_system_has_to_write_them_one_by_one(tmp_pat
     again.load_state_dict(state)
     assert torch.equal(again[:]["next", "pixels"], content)
     assert not refused
+
+
+def test_a_kill_while_rows_are_reserved_leaves_a_directory_that_any_replay_can_use(tmp_path):
+    program = f"""
+        import os, signal
+        from crptpro.data import FrameReplay, mapped_file
+        def half(file, offset, size):
+            os.ftruncate(file, size // 2)
+            os.kill(os.getpid(), signal.SIGKILL)
+        mapped_file.os.posix_fallocate = half
+        FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path={str(tmp_path)!r})
+    """
+    ended = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], timeout=120)
+    assert ended.returncode == -9
+    replay = FrameReplay(10, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
+    Driver(replay).write(15)
+    assert not list(tmp_path.glob(".*"))
 
 
 @pytest.mark.parametrize(("number", "kind", "message"), [
