@@ -19,7 +19,7 @@ from crptpro.modules import PixelEncoder, Projector, Prototypes, resolve_precisi
 from crptpro.modules.precision import Precision
 from crptpro.objectives import ProtoLoss, method_defaults
 from crptpro.pretrained import Pretrained
-from crptpro.training.downstream_parts import build_parts, worth_keeping_projections
+from crptpro.training.downstream_parts import build_parts, dense_dtype, worth_keeping_projections
 from crptpro.training.frozen_features import dense_slots
 from crptpro.training.pretrain.augmenter import Augmenter
 from crptpro.training.pretrain.learner import Learner
@@ -148,7 +148,7 @@ def synthetic_episodes(
 
 def dense_bytes(pretrained: Pretrained, config: DownstreamConfig) -> int:
     """Return the memory of the dense maps of a full replay, and of the projections where they are kept too."""
-    dtype = resolve_precision(config.precision, config.device)
+    dtype = dense_dtype(config, resolve_precision(config.precision, config.device))
     geometry = dense_shift_geometry(pretrained.encoder, config.shift_pad)
     projections = 4 * (_kept_latent_dim(pretrained, config) or 0) * (2 * config.shift_pad + 1) ** 2
     return (geometry.values * dtype.itemsize + projections) * _slots(config)
@@ -160,7 +160,7 @@ def require_dense(pretrained: Pretrained, config: DownstreamConfig) -> None:
     Raises:
         CRPTproError: with the library's reason.
     """
-    dtype = resolve_precision(config.precision, config.device)
+    dtype = dense_dtype(config, resolve_precision(config.precision, config.device))
     mode, reason = choose_feature_mode(
         "auto", pretrained.encoder, _slots(config), dtype, pad=config.shift_pad,
         latent_dim=_kept_latent_dim(pretrained, config),

@@ -118,6 +118,9 @@ class SACSettings:
     features: Literal["auto", "dense", "reencode"] = "auto"
     """how shifted features are had: cut from dense maps stored once per observation, or encoded at every update (drq
     encodes, whatever is said here)"""
+    dense_precision: Literal["auto", "bf16"] = "auto"
+    """number format of the dense maps: `auto` is that of `precision`; bf16 halves their memory where networks compute
+    in fp32, and rounds every feature to eight significant bits"""
     skill_ddpg: SkillDDPGSettings = field(default_factory=SkillDDPGSettings)
     """what skill-ddpg alone reads"""
 
@@ -147,6 +150,12 @@ class SACSettings:
             raise ValueError(
                 f"`replay_capacity` ({self.replay_capacity}) must hold the {self.random_agent_steps} transitions "
                 "of `random_agent_steps`, or no update would ever start."
+            )
+        if self.dense_precision not in ("auto", "bf16"):
+            raise ValueError(f"`dense_precision` must be 'auto' or 'bf16', got {self.dense_precision!r}.")
+        if self.dense_precision != "auto" and self.features == "reencode":
+            raise ValueError(
+                "`dense_precision` is for dense maps, which features='reencode' does not keep: leave it out."
             )
         if self.algorithm != "skill-ddpg" and self.skill_ddpg != SkillDDPGSettings():
             raise ValueError(

@@ -27,8 +27,9 @@ class World:
         path: Path | None = None,
         slots: int | None = None,
         projector: torch.nn.Module | None = None,
+        maps_dtype: torch.dtype | None = None,
     ) -> None:
-        self.encoder = make_encoder()
+        self.encoder, self.maps_dtype = make_encoder(), maps_dtype
         self.replay = FrameReplay(CAPACITY, frame_shape=(3, SIZE, SIZE), action_dim=1, path=path, slack=SLACK)
         self.replay_rng, self.shift_rng = (torch.Generator().manual_seed(seed) for seed in (1, 2))
         self.replay.set_rng(self.replay_rng)
@@ -38,6 +39,7 @@ class World:
             mode=mode,
             pad=PAD,
             slots=slots,
+            maps_dtype=maps_dtype,
             generator=self.shift_rng,
             projector=projector,
         )
@@ -60,8 +62,9 @@ class World:
     def observe(self, stack: list[torch.Tensor], slot: int) -> None:
         pixels = torch.cat(stack)
         self.slots_seen.append(slot)
+        rtol = 1e-4 if self.maps_dtype is None else 2.0**-8
         torch.testing.assert_close(
-            self.features.observe(pixels, slot), self.encoder(pixels.unsqueeze(0)), rtol=1e-4, atol=1e-5
+            self.features.observe(pixels, slot), self.encoder(pixels.unsqueeze(0)), rtol=rtol, atol=1e-5
         )
 
     def sample(self) -> dict[str, torch.Tensor]:
@@ -92,6 +95,18 @@ def test_dense_equals_reencoded_for_the_same_generator_states_at_every_place_of_
         assert torch.equal(dense.shift_rng.get_state(), plain.shift_rng.get_state())
     assert max(dense.slots_seen) == dense.replay.frame_slots - 1
     assert len(dense.replay) == CAPACITY
+
+
+def test_maps_in_bfloat16_give_a_float32_encoder_its_features_rounded_once() -> None:
+    whole, half = World("dense"), World("dense", maps_dtype=torch.bfloat16)
+    assert 2 * half.features.cache.nbytes == whole.features.cache.nbytes
+    for length in LENGTHS:
+        whole.play(length)
+        half.play(length)
+        for ours, theirs in zip(half.sample().values(), whole.sample().values()):
+            assert ours.dtype == theirs.dtype
+            if ours.dtype == torch.float32:  # rewards are whole numbers, which rounding leaves alone
+                assert torch.equal(ours, theirs.bfloat16().float())
 
 
 @pytest.mark.parametrize("mode", ["dense", "reencode"])

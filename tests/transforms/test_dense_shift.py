@@ -97,7 +97,7 @@ def test_maps_carry_no_gradient_and_have_the_dtype_asked_for():
 def test_indexing_as_on_a_gpu_gives_the_same_crops_as_slicing():
     maps = torch.randn(7, 4, 3, 11, 12)
     rows, offsets = torch.randint(0, 7, (81,)), ALL_SHIFTS
-    indexed = _crop_by_index(maps, rows, offsets, 2, (5, 7, 8), None)
+    indexed = _crop_by_index(maps, rows, offsets, 2, (5, 7, 8))
     assert torch.equal(indexed, crop_rows(maps, rows, offsets))
 
 
@@ -109,6 +109,28 @@ def test_crops_can_be_written_into_a_given_tensor():
     assert torch.equal(out, crop_rows(maps, rows, offsets))
     with pytest.raises(ValueError, match="out"):
         crop_rows(maps, rows, offsets, out=out.float())
+
+
+@pytest.mark.parametrize("into", ["new", "given"])
+def test_crops_of_bfloat16_maps_come_in_float32_with_the_same_values(into: str):
+    maps = torch.randn(7, 4, 3, 11, 12).bfloat16()
+    maps[0, 0, 0, 0, :4] = torch.tensor([-0.0, torch.inf, -torch.inf, 1e-40])
+    rows, offsets = torch.randint(0, 7, (81,)), ALL_SHIFTS
+    out = torch.full((81, 3 * 7 * 8), torch.nan) if into == "given" else None
+    crops = crop_rows(maps, rows, offsets, out=out, dtype=torch.float32)
+    assert crops.dtype == torch.float32
+    expected = crop_rows(maps, rows, offsets).float()
+    assert torch.equal(crops.view(torch.int32), expected.view(torch.int32))
+
+
+@pytest.mark.parametrize(
+    ("maps", "features"), [("float32", "bfloat16"), ("bfloat16", "float64"), ("float32", "float64")]
+)
+def test_maps_are_read_in_no_other_format(maps: str, features: str):
+    store = torch.zeros(1, 4, 3, 9, 9, dtype=getattr(torch, maps))
+    where = torch.tensor([0]), torch.tensor([[0, 0]])
+    with pytest.raises(ValueError, match=f"maps in torch.{maps} .* got torch.{features}"):
+        crop_rows(store, *where, dtype=getattr(torch, features))
 
 
 def test_encoders_of_another_form_are_refused_with_the_remedy():

@@ -143,7 +143,7 @@ def test_auto_falls_back_with_a_one_line_reason(encoder, available, why):
 def test_too_little_memory_for_float32_says_whether_bf16_would_fit(available_gib: int, would_fit: bool):
     mode, reason = choose_feature_mode("auto", PixelEncoder(), 40_000, torch.float32, available_gib * 2**30)
     assert mode == "reencode"
-    assert ("precision bf16 would need 14.5" in reason) is would_fit
+    assert ("in bf16, by dense_precision, it would fit with 14.5 GiB" in reason) is would_fit
 
 
 def test_a_cache_that_is_asked_for_and_may_not_fit_is_warned_of(caplog):

@@ -104,6 +104,7 @@ class DrQConfig(DownstreamConfig):
     queue_size: Suppress[int] = 2_048
     reset_queue: Suppress[bool] = False
     features: Suppress[Literal["auto", "dense", "reencode"]] = "auto"
+    dense_precision: Suppress[Literal["auto", "bf16"]] = "auto"
     skill_ddpg: Suppress[SkillDDPGSettings] = field(default_factory=SkillDDPGSettings)
 
 

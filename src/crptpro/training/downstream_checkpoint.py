@@ -38,6 +38,7 @@ CAME_LATER: dict[str, Any] = {
     "skill_ddpg": dataclasses.asdict(SkillDDPGSettings()),
     "transfer_actor": None,
     "colors": "normal",
+    "dense_precision": "auto",
 }
 """Settings that checkpoints of earlier versions do not name, with what was the case then."""
 

@@ -177,7 +177,7 @@ def build_parts(
         trained = TrainedFeatures(encoder, replay, **shifts)
         return Parts(encoder, algorithm, replay, trained, None, "trained")
 
-    slots = dense_slots(replay, _agent_steps(config))
+    slots, maps_dtype = dense_slots(replay, _agent_steps(config)), dense_dtype(config, dtype)
     latent_dim = None
     if (
         prototypes is not None
@@ -195,16 +195,17 @@ def build_parts(
         # What there was room for when the run began: the other way rounds differently.
         mode, keeps_projections = before["features"], latent_dim is not None
         if mode == "dense" and not complete:
-            _require_room(config, encoder, slots, dtype, available, run_dir, latent_dim=latent_dim)
+            _require_room(config, encoder, slots, maps_dtype, available, run_dir, latent_dim=latent_dim)
     else:
         mode, keeps_projections = _choose_features(
-            config, encoder, slots, dtype, available, latent_dim=latent_dim
+            config, encoder, slots, maps_dtype, available, latent_dim=latent_dim
         )
     features = FrozenFeatures(
         encoder,
         replay,
         mode=mode,
         slots=slots,
+        maps_dtype=maps_dtype,
         projector=projector if keeps_projections else None,
         n_step=algorithm.n_step,
         discount=config.discount,
@@ -242,7 +243,7 @@ def _choose_features(
         config: what was asked for.
         encoder: frozen.
         slots: observations.
-        dtype: of the features.
+        dtype: of the dense maps.
         available: bytes.
         latent_dim: length of the projections, if they are to be kept where there is room.
     """
@@ -278,6 +279,11 @@ def _require_room(
             "differently, so it takes another run directory."
         )
     logger.info("features: dense-shift cache, as the run began (%s)", size)
+
+
+def dense_dtype(config: DownstreamConfig, compute_dtype: torch.dtype) -> torch.dtype:
+    """Return in which format dense maps are kept by a run whose networks compute in ``compute_dtype``."""
+    return torch.bfloat16 if config.dense_precision == "bf16" else compute_dtype
 
 
 def worth_keeping_projections(config: DownstreamConfig) -> bool:

@@ -23,6 +23,7 @@ class FrozenFeatures:
         mode: ``"dense"`` or ``"reencode"``; see :func:`crptpro.transforms.choose_feature_mode`.
         slots: observations to keep dense maps of; by default all that the replay can hold. A smaller number must
             be at least the number of observations that will ever be stored; see :func:`dense_slots`.
+        maps_dtype: of the dense maps, by default what the encoder computes in; features come in the latter.
         pad: largest random shift in pixels.
         generator: source of the shifts.
         device: where features live.
@@ -43,6 +44,7 @@ class FrozenFeatures:
         mode: Literal["dense", "reencode"],
         pad: int,
         slots: int | None = None,
+        maps_dtype: torch.dtype | None = None,
         generator: torch.Generator,
         device: torch.device | str = "cpu",
         projector: nn.Module | None = None,
@@ -58,7 +60,13 @@ class FrozenFeatures:
         self.cache: DenseShiftCache | None = None
         if mode == "dense":
             self.cache = DenseShiftCache(
-                encoder, self.slots, pad=pad, dtype=encoder.compute_dtype, device=device, projector=projector
+                encoder,
+                self.slots,
+                pad=pad,
+                dtype=maps_dtype or encoder.compute_dtype,
+                features_dtype=encoder.compute_dtype,
+                device=device,
+                projector=projector,
             )
         self.shifted = DenseShiftFeatures(
             self.cache,

@@ -139,7 +139,13 @@ def crop_features(maps: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
 
 @torch.no_grad()
 def crop_rows(
-    maps: Tensor, rows: Tensor, offsets: Tensor, *, pad: int = 4, out: Tensor | None = None
+    maps: Tensor,
+    rows: Tensor,
+    offsets: Tensor,
+    *,
+    pad: int = 4,
+    out: Tensor | None = None,
+    dtype: torch.dtype | None = None,
 ) -> Tensor:
     """Crop row ``rows[i]`` of a store of maps at ``offsets[i]``.
 
@@ -151,15 +157,18 @@ def crop_rows(
         rows: int64 ``[B]``.
         offsets: int64 ``[B, 2]``, (row, column) in ``{0, ..., 2 * pad}``.
         pad: as given to :func:`dense_shift_maps`.
-        out: contiguous ``[B, feature_dim]`` of the maps' dtype to write into. Reusing one halves the time
-            on a CPU, where the rest goes into mapping fresh memory.
+        out: contiguous ``[B, feature_dim]`` of ``dtype`` to write into. Reusing one halves the time on a CPU, where
+            the rest goes into mapping fresh memory.
+        dtype: of the crops: that of the maps when None, or float32 of bfloat16 maps.
 
     Returns:
         ``[B, feature_dim]``; ``out`` if given.
 
     Raises:
-        ValueError: shapes that do not fit, or an offset outside the range (read on the CPU only).
+        ValueError: shapes or formats that do not fit, or an offset outside the range (read on the CPU only).
     """
+    dtype = maps.dtype if dtype is None else dtype
+    require_readable(maps.dtype, dtype)
     batch, channels = rows.shape[0], maps.shape[2]
     if offsets.shape != (batch, 2):
         raise ValueError(f"expected offsets of shape [{batch}, 2], got {tuple(offsets.shape)}.")
@@ -168,17 +177,18 @@ def crop_rows(
     extra = 2 * pad // phases
     height, width = maps.shape[-2] - extra, maps.shape[-1] - extra
     shape = (batch, channels * height * width)
-    if out is not None and (out.shape != shape or out.dtype != maps.dtype):
-        raise ValueError(
-            f"expected out of shape {shape} and {maps.dtype}, got {tuple(out.shape)}, {out.dtype}."
-        )
+    if out is not None and (out.shape != shape or out.dtype != dtype):
+        raise ValueError(f"expected out of shape {shape} and {dtype}, got {tuple(out.shape)}, {out.dtype}.")
     if maps.device.type != "cpu":
-        return _crop_by_index(maps, rows, offsets, phases, (extra + 1, height, width), out)
+        crops = _crop_by_index(maps, rows, offsets, phases, (extra + 1, height, width))
+        return crops.to(dtype) if out is None else out.copy_(crops)
     # Channels first although channels last would copy in longer runs: the features must come in (C, H, W)
     # order, and turning a batch around costs three times the whole copy.
-    crops = empty_batch(shape, maps.dtype) if out is None else out
+    crops = empty_batch(shape, dtype) if out is None else out
     source = as_numpy_bits(maps)
-    target = as_numpy_bits(crops).reshape(batch, channels, height, width)
+    widens = dtype != maps.dtype
+    target = crops.view(torch.int32).numpy() if widens else as_numpy_bits(crops)
+    target = target.reshape(batch, channels, height, width)
     where = list(zip(rows.tolist(), offsets.tolist()))
 
     def crop_part(part: slice) -> None:
@@ -186,13 +196,15 @@ def crop_rows(
             top, left = dy // phases, dx // phases
             phase = dy % phases * phases + dx % phases
             crop[:] = source[row, phase, :, top : top + height, left : left + width]
+            if widens:
+                crop <<= 16  # the bits of a bfloat16 are the upper half of the same number's in float32
 
     split_among_threads(crop_part, batch)
     return crops
 
 
 def _crop_by_index(
-    maps: Tensor, rows: Tensor, offsets: Tensor, phases: int, sizes: tuple[int, int, int], out: Tensor | None
+    maps: Tensor, rows: Tensor, offsets: Tensor, phases: int, sizes: tuple[int, int, int]
 ) -> Tensor:
     origins, height, width = sizes
     slots, phase_count, channels = maps.shape[:3]
@@ -204,5 +216,14 @@ def _crop_by_index(
     rows, offsets = rows.to(maps.device), offsets.to(maps.device)
     origin, remainder = offsets // phases, offsets % phases
     phase = remainder[:, 0] * phases + remainder[:, 1]
-    crops = every_crop[rows, phase, origin[:, 0], origin[:, 1]].flatten(1)
-    return crops if out is None else out.copy_(crops)
+    return every_crop[rows, phase, origin[:, 0], origin[:, 1]].flatten(1)
+
+
+def require_readable(maps: torch.dtype, features: torch.dtype) -> None:
+    """Refuse to read maps of one format as features of another, except bfloat16 as float32.
+
+    Raises:
+        ValueError: naming both.
+    """
+    if features != maps and (maps, features) != (torch.bfloat16, torch.float32):
+        raise ValueError(f"maps in {maps} are read as {maps}, or bfloat16 as float32; got {features}.")

@@ -10,7 +10,13 @@ from torch import Tensor, nn
 
 from crptpro.host_memory import empty_on_huge_pages
 from crptpro.modules import PixelEncoder
-from crptpro.transforms.dense_shift import crop_features, crop_rows, dense_shift_geometry, dense_shift_maps
+from crptpro.transforms.dense_shift import (
+    crop_features,
+    crop_rows,
+    dense_shift_geometry,
+    dense_shift_maps,
+    require_readable,
+)
 from crptpro.transforms.free_memory import free_bytes
 
 FeatureMode = Literal["auto", "dense", "reencode"]
@@ -32,8 +38,10 @@ class DenseShiftCache:
             weights must not change while the cache is in use.
         slots: rows of the store; one per stored observation.
         pad: largest shift in pixels.
-        dtype: of the stored maps and of the features read. bfloat16 halves the memory and rounds each
-            feature to eight significant bits (exact if the encoder computes in bfloat16).
+        dtype: of the stored maps. bfloat16 halves the memory and rounds each feature to eight significant bits
+            (exact if the encoder computes in bfloat16).
+        features_dtype: of the features read: that of the maps when None, or float32 of bfloat16 maps, which takes no
+            longer than float32 of float32.
         device: where the store lives and the encoder runs.
         projector: with a projector, its output for all ``(2 * pad + 1)**2`` shifts is kept too (float32),
             computed from the maps as stored.
@@ -42,7 +50,7 @@ class DenseShiftCache:
         nbytes: memory of the full store.
 
     Raises:
-        ValueError: an encoder that is not of this form, or no slots.
+        ValueError: an encoder that is not of this form, no slots, or features in a format that maps are not read in.
     """
 
     def __init__(
@@ -52,6 +60,7 @@ class DenseShiftCache:
         *,
         pad: int = 4,
         dtype: torch.dtype = torch.bfloat16,
+        features_dtype: torch.dtype | None = None,
         device: torch.device | str = "cpu",
         projector: nn.Module | None = None,
     ) -> None:
@@ -60,6 +69,8 @@ class DenseShiftCache:
         geometry = dense_shift_geometry(encoder, pad)
         self.encoder, self.projector = encoder, projector
         self.slots, self.pad, self.dtype = slots, pad, dtype
+        self.features_dtype = dtype if features_dtype is None else features_dtype
+        require_readable(dtype, self.features_dtype)
         self.device = torch.device(device)
         self.feature_dim = geometry.feature_dim
         self._maps = self._allocate((slots, *geometry.maps_shape), dtype)
@@ -108,7 +119,7 @@ class DenseShiftCache:
         Args:
             slots: int64 ``[B]``.
             offsets: int64 ``[B, 2]``, (row, column) in ``{0, ..., 2 * pad}``.
-            out: ``[B, feature_dim]`` of the store's dtype to write into; reusing one halves the time on a
+            out: ``[B, feature_dim]`` of :attr:`features_dtype` to write into; reusing one halves the time on a
                 CPU.
 
         Returns:
@@ -118,7 +129,7 @@ class DenseShiftCache:
             IndexError: a slot outside the store or never written (checked for slots on the CPU).
         """
         self._require_written(slots)
-        return crop_rows(self._maps, slots, offsets, pad=self.pad, out=out)
+        return crop_rows(self._maps, slots, offsets, pad=self.pad, out=out, dtype=self.features_dtype)
 
     def center(self, slots: Tensor | int) -> Tensor:
         """Return the features of the observations as they are, un-shifted: what an agent acts on.
@@ -245,11 +256,8 @@ def choose_feature_mode(
         return "dense", f"dense-shift cache, as asked ({size})"
     if needed > MEMORY_SHARE * available:
         in_bf16 = dense_cache_bytes(encoder, slots, torch.bfloat16, pad=pad, latent_dim=latent_dim)
-        remedy = (
-            f"; precision bf16 would need {in_bf16 / 2**30:.1f}"
-            if in_bf16 <= MEMORY_SHARE * available
-            else ""
-        )
+        fits = in_bf16 <= MEMORY_SHARE * available
+        remedy = f"; in bf16, by dense_precision, it would fit with {in_bf16 / 2**30:.1f} GiB" if fits else ""
         return (
             "reencode",
             f"re-encoding at every update: too little memory for the dense-shift cache ({size}{remedy})",

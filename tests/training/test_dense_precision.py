@@ -1,0 +1,81 @@
+"""Dense maps in bfloat16 for networks that compute in float32."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from test_downstream import SMALL, rows_without_time, small_pretrained, train
+from test_downstream_parts import parts_of
+
+from crptpro.downstream_config import DownstreamConfig
+from crptpro.errors import CheckpointError
+from crptpro.training import downstream_parts
+from crptpro.training.checkpoint import CheckpointDir
+from crptpro.transforms import dense_shift_geometry
+
+HALF: dict[str, Any] = {"precision": "fp32", "dense_precision": "bf16"}
+
+
+@pytest.mark.parametrize(("dense_precision", "mode"), [("bf16", "dense"), ("auto", "reencode")])
+def test_a_memory_too_small_for_float32_holds_bfloat16(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    dense_precision: str,
+    mode: str,
+) -> None:
+    values = dense_shift_geometry(small_pretrained().encoder, 4).values
+    monkeypatch.setattr(downstream_parts, "free_bytes", lambda device: int(59 * values * 3 / 0.8))
+    settings = {**HALF, "dense_precision": dense_precision, "env_steps": 10_000, "features": "auto"}
+    with caplog.at_level("INFO", logger="crptpro"):
+        parts = parts_of(small_pretrained(), tmp_path, **settings)
+    assert parts.feature_mode == mode
+    assert ("by dense_precision, it would fit" in caplog.text) is (mode == "reencode")
+    if parts.features.cache is not None:
+        assert parts.features.cache.dtype == torch.bfloat16
+        assert parts.features.cache.features_dtype == parts.encoder.compute_dtype == torch.float32
+
+
+def test_it_trains_the_agent_of_float32_maps_up_to_rounding(tmp_path: Path) -> None:
+    whole, half = train(tmp_path / "fp32", precision="fp32"), train(tmp_path / "bf16", **HALF)
+    first, other = (run.policy.actor.state_dict() for run in (whole, half))
+    assert any(not torch.equal(first[key], other[key]) for key in first)
+    for key, value in first.items():
+        torch.testing.assert_close(other[key], value, rtol=0.02, atol=2e-3)
+
+
+def test_stopping_and_resuming_gives_the_numbers_of_an_uninterrupted_run(tmp_path: Path) -> None:
+    whole = train(tmp_path / "whole", **HALF)
+    train(tmp_path / "parts", **HALF, env_steps=60)
+    resumed = train(tmp_path / "parts", **HALF)
+    for key, value in whole.policy.actor.state_dict().items():
+        assert torch.equal(resumed.policy.actor.state_dict()[key], value), key
+    kept = [row for row in resumed.evaluations if row["env_steps"] != 60]
+    assert rows_without_time(kept) == rows_without_time(whole.evaluations)
+
+
+def test_a_run_goes_on_with_the_maps_that_it_began_with(tmp_path: Path) -> None:
+    train(tmp_path, **HALF, env_steps=60)
+    with pytest.raises(CheckpointError, match="dense_precision was 'bf16', now 'auto'"):
+        train(tmp_path, precision="fp32")
+
+
+def test_a_checkpoint_from_before_the_setting_existed_goes_on(tmp_path: Path) -> None:
+    train(tmp_path, env_steps=60)
+    checkpoints = CheckpointDir(tmp_path / "checkpoints")
+    state = checkpoints.load_latest()
+    assert state is not None
+    assert state["fingerprint"].pop("dense_precision") == "auto"
+    checkpoints.save(state, counter=state["counters"]["agent_steps"])
+    assert train(tmp_path).env_steps == 120
+
+
+def test_what_keeps_no_dense_maps_refuses_a_format_for_them() -> None:
+    with pytest.raises(ValueError, match=r"`dense_precision`.*'fp16'"):
+        dataclasses.replace(SMALL, dense_precision="fp16")
+    with pytest.raises(ValueError, match="features='reencode' does not keep"):
+        DownstreamConfig(features="reencode", dense_precision="bf16")
