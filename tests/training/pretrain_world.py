@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import csv
+from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.objectives import LossModule
 
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import ProtoLoss
+from crptpro.training import pretrain
 
 SIZE = 16
 
@@ -53,3 +57,30 @@ def same_state(a: Any, b: Any) -> bool:
     """Bit equality of two losses, targets and coefficients included."""
     one, two = a.state_dict(), b.state_dict()
     return one.keys() == two.keys() and all(torch.equal(one[key], two[key]) for key in one)
+
+
+TIMED = {"unix_time_s", "updates_per_s", "resident_bytes"}
+
+
+def run(loss: LossModule, updates: int, datasets: Any = None, **options: Any) -> Any:
+    return pretrain(loss, datasets or make_datasets(), updates=updates, **{**SETTINGS, **options})
+
+
+def record(run_dir: Path) -> list[dict[str, str]]:
+    with open(run_dir / "pretrain.csv") as file:
+        return [{k: v for k, v in row.items() if k not in TIMED} for row in csv.DictReader(file)]
+
+
+class Spy:
+    """Notes the order in which datasets are sampled."""
+
+    def __init__(self, name: str, dataset: Any, order: list[str]) -> None:
+        self.name, self.dataset, self.order = name, dataset, order
+        self.domain = name
+
+    def sample(self, batch_size: int) -> TensorDictBase:
+        self.order.append(self.name)
+        return self.dataset.sample(batch_size)
+
+    def set_rng(self, generator: torch.Generator) -> None:
+        self.dataset.set_rng(generator)
