@@ -79,25 +79,20 @@ def downstream_candidates(
     """
     episodes = list(synthetic_episodes(config.resolved_replay_capacity, pretrained.encoder.image_size))
     ours: dict[str, DownstreamUpdates] = {}
-    anew, dense = (
-        {
-            f"ours {precision}, {words}": {"features": features, "precision": precision}
-            for precision in precisions()
-        }
-        for features, words in (("reencode", "encoding anew"), ("dense", "dense features"))
-    )
-    # Where auto is bf16, it has both: half the memory, and faster arithmetic.
-    halved = {
-        "ours fp32, dense features in bf16": {**dense["ours fp32, dense features"], "dense_precision": "bf16"}
-    }
-    variants: dict[str, dict[str, Any]] = anew | (halved if len(dense) == 1 else {}) | dense
-    for name, changes in variants.items():
-        ours[name] = DownstreamUpdates(
-            pretrained,
-            episodes,
-            config=dataclasses.replace(config, **changes),
-            run_dir=scratch / "_".join(changes.values()),
-        )
+    ways = [("reencode", "auto", "encoding anew"), ("dense", "auto", "dense features")]
+    if precisions() == ["fp32"]:  # where auto is bf16, it has both: half the memory, and faster arithmetic
+        ways.insert(1, ("dense", "bf16", "dense features in bf16"))
+    for features, dense_precision, words in ways:
+        for precision in precisions():
+            changes: dict[str, Any] = {
+                "features": features, "dense_precision": dense_precision, "precision": precision,
+            }  # fmt: skip
+            ours[f"ours {precision}, {words}"] = DownstreamUpdates(
+                pretrained,
+                episodes,
+                config=dataclasses.replace(config, **changes),
+                run_dir=scratch / "_".join(changes.values()),
+            )
     parts = next(iter(ours.values())).parts
     store = StackedStore.of(parts.replay, len(parts.replay))
     plain = PlainDownstream.like(pretrained, parts.learner.loss.actor, parts.learner.loss.critic)

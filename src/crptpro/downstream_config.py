@@ -153,9 +153,10 @@ class SACSettings:
             )
         if self.dense_precision not in ("auto", "bf16"):
             raise ValueError(f"`dense_precision` must be 'auto' or 'bf16', got {self.dense_precision!r}.")
-        if self.dense_precision != "auto" and self.features == "reencode":
+        if self.dense_precision != "auto" and (self.features == "reencode" or self.algorithm == "drq"):
             raise ValueError(
-                "`dense_precision` is for dense maps, which features='reencode' does not keep: leave it out."
+                f"`dense_precision` is {self.dense_precision!r}, but neither features='reencode' nor drq keeps dense "
+                "maps: leave it out."
             )
         if self.algorithm != "skill-ddpg" and self.skill_ddpg != SkillDDPGSettings():
             raise ValueError(

@@ -77,5 +77,6 @@ def test_a_checkpoint_from_before_the_setting_existed_goes_on(tmp_path: Path) ->
 def test_what_keeps_no_dense_maps_refuses_a_format_for_them() -> None:
     with pytest.raises(ValueError, match=r"`dense_precision`.*'fp16'"):
         dataclasses.replace(SMALL, dense_precision="fp16")
-    with pytest.raises(ValueError, match="features='reencode' does not keep"):
-        DownstreamConfig(features="reencode", dense_precision="bf16")
+    for settings in ({"features": "reencode"}, {"algorithm": "drq", "intrinsic_reward_coef": 0.0}):
+        with pytest.raises(ValueError, match="`dense_precision` is 'bf16', but neither"):
+            DownstreamConfig(**settings, dense_precision="bf16")

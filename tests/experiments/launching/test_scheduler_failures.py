@@ -101,13 +101,16 @@ def test_a_second_signal_stops_them_at_once(store: Store) -> None:
     assert launcher.jobs[0].stops == 2
 
 
-def test_jobs_are_stopped_when_the_scheduler_itself_fails(store: Store) -> None:
-    class Full(FakeLauncher):
-        def start(self, work: Work, *, is_exclusive: bool) -> FakeJob:
-            if self.jobs:
-                raise OSError("no space left")
-            return super().start(work, is_exclusive=is_exclusive)
+class Full(FakeLauncher):
+    """Fails at the second job."""
 
+    def start(self, work: Work, *, is_exclusive: bool) -> FakeJob:
+        if self.jobs:
+            raise OSError("no space left")
+        return super().start(work, is_exclusive=is_exclusive)
+
+
+def test_jobs_are_stopped_when_the_scheduler_itself_fails(store: Store) -> None:
     launcher = Full(polls=1_000)
     with pytest.raises(OSError, match="no space"):
         run(store, launcher, FakePiece("a"), FakePiece("b"))
@@ -115,12 +118,6 @@ def test_jobs_are_stopped_when_the_scheduler_itself_fails(store: Store) -> None:
 
 
 def test_what_has_failed_is_known_also_where_an_error_ends_the_rest(store: Store) -> None:
-    class Full(FakeLauncher):
-        def start(self, work: Work, *, is_exclusive: bool) -> FakeJob:
-            if self.jobs:
-                raise OSError("no space left")
-            return super().start(work, is_exclusive=is_exclusive)
-
     bad = FakePiece("bad")
     failures: list[Failure] = []
     plan = plan_of(store, bad, FakePiece("encoder", (bad,)), FakePiece("good"))
