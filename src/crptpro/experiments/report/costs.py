@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
+from crptpro.cards import read_json
+from crptpro.errors import CRPTproError, RecordError
+from crptpro.experiments.measurements import TimingPiece
+from crptpro.experiments.pieces import piece_from_json
 from crptpro.experiments.published import EFFICIENCY
 from crptpro.experiments.report import drawing
-from crptpro.experiments.report.blocks import Block, Cell, Figure, Paragraph, Table, cells
+from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Figure, Paragraph, Table, cells
+from crptpro.experiments.report.machines import Machines
 from crptpro.experiments.report.measurements import Row, mean_of, rows_of
 from crptpro.experiments.report.palette import in_order
-from crptpro.experiments.report.reading import Asked
+from crptpro.experiments.report.reading import Asked, Made, machine
+from crptpro.experiments.store import DONE
 
 PAPER = {entry.method: entry for entry in EFFICIENCY}
 Timings = Mapping[tuple[str, int], Sequence[Row]]
@@ -41,20 +49,34 @@ def _timed_on(where: str, rows: Sequence[Row], name: str) -> list[Block]:
     for row in rows:
         found.setdefault((row["method"], int(row.number("domains") or 0)), []).append(row)
     methods, counts = in_order(method for method, _ in found), sorted({count for _, count in found})
+    machines = Machines()
+    made_on = {
+        (method, count): machines.numbers_of(_machines(found[method, count]))
+        for method in methods
+        for count in counts
+        if (method, count) in found
+    }
+    which = f". {machines.text()}" if machines.differ else " (hardware below)."
     text = (
-        f"Timed on {where} (hardware below). Hours are those of pre-training proper: environments that explore are "
-        "part of it, the collection of random datasets, which is done once for all, has its own column: what it had "
-        "taken when this was timed. Hours of the "
-        "paper's budget follow updates with the paper's batches and decisions, which were timed for themselves."
+        f"Timed on {where}{which} Hours are those of pre-training proper: environments that explore are part of it, "
+        "the collection of random datasets, which is done once for all, has its own column: what it had taken when "
+        "this was timed. Hours of the paper's budget follow updates with the paper's batches and decisions, which "
+        "were timed for themselves."
     )
     return [
-        _table(found, methods, counts, where),
-        *_figures(name, found, methods, counts),
+        _table(found, methods, counts, where, made_on if machines.differ else {}),
+        *_figures(name, found, methods, counts, made_on if machines.differ else {}),
         Paragraph(text, "note"),
     ]
 
 
-def _table(found: Timings, methods: Sequence[str], counts: Sequence[int], where: str) -> Table:
+def _table(
+    found: Timings,
+    methods: Sequence[str],
+    counts: Sequence[int],
+    where: str,
+    made_on: Mapping[tuple[str, int], str],
+) -> Table:
     lines = []
     for method in methods:
         for count in counts:
@@ -78,11 +100,13 @@ def _table(found: Timings, methods: Sequence[str], counts: Sequence[int], where:
                         mean_of(own, "paper_projected_hours", 1, ".3g"),
                         published="" if hours is None else f"{hours:g}",
                     ),
+                    *([made_on[method, count]] if made_on else []),
                 )
             )
     columns = (
         "method", "domains", "s per encoder update", "s per decision", "encoder updates at this scale",
         "hours at this scale", "hours of collection", "encoder updates, paper's budget", "hours, paper's budget",
+        *(["made on"] if made_on else []),
     )  # fmt: skip
     caption = (
         f"Pre-training by number of domains on {where}: some updates timed here (n timings), projected to whole "
@@ -91,7 +115,13 @@ def _table(found: Timings, methods: Sequence[str], counts: Sequence[int], where:
     return Table(caption, columns, tuple(lines), labels=2)
 
 
-def _figures(name: str, found: Timings, methods: Sequence[str], counts: Sequence[int]) -> list[Block]:
+def _figures(
+    name: str,
+    found: Timings,
+    methods: Sequence[str],
+    counts: Sequence[int],
+    made_on: Mapping[tuple[str, int], str],
+) -> list[Block]:
     most = max(counts)
     timings = sum(len(own) for own in found.values())
     hours: dict[str, list[float | None]] = {
@@ -104,15 +134,43 @@ def _figures(name: str, found: Timings, methods: Sequence[str], counts: Sequence
         _domains(count): [_mean(found, m, count, "paper_updates") for m in methods] for count in counts
     }
     caption = f"Hours of pre-training with the paper's budget for {_domains(most)}; {timings} timings of all counts."
+    names = list(methods)
+    if made_on:
+        caption += " In brackets the machine, as numbered below: hours compare only within one."
+        names = [f"{m} [{made_on.get((m, most), ABSENT)}]" for m in methods]
     was_timed = any(hour is not None for hour in hours[f"projected here, {_domains(most)}"])
     return [
-        *([Figure(f"{name}-hours", caption, drawing.bars(methods, hours, "hours"))] if was_timed else []),
+        *([Figure(f"{name}-hours", caption, drawing.bars(names, hours, "hours"))] if was_timed else []),
         Figure(
             f"{name}-updates",
             "Encoder updates of the paper's budget by number of domains.",
             drawing.bars(methods, updates, "encoder updates"),
         ),
     ]
+
+
+def _machines(rows: Sequence[Row]) -> list[str]:
+    """Name the machines of timings, and of the timings that one adds up, which others may have made."""
+    return [
+        machine(done.get("hardware") or {})
+        for piece in {row.goal.piece.key: row.goal.piece for row in rows}.values()
+        for done in [piece.done or {}, *_parts_done(piece)]
+    ]
+
+
+def _parts_done(piece: Made) -> list[dict[str, Any]]:
+    """Read what is recorded of the parts of a timing that adds up several."""
+    try:
+        described = piece_from_json(dict(piece.description))
+    except CRPTproError:
+        return []
+    if not isinstance(described, TimingPiece) or len(described.encoders) < 2:
+        return []
+    found = []
+    for part in described.parts:
+        with contextlib.suppress(RecordError):
+            found.append(read_json(piece.directory.parent / part.key / DONE, error=RecordError))
+    return found
 
 
 def _paper(method: str, count: int) -> tuple[float | None, int | None]:

@@ -20,6 +20,7 @@ from crptpro.experiments.pieces import (
 )
 from crptpro.experiments.records import read_run
 from crptpro.experiments.report.blocks import ABSENT, Block, Cell, Paragraph, Table, cells, counted
+from crptpro.experiments.report.machines import Machines
 from crptpro.experiments.report.palette import in_order
 from crptpro.experiments.report.reading import Asked, Made, machine
 from crptpro.training.action_repeat import action_repeat_of
@@ -44,23 +45,21 @@ def spending(asked: Asked, pieces: Mapping[str, Made]) -> tuple[Block, ...]:
             runs.setdefault(goal.label, {})[piece.key] = piece
     if not runs:
         return ()
-    places: dict[str, str] = {}
-    lines = [_line(label, list(runs[label].values()), pieces, places) for label in in_order(runs)]
+    machines = Machines()
+    lines = [_line(label, list(runs[label].values()), pieces, machines) for label in in_order(runs)]
     caption = (
         "What scores took: means over the encoders and over the runs of a method, wall clock of all attempts. "
         "Pre-training includes its exploring; an encoder that was fine-tuned counts with what it started from, and "
         "data that methods share with each of them."
     )
-    text = f"Made on {'; '.join(f'{number}: {name}' for name, number in places.items())}."
-    if len(places) > 1:
-        text += " Times compare only within one machine, and pieces that shared one slowed each other down."
-    return (Table(caption, COLUMNS, tuple(lines)), *([Paragraph(text, "note")] if places else []))
+    text = machines.text()
+    return (Table(caption, COLUMNS, tuple(lines)), *([Paragraph(text, "note")] if text else []))
 
 
 def _line(
-    label: str, runs: Sequence[RunPiece], pieces: Mapping[str, Made], places: dict[str, str]
+    label: str, runs: Sequence[RunPiece], pieces: Mapping[str, Made], machines: Machines
 ) -> tuple[Cell, ...]:
-    """Return a method's row; machines that have no number in ``places`` get the next one."""
+    """Return a method's row; machines that have no number yet get the next one."""
     encoders = [encoder for encoder in dict.fromkeys(run.encoder for run in runs) if encoder is not None]
     chains = [encoder.lineage for encoder in encoders]
     data = [_datasets(chain) for chain in chains]
@@ -69,8 +68,7 @@ def _line(
         updates = Cell(_mean([_updates_with_the_task(run, pieces) for run in runs]), "with the task")
     needed: list[Piece] = [*(e for chain in chains for e in chain), *(d for own in data for d in own), *runs]
     made = [pieces[piece.key].done for piece in needed if piece.key in pieces]
-    where = sorted({_machine(done) for done in made if done is not None})
-    made_on = [places.setdefault(name, str(len(places) + 1)) for name in where]
+    made_on = machines.numbers_of(_machine(done) for done in made if done is not None)
     return cells(
         label,
         str(len(chains)),
@@ -80,7 +78,7 @@ def _line(
         _time([_seconds(chain, pieces) for chain in chains]),
         Cell(str(len(runs)), f"{_mean([run_config(run).env_steps for run in runs])} env steps"),
         _time([_seconds([run], pieces) for run in runs]),
-        ", ".join(sorted(made_on)) or ABSENT,
+        made_on,
     )
 
 
