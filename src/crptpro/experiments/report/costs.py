@@ -57,6 +57,7 @@ def _timed_on(where: str, rows: Sequence[Row], name: str) -> list[Block]:
         if (method, count) in found
     }
     which = f". {machines.text()}" if machines.differ else " (hardware below)."
+    numbered = made_on if machines.differ else {}
     text = (
         f"Timed on {where}{which} Hours are those of pre-training proper: environments that explore are part of it, "
         "the collection of random datasets, which is done once for all, has its own column: what it had taken when "
@@ -64,8 +65,8 @@ def _timed_on(where: str, rows: Sequence[Row], name: str) -> list[Block]:
         "were timed for themselves."
     )
     return [
-        _table(found, methods, counts, where, made_on if machines.differ else {}),
-        *_figures(name, found, methods, counts, made_on if machines.differ else {}),
+        _table(found, methods, counts, where, numbered),
+        *_figures(name, found, methods, counts, numbered),
         Paragraph(text, "note"),
     ]
 
