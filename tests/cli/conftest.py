@@ -6,12 +6,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from command import Call, toy_dataset
+import torch
+from command import SIZE, Call, toy_dataset
 from toy_world import FIXED
 
 from crptpro import domains, plugins
 from crptpro.cli import main
 from crptpro.domains import register_domain
+from crptpro.modules import PixelEncoder
+from crptpro.objectives import ProtoLoss
+from crptpro.pretrained import save_pretrained
 
 collect_ignore = ["own_method.py", "conftest.py"]
 """What a test hands to the command must not have been imported by looking for doctests in it; nor may this file be,
@@ -45,3 +49,10 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
 @pytest.fixture
 def dataset(tmp_path: Path) -> Path:
     return toy_dataset(tmp_path / "data" / "toy")
+
+
+@pytest.fixture
+def encoder(tmp_path: Path) -> Path:
+    torch.manual_seed(0)
+    loss = ProtoLoss(PixelEncoder(image_size=SIZE), num_prototypes=16, latent_dim=4, hidden_dim=8)
+    return save_pretrained(loss, tmp_path / "encoder")

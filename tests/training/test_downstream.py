@@ -21,10 +21,8 @@ from crptpro.pretrained import (
     trim_pretrained,
 )
 from crptpro.training import DownstreamConfig, load_agent, train_downstream
-from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.downstream import _replay_capacity
 from crptpro.training.downstream_run import DownstreamRun
-from crptpro.training.frozen_features import FrozenFeatures
 from crptpro.training.rad_sac_learner import RADSACLearner
 
 EPISODE = 10
@@ -130,21 +128,6 @@ def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path: Pat
     assert rows_without_time(first.evaluations) != rows_without_time(other.evaluations)
 
 
-@pytest.mark.parametrize("features", ["dense", "reencode"])
-def test_stopping_and_resuming_gives_the_numbers_of_an_uninterrupted_run(
-    tmp_path: Path, features: str
-) -> None:
-    whole = train(tmp_path / "whole", features=features)
-    train(tmp_path / "parts", features=features, env_steps=60)
-    resumed = train(tmp_path / "parts", features=features)
-    assert resumed.env_steps == whole.env_steps
-    for key, value in whole.policy.actor.state_dict().items():
-        torch.testing.assert_close(resumed.policy.actor.state_dict()[key], value, rtol=0, atol=0)
-    # The shorter budget made the first part end with an evaluation of its own, at 60 env steps.
-    kept = [row for row in resumed.evaluations if row["env_steps"] != 60]
-    assert rows_without_time(kept) == rows_without_time(whole.evaluations)
-
-
 def test_dense_and_reencoded_features_train_the_same_agent(tmp_path: Path) -> None:
     first_rows = []
     for mode in ("dense", "reencode"):
@@ -174,14 +157,6 @@ def test_kept_and_computed_embeddings_give_the_same_bonus(
     assert kept.env_steps == computed.env_steps
 
 
-def test_a_finished_run_returns_its_result_without_doing_anything_again(tmp_path: Path) -> None:
-    first = train(tmp_path)
-    record = (tmp_path / "eval.csv").read_bytes()
-    again = train(tmp_path)
-    assert (tmp_path / "eval.csv").read_bytes() == record
-    assert again.evaluations == first.evaluations
-
-
 def test_an_artifact_without_prototypes_trains_without_bonus_and_says_so_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -195,18 +170,6 @@ def test_an_artifact_without_prototypes_trains_without_bonus_and_says_so_once(
 def test_the_bonus_is_logged_when_there_are_prototypes(tmp_path: Path) -> None:
     train(tmp_path)
     assert "intrinsic_reward" in (tmp_path / "train.csv").read_text().splitlines()[0]
-
-
-def test_other_settings_do_not_continue_a_run(tmp_path: Path) -> None:
-    train(tmp_path, env_steps=40)
-    with pytest.raises(CheckpointError, match="batch_size was 8, now 4"):
-        train(tmp_path, batch_size=4)
-
-
-def test_a_directory_with_a_run_is_not_overwritten_when_resuming_is_off(tmp_path: Path) -> None:
-    train(tmp_path, env_steps=40)
-    with pytest.raises(CheckpointError, match="already holds a run"):
-        train(tmp_path, resume=False)
 
 
 def test_an_agent_is_refused_as_a_pretrained_encoder(tmp_path: Path) -> None:
@@ -265,46 +228,6 @@ def test_every_logged_mean_is_over_the_updates_that_reported_it(tmp_path: Path) 
     with open(tmp_path / "train.csv", newline="") as file:
         alphas = [float(row["alpha"]) for row in csv.DictReader(file)]
     assert alphas == pytest.approx([0.25] * len(alphas))
-
-
-def test_a_smaller_budget_than_what_was_done_is_refused(tmp_path: Path) -> None:
-    train(tmp_path)
-    with pytest.raises(CheckpointError, match=r"has done 120 env steps, 40 are asked"):
-        train(tmp_path, env_steps=40)
-
-
-def test_what_auto_became_must_agree_when_a_run_is_continued(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    train(tmp_path, env_steps=60, features="auto", precision="fp32")
-    with pytest.raises(CheckpointError, match="precision was 'fp32', now 'bf16'"):
-        train(tmp_path, precision="bf16")
-    with pytest.raises(CheckpointError, match="features was 'dense', now 'reencode'"):
-        train(tmp_path, features="reencode")
-    with pytest.raises(CheckpointError, match="compile was 'absent', now 'on'"):
-        train(tmp_path, features="dense", compile="on")
-    with pytest.raises(CheckpointError, match="channels_last was 'absent', now 'off'"):
-        train(tmp_path, features="dense", channels_last="off")
-    assert train(tmp_path, features="dense", compile="off").env_steps == 120
-
-
-@pytest.mark.parametrize("begun_in", ["fp32", "bf16"])
-def test_a_run_goes_on_in_the_arithmetic_that_it_began_in_on_a_machine_with_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begun_in: str
-) -> None:
-    monkeypatch.setattr("crptpro.modules.precision._is_cpu_faster_in_bf16", lambda: begun_in == "bf16")
-    train(tmp_path, env_steps=60, precision="auto")
-    monkeypatch.setattr("crptpro.modules.precision._is_cpu_faster_in_bf16", lambda: begun_in != "bf16")
-    assert train(tmp_path, precision="auto").env_steps == 120
-    kept = CheckpointDir(tmp_path / "checkpoints").load_latest()
-    assert kept is not None
-    assert kept["fingerprint"]["precision"] == begun_in
-
-
-def test_a_finished_run_encodes_nothing_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    train(tmp_path)
-    monkeypatch.setattr(FrozenFeatures, "rebuild", lambda *args, **options: pytest.fail("encoded again"))
-    train(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What a downstream run needs to be continued, and what it says where that is missing."""
+"""A downstream run that is continued or found finished: the same numbers, what it needs, what it refuses."""
 
 from __future__ import annotations
 
@@ -7,14 +7,91 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_downstream import small_pretrained, train
+from test_downstream import rows_without_time, small_pretrained, train
 from torchrl.envs import CatFrames, EnvBase, TransformedEnv
 from toy_world import ToyEnv
 
 from crptpro.errors import CheckpointError
 from crptpro.training import downstream_parts
+from crptpro.training.checkpoint import CheckpointDir
 from crptpro.training.downstream_run import DownstreamRun
+from crptpro.training.frozen_features import FrozenFeatures
 from crptpro.transforms import dense_shift_geometry
+
+
+@pytest.mark.parametrize("features", ["dense", "reencode"])
+def test_stopping_and_resuming_gives_the_numbers_of_an_uninterrupted_run(
+    tmp_path: Path, features: str
+) -> None:
+    whole = train(tmp_path / "whole", features=features)
+    train(tmp_path / "parts", features=features, env_steps=60)
+    resumed = train(tmp_path / "parts", features=features)
+    assert resumed.env_steps == whole.env_steps
+    for key, value in whole.policy.actor.state_dict().items():
+        torch.testing.assert_close(resumed.policy.actor.state_dict()[key], value, rtol=0, atol=0)
+    # The shorter budget made the first part end with an evaluation of its own, at 60 env steps.
+    kept = [row for row in resumed.evaluations if row["env_steps"] != 60]
+    assert rows_without_time(kept) == rows_without_time(whole.evaluations)
+
+
+def test_a_finished_run_returns_its_result_without_doing_anything_again(tmp_path: Path) -> None:
+    first = train(tmp_path)
+    record = (tmp_path / "eval.csv").read_bytes()
+    again = train(tmp_path)
+    assert (tmp_path / "eval.csv").read_bytes() == record
+    assert again.evaluations == first.evaluations
+
+
+def test_other_settings_do_not_continue_a_run(tmp_path: Path) -> None:
+    train(tmp_path, env_steps=40)
+    with pytest.raises(CheckpointError, match="batch_size was 8, now 4"):
+        train(tmp_path, batch_size=4)
+
+
+def test_a_directory_with_a_run_is_not_overwritten_when_resuming_is_off(tmp_path: Path) -> None:
+    train(tmp_path, env_steps=40)
+    with pytest.raises(CheckpointError, match="already holds a run"):
+        train(tmp_path, resume=False)
+
+
+def test_a_smaller_budget_than_what_was_done_is_refused(tmp_path: Path) -> None:
+    train(tmp_path)
+    with pytest.raises(CheckpointError, match=r"has done 120 env steps, 40 are asked"):
+        train(tmp_path, env_steps=40)
+
+
+def test_what_auto_became_must_agree_when_a_run_is_continued(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(tmp_path, env_steps=60, features="auto", precision="fp32")
+    with pytest.raises(CheckpointError, match="precision was 'fp32', now 'bf16'"):
+        train(tmp_path, precision="bf16")
+    with pytest.raises(CheckpointError, match="features was 'dense', now 'reencode'"):
+        train(tmp_path, features="reencode")
+    with pytest.raises(CheckpointError, match="compile was 'absent', now 'on'"):
+        train(tmp_path, features="dense", compile="on")
+    with pytest.raises(CheckpointError, match="channels_last was 'absent', now 'off'"):
+        train(tmp_path, features="dense", channels_last="off")
+    assert train(tmp_path, features="dense", compile="off").env_steps == 120
+
+
+@pytest.mark.parametrize("begun_in", ["fp32", "bf16"])
+def test_a_run_goes_on_in_the_arithmetic_that_it_began_in_on_a_machine_with_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begun_in: str
+) -> None:
+    monkeypatch.setattr("crptpro.modules.precision._is_cpu_faster_in_bf16", lambda: begun_in == "bf16")
+    train(tmp_path, env_steps=60, precision="auto")
+    monkeypatch.setattr("crptpro.modules.precision._is_cpu_faster_in_bf16", lambda: begun_in != "bf16")
+    assert train(tmp_path, precision="auto").env_steps == 120
+    kept = CheckpointDir(tmp_path / "checkpoints").load_latest()
+    assert kept is not None
+    assert kept["fingerprint"]["precision"] == begun_in
+
+
+def test_a_finished_run_encodes_nothing_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    train(tmp_path)
+    monkeypatch.setattr(FrozenFeatures, "rebuild", lambda *args, **options: pytest.fail("encoded again"))
+    train(tmp_path)
 
 
 @pytest.mark.parametrize(

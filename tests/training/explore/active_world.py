@@ -1,7 +1,8 @@
-"""Toy domains and a tiny loss for tests of active pre-training."""
+"""Toy domains, a tiny loss and what is compared in tests of active pre-training."""
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -68,3 +69,20 @@ def explore(
         env_factory=factory,
     )
     return loss, result
+
+
+def same_state(one: torch.nn.Module, two: torch.nn.Module) -> bool:
+    a, b = one.state_dict(), two.state_dict()
+    return a.keys() == b.keys() and all(torch.equal(a[key], b[key]) for key in a)
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return [
+            {
+                key: value
+                for key, value in row.items()
+                if "time" not in key and "per_s" not in key and "bytes" not in key
+            }
+            for row in csv.DictReader(file)
+        ]
