@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from dying import killed_in
 from tensordict import TensorDict
 from test_downstream import EPISODE, SMALL, small_pretrained
 from torchrl.envs import CatFrames, EnvBase, TransformedEnv
@@ -78,28 +79,16 @@ def lucky_env(task: str, *, seed: int, image_size: int, frame_stack: int, **sett
 
 
 def test_a_world_that_draws_from_pythons_and_numpys_generators_goes_on_with_the_same_numbers(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    class Killed(BaseException):
-        pass
-
     def train(run_dir: Path) -> None:
         train_downstream(
             "toy", small_pretrained(), run_dir=run_dir, config=SMALL, env_factory=lucky_env, progress=False
         )
 
     train(tmp_path / "whole")
-    original = DownstreamRun.run_episode
-
-    def dies(run: DownstreamRun, bar: object) -> None:
-        if run.episodes == 4:
-            raise Killed
-        original(run, bar)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(DownstreamRun, "run_episode", dies)
-        with pytest.raises(Killed):
-            train(tmp_path / "killed")
+    with killed_in(DownstreamRun, "run_episode", lambda run: run.episodes == 4):
+        train(tmp_path / "killed")
     seed_everything(99)
     train(tmp_path / "killed")
     for name in ("eval.csv", "train.csv", "episodes.csv"):

@@ -8,14 +8,15 @@ from pathlib import Path
 import pytest
 import torch
 from active_world import explore, make_loss, rows, same_state, toy_env
+from dying import killed_in
 
 from crptpro.errors import CheckpointError
 from crptpro.training.explore.member import Member
 from crptpro.training.explore.run import ActiveRun
 
 
-class Killed(BaseException):
-    pass
+def no_world(domain: str, **settings: object) -> object:
+    raise AssertionError("a world was made")
 
 
 @pytest.mark.parametrize(
@@ -30,20 +31,11 @@ class Killed(BaseException):
     ],
 )
 def test_killed_in_the_middle_of_an_episode_it_ends_with_the_same_weights_and_records(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str, domains: tuple[str, ...], turn: int
+    tmp_path: Path, method: str, domains: tuple[str, ...], turn: int
 ) -> None:
     whole, expected = explore(tmp_path / "whole", domains, make_loss(method))
-    original = ActiveRun._turn
-
-    def dies(run: ActiveRun, index: int) -> None:
-        if run.decisions == turn:
-            raise Killed
-        original(run, index)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(ActiveRun, "_turn", dies)
-        with pytest.raises(Killed):
-            explore(tmp_path / "killed", domains, make_loss(method))
+    with killed_in(ActiveRun, "_turn", lambda run: run.decisions == turn):
+        explore(tmp_path / "killed", domains, make_loss(method))
     resumed, result = explore(tmp_path / "killed", domains, make_loss(method))
     assert (result.resumed_from > 0) == (turn > 20)
     assert same_state(whole, resumed)
@@ -63,19 +55,10 @@ def test_a_finished_run_is_found_again_and_changes_nothing(tmp_path: Path) -> No
     assert again.training_record["collapse"] == loss.training_record["collapse"]
 
 
-def test_a_ring_shorter_than_the_run_survives_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ring_shorter_than_the_run_survives_a_kill(tmp_path: Path) -> None:
     whole, _ = explore(tmp_path / "whole", replay_capacity=20)
-    original = Member.decide
-
-    def dies(member: Member, *args) -> None:
-        if member.agent_steps == 44:
-            raise Killed
-        original(member, *args)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Member, "decide", dies)
-        with pytest.raises(Killed):
-            explore(tmp_path / "killed", replay_capacity=20)
+    with killed_in(Member, "decide", lambda member: member.agent_steps == 44):
+        explore(tmp_path / "killed", replay_capacity=20)
     resumed, _ = explore(tmp_path / "killed", replay_capacity=20)
     assert same_state(whole, resumed)
 
@@ -91,22 +74,10 @@ def test_other_settings_are_refused_by_name(tmp_path: Path) -> None:
 
 
 def test_a_world_that_does_not_repeat_itself_is_announced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    class Dies(ActiveRun):
-        pass
-
-    original = ActiveRun._turn
-
-    def dies(run: ActiveRun, index: int) -> None:
-        if run.decisions == 50:
-            raise Killed
-        original(run, index)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(ActiveRun, "_turn", dies)
-        with pytest.raises(Killed):
-            explore(tmp_path)
+    with killed_in(ActiveRun, "_turn", lambda run: run.decisions == 50):
+        explore(tmp_path)
 
     def another_world(domain: str, *, seed: int, **settings) -> object:
         env = toy_env(domain, seed=seed, **settings)
@@ -118,22 +89,11 @@ def test_a_world_that_does_not_repeat_itself_is_announced(
     assert "does not repeat an episode" in caplog.text
 
 
-def test_short_episodes_cost_frames_and_a_killed_run_of_them_is_continued_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_short_episodes_cost_frames_and_a_killed_run_of_them_is_continued_too(tmp_path: Path) -> None:
     """Each episode has one frame more than decisions; with few decisions the ring wraps early."""
     whole, _ = explore(tmp_path / "whole", ("varied",), env_steps=1_200)
-    original = ActiveRun._turn
-
-    def dies(run: ActiveRun, index: int) -> None:
-        if run.decisions == 590:
-            raise Killed
-        original(run, index)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(ActiveRun, "_turn", dies)
-        with pytest.raises(Killed):
-            explore(tmp_path / "killed", ("varied",), env_steps=1_200)
+    with killed_in(ActiveRun, "_turn", lambda run: run.decisions == 590):
+        explore(tmp_path / "killed", ("varied",), env_steps=1_200)
     resumed, _ = explore(tmp_path / "killed", ("varied",), env_steps=1_200)
     assert same_state(whole, resumed)
 
@@ -143,18 +103,9 @@ def test_a_run_goes_on_in_the_arithmetic_that_it_began_in_on_a_machine_with_anot
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begun_in: str
 ) -> None:
     whole, _ = explore(None, precision=begun_in)
-    original = ActiveRun._turn
-
-    def dies(run: ActiveRun, index: int) -> None:
-        if run.decisions == 70:
-            raise Killed
-        original(run, index)
-
-    with monkeypatch.context() as patched:
-        patched.setattr("crptpro.modules.precision._is_cpu_faster_in_bf16", lambda: begun_in == "bf16")
-        patched.setattr(ActiveRun, "_turn", dies)
-        with pytest.raises(Killed):
-            explore(tmp_path, precision="auto")
+    monkeypatch.setattr("crptpro.modules.precision._is_cpu_faster_in_bf16", lambda: begun_in == "bf16")
+    with killed_in(ActiveRun, "_turn", lambda run: run.decisions == 70):
+        explore(tmp_path, precision="auto")
     monkeypatch.setattr("crptpro.modules.precision._is_cpu_faster_in_bf16", lambda: begun_in != "bf16")
     resumed, result = explore(tmp_path, precision="auto")
     assert result.resumed_from > 0
@@ -165,23 +116,13 @@ def test_a_run_goes_on_in_the_arithmetic_that_it_began_in_on_a_machine_with_anot
 def test_another_budget_is_refused_by_name_and_nothing_is_built_for_it(tmp_path: Path) -> None:
     explore(tmp_path)
 
-    def no_world(domain: str, **settings: object) -> object:
-        raise AssertionError("a world was made")
-
     with pytest.raises(CheckpointError, match="env_steps was 240, now 300"):
         explore(tmp_path, env_steps=300, env_factory=no_world)
 
 
-def test_an_attempt_without_a_checkpoint_leaves_nothing_in_the_way(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def dies(run: ActiveRun, index: int) -> None:
-        raise Killed
-
-    with monkeypatch.context() as patched:
-        patched.setattr(ActiveRun, "_turn", dies)
-        with pytest.raises(Killed):
-            explore(tmp_path, replay_capacity=20)
+def test_an_attempt_without_a_checkpoint_leaves_nothing_in_the_way(tmp_path: Path) -> None:
+    with killed_in(ActiveRun, "_turn", lambda run: True):
+        explore(tmp_path, replay_capacity=20)
     _, result = explore(tmp_path, replay_capacity=50)
     assert result.env_steps == 240
 
@@ -189,9 +130,6 @@ def test_an_attempt_without_a_checkpoint_leaves_nothing_in_the_way(
 def test_a_finished_run_needs_neither_its_replays_nor_its_worlds(tmp_path: Path) -> None:
     loss, first = explore(tmp_path)
     shutil.rmtree(tmp_path / "replay")
-
-    def no_world(domain: str, **settings: object) -> object:
-        raise AssertionError("a world was made")
 
     again, second = explore(tmp_path, env_factory=no_world)
     assert same_state(loss, again)
