@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -40,12 +41,19 @@ def test_a_memory_too_small_for_float32_holds_bfloat16(
         assert parts.features.cache.features_dtype == parts.encoder.compute_dtype == torch.float32
 
 
-def test_it_trains_the_agent_of_float32_maps_up_to_rounding(tmp_path: Path) -> None:
-    whole, half = train(tmp_path / "fp32", precision="fp32"), train(tmp_path / "bf16", **HALF)
-    first, other = (run.policy.actor.state_dict() for run in (whole, half))
-    assert any(not torch.equal(first[key], other[key]) for key in first)
-    for key, value in first.items():
-        torch.testing.assert_close(other[key], value, rtol=0.02, atol=2e-3)
+def test_it_trains_the_agent_of_float32_maps_within_what_another_seed_changes(tmp_path: Path) -> None:
+    # Adam turns the rounding of a gradient near zero into a whole step, so single weights differ by what the processor
+    # makes of them; the losses of the run are what holds on any.
+    def losses(name: str, **settings: Any) -> torch.Tensor:
+        train(tmp_path / name, **settings)
+        with (tmp_path / name / "train.csv").open(newline="") as file:
+            return torch.tensor(
+                [float(row["loss_qvalue"]) for row in csv.DictReader(file) if row["loss_qvalue"]]
+            )
+
+    whole, half, other = losses("fp32", precision="fp32"), losses("bf16", **HALF), losses("other", seed=1)
+    assert len(whole) == len(half) == len(other) > 3
+    assert 0 < (half - whole).abs().mean() < 0.1 * (other - whole).abs().mean()
 
 
 def test_stopping_and_resuming_gives_the_numbers_of_an_uninterrupted_run(tmp_path: Path) -> None:

@@ -187,11 +187,10 @@ def test_an_update_that_is_never_reached_is_refused(done: int) -> None:
 
 
 def test_the_layout_changes_rounding_only_is_recorded_and_is_left_as_it_was(tmp_path: Path) -> None:
-    last, usual = make_loss(), make_loss()
-    run(last, 6)
-    run(usual, 6, channels_last="off", run_dir=tmp_path)
-    for one, two in zip(last.parameters(), usual.parameters()):
-        torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-4)
+    last, usual, other = make_loss(), make_loss(), make_loss()
+    results = [run(last, 6), run(usual, 6, channels_last="off", run_dir=tmp_path), run(other, 6, seed=1)]
+    first, second, of_seed_1 = (result.metrics["loss"] for result in results)
+    assert abs(second - first) < 0.1 * abs(of_seed_1 - first)
     assert (last.training_record["channels_last"], usual.training_record["channels_last"]) == (True, False)
     assert is_channels_last(usual)
     # Runs from before the switch can be continued.

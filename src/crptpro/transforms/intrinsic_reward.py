@@ -15,7 +15,7 @@ from torchrl.envs.transforms import Transform
 from crptpro.transforms.keys import as_key_list, with_next, without_next
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
+    from typing import Self
 
 
 class IntrinsicReward(Transform):

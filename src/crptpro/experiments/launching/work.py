@@ -93,7 +93,7 @@ class Work:
 
     def heading(self) -> str:
         """First line of an attempt in the log."""
-        now = datetime.datetime.now(datetime.timezone.utc).isoformat(sep=" ", timespec="seconds")
+        now = datetime.datetime.now(datetime.UTC).isoformat(sep=" ", timespec="seconds")
         where = f"{socket.gethostname()}, process {os.getpid()}, {self.settings.device}"
         return f"--- {now}: {where}, {self.settings.threads} threads"
 

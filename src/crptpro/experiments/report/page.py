@@ -82,7 +82,7 @@ def make_page(source: Source, bootstrap: Bootstrap) -> Page:
         source: as read.
         bootstrap: how intervals are made.
     """
-    now = datetime.datetime.now(datetime.timezone.utc)
+    now = datetime.datetime.now(datetime.UTC)
     scales = list(dict.fromkeys(asked.scale for asked in source.asked))
     what = f"reproduction at scale {' and '.join(scales)}" if scales else "downstream runs"
     summary = (
