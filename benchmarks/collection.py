@@ -1,50 +1,52 @@
-"""Collection of pixels: TorchRL's ``DMControlEnv`` beside ours, per core, and ours with several workers.
+"""Collection of pixels: TorchRL's ``DMControlEnv`` and ``Collector`` beside ours, per core, and ours with workers.
 
 ``python -m benchmarks.collection`` compares like with like, in one process that is held on one core, the renderer on
 one thread (``LP_NUM_THREADS=1``), domain by domain, blocks of transitions in turns:
 
-* environments alone: single frames, nothing stored. Ours turn the image to ``[C, H, W]`` and numbers to float32,
-  which TorchRL's leave to transforms.
+* environments alone: single frames, nothing stored. TorchRL's render at every env step, so twice per agent step at an
+  action repeat of 2, with a camera made anew for every image.
 * collecting: TorchRL's ``Collector`` fills a ``LazyMemmapStorage`` with single frames. Ours is what ``collect_random``
-  does in a worker and its parent: every block is an episode of its own (one more image, for its first observation),
-  its physical state, checksums, and files synced to the disk.
+  does, every block an episode: physical state, checksums, files synced to the disk. Between them, our environment and
+  ``FrameDataset.extend`` with TorchRL's ``Collector``.
 
-Neither stacks frames. CPU time stands beside wall time: it shows that no candidate had more than its core. The rest
-is ``collect_random`` as it is, with its processes.
+Then ``collect_random`` with several worker processes.
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import json
 import logging
 import os
-import statistics
-import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 import tyro
+from torchrl.collectors import Collector
+from torchrl.data import LazyMemmapStorage, ReplayBuffer
+from torchrl.envs import DMControlWrapper, EnvBase
+from torchrl.modules import RandomPolicy
 
-from benchmarks.collecting_ways import OwnCollection, StockCollection, documented_env, stepper, stock_env
-from benchmarks.collecting_workers import worker_rates, worker_table
-from benchmarks.measure import Timing, ratios, save, side_by_side
+from benchmarks.measure import Timing, ratios, save, side_by_side, timing_of
 from crptpro.console import run_main
+from crptpro.data import FrameDataset, collect_random
+from crptpro.data.collect import collect_episode
+from crptpro.domains import SUITE_TASKS, get_domain
 from crptpro.envs import make_env
 from crptpro.envs.rendering import backend_card, select_backend
-from crptpro.quality import Quality
+from crptpro.errors import CRPTproError
+from crptpro.values import Quality
 
-logger = logging.getLogger("crptpro.benchmarks.collection")
-
-STOCK = "TorchRL"
+TORCHRL = "TorchRL"
 EXACT, FAST = "crptpro, exact", "crptpro, fast"
-DOCUMENTED = "TorchRL `DMControlEnv`, 240 x 320"
-TARGETS = {EXACT: 2.0, FAST: 3.5}
+MIXED = "crptpro, exact, TorchRL's Collector"
+QUALITIES: dict[str, Quality] = {EXACT: "exact", FAST: "fast"}
 
 
 @dataclass(frozen=True)
@@ -57,22 +59,12 @@ class Settings:
     """transitions of one timed block"""
     rounds: int = 7
     """timed blocks of each candidate, taken in turns"""
-    warmup: int = 1
-    """blocks of each candidate before the first timed one"""
     image_size: int = 84
     """height and width in pixels"""
-    action_repeat: int = 2
-    """env steps per transition"""
     workers: tuple[int, ...] = (1, 2)
-    """numbers of collecting processes; the ratios are to the first; none to leave this part out"""
-    pool_domain: str = "cheetah"
-    """what they collect"""
-    pool_transitions: int = 4_000
-    """how much each of them collects, best a multiple of the largest number times an episode of 500"""
-    pool_rounds: int = 2
-    """collections of each number of workers, taken in turns"""
-    pool_quality: Quality = "exact"
-    """their render quality"""
+    """numbers of collecting processes; none to leave this part out"""
+    worker_transitions: int = 4_000
+    """how much each number of them collects of the first domain, best a multiple of the largest number times 500"""
     scratch: Path | None = None
     """where frames are written for the time being; the system's temporary directory by default"""
     out: Path | None = None
@@ -84,37 +76,137 @@ def main(settings: Settings) -> dict[str, Any]:
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces storages on standard output
     os.environ["LP_NUM_THREADS"] = "1"
     select_backend(processes=max(settings.workers, default=1))
-    alone: dict[str, dict[str, Rate]] = {}
-    stored: dict[str, dict[str, Rate]] = {}
-    with tempfile.TemporaryDirectory(prefix="crptpro-collection-", dir=settings.scratch) as work:
-        with one_core():
-            for domain in settings.domains:
-                logger.info("%s, on one core", domain)
-                alone[domain], stored[domain] = _compare(domain, settings, Path(work) / domain)
-        logger.info("%s, with %s workers", settings.pool_domain, settings.workers)
-        pool = worker_rates(
-            settings.pool_domain,
-            Path(work),
-            workers=settings.workers,
-            transitions=settings.pool_transitions,
-            rounds=settings.pool_rounds,
-            quality=settings.pool_quality,
-        )
-    results: dict[str, Any] = {
-        "environment alone": {domain: _as_json(rates) for domain, rates in alone.items()},
-        "collecting": {domain: _as_json(rates) for domain, rates in stored.items()},
-        "workers": pool,
-        "render": backend_card(),
-        "lp_num_threads": os.environ["LP_NUM_THREADS"],
-    }
+    results: dict[str, Any] = {"render": backend_card()}
+    print("| domain | what | candidate | transitions/s | times TorchRL |\n|---|---|---|---|---|", flush=True)
+    with tempfile.TemporaryDirectory(prefix="crptpro-collection-", dir=settings.scratch) as work, one_core():
+        for domain in settings.domains:
+            torch.manual_seed(0)
+            for what, timings in compare(domain, settings, Path(work) / domain):
+                faster = {name: 1 / ratio for name, ratio in ratios(timings, to=TORCHRL).items()}
+                for name, timing in timings.items():
+                    rate = f"{1 / timing.median_s:.1f} | {faster[name]:.2f}"
+                    print(f"| {domain} | {what} | {name} | {rate} |", flush=True)
+                results.setdefault(what, {})[domain] = {"timings": timings, "times_torchrl": faster}
+    results["workers"] = time_workers(settings)
     save("collection", settings, results, out=settings.out)
-    print(f"\n`python -m benchmarks.collection {' '.join(sys.argv[1:])}`\n")
-    print(f"One core, {results['render']['gl_renderer']}, LP_NUM_THREADS=1\n")
-    print(_core_table({"environment alone": alone, "collecting": stored}))
-    if pool:
-        print(f"\n`collect_random`, {settings.pool_domain}, {settings.pool_quality}\n")
-        print(worker_table(pool))
     return results
+
+
+def compare(domain: str, settings: Settings, work: Path) -> Iterator[tuple[str, dict[str, Timing]]]:
+    """Time one domain's environments alone, then collecting."""
+    size, block = settings.image_size, settings.block
+    own = functools.partial(make_env, domain, seed=0, frame_stack=1, image_size=size)
+    timed = functools.partial(side_by_side, rounds=settings.rounds, warmup=1, per_call=block)
+    with contextlib.ExitStack() as stack:
+        envs = {
+            TORCHRL: torchrl_env(domain, image_size=size),
+            EXACT: own(quality="exact"),
+            FAST: own(quality="fast"),
+        }
+        for env in envs.values():
+            stack.callback(env.close)
+        yield "environment alone", timed({name: stepper(env, block) for name, env in envs.items()})
+    with contextlib.ExitStack() as stack:
+        storage = LazyMemmapStorage(block * (settings.rounds + 1), scratch_dir=work / "torchrl")
+        stock = stack.enter_context(
+            collector(
+                torchrl_env(domain, image_size=size), block, replay_buffer=ReplayBuffer(storage=storage)
+            )
+        )
+        calls: dict[str, Callable[[], Any]] = {TORCHRL: lambda: next(stock)}
+        ours = stack.enter_context(collector(own(physics_state=True), block))
+        mixed = FrameDataset.create(work / "mixed", domain=domain, transitions=2**31)
+        stack.callback(mixed.close)
+        calls[MIXED] = lambda: mixed.extend(next(ours))
+        for name, quality in QUALITIES.items():
+            env = own(quality=quality, physics_state=True)
+            dataset = FrameDataset.create(work / quality, domain=domain, transitions=2**31)
+            stack.callback(env.close)
+            stack.callback(dataset.close)
+            calls[name] = functools.partial(collect_block, env, dataset, block)
+        yield "collecting", timed(calls)
+
+
+def stepper(env: EnvBase, transitions: int) -> Callable[[], None]:
+    """Return a call that steps an environment at random so many times, resetting it where an episode ends."""
+    policy = RandomPolicy(env.full_action_spec)
+    state = env.reset()
+
+    def step() -> None:
+        nonlocal state
+        for _ in range(transitions):
+            _, state = env.step_and_maybe_reset(policy(state))
+
+    return step
+
+
+def torchrl_env(domain: str, *, image_size: int) -> EnvBase:
+    """Build TorchRL's environment at the image size, camera and action repeat that this library uses.
+
+    ``DMControlEnv`` hands ``render_kwargs`` on to dm_control's task, which refuses it, so the size is given to the
+    wrapper below it, ``DMControlWrapper``; they are the same environment otherwise.
+
+    Raises:
+        CRPTproError: for a domain that is not of dm_control's suite.
+    """
+    found = get_domain(domain)
+    world = next((world for world, tasks in SUITE_TASKS.items() if found.task in tasks), None)
+    if found.source != "suite" or world is None:
+        raise CRPTproError(f"TorchRL's DMControlEnv knows dm_control's suite only; {domain!r} is not of it.")
+    select_backend()
+    from dm_control import suite  # after the choice of the render backend, which it reads
+
+    env = suite.load(world, found.task.removeprefix(f"{world}_"), task_kwargs={"random": 0})
+    return DMControlWrapper(
+        env, from_pixels=True, pixels_only=True, frame_skip=found.action_repeat, camera_id=found.camera,
+        render_kwargs={"height": image_size, "width": image_size},
+    )  # fmt: skip
+
+
+@contextlib.contextmanager
+def collector(env: EnvBase, block: int, **options: Any) -> Iterator[Iterator[Any]]:
+    """Yield the batches of TorchRL's ``Collector`` with a random policy."""
+    policy = RandomPolicy(env.full_action_spec)
+    found = Collector(env, policy, frames_per_batch=block, total_frames=-1, **options)
+    try:
+        yield iter(found)
+    finally:
+        found.shutdown()
+
+
+def collect_block(env: EnvBase, dataset: FrameDataset, transitions: int) -> None:
+    """Collect one episode as ``collect_random`` does."""
+    seed = dataset.episodes
+    dataset.extend(collect_episode(env, env_seed=seed, action_seed=seed, limit=transitions))
+    dataset.end_episode()
+
+
+def time_workers(settings: Settings) -> dict[int, dict[str, Timing]]:
+    """Collect with each number of workers, in turns, twice; print transitions/s whole and without the start."""
+    found: dict[int, dict[str, list[float]]] = {n: {"whole": [], "running": []} for n in settings.workers}
+    for _ in range(2 if settings.workers else 0):
+        for count, seconds in found.items():
+            with tempfile.TemporaryDirectory(prefix="crptpro-collection-", dir=settings.scratch) as root:
+                total, start = settings.worker_transitions, time.perf_counter()
+                path = collect_random(
+                    settings.domains[0], root, transitions=total, workers=count, progress=False
+                )
+                seconds["whole"].append((time.perf_counter() - start) / total)
+                rest = [
+                    json.loads(line) for line in (path / "journal.jsonl").read_text().splitlines()[count:]
+                ]
+                transitions = sum(entry["transitions"] for entry in rest)
+                if transitions:  # after each worker's first episode
+                    seconds["running"].append(sum(entry["wall_s"] for entry in rest) / transitions)
+    timings = {n: {k: timing_of(v) for k, v in seconds.items() if v} for n, seconds in found.items()}
+    if timings:
+        print("\n| workers | transitions/s, running | with start |\n|---|---|---|")
+    for count, timing in timings.items():
+        rates = [
+            f"{1 / timing[kind].median_s:.1f}" if kind in timing else "" for kind in ("running", "whole")
+        ]
+        print(f"| {count} | {' | '.join(rates)} |")
+    return timings
 
 
 @contextlib.contextmanager
@@ -131,96 +223,6 @@ def one_core() -> Iterator[None]:
         torch.set_num_threads(threads)
         if cores:
             os.sched_setaffinity(0, cores)
-
-
-@dataclass(frozen=True)
-class Rate:
-    """How fast one candidate is.
-
-    Args:
-        block: wall times of one block.
-        per_s: transitions per second of wall time, median.
-        cpu_ms: milliseconds of CPU time per transition, all threads, median; steadier where the core is shared.
-        times_stock: times the transitions per second of TorchRL.
-    """
-
-    block: Timing
-    per_s: float
-    cpu_ms: float
-    times_stock: float
-
-
-def _compare(domain: str, settings: Settings, work: Path) -> tuple[dict[str, Rate], dict[str, Rate]]:
-    """Return the rates of environments alone, and of collecting."""
-    size, repeat, block = settings.image_size, settings.action_repeat, settings.block
-    stock = functools.partial(stock_env, domain, image_size=size, action_repeat=repeat)
-    own = functools.partial(make_env, domain, seed=0, frame_stack=1, image_size=size, action_repeat=repeat)
-    torch.manual_seed(0)
-    with contextlib.ExitStack() as stack:
-        envs = {
-            STOCK: stock(),
-            DOCUMENTED: documented_env(domain, action_repeat=repeat),
-            EXACT: own(quality="exact"),
-            FAST: own(quality="fast"),
-        }
-        for env in envs.values():
-            stack.callback(env.close)
-        alone = _rates({name: stepper(env, block) for name, env in envs.items()}, settings)
-    with contextlib.ExitStack() as stack:
-        capacity = block * (settings.rounds + settings.warmup)
-        collections: dict[str, StockCollection | OwnCollection] = {
-            STOCK: StockCollection(stock(), transitions=block, scratch=work / "stock", capacity=capacity)
-        }
-        for name, quality in ((EXACT, "exact"), (FAST, "fast")):
-            with_state = functools.partial(own, quality=quality, physics_state=True)
-            collections[name] = OwnCollection(with_state, transitions=block, root=work / quality)
-        for collection in collections.values():
-            stack.callback(collection.close)
-        return alone, _rates({name: item.collect for name, item in collections.items()}, settings)
-
-
-def _rates(calls: Mapping[str, Callable[[], None]], settings: Settings) -> dict[str, Rate]:
-    cpu_s: dict[str, list[float]] = {name: [] for name in calls}
-
-    def noting_cpu(name: str, call: Callable[[], None]) -> Callable[[], None]:
-        def noted() -> None:
-            start = time.process_time()
-            call()
-            cpu_s[name].append(time.process_time() - start)
-
-        return noted
-
-    noted = {name: noting_cpu(name, call) for name, call in calls.items()}
-    timings = side_by_side(noted, rounds=settings.rounds, warmup=settings.warmup)
-    slower = ratios(timings, to=STOCK)
-    return {
-        name: Rate(
-            block=timing,
-            per_s=settings.block / timing.median_s,
-            cpu_ms=1e3 * statistics.median(cpu_s[name][settings.warmup :]) / settings.block,
-            times_stock=1 / slower[name],
-        )
-        for name, timing in timings.items()
-    }
-
-
-def _as_json(rates: Mapping[str, Rate]) -> dict[str, dict[str, Any]]:
-    return {name: asdict(rate) for name, rate in rates.items()}
-
-
-def _core_table(parts: Mapping[str, Mapping[str, Mapping[str, Rate]]]) -> str:
-    lines = [
-        "| domain | what | candidate | transitions/s | CPU ms per transition | times TorchRL | target |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {domain} | {what} | {name} | {rate.per_s:.1f} | {rate.cpu_ms:.2f} | {rate.times_stock:.2f} "
-        f"| {TARGETS.get(name, '')} |"
-        for what, domains in parts.items()
-        for domain, rates in domains.items()
-        for name, rate in rates.items()
-    ]
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,11 @@
-"""Everything that needs a CUDA device: parity of the fast ways, updates with every switch, where the time goes.
+"""Everything that needs a CUDA device: parity of the fast ways, updates with every switch, a sustained run.
 
-``python -m benchmarks.gpu`` prints, on synthetic frames held by the device:
+``python -m benchmarks.gpu`` prints, on synthetic frames that the device holds:
 
-* ``parity``: batches of the device against the CPU's, recorded and compiled updates against plain ones, both stages.
-* ``pretrain``: one update, batches included: float32, TF32, bfloat16, recorded, compiled, both.
-* ``sustained``: ``pretrain(...)`` as it is, and what 50,000 updates take; peak memory.
-* ``downstream``: one update of the learner on features, with every switch, and what the 250,000 updates of 500,000 env
-  steps take; simulator, encoding and evaluation left out.
-* ``profile``: the kernels of recorded updates, beside the least arithmetic and traffic at the rates that one large
-  product and one large copy reach on this device.
+* ``parity``: the device's samples and shifts against the CPU's; compiled and recorded updates against plain ones.
+* ``pretrain``: one update, batches included: float32, TF32, bfloat16, compiled, recorded as a CUDA graph, both.
+* ``downstream``: one update from dense features: float32, TF32, bfloat16, compiled.
+* ``sustained``: ``pretrain(...)`` as it is, what 50,000 updates take, and its peak memory.
 
 ``--tiny`` runs all of it at a toy size, on the CPU where there is no GPU (nothing is recorded there).
 """
@@ -17,8 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
-import logging
+import statistics
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,36 +23,35 @@ from typing import Any, Literal
 
 import torch
 import tyro
+from torch import Tensor, nn
 
-from benchmarks.gpu_checks import CAPTURED_TOLERANCE, COMPILED_TOLERANCE, check_batches, check_updates
-from benchmarks.gpu_profile import profile_updates
-from benchmarks.gpu_updates import DevicePretrainUpdates, DeviceSACUpdates, open_on
-from benchmarks.library_updates import fresh_loss
-from benchmarks.measure import Timing, ratios, save, side_by_side, table
-from benchmarks.synthetic import write_dataset
+from benchmarks.library import Downstream, PretrainUpdates, fresh_loss, fresh_pretrained
+from benchmarks.measure import report, save, side_by_side
+from benchmarks.synthetic import make_drifting_env, write_dataset
 from crptpro.console import run_main
 from crptpro.data import FrameDataset
 from crptpro.errors import CRPTproError
-from crptpro.training import pretrain
+from crptpro.modules.precision import Precision
+from crptpro.training import DownstreamConfig, pretrain
+from crptpro.transforms import draw_offsets, random_shift
 
-logger = logging.getLogger("crptpro.benchmarks.gpu")
-
-Section = Literal["parity", "pretrain", "sustained", "downstream", "profile"]
-SECTIONS: tuple[Section, ...] = ("parity", "pretrain", "sustained", "downstream", "profile")
+Section = Literal["parity", "pretrain", "downstream", "sustained"]
 PAPER_UPDATES = 50_000
-PAPER_AGENT_STEPS = 250_000
+RECORDED_TOLERANCE, COMPILED_TOLERANCE = 1e-5, 1e-3
+"""Largest difference allowed between float32 weights after some updates at learning rate 1e-4: Adam turns the rounding
+of a gradient near zero into a step of the learning rate."""
 
 
 @dataclass(frozen=True)
 class Settings:
     """What to run, at which size and how often."""
 
-    only: tuple[Section, ...] = SECTIONS
+    only: tuple[Section, ...] = ("parity", "pretrain", "downstream", "sustained")
     """sections to run"""
     tiny: bool = False
     """a toy size that takes seconds, on the CPU if there is no GPU"""
-    device: str = "cuda"
-    """where to run"""
+    compile: bool = True
+    """also the compiled candidates"""
     rounds: int = 15
     """timed calls of each candidate, taken in turns"""
     updates_per_call: int = 20
@@ -64,35 +59,25 @@ class Settings:
     batch_size: int = 512
     """transitions per update"""
     prototypes: int = 512
-    """of the pre-training loss"""
+    """of loss and bonus"""
     image_size: int = 84
     """height and width in pixels"""
-    domains: int = 3
-    """synthetic datasets"""
-    transitions: int = 20_000
-    """of each dataset, 21 KB each"""
-    feature_dim: int = 39_200
-    """of the downstream learner's input"""
-    hidden_dim: int = 1024
-    """of the downstream actor and critic"""
+    transitions: int = 5_000
+    """of each of three datasets, which every candidate holds on the device, 21 KB each, and of the replay"""
     parity_updates: int = 20
     """updates before weights are compared"""
     sustained_updates: int = 5_000
     """updates of the section `sustained`"""
-    compile: bool = True
-    """also the compiled candidates"""
     out: Path | None = None
     """directory of the JSON; benchmarks/results by default"""
 
     def resolved(self) -> Settings:
         """Return the settings with what `tiny` changes."""
-        if not self.tiny:
-            return self
-        return dataclasses.replace(
-            self, device="cuda" if torch.cuda.is_available() else "cpu", rounds=1, updates_per_call=2, batch_size=8,
-            prototypes=16, image_size=16, domains=2, transitions=40, feature_dim=40, hidden_dim=16, parity_updates=6,
-            sustained_updates=8,
-        )  # fmt: skip
+        sizes: dict[str, int] = {
+            "rounds": 1, "updates_per_call": 2, "batch_size": 8, "prototypes": 16, "image_size": 16, "transitions": 40,
+            "parity_updates": 6, "sustained_updates": 8,
+        }  # fmt: skip
+        return dataclasses.replace(self, **sizes) if self.tiny else self  # type: ignore[arg-type]
 
 
 def main(settings: Settings) -> dict[str, Any]:
@@ -102,161 +87,205 @@ def main(settings: Settings) -> dict[str, Any]:
         CRPTproError: without a CUDA device, or if a check of the section `parity` fails.
     """
     settings = settings.resolved()
-    device = torch.device(settings.device)
-    if device.type == "cuda" and not torch.cuda.is_available():
+    if not (torch.cuda.is_available() or settings.tiny):
         raise CRPTproError("No CUDA device here. `--tiny` runs through on the CPU.")
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     results: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory() as scratch:
-        paths = {
-            f"domain_{number}": write_dataset(
-                Path(scratch) / f"domain_{number}", transitions=settings.transitions, seed=number,
-                image_size=settings.image_size,
-            )
-            for number in range(settings.domains)
-        }  # fmt: skip
-        datasets = open_on(paths, device)
+    with tempfile.TemporaryDirectory(prefix="crptpro-gpu-") as directory:
+        sizes = {"transitions": settings.transitions, "image_size": settings.image_size}
+        paths = [write_dataset(Path(directory) / f"drifting_{seed}", seed=seed, **sizes) for seed in range(3)]
         sections: dict[Section, Callable[[], Any]] = {
-            "parity": lambda: check_parity(settings, datasets, open_on(paths, torch.device("cpu"))),
-            "pretrain": lambda: time_pretraining(settings, datasets),
-            "sustained": lambda: time_sustained(settings, datasets, Path(scratch)),
-            "downstream": lambda: time_downstream(settings),
-            "profile": lambda: profile_updates(
-                _pretraining(settings, datasets, captures=True, compiles=settings.compile),
-                tiny=settings.tiny,
-            ),
+            "parity": lambda: check_parity(settings, paths, device),
+            "pretrain": lambda: time_pretraining(settings, paths, device),
+            "downstream": lambda: time_downstream(settings, device),
+            "sustained": lambda: time_sustained(settings, paths, device, Path(directory)),
         }
         for name in settings.only:
-            print(f"\n## {name}\n")
+            print(f"\n## {name}\n", flush=True)
             results[name] = sections[name]()
             if device.type == "cuda":
                 torch.cuda.empty_cache()
-    logger.info("written: %s", save("gpu", settings, results, out=settings.out))
+            save("gpu", settings, results, out=settings.out)
     failed = [check["check"] for check in results.get("parity", []) if not check["passed"]]
     if failed:
         raise CRPTproError(f"Parity does not hold: {'; '.join(failed)}. Do not trust the times either.")
     return results
 
 
-def check_parity(
-    settings: Settings, datasets: dict[str, FrameDataset], on_cpu: dict[str, FrameDataset]
-) -> list[dict[str, Any]]:
+def check_parity(settings: Settings, paths: list[Path], device: torch.device) -> list[dict[str, Any]]:
     """Run every check and print whether it passed."""
-    pretraining = functools.partial(_pretraining, settings, datasets, precision="fp32")
-    downstream = functools.partial(_downstream, settings, precision="fp32")
-    checks = [check_batches(datasets, on_cpu, batch_size=settings.batch_size, captures=True)]
-    for stage, make in (("pre-training", pretraining), ("downstream", downstream)):
-        compare = functools.partial(check_updates, make=make, updates=settings.parity_updates)
-        checks.append(compare(f"{stage}, recorded", tolerance=CAPTURED_TOLERANCE, captures=True))
-        if settings.compile:
-            name = f"{stage}, compiled and recorded"
-            checks.append(compare(name, tolerance=COMPILED_TOLERANCE, captures=True, compiles=True))
-    print("| check | largest weight difference | allowed | |\n|---|---|---|---|")
+    checks = [check_batches(paths[0], settings.batch_size, device)]
+    records = device.type == "cuda"
+    ways: list[tuple[str, float, dict[str, bool]]] = []
+    if records:
+        ways.append(("recorded", RECORDED_TOLERANCE, {"cuda_graph": True}))
+    if settings.compile:
+        ways.append(("compiled", COMPILED_TOLERANCE, {"compile": True}))
+    if records and settings.compile:
+        ways.append(("compiled and recorded", COMPILED_TOLERANCE, {"compile": True, "cuda_graph": True}))
+    make_pretraining = functools.partial(pretraining, settings, paths, device, precision="fp32")
+    make_downstream = functools.partial(downstream, settings, device, precision="fp32")
+    for name, tolerance, switches in ways:
+        fast = functools.partial(make_pretraining, **switches)
+        checks.append(
+            check_updates(f"pre-training, {name}", make_pretraining, fast, settings.parity_updates, tolerance)
+        )
+    if settings.compile:
+        fast = functools.partial(make_downstream, compile=True)
+        checks.append(
+            check_updates(
+                "downstream, compiled", make_downstream, fast, settings.parity_updates, COMPILED_TOLERANCE
+            )
+        )
+    print("| check | largest difference | allowed | |\n|---|---|---|---|")
     for check in checks:
-        difference = check.get("largest_weight_difference", 0.0)
         verdict = "ok" if check["passed"] else "**FAILED**"
-        print(f"| {check['check']} | {difference:.1e} | {check.get('tolerance', 0.0):.0e} | {verdict} |")
+        print(f"| {check['check']} | {check['difference']:.1e} | {check['allowed']:.0e} | {verdict} |")
     return checks
 
 
-def time_pretraining(settings: Settings, datasets: dict[str, FrameDataset]) -> dict[str, Any]:
+def check_batches(path: Path, batch_size: int, device: torch.device) -> dict[str, Any]:
+    """Compare a batch of the device, shifted there, with what the CPU makes of the same draws; must be equal."""
+    generator = torch.Generator(device).manual_seed(0)
+    batch = FrameDataset.open(path, device=device, generator=generator).sample(batch_size)
+    expected = FrameDataset.open(path)[batch["index"].cpu()]
+    difference = 0.0
+    for key in ("pixels", ("next", "pixels")):
+        offsets = draw_offsets(batch_size, 4)
+        one, other = random_shift(batch[key], offsets).cpu(), random_shift(expected[key], offsets)
+        difference = max(difference, float((one.int() - other.int()).abs().max()))
+    name = "samples and shifts, against the CPU's"
+    return {"check": name, "difference": difference, "allowed": 0.0, "passed": difference == 0}
+
+
+Updates = tuple[Callable[[], Any], nn.Module]
+
+
+def check_updates(
+    name: str, plain: Callable[[], Updates], fast: Callable[[], Updates], updates: int, tolerance: float
+) -> dict[str, Any]:
+    """Compare weights after some updates with switches and without, from the same start on the same batches.
+
+    A GPU may add up gradients in another order each time, so the plain updates are done twice: what differs by no more
+    than three times as much as they do from themselves passes too.
+    """
+    made = [plain(), plain(), fast()]
+    for _ in range(updates):
+        for call, _loss in made:
+            call()
+    reference, again, other = (loss for _, loss in made)
+    allowed = max(tolerance, 3 * largest_difference(reference, again))
+    difference = largest_difference(reference, other)
+    return {"check": name, "difference": difference, "allowed": allowed, "passed": difference <= allowed}
+
+
+def largest_difference(one: nn.Module, two: nn.Module) -> float:
+    """Return the largest difference of two modules' floating entries, targets included; NaN is infinite."""
+    theirs = two.state_dict()
+    return max(
+        float((value.double() - theirs[key].double()).abs().max().nan_to_num(torch.inf))
+        for key, value in one.state_dict().items()
+        if isinstance(value, Tensor) and value.is_floating_point() and value.numel()
+    )
+
+
+def time_pretraining(settings: Settings, paths: list[Path], device: torch.device) -> dict[str, Any]:
     """Time one pre-training update with every switch."""
-    make = functools.partial(_pretraining, settings, datasets)
-    candidates: dict[str, Callable[[], Any]] = {
-        "fp32": make(precision="fp32"),
-        "TF32": make(precision="fp32", tf32=True),
-        "bf16": make(),
-        "bf16, recorded": make(captures=True),
-        "bf16, recorded, usual layout": make(captures=True, channels_last=False),
+    make = functools.partial(pretraining, settings, paths, device)
+    candidates = {
+        "fp32": make(precision="fp32")[0],
+        "TF32": in_tf32(make(precision="fp32")[0]),
+        "bf16": make(precision="bf16")[0],
+    }
+    if device.type == "cuda":
+        candidates["bf16, recorded"] = make(precision="bf16", cuda_graph=True)[0]
+    if settings.compile:
+        candidates["bf16, compiled"] = make(precision="bf16", compile=True)[0]
+    if settings.compile and device.type == "cuda":
+        candidates["bf16, compiled and recorded"] = make(precision="bf16", compile=True, cuda_graph=True)[0]
+    return time_updates(settings, candidates, device, unit="pre-training update")
+
+
+def time_downstream(settings: Settings, device: torch.device) -> dict[str, Any]:
+    """Time one downstream update from dense features with every switch."""
+    make = functools.partial(downstream, settings, device)
+    candidates = {
+        "fp32": make(precision="fp32")[0],
+        "TF32": in_tf32(make(precision="fp32")[0]),
+        "bf16": make(precision="bf16")[0],
     }
     if settings.compile:
-        candidates["bf16, compiled"] = make(compiles=True)
-        candidates["bf16, compiled and recorded"] = make(compiles=True, captures=True)
-    return _report(settings, candidates, count=PAPER_UPDATES, unit="pre-training update")
+        candidates["bf16, compiled"] = make(precision="bf16", compile=True)[0]
+    return time_updates(settings, candidates, device, unit="downstream update")
 
 
-def time_downstream(settings: Settings) -> dict[str, Any]:
-    """Time one update of the downstream learner with every switch."""
-    make = functools.partial(_downstream, settings)
-    candidates: dict[str, Callable[[], Any]] = {
-        "fp32": make(precision="fp32"),
-        "bf16": make(),
-        "bf16, recorded": make(captures=True),
-    }
-    if settings.compile:
-        candidates["bf16, compiled and recorded"] = make(compiles=True, captures=True)
-    return _report(settings, candidates, count=PAPER_AGENT_STEPS, unit="downstream update")
+def time_updates(
+    settings: Settings, candidates: dict[str, Callable[[], Any]], device: torch.device, *, unit: str
+) -> dict[str, Any]:
+    """Time candidates in turns, many updates between two looks at the clock."""
+    count = settings.updates_per_call
+
+    def many(call: Callable[[], Any]) -> None:
+        for _ in range(count):
+            call()
+
+    calls = {name: functools.partial(many, call) for name, call in candidates.items()}
+    return report(side_by_side(calls, rounds=settings.rounds, per_call=count, device=device), unit=unit)
 
 
-def time_sustained(settings: Settings, datasets: dict[str, FrameDataset], scratch: Path) -> dict[str, Any]:
+def time_sustained(
+    settings: Settings, paths: list[Path], device: torch.device, scratch: Path
+) -> dict[str, Any]:
     """Pre-train for a while as a user does and project the paper's number of updates."""
-    device = torch.device(settings.device)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     loss = fresh_loss(image_size=settings.image_size, prototypes=settings.prototypes)
     result = pretrain(
-        loss, datasets, updates=settings.sustained_updates, batch_size=settings.batch_size, device=device,
-        run_dir=scratch / "sustained", log_interval=max(1, settings.sustained_updates // 10),
-        compile="auto" if settings.compile else "off",
+        loss, paths, updates=settings.sustained_updates, batch_size=settings.batch_size, device=str(device),
+        run_dir=scratch / "sustained", log_interval=max(1, settings.sustained_updates // 10), compile=settings.compile,
+        cuda_graph=device.type == "cuda",
     )  # fmt: skip
-    rates = sorted(row["updates_per_s"] for row in result.history if "updates_per_s" in row)
-    steady = rates[len(rates) // 2]
-    found = {
-        "updates": result.updates,
-        "seconds": result.seconds,
-        "precision": result.precision,
-        "compile": loss.training_record["compile"],
-        "cuda_graph": loss.training_record["cuda_graph"],
-        "median_updates_per_s": steady,
-        "projected_s": PAPER_UPDATES / steady,
-    }
-    if device.type == "cuda":
-        found["peak_allocated_bytes"] = torch.cuda.max_memory_allocated(device)
-        found["peak_reserved_bytes"] = torch.cuda.max_memory_reserved(device)
-    print(json.dumps(found, indent=1))
-    return found
-
-
-def _pretraining(
-    settings: Settings, datasets: dict[str, FrameDataset], **switches: Any
-) -> DevicePretrainUpdates:
-    return DevicePretrainUpdates(
-        datasets, batch_size=settings.batch_size, prototypes=settings.prototypes, **switches
+    rate = statistics.median(row["updates_per_s"] for row in result.history if "updates_per_s" in row)
+    peak = torch.cuda.max_memory_allocated(device) if device.type == "cuda" else 0
+    print(
+        f"{rate:.1f} updates/s; {PAPER_UPDATES:,} take {PAPER_UPDATES / rate:.0f} s; peak {peak / 2**30:.2f} GiB."
     )
+    return {"updates_per_s": rate, "projected_s": PAPER_UPDATES / rate, "peak_allocated_bytes": peak}
 
 
-def _downstream(settings: Settings, **switches: Any) -> DeviceSACUpdates:
-    return DeviceSACUpdates(
-        feature_dim=settings.feature_dim, batch_size=settings.batch_size, hidden_dim=settings.hidden_dim,
-        device=settings.device, **switches,
+def pretraining(settings: Settings, paths: list[Path], device: torch.device, **switches: Any) -> Updates:
+    """Return pre-training updates and what they train."""
+    loss = fresh_loss(image_size=settings.image_size, prototypes=settings.prototypes)
+    return PretrainUpdates(loss, paths, batch_size=settings.batch_size, device=device, **switches), loss
+
+
+def downstream(
+    settings: Settings, device: torch.device, *, precision: Precision, compile: bool = False
+) -> Updates:
+    """Return downstream updates and what they train."""
+    config = DownstreamConfig(
+        env_steps=500_000, replay_capacity=settings.transitions, random_agent_steps=1, device=str(device),
+        batch_size=settings.batch_size, features="dense", precision=precision, compile=compile,
     )  # fmt: skip
+    pretrained = fresh_pretrained(image_size=settings.image_size, prototypes=settings.prototypes)
+    run = Downstream(pretrained, config, env_factory=make_drifting_env)
+    run.fill(settings.transitions)
+    return run.update, run.learner.loss
 
 
-def _report(
-    settings: Settings, candidates: dict[str, Callable[[], Any]], *, count: int, unit: str
-) -> dict[str, Any]:
-    """Time candidates in turns, print milliseconds per update and what ``count`` of them take."""
-    per_call = settings.updates_per_call
+def in_tf32(call: Callable[[], Any]) -> Callable[[], None]:
+    """Let float32 factors be rounded to TF32 during a call."""
 
-    def many(call: Callable[[], Any]) -> None:
-        for _ in range(per_call):
+    def rounded() -> None:
+        cudnn, matmul = torch.backends.cudnn, torch.backends.cuda.matmul
+        before = cudnn.allow_tf32, matmul.allow_tf32
+        cudnn.allow_tf32 = matmul.allow_tf32 = True
+        try:
             call()
+        finally:
+            cudnn.allow_tf32, matmul.allow_tf32 = before
 
-    calls = {name: functools.partial(many, call) for name, call in candidates.items()}
-    timed = side_by_side(calls, rounds=settings.rounds, warmup=2, device=settings.device)
-    timings = {
-        name: Timing(t.median_s / per_call, t.best_s / per_call, t.worst_s / per_call, t.rounds)
-        for name, t in timed.items()
-    }
-    best = min(timings, key=lambda name: timings[name].median_s)
-    print(f"One {unit}; times slower than '{best}'.\n\n{table(timings, to=best)}\n")
-    projected = {name: count * t.median_s for name, t in timings.items()}
-    print(f"{count:,} of '{best}' take {projected[best]:.0f} s.")
-    return {
-        "unit": unit,
-        "timings": timings,
-        "times_slower": ratios(timings, to=best),
-        "projected_s": projected,
-    }
+    return rounded
 
 
 if __name__ == "__main__":

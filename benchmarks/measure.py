@@ -1,4 +1,4 @@
-"""Fair timing: candidates take turns in one process, medians are compared, and the machine is written down."""
+"""Fair timing: candidates take turns, medians are compared, and the machine is written down."""
 
 from __future__ import annotations
 
@@ -14,21 +14,15 @@ from typing import Any
 import torch
 from tqdm.auto import tqdm
 
-from crptpro.cards import provenance, write_json
+from crptpro.artifact import write_json
+from crptpro.provenance import hardware, provenance
 
 RESULTS = Path(__file__).parent / "results"
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Wall times of one candidate.
-
-    Args:
-        median_s: median over the rounds, seconds per call.
-        best_s: shortest.
-        worst_s: longest.
-        rounds: calls that were timed.
-    """
+    """Wall times of one candidate, seconds per unit of work."""
 
     median_s: float
     best_s: float
@@ -36,19 +30,22 @@ class Timing:
     rounds: int
 
 
+def timing_of(seconds: list[float]) -> Timing:
+    """Return median, best and worst of at least one time."""
+    return Timing(statistics.median(seconds), min(seconds), max(seconds), len(seconds))
+
+
 def side_by_side(
-    candidates: Mapping[str, Callable[[], Any]],
-    *,
-    rounds: int,
-    warmup: int = 2,
+    candidates: Mapping[str, Callable[[], Any]], *, rounds: int, warmup: int = 2, per_call: int = 1,
     device: torch.device | str = "cpu",
-) -> dict[str, Timing]:
+) -> dict[str, Timing]:  # fmt: skip
     """Time candidates in turns, so that whatever else the machine does meets all of them alike.
 
     Args:
-        candidates: name to a call that does the work once.
+        candidates: name to a call that does the work.
         rounds: timed calls of each.
         warmup: calls of each before the first timed one.
+        per_call: units of work in a call; times are per unit.
         device: waited for before a clock is read.
 
     Raises:
@@ -56,7 +53,6 @@ def side_by_side(
     """
     if rounds < 1:
         raise ValueError(f"`rounds` must be at least 1, got {rounds}.")
-    device = torch.device(device)
     for call in candidates.values():
         for _ in range(warmup):
             call()
@@ -67,44 +63,45 @@ def side_by_side(
             start = time.perf_counter()
             call()
             _wait_for(device)
-            seconds[name].append(time.perf_counter() - start)
-    return {
-        name: Timing(statistics.median(times), min(times), max(times), rounds)
-        for name, times in seconds.items()
-    }
+            seconds[name].append((time.perf_counter() - start) / per_call)
+    return {name: timing_of(times) for name, times in seconds.items()}
 
 
 def ratios(timings: Mapping[str, Timing], *, to: str) -> dict[str, float]:
-    """Return how many times faster than every candidate ``to`` is (its own ratio is 1)."""
+    """Return how many times the time of ``to`` every candidate takes."""
     return {name: timing.median_s / timings[to].median_s for name, timing in timings.items()}
 
 
-def table(timings: Mapping[str, Timing], *, to: str) -> str:
-    """Return a Markdown table: median, spread, and how many times ``to`` is faster.
-
-    Args:
-        timings: from :func:`side_by_side`.
-        to: the candidate whose ratios are shown.
-    """
-    faster = ratios(timings, to=to)
-    lines = ["| candidate | median ms | best to worst ms | times slower |", "|---|---|---|---|"]
+def report(timings: Mapping[str, Timing], *, unit: str, to: str | None = None) -> dict[str, Any]:
+    """Print a table of times and of ratios to ``to`` (the last candidate by default); returns what it shows."""
+    to = to or list(timings)[-1]
+    slower = ratios(timings, to=to)
+    print(f"One {unit}; times the time of '{to}'.\n")
+    print("| candidate | median ms | best to worst ms | times |\n|---|---|---|---|")
     for name, t in timings.items():
-        spread = f"{1e3 * t.best_s:.1f} to {1e3 * t.worst_s:.1f}"
-        lines.append(f"| {name} | {1e3 * t.median_s:.1f} | {spread} | {faster[name]:.2f} |")
-    return "\n".join(lines)
+        spread = f"{1e3 * t.best_s:.2f} to {1e3 * t.worst_s:.2f}"
+        print(f"| {name} | {1e3 * t.median_s:.2f} | {spread} | {slower[name]:.2f} |", flush=True)
+    return {"unit": unit, "timings": timings, "times_slower": slower, "than": to}
+
+
+def machine() -> str:
+    """Return one line about what the times were measured on."""
+    facts = hardware()
+    cpu = f"{torch.get_num_threads()} threads on {facts['cpu_cores']} cores of {facts['cpu']}"
+    gpus = "".join(f", {name}" for name in facts["gpus"])
+    return (
+        f"{cpu} ({facts['cpu_instructions']}){gpus}, torch {torch.__version__}, load {os.getloadavg()[0]:.1f}"
+    )
 
 
 def save(name: str, settings: Any, results: Mapping[str, Any], *, out: Path | None = None) -> Path:
-    """Write what was measured, how and on what, as JSON.
+    """Write what was measured, how and on what, as JSON, and print where.
 
     Args:
         name: of the benchmark; the file is called so.
         settings: the benchmark's dataclass.
-        results: JSON-able; timings may be :class:`Timing`.
+        results: plain values and :class:`Timing`.
         out: directory; ``benchmarks/results`` by default.
-
-    Returns:
-        The file.
     """
     arguments = [_without_place(argument) for argument in sys.argv[1:]]
     content = {
@@ -112,12 +109,12 @@ def save(name: str, settings: Any, results: Mapping[str, Any], *, out: Path | No
         "command": " ".join(["python", "-m", f"benchmarks.{name}", *arguments]),
         "settings": _plain(asdict(settings)),
         "results": _plain(results),
-        "threads": torch.get_num_threads(),
-        "load_average_at_end": os.getloadavg()[0],
+        "machine": machine(),
         **provenance(),
     }
     path = (out or RESULTS) / f"{name}.json"
     write_json(path, content)
+    print(f"\n{machine()}\n{path}\n", flush=True)
     return path
 
 
@@ -138,6 +135,6 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _wait_for(device: torch.device) -> None:
-    if device.type == "cuda":
+def _wait_for(device: torch.device | str) -> None:
+    if torch.device(device).type == "cuda":
         torch.cuda.synchronize(device)

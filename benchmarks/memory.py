@@ -1,41 +1,40 @@
-"""Bytes on disk and resident memory of each stage, beside the targets: collection, pre-training, downstream.
+"""Bytes on disk and resident memory of each stage: collection, pre-training, downstream.
 
-``python -m benchmarks.memory`` runs every stage in a process of its own (:mod:`benchmarks.stages`) and watches it from
-outside. Resident means beyond the page cache (anonymous and shared memory): the frames on disk are mapped, and their
-pages are given back whenever something else wants the memory. Collection and the downstream environments render;
-other pixels are drifting pictures.
+``python -m benchmarks.memory`` runs every stage in a process of its own and watches it and its children from outside
+(Linux: ``/proc``). Resident means beyond the page cache (anonymous and shared memory): the frames on disk are mapped,
+and their pages are given back whenever something else wants the memory. Collection renders; other pixels are drifting
+pictures. The processes that evaluate a downstream run come on top, 0.5 GB each.
 """
 
 from __future__ import annotations
 
-import logging
+import json
+import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import psutil
 import tyro
 
-from benchmarks import stages
+from benchmarks.library import Downstream, fresh_loss, fresh_pretrained
 from benchmarks.measure import save
-from benchmarks.resident import Resident
-from benchmarks.synthetic import write_dataset
-from crptpro.cards import require_disk
-from crptpro.console import run_main
-from crptpro.data import FrameReplay, Layout
+from benchmarks.synthetic import make_drifting_env, write_dataset
+from crptpro.artifact import require_disk
+from crptpro.console import configure_logging, run_main
+from crptpro.data import FrameDataset, collect_random
 from crptpro.errors import CRPTproError
-from crptpro.modules import PixelEncoder, resolve_precision
-from crptpro.transforms import choose_feature_mode
+from crptpro.training import DownstreamConfig, pretrain
 
-logger = logging.getLogger("crptpro.benchmarks.memory")
-
-PROJECTED_TRANSITIONS = 100_000
-EPISODE_TRANSITIONS = 500
-FRAME_BYTES = 3 * 84 * 84
-#: GB, from the performance goals of this project.
-TARGETS = {"disk": 2.2, "pretraining": 3.0, "downstream, dense": 20.0, "downstream, reencode": 4.0}
+LOOK_S, SEARCH_S = 0.02, 0.5
+"""Seconds between two looks at the memory, and between two searches for new children."""
+TARGETS_GB = {"pretraining": 3.0, "downstream, auto": 20.0, "downstream, reencode": 4.0}
+DISK_TARGET = 22_000
+"""Bytes per transition: 2.2 GB for 100,000."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +42,9 @@ class Settings:
     """The sizes at which each stage is measured."""
 
     task: str = "cheetah_run"
-    """what is collected, and whose environments the downstream stage has"""
+    """what is collected"""
     collect_transitions: int = 1_500
     """length of the collection; its memory does not grow with it"""
-    workers: int = 1
-    """collecting processes"""
-    quality: Literal["exact", "fast"] = "exact"
-    """render quality of the collection"""
     datasets: int = 3
     """domains of the pre-training"""
     dataset_transitions: int = 5_000
@@ -60,8 +55,8 @@ class Settings:
     """updates of each; the peak is reached in the first ones"""
     replay_transitions: int = 40_000
     """downstream replay"""
-    features: tuple[Literal["dense", "reencode"], ...] = ("dense", "reencode")
-    """downstream runs, by where features come from; dense ones at 40,000 transitions take 16 GB"""
+    features: tuple[Literal["auto", "reencode"], ...] = ("auto", "reencode")
+    """downstream runs: dense features (16 GB at 40,000 transitions), or encoding at every update"""
     scratch: Path | None = None
     """where frames are written for the time being, not a RAM disk; the system's temporary directory by default"""
     out: Path | None = None
@@ -69,164 +64,165 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class Row:
-    """One line of the table.
+class Resident:
+    """What a program took: peak bytes over all its processes beyond the page cache, and what it answered."""
 
-    Args:
-        name: what was measured.
-        value: GB (10^9 bytes).
-        target: GB, if there is one.
-        note: how it was measured.
-    """
-
-    name: str
-    value: float
-    target: float | None = None
-    note: str = ""
+    peak_bytes: int
+    answer: dict[str, Any]
 
 
-def main(settings: Settings, run_stage: stages.Runner = stages.run_watched) -> dict[str, Any]:
+Runner = Callable[[str, dict[str, Any]], Resident]
+
+
+def main(settings: Settings, run_stage: Runner | None = None) -> dict[str, Any]:
     """Measure, print the tables, write the JSON, and return what it holds.
 
     Raises:
-        DiskSpaceError: if the frames do not fit the disk; nothing has been written then.
-        CRPTproError: if the dense features do not fit the memory, or a stage fails.
+        DiskSpaceError: the frames do not fit the disk; nothing has been written then.
+        CRPTproError: a stage fails.
     """
-    disk: list[Row] = []
-    resident: list[Row] = []
+    run_stage = run_stage or run_watched
+    sizes = {name: getattr(settings, name) for name in ("batch_size", "updates")}
     found: dict[str, Resident] = {}
     with tempfile.TemporaryDirectory(prefix="crptpro-memory-", dir=settings.scratch) as directory:
         work = Path(directory)
-        _announce(settings, work)
+        frames = settings.collect_transitions + settings.datasets * settings.dataset_transitions
+        needed = 3 * 84**2 * (frames + 2 * settings.replay_transitions)
+        require_disk(work, needed, "Measuring the stages")
         found["imports"] = run_stage("imports", {})
-        found["collection"] = run_stage("collection", _collection(settings, work))
-        disk += _dataset_rows(found["collection"].answer)
-        found["pretraining"] = run_stage("pretraining", _pretraining(settings, work))
-        for mode in settings.features:
+        collecting = {"task": settings.task, "root": str(work), "transitions": settings.collect_transitions}
+        found["collection"] = run_stage("collection", collecting)
+        paths = [
+            str(write_dataset(work / f"domain_{seed}", transitions=settings.dataset_transitions, seed=seed))
+            for seed in range(settings.datasets)
+        ]
+        found["pretraining"] = run_stage(
+            "pretraining", {"paths": paths, "run_dir": str(work / "run"), **sizes}
+        )
+        for features in settings.features:
             with tempfile.TemporaryDirectory(dir=work) as run_dir:  # one replay on the disk at a time
-                taken = run_stage("downstream", _downstream(settings, mode, run_dir))
-            found[f"downstream, {mode}"] = taken
-        if settings.features:
-            disk += _replay_rows(found[f"downstream, {settings.features[-1]}"].answer)
+                facts = {"features": features, "transitions": settings.replay_transitions, "run_dir": run_dir}
+                found[f"downstream, {features}"] = run_stage("downstream", {**facts, **sizes})
+    print("| on disk | bytes per transition | target |\n|---|---|---|")
     for name, taken in found.items():
-        note = f"{taken.peak_file_bytes / 1e9:.2f} GB of mapped files besides"
-        resident.append(Row(name, taken.peak_bytes / 1e9, TARGETS.get(name), note))
-    results = {
-        "disk": [asdict(row) for row in disk],
-        "resident": [asdict(row) for row in resident],
-        "stages": {name: asdict(taken) for name, taken in found.items()},
-    }
+        if "bytes_per_transition" in taken.answer:
+            print(f"| {name} | {taken.answer['bytes_per_transition']:,.0f} | {DISK_TARGET:,} |")
+    print("\n| resident beyond the page cache, peak of all processes | GB | target |\n|---|---|---|")
+    for name, taken in found.items():
+        print(f"| {name} | {taken.peak_bytes / 1e9:.2f} | {TARGETS_GB.get(name, '')} |")
+    results = {name: {"peak_bytes": taken.peak_bytes, **taken.answer} for name, taken in found.items()}
     save("memory", settings, results, out=settings.out)
-    print(f"\n`python -m benchmarks.memory {' '.join(sys.argv[1:])}`\n")
-    print(f"On disk\n\n{_table(disk)}\n")
-    print(f"Resident beyond the page cache, peak over all processes of a stage\n\n{_table(resident)}")
     return results
 
 
-def _announce(settings: Settings, work: Path) -> None:
-    """Say what will be written and taken, and refuse what does not fit."""
-    frames = settings.collect_transitions + settings.datasets * settings.dataset_transitions
-    replay = settings.replay_transitions if settings.features else 0
-    # The ring has room for the frames that a checkpoint may still need: some 20 % at 40,000 transitions.
-    size = FRAME_BYTES * (frames + replay * 1.05 + 8_000)
-    logger.info("%.1f GB below %s, until the end", size / 1e9, work)
-    require_disk(work, int(size), "Measuring the stages")
-    if "dense" in settings.features:
-        slots = _ring_rows(settings.replay_transitions)
-        dtype = resolve_precision("auto", "cpu")
-        mode, reason = choose_feature_mode("auto", PixelEncoder(), slots, dtype)
-        if mode != "dense":
-            raise CRPTproError(
-                f"{reason}. Close what else takes memory, ask for fewer --replay-transitions, or --features reencode."
-            )
-        logger.info("downstream: %s", reason)
+# --- the stages, each called in a process of its own -----------------------------------------------------------------
 
 
-def _collection(settings: Settings, work: Path) -> dict[str, Any]:
-    return {
-        "task": settings.task,
-        "root": str(work / "collected"),
-        "transitions": settings.collect_transitions,
-        "workers": settings.workers,
-        "quality": settings.quality,
-    }
+def imports() -> dict[str, Any]:
+    """Do nothing: what is resident then are the imports."""
+    return {}
 
 
-def _pretraining(settings: Settings, work: Path) -> dict[str, Any]:
-    paths = [
-        write_dataset(work / f"domain_{index}", transitions=settings.dataset_transitions, seed=index)
-        for index in range(settings.datasets)
-    ]
-    return {
-        "datasets": [str(path) for path in paths],
-        "run_dir": str(work / "pretraining"),
-        "updates": settings.updates,
-        "batch_size": settings.batch_size,
-    }
+def collection(*, task: str, root: str, transitions: int) -> dict[str, Any]:
+    """Collect a dataset."""
+    path = collect_random(task, root, transitions=transitions)
+    return {"bytes_per_transition": disk_bytes(path) / len(FrameDataset.open(path))}
 
 
-def _downstream(settings: Settings, mode: str, run_dir: str) -> dict[str, Any]:
-    return {
-        "task": settings.task,
-        "run_dir": run_dir,
-        "features": mode,
-        "replay_transitions": settings.replay_transitions,
-        "updates": settings.updates,
-        "batch_size": settings.batch_size,
-        "episode_transitions": EPISODE_TRANSITIONS,
-    }
+def pretraining(*, paths: list[str], run_dir: str, updates: int, batch_size: int) -> dict[str, Any]:
+    """Pre-train the paper's networks for a few updates, with a record and a checkpoint."""
+    result = pretrain(
+        fresh_loss(), paths, updates=updates, batch_size=batch_size, run_dir=run_dir, progress=False
+    )
+    return {"precision": result.training["settings"]["precision"]}
 
 
-def _dataset_rows(answer: Mapping[str, Any]) -> list[Row]:
-    transitions, layout = answer["transitions"], Layout.from_dict(answer["layout"])
-    episodes = -(-PROJECTED_TRANSITIONS // EPISODE_TRANSITIONS)
-    projected = layout.bytes(PROJECTED_TRANSITIONS, PROJECTED_TRANSITIONS + episodes)
-    return [
-        Row(
-            f"dataset of {transitions:,} transitions",
-            answer["bytes_on_disk"] / 1e9,
-            note=f"{answer['bytes_on_disk'] / transitions:,.0f} bytes per transition, every file counted",
-        ),
-        Row(
-            f"dataset of {PROJECTED_TRANSITIONS:,}",
-            projected / 1e9,
-            TARGETS["disk"],
-            f"{projected / PROJECTED_TRANSITIONS:,.0f} bytes per transition, from the layout, episodes of "
-            f"{EPISODE_TRANSITIONS}",
-        ),
-    ]
+def downstream(
+    *, features: Literal["auto", "reencode"], transitions: int, run_dir: str, updates: int, batch_size: int
+) -> dict[str, Any]:
+    """Fill the replay of a downstream run and update."""
+    config = DownstreamConfig(
+        env_steps=500_000, replay_capacity=transitions, random_agent_steps=1, batch_size=batch_size,
+        features=features,
+    )  # fmt: skip
+    run = Downstream(fresh_pretrained(), config, env_factory=make_drifting_env, run_dir=Path(run_dir))
+    run.fill(transitions)
+    for _ in range(updates):
+        run.update()
+    return {"features": run.features, "bytes_per_transition": disk_bytes(Path(run_dir)) / transitions}
 
 
-def _replay_rows(answer: Mapping[str, Any]) -> list[Row]:
-    transitions, slots = answer["transitions"], answer["frame_slots"]
-    slack, size = slots - answer["window"], answer["replay_bytes_on_disk"]
-    rows = [
-        Row(
-            f"replay of {transitions:,} transitions",
-            size / 1e9,
-            note=f"{size / transitions:,.0f} bytes per transition; {slots:,} rows, {slack:,} for checkpoints",
+STAGES: dict[str, Callable[..., dict[str, Any]]] = {
+    "imports": imports, "collection": collection, "pretraining": pretraining, "downstream": downstream,
+}  # fmt: skip
+
+
+def disk_bytes(directory: Path) -> int:
+    """Return what the files below a directory take on disk."""
+    return sum(512 * file.stat().st_blocks for file in directory.rglob("*") if file.is_file())
+
+
+def child(name: str, arguments: str) -> None:
+    """Run one stage; the last line printed is its answer."""
+    configure_logging()
+    print(json.dumps(STAGES[name](**json.loads(arguments))))
+
+
+# --- watching --------------------------------------------------------------------------------------------------------
+
+
+def run_watched(name: str, arguments: dict[str, Any]) -> Resident:
+    """Run a stage in a process of its own and watch its memory."""
+    code = "import sys; from benchmarks.memory import child; child(*sys.argv[1:])"
+    return watch([sys.executable, "-c", code, name, json.dumps(arguments)])
+
+
+def watch(command: list[str]) -> Resident:
+    """Run a program to its end in the repository's root, looking at its memory and its children's every 20 ms.
+
+    Raises:
+        CRPTproError: it fails.
+    """
+    with tempfile.TemporaryFile("w+") as printed:
+        process = subprocess.Popen(command, stdout=printed, cwd=Path(__file__).parents[1])
+        try:
+            peak = _peak(process)
+        finally:
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+        printed.seek(0)
+        lines = printed.read().strip().splitlines()
+    if process.returncode:
+        raise CRPTproError(
+            f"{' '.join(command)} ended with status {process.returncode}; see its messages above."
         )
-    ]
-    for label, extra in (("as downstream makes it", slack), ("without rows for checkpoints", 0)):
-        projected = size / slots * (_ring_rows(PROJECTED_TRANSITIONS) + extra)
-        note = f"{projected / PROJECTED_TRANSITIONS:,.0f} bytes per transition, projected"
-        rows.append(
-            Row(f"replay of {PROJECTED_TRANSITIONS:,}, {label}", projected / 1e9, TARGETS["disk"], note)
-        )
-    return rows
+    return Resident(peak, json.loads(lines[-1]) if lines else {})
 
 
-def _ring_rows(transitions: int) -> int:
-    """Return the rows of a replay that keeps nothing for checkpoints; one of tiny frames has as many."""
-    return FrameReplay(transitions, frame_shape=(1, 1, 1), action_dim=1).window
+def _peak(process: subprocess.Popen[bytes]) -> int:
+    pids, searched_s, peak = [process.pid], 0.0, 0
+    while process.poll() is None:
+        if time.monotonic() - searched_s > SEARCH_S:
+            searched_s = time.monotonic()
+            try:
+                children = psutil.Process(process.pid).children(recursive=True)
+            except psutil.Error:
+                break
+            pids = [process.pid, *(found.pid for found in children)]
+        peak = max(peak, sum(map(_resident_bytes, pids)))
+        time.sleep(LOOK_S)
+    return peak
 
 
-def _table(rows: list[Row]) -> str:
-    lines = ["| what | GB | target GB | of the target | how |", "|---|---|---|---|---|"]
-    for row in rows:
-        target = ("", "") if row.target is None else (f"{row.target:g}", f"{row.value / row.target:.2f}")
-        lines.append(f"| {row.name} | {row.value:.3f} | {target[0]} | {target[1]} | {row.note} |")
-    return "\n".join(lines)
+def _resident_bytes(pid: int) -> int:
+    """Return anonymous and shared memory; nothing of a process that has ended."""
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except (FileNotFoundError, ProcessLookupError):
+        return 0
+    kb = {line.split(":")[0]: int(line.split()[1]) for line in lines if line.startswith("Rss")}
+    return 1024 * (kb.get("RssAnon", 0) + kb.get("RssShmem", 0))
 
 
 if __name__ == "__main__":

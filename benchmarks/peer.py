@@ -21,21 +21,17 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from benchmarks.plain_store import StackedStore
+from benchmarks.plain_pretrain import StackedStore
 from crptpro.errors import CRPTproError
 
 FILES = ("proto.py", "utils.py", "replay_buffer.py")
-#: The released encoder's features are written into its code: 32 x 35 x 35, of 84 x 84 images.
 IMAGE_SIZE = 84
+"""The released encoder's features are written into its code: 32 x 35 x 35, of 84 x 84 images."""
 _MODULES = tuple(Path(file).stem for file in FILES)
 
 
 class RandomCrop(nn.Module):
-    """Stand-in for ``kornia.augmentation.RandomCrop`` without padding: an integer crop per sample.
-
-    Args:
-        size: height and width of the crop.
-    """
+    """Stand-in for ``kornia.augmentation.RandomCrop`` without padding: an integer crop per sample."""
 
     def __init__(self, size: Sequence[int]) -> None:
         super().__init__()

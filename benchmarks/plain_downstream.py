@@ -16,8 +16,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from benchmarks.plain_pretrain import PlainEncoder, copy_parameters, move_towards
-from benchmarks.plain_store import Batch, StackedStore, random_crop
+from benchmarks.plain_pretrain import (
+    Batch,
+    PlainEncoder,
+    StackedStore,
+    copy_parameters,
+    move_towards,
+    random_crop,
+)
 from crptpro.modules import SquashedGaussianActor, TwinCritic
 from crptpro.pretrained import Pretrained
 
@@ -47,14 +53,7 @@ def mlp(in_dim: int, hidden_dim: int, out_dim: int) -> nn.Sequential:
 
 
 class PlainActor(nn.Module):
-    """Squashed Gaussian policy on features.
-
-    Args:
-        feature_dim: of the features.
-        action_dim: A.
-        bottleneck_dim: behind the trunk.
-        hidden_dim: of the two hidden layers.
-    """
+    """Squashed Gaussian policy on features."""
 
     def __init__(self, feature_dim: int, action_dim: int, bottleneck_dim: int, hidden_dim: int) -> None:
         super().__init__()
@@ -74,14 +73,7 @@ class PlainActor(nn.Module):
 
 
 class PlainCritic(nn.Module):
-    """Two Q-functions on one trunk.
-
-    Args:
-        feature_dim: of the features.
-        action_dim: A.
-        bottleneck_dim: behind the trunk.
-        hidden_dim: of the two hidden layers of each head.
-    """
+    """Two Q-functions on one trunk."""
 
     def __init__(self, feature_dim: int, action_dim: int, bottleneck_dim: int, hidden_dim: int) -> None:
         super().__init__()
@@ -96,17 +88,7 @@ class PlainCritic(nn.Module):
 
 
 class PlainDownstream:
-    """Frozen networks, SAC, its three optimisers, and the bonus's queue.
-
-    Args:
-        encoder: frozen.
-        projector: frozen, features to latents.
-        prototypes: frozen, ``[M, D]``.
-        actor: trained.
-        critic: trained.
-        target_entropy: minus the action dimension.
-        generator: of the actions' noise.
-    """
+    """Frozen encoder, projector and prototypes, SAC with its three optimisers, and the bonus's queue."""
 
     def __init__(
         self,

@@ -3,6 +3,10 @@
 The yardstick of ``benchmarks.updates``. It computes what :class:`crptpro.objectives.ProtoLoss` and its training loop
 compute (a test compares losses, gradients and whole updates), with contiguous NCHW images, ``nn.Conv2d``, torch's
 default Adam and a Python loop for the moving average. Source: CRPTpro (arXiv 2302.05614), Eq. 1-9.
+
+Transitions are stored as in the released agents of CRPTpro and Proto-RL (``replay_buffer.py``): both stacks of nine
+channels, 127 KB. The shift is an integer crop per sample, on uint8: interpolating in float32, as DrQ-v2 does, takes
+several times as long and is not exact; comparing with it would flatter us.
 """
 
 from __future__ import annotations
@@ -10,13 +14,13 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from typing import cast
+from typing import NamedTuple, cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torchrl.data import ReplayBuffer
 
-from benchmarks.plain_store import StackedStore, random_crop
 from crptpro.modules import PixelEncoder, Predictor
 from crptpro.objectives import ProtoLoss
 
@@ -26,16 +30,51 @@ ALPHA = 5e-3
 OFFSET = 1.5
 TEMPERATURE = 0.1
 SINKHORN_ITERATIONS = 3
+PAD = 4
+
+
+class Batch(NamedTuple):
+    """Transitions: images uint8 ``[B, 9, H, W]``, the rest float32; bootstrapping stops where not_terminated is 0."""
+
+    obs: Tensor
+    action: Tensor
+    reward: Tensor
+    next_obs: Tensor
+    not_terminated: Tensor
+
+
+class StackedStore:
+    """All transitions in memory, stacks written out, sampled uniformly with replacement."""
+
+    def __init__(self, content: Batch) -> None:
+        self.content = content
+
+    @classmethod
+    def of(cls, buffer: ReplayBuffer, transitions: int) -> StackedStore:
+        """Write out the first ``transitions`` of a buffer of ours, or all if it has fewer."""
+        count = min(transitions, len(buffer))
+        parts = [buffer[part] for part in torch.arange(count).split(1_000)]
+        action = torch.cat([part["action"] for part in parts])
+        reward = torch.cat([part["next", "reward"] for part in parts])
+        not_terminated = 1 - torch.cat([part["next", "terminated"] for part in parts]).float()
+        shape = (count, *parts[0]["pixels"].shape[1:])
+        obs, next_obs = torch.empty(shape, dtype=torch.uint8), torch.empty(shape, dtype=torch.uint8)
+        for index, part in enumerate(parts):
+            rows = slice(index * 1_000, index * 1_000 + len(part))
+            obs[rows], next_obs[rows] = part["pixels"], part["next", "pixels"]
+        return cls(Batch(obs, action, reward, next_obs, not_terminated))
+
+    def __len__(self) -> int:
+        return len(self.content.obs)
+
+    def sample(self, batch_size: int) -> Batch:
+        """Draw a batch, not shifted."""
+        index = torch.randint(len(self), (batch_size,))
+        return Batch(*(column[index] for column in self.content))
 
 
 class PlainEncoder(nn.Module):
-    """Four 3x3 convolutions with ReLU, flattened.
-
-    Args:
-        in_channels: of the stacked images.
-        channels: outputs of each convolution.
-        strides: of each convolution.
-    """
+    """3x3 convolutions with ReLU, flattened."""
 
     def __init__(
         self,
@@ -59,14 +98,7 @@ class PlainEncoder(nn.Module):
 
 
 class PlainPretraining:
-    """Networks, targets, loss and optimiser of the pre-training stage.
-
-    Args:
-        encoder: images to features.
-        projector: features to latents.
-        predictor: latents to latents.
-        prototypes: ``[M, D]``, trained in place.
-    """
+    """Networks, targets, loss and optimiser of the pre-training stage; prototypes are ``[M, D]``."""
 
     def __init__(
         self, encoder: PlainEncoder, projector: nn.Linear, predictor: nn.Sequential, prototypes: nn.Parameter
@@ -150,3 +182,16 @@ def copy_parameters(source: nn.Module, target: nn.Module) -> None:
     """Give ``target`` the parameters of ``source``, which come in the same order, and their dtype."""
     for t, s in zip(target.parameters(), source.parameters(), strict=True):
         t.data = s.detach().clone()
+
+
+def random_crop(images: Tensor, pad: int = PAD) -> Tensor:
+    """Shift every image by its own random integer offset: :func:`crop` at uniform offsets."""
+    return crop(images, torch.randint(0, 2 * pad + 1, (len(images), 2)), pad)
+
+
+def crop(images: Tensor, offsets: Tensor, pad: int = PAD) -> Tensor:
+    """Crop images ``[B, C, H, W]`` at offsets ``[B, 2]``, ``{0, ..., 2 * pad}``, from themselves, border replicated."""
+    height, width = images.shape[-2:]
+    padded = F.pad(images, (pad, pad, pad, pad), mode="replicate")
+    windows = padded.unfold(2, height, 1).unfold(3, width, 1)  # (B, C, 9, 9, H, W), a view
+    return windows[torch.arange(len(images)), :, offsets[:, 0], offsets[:, 1]]

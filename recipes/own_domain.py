@@ -10,9 +10,8 @@ It has no prototypes, hence no exploration bonus, which the downstream stage say
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -25,10 +24,10 @@ from torchrl.objectives import LossModule
 from crptpro.console import run_main
 from crptpro.data import collect_random
 from crptpro.modules import PixelEncoder, Predictor, Projector
-from crptpro.objectives import MethodDefaults, register_method
+from crptpro.objectives import register_method
 from crptpro.pretrained import save_pretrained
 from crptpro.seeding import seed_everything
-from crptpro.training import pretrain, train_downstream
+from crptpro.training import DownstreamConfig, PretrainConfig, pretrain, train_downstream
 
 
 class NextLatentLoss(LossModule):
@@ -66,7 +65,7 @@ class NextLatentLoss(LossModule):
 
 
 register_method(
-    "next-latent", NextLatentLoss, MethodDefaults(updates=300, batch_size=128, lr=3e-4, encoder_tau=0.05)
+    "next-latent", NextLatentLoss, updates=300, batch_size=128, learning_rate=3e-4, encoder_tau=0.05
 )
 
 
@@ -76,65 +75,43 @@ class Config:
 
     world: str = "gymnasium:HalfCheetah-v5"
     """any Gymnasium id that renders RGB and has continuous actions"""
-    transitions: int = 1_000
-    """random transitions"""
-    updates: int = 300
-    """encoder updates"""
-    pretrain_batch_size: int = 128
-    """transitions per encoder update"""
-    env_steps: int = 4_000
-    """simulator steps of SAC"""
-    random_agent_steps: int = 500
-    """decisions before the first SAC update"""
-    replay_capacity: int = 5_000
-    """transitions kept for replay"""
-    batch_size: int = 128
-    """transitions per SAC update"""
     out: Path = Path("runs/own_domain")
     """everything is written below this directory"""
     seed: int = 0
     """seeds every stage"""
+    transitions: int = 1_000
+    """random transitions"""
     workers: int = 2
     """collecting processes"""
-    quality: Literal["exact", "fast"] = "exact"
-    """render quality"""
+    pretrain: PretrainConfig = field(default_factory=PretrainConfig)
+    """pre-training; what is left open is what was registered above"""
+    downstream: DownstreamConfig = field(
+        default_factory=lambda: DownstreamConfig(
+            env_steps=4_000,
+            batch_size=128,
+            learning_rate=1e-3,
+            replay_capacity=5_000,
+            random_agent_steps=500,
+            eval_interval_env_steps=2_000,
+            eval_episodes=2,
+        )
+    )
+    """SAC on the frozen encoder"""
 
 
 def main(config: Config) -> None:
     """Collect, pre-train, learn."""
-    seed_everything(config.seed)
+    seed, out = config.seed, config.out
     dataset = collect_random(
-        config.world,
-        config.out / "data",
-        transitions=config.transitions,
-        seed=config.seed,
-        workers=config.workers,
-        quality=config.quality,
-    )
+        config.world, out / "data", transitions=config.transitions, seed=seed, workers=config.workers
+    )  # fmt: skip
+    seed_everything(seed)
     loss = NextLatentLoss(PixelEncoder())
-    pretrain(
-        loss,
-        [dataset],
-        updates=config.updates,
-        batch_size=config.pretrain_batch_size,
-        seed=config.seed,
-        run_dir=config.out / "pretrain",
-    )
-    encoder = save_pretrained(loss, config.out / "encoder")
+    result = pretrain(loss, dataset, run_dir=out / "pretrain", config=replace(config.pretrain, seed=seed))
+    encoder = save_pretrained(result, out / "encoder")
     train_downstream(
-        config.world,
-        encoder,
-        run_dir=config.out / "downstream",
-        env_steps=config.env_steps,
-        random_agent_steps=config.random_agent_steps,
-        replay_capacity=config.replay_capacity,
-        batch_size=config.batch_size,
-        learning_rate=1e-3,
-        eval_interval_env_steps=2_000,
-        eval_episodes=2,
-        seed=config.seed,
-        quality=config.quality,
-    )
+        config.world, encoder, run_dir=out / "downstream", config=replace(config.downstream, seed=seed)
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

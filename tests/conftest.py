@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+import logging
+
 import pytest
 import torch
 
 # Looking for doctests would import this file once more, under a name that another conftest.py has too.
 collect_ignore = ["conftest.py"]
+
+
+@pytest.fixture(autouse=True)
+def _log_is_as_a_library_has_it() -> None:
+    """A command that an earlier test ran in this process has given the log a handler of its own."""
+    library = logging.getLogger("crptpro")
+    library.handlers.clear()
+    library.propagate = True
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -1,44 +1,145 @@
+"""Files and directories that are whole or not there, and are checked before use."""
+
 from __future__ import annotations
 
 import errno
 import os
 import shutil
-import subprocess
-import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from safetensors import SafetensorError
 from torch import nn
 
 from crptpro import artifact
-from crptpro.artifact import read_artifact, write_artifact
-from crptpro.errors import CRPTproError, DiskSpaceError, PretrainedError
+from crptpro.artifact import read_artifact, read_json, require_disk, write_artifact, write_json, write_whole
+from crptpro.errors import CRPTproError, DatasetError, DiskSpaceError, PretrainedError
 
 
-def write(path: Path, value: float = 1.0) -> Path:
+def write(path: Path, value: float = 1.0, **card: Any) -> Path:
     layer = nn.Linear(2, 3)
     nn.init.constant_(layer.weight, value)
-    return write_artifact(path, {"layer": layer}, card={"task": "walker"}, format_name="test", version=2)
+    card = {"task": "walker", **card}
+    return write_artifact(path, {"layer": layer}, card=card, format_name="test", version=2)
 
 
-def read(path: Path) -> tuple[dict, dict]:
+def read(path: Path) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     return read_artifact(path, format_name="test", version=2, error=PretrainedError)
 
 
-def test_weights_and_card_round_trip(tmp_path: Path) -> None:
-    card, tensors = read(write(tmp_path / "a", 2.5))
-    assert card["task"] == "walker"
-    assert card["format"] == "test"
-    assert set(tensors) == {"layer.weight", "layer.bias"}
-    torch.testing.assert_close(tensors["layer.weight"], torch.full((3, 2), 2.5), rtol=0, atol=0)
+def value_of(path: Path) -> float:
+    return float(read(path)[1]["layer.weight"][0, 0])
 
 
-def test_writing_again_replaces_the_artifact_and_leaves_nothing_else(tmp_path: Path) -> None:
+# --- files --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("content", ["caf\N{LATIN SMALL LETTER E WITH ACUTE}\r\n", b"\x00\xff"])
+def test_what_is_written_is_read_and_its_directory_made(tmp_path: Path, content: str | bytes) -> None:
+    path = write_whole(tmp_path / "made" / "a.txt", content)
+    assert path.read_bytes() == (content if isinstance(content, bytes) else content.encode())
+    assert [file.name for file in path.parent.iterdir()] == ["a.txt"]
+
+
+@pytest.mark.parametrize(("number", "kind", "message"), [
+    (errno.ENOSPC, DiskSpaceError, r"disk is full: .*/card\.json cannot be written"),
+    (errno.EDQUOT, DiskSpaceError, r"disk is full: .*/card\.json cannot be written"),
+    (errno.EIO, OSError, r"Input/output error: '.*/card\.json'"),
+])  # fmt: skip
+def test_a_write_that_fails_names_the_file_and_keeps_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, kind: type[Exception], message: str
+) -> None:
+    path = tmp_path / "card.json"
+    write_json(path, {"a": 1})
+
+    def fail(descriptor: int) -> None:
+        raise OSError(number, os.strerror(number))  # of an open file, the system says no name
+
+    monkeypatch.setattr(artifact.os, "fsync", fail)
+    with pytest.raises(kind, match=message):
+        write_json(path, {"a": 2})
+    assert read_json(path) == {"a": 1}
+    assert [p.name for p in tmp_path.iterdir()] == ["card.json"]
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("{", "cannot be read as JSON"), ("[1]", "holds a list"), (None, r"card\.json does not exist"),
+])  # fmt: skip
+def test_a_damaged_or_missing_card_is_named(tmp_path: Path, text: str | None, message: str) -> None:
+    if text is not None:
+        (tmp_path / "card.json").write_text(text)
+    with pytest.raises(DatasetError, match=message):
+        read_json(tmp_path / "card.json", error=DatasetError)
+
+
+def test_every_number_in_a_card_is_the_plain_number_it_means_or_refused_by_name(tmp_path: Path) -> None:
+    given = {
+        "size": np.int64(84),
+        "rate": torch.tensor(0.5),
+        "shape": (np.uint8(3), 2),
+        "out": Path("a"),
+        "no": None,
+    }
+    write_json(tmp_path / "card.json", {"config": given, "ok": np.bool_(True)})
+    assert read_json(tmp_path / "card.json") == {
+        "config": {"size": 84, "rate": 0.5, "shape": [3, 2], "out": "a", "no": None}, "ok": True,
+    }  # fmt: skip
+    for entry in (object(), nn.Linear(1, 1), 1j, {3: 4}):
+        with pytest.raises(ValueError, match=r"card\.json\.config\.what"):
+            write_json(tmp_path / "card.json", {"config": {"what": entry}})
+    assert read_json(tmp_path / "card.json")["ok"] is True
+
+
+def test_a_disk_that_cannot_hold_the_data_is_refused_with_both_sizes(tmp_path: Path) -> None:
+    with pytest.raises(DiskSpaceError, match=r"collection needs .* GB, but .* has .* GB free"):
+        require_disk(tmp_path / "not" / "yet", 10**18, "collection")
+    require_disk(tmp_path / "not" / "yet", 1, "collection")
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path / "home"
+
+
+def test_paths_mean_what_a_shell_means_and_empty_ones_are_refused(home: Path) -> None:
+    write(Path("~/runs/a"), 3.0)
+    assert value_of(home / "runs" / "a") == value_of(Path("~/runs/a")) == 3
+    write_json("~/card.json", {})
+    assert (home / "card.json").exists()
+    assert not Path("~").exists()
+    for bad in ("", b"\xff".decode(errors="surrogateescape")):
+        with pytest.raises(ValueError, match=r"is empty|is not UTF-8"):
+            write_artifact(bad, {}, card={}, format_name="test", version=1)
+
+
+@pytest.fixture(params=[0o077, 0o002, 0o022])
+def umask(request: pytest.FixtureRequest) -> Iterator[int]:
+    before = os.umask(request.param)
+    yield request.param
+    os.umask(before)
+
+
+def test_files_and_directories_have_the_rights_that_the_umask_leaves(tmp_path: Path, umask: int) -> None:
+    path = write(tmp_path / "new" / "a")
+    for folder in (path.parent, path):
+        assert folder.stat().st_mode & 0o777 == 0o777 & ~umask
+    assert {file.stat().st_mode & 0o777 for file in path.iterdir()} == {0o666 & ~umask}
+
+
+# --- artifacts ----------------------------------------------------------------------------------------------------
+
+
+def test_weights_and_card_round_trip_and_writing_again_replaces_them(tmp_path: Path) -> None:
     write(tmp_path / "a", 1.0)
-    write(tmp_path / "a", 2.0)
-    assert read(tmp_path / "a")[1]["layer.weight"][0, 0] == 2
+    card, tensors = read(write(tmp_path / "a", 2.5))
+    assert (card["task"], card["format"]) == ("walker", "test")
+    assert set(tensors) == {"layer.weight", "layer.bias"}
+    assert torch.equal(tensors["layer.weight"], torch.full((3, 2), 2.5))
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
@@ -56,14 +157,9 @@ def test_what_is_no_artifact_of_this_kind_is_not_replaced(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(("step", "error", "kind", "message"), [
-    ("crptpro.cards.os.fsync", OSError(errno.ENOSPC, "No space left"), DiskSpaceError, "disk is full: {} cannot"),
-    ("crptpro.cards.os.replace", OSError(errno.EDQUOT, "Quota"), DiskSpaceError, "disk is full: {} cannot"),
-    ("crptpro.artifact.os.fsync", OSError(errno.EIO, "Input/output error"), OSError, "error: '{}'"),
-    ("safetensors.torch.save_file", SafetensorError("I/O error: No space left on device (os error 28)"),
-     DiskSpaceError, "disk is full: {} cannot"),
-    ("safetensors.torch.save_file", SafetensorError("IoError(Os { code: 122, kind: Other, message: 'x' })"),
-     DiskSpaceError, "disk is full: {} cannot"),
-    ("safetensors.torch.save_file", SafetensorError("no tensor"), SafetensorError, "no tensor"),
+    ("os.fsync", OSError(errno.ENOSPC, "No space left"), DiskSpaceError, "disk is full: {} cannot"),
+    ("os.replace", OSError(errno.EDQUOT, "Quota"), DiskSpaceError, "disk is full: {} cannot"),
+    ("os.rename", OSError(errno.EIO, "Input/output error"), OSError, "error: '{}"),
 ])  # fmt: skip
 def test_a_failed_write_keeps_the_old_artifact_and_names_it(
     tmp_path: Path,
@@ -78,108 +174,91 @@ def test_a_failed_write_keeps_the_old_artifact_and_names_it(
     def fail(*args: object) -> None:
         raise error
 
-    monkeypatch.setattr(step, fail)
-    with pytest.raises(kind, match=message.format(tmp_path / "a")):
-        write(tmp_path / "a", 2.0)
-    monkeypatch.undo()
-    assert read(tmp_path / "a")[1]["layer.weight"][0, 0] == 1
+    with monkeypatch.context() as patched:
+        patched.setattr(f"crptpro.artifact.{step}", fail)
+        with pytest.raises(kind, match=message.format(tmp_path / "a")):
+            write(tmp_path / "a", 2.0)
+    with pytest.raises(ValueError, match=r"card\.json\.odd"):
+        write(tmp_path / "a", 2.0, odd=object())
+    assert value_of(tmp_path / "a") == 1
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
-@pytest.mark.parametrize(
-    ("folder", "given"), [("a", "."), ("a", ""), ("a/sub", ".."), ("a/sub", "../sub/..")]
-)
-def test_the_directory_that_one_is_in_is_read_like_any_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, given: str
-) -> None:
-    write(tmp_path / "a", 1.0)
-    (tmp_path / "a" / "sub").mkdir()
-    monkeypatch.chdir(tmp_path / folder)
-    assert read(Path(given))[1]["layer.weight"][0, 0] == 1
-
-
-def test_a_root_that_is_no_artifact_is_named() -> None:
-    with pytest.raises(PretrainedError, match=r"/card\.json does not exist"):
-        read(Path("/"))
-
-
-@pytest.mark.parametrize(("folder", "given"), [("a", "."), ("a", "../a"), ("a/sub", ".."), ("empty", ".")])
-def test_the_directory_that_one_is_in_is_not_replaced_under_ones_feet(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, given: str
-) -> None:
-    write(tmp_path / "a", 1.0)
-    for name in ("a/sub", "empty"):
-        (tmp_path / name).mkdir()
-    monkeypatch.chdir(tmp_path / folder)
-    with pytest.raises(CRPTproError, match="is the current directory or around it"):
-        write(Path(given), 2.0)
-    assert read(tmp_path / "a")[1]["layer.weight"][0, 0] == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "empty"]
-    # Where the new one is found again, a run that began there may save.
-    assert read(write(tmp_path / "a", 2.0))[1]["layer.weight"][0, 0] == 2
-
-
-def test_a_kill_between_the_two_renames_loses_nothing(tmp_path: Path) -> None:
-    write(tmp_path / "a", 1.0)
-    (tmp_path / "a").rename(artifact._previous(tmp_path / "a"))
-    assert read(tmp_path / "a")[1]["layer.weight"][0, 0] == 1
-
-
-def test_a_reader_between_the_two_renames_of_a_writer_does_not_disturb_it(
+def test_what_was_written_is_read_back_before_it_replaces_anything(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(tmp_path / "a", 1.0)
-    seen = []
-    rename = os.rename
+    whole = artifact.write_whole
 
-    def rename_and_read(old: Path, new: Path) -> None:
+    def lossy(path: Path, content: Any) -> Path:
+        return whole(path, content[:-1] if path.name == "weights.safetensors" else content)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(artifact, "write_whole", lossy)
+        with pytest.raises(CRPTproError, match="truncated, damaged or replaced"):
+            write(tmp_path / "a", 2.0)
+    assert value_of(tmp_path / "a") == 1
+
+
+def test_the_directory_that_one_is_in_is_read_and_written_like_any_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path / "a", 1.0)
+    (tmp_path / "a" / "sub").mkdir()
+    monkeypatch.chdir(tmp_path / "a" / "sub")
+    assert value_of(Path("..")) == value_of(Path("../sub/..")) == 1
+    monkeypatch.chdir(tmp_path / "a")
+    assert value_of(Path(".")) == 1
+    write(Path("."), 2.0)
+    assert value_of(tmp_path / "a") == 2
+
+
+def test_a_kill_between_the_two_renames_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path / "a", 1.0)
+    rename, seen = os.rename, []
+
+    def killed(old: Path, new: Path) -> None:
         if new == tmp_path / "a":
-            seen.append(read(tmp_path / "a")[1]["layer.weight"][0, 0].item())
+            seen.append(value_of(tmp_path / "a"))  # a reader comes between
+            raise KeyboardInterrupt
         rename(old, new)
 
-    monkeypatch.setattr(artifact.os, "rename", rename_and_read)
-    write(tmp_path / "a", 2.0)
+    with monkeypatch.context() as patched:
+        patched.setattr(artifact.os, "rename", killed)
+        with pytest.raises(KeyboardInterrupt):
+            write(tmp_path / "a", 2.0)
     assert seen == [1.0]
-    assert read(tmp_path / "a")[1]["layer.weight"][0, 0] == 2
+    assert value_of(tmp_path / "a") == 1
+    write(tmp_path / "a", 2.0)
+    assert value_of(tmp_path / "a") == 2
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
-@pytest.mark.parametrize("moment", ["_sha256", "read_json"])
 def test_an_artifact_that_is_replaced_while_it_is_read_is_the_new_one_as_a_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(tmp_path / "a", 1.0)
-    step = getattr(artifact, moment)
+    step = artifact.read_json
 
-    def step_and_replace(*args: object, **kwargs: object) -> object:
+    def read_and_replace(*args: Any, **kwargs: Any) -> dict[str, Any]:
         found = step(*args, **kwargs)
-        monkeypatch.setattr(artifact, moment, step)
+        monkeypatch.setattr(artifact, "read_json", step)
         write(tmp_path / "a", 2.0)
         return found
 
-    monkeypatch.setattr(artifact, moment, step_and_replace)
+    monkeypatch.setattr(artifact, "read_json", read_and_replace)
     card, tensors = read(tmp_path / "a")
     assert tensors["layer.weight"][0, 0] == 2
     assert card == read(tmp_path / "a")[0]
 
 
-def test_what_a_killed_writer_left_is_removed_by_the_next_and_a_living_ones_is_not(tmp_path: Path) -> None:
-    dead = subprocess.Popen([sys.executable, "-c", ""])
-    dead.wait()
-    prefix = artifact._temporary_prefix(tmp_path / "a")
-    others = artifact._temporary_prefix(tmp_path / "a.b")
-    stale = tmp_path / f"{prefix}{dead.pid}-k2j3h4x_"
-    kept = [
-        tmp_path / f"{prefix}{os.getpid()}-k2j3h4x_",  # a writer at work
-        tmp_path / f".a.writing-another-host-{dead.pid}-k2j3h4x_",  # whose processes cannot be asked
-        tmp_path / f"{others}{dead.pid}-k2j3h4x_",  # of another artifact
-    ]
-    for path in (stale, *kept):
-        path.mkdir()
-        (path / "weights.safetensors").write_text("half")
+def test_what_a_killed_writer_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    (tmp_path / ".a.writing").mkdir()
+    (tmp_path / ".a.writing" / "weights.safetensors").write_text("half")
     write(tmp_path / "a")
-    assert not stale.exists()
-    assert all(path.exists() for path in kept)
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
 def truncate(path: Path) -> None:
@@ -187,16 +266,13 @@ def truncate(path: Path) -> None:
     weights.write_bytes(weights.read_bytes()[:-4])
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (shutil.rmtree, "does not exist"),
-        (lambda p: (p / "card.json").unlink(), "card.json does not exist"),
-        (lambda p: (p / "weights.safetensors").unlink(), "weights.safetensors is missing"),
-        (truncate, "truncated, damaged or replaced"),
-    ],
-)
-def test_each_kind_of_damage_is_named(tmp_path: Path, damage, message: str) -> None:
+@pytest.mark.parametrize(("damage", "message"), [
+    (shutil.rmtree, "does not exist"),
+    (lambda p: (p / "card.json").unlink(), "card.json does not exist"),
+    (lambda p: (p / "weights.safetensors").unlink(), "weights.safetensors is missing"),
+    (truncate, "truncated, damaged or replaced"),
+])  # fmt: skip
+def test_each_kind_of_damage_is_named(tmp_path: Path, damage: Callable[[Path], None], message: str) -> None:
     write(tmp_path / "a")
     damage(tmp_path / "a")
     with pytest.raises(PretrainedError, match=message):

@@ -34,7 +34,7 @@ def test_collect_pretrain_freeze_and_learn_in_under_twenty_seconds(tmp_path: Pat
     result = pretrain(loss, paths, updates=5, batch_size=8, precision="fp32", progress=False)
     assert math.isfinite(result.metrics["loss"])
     assert not torch.equal(encoder.convs[0].weight, before)
-    save_pretrained(loss, tmp_path / "encoder")
+    save_pretrained(result, tmp_path / "encoder")
 
     artifact = load_pretrained(tmp_path / "encoder")
     frozen = {key: value.clone() for key, value in artifact.encoder.state_dict().items()}
@@ -48,6 +48,6 @@ def test_collect_pretrain_freeze_and_learn_in_under_twenty_seconds(tmp_path: Pat
     agent, _ = load_agent(tmp_path / "run" / "agent")
     for key, value in frozen.items():
         assert torch.equal(agent.encoder.state_dict()[key], value), key
-    episodes, _ = evaluate(agent, make_env(FIXED, seed=0, image_size=12), episodes=2, progress=False)
+    episodes = evaluate(agent, make_env(FIXED, seed=0, image_size=12), episodes=2, progress=False)
     assert [episode.agent_steps for episode in episodes] == [10, 10]
     assert time.monotonic() - started < 20

@@ -12,7 +12,11 @@ import pytest
 
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import CheckpointError, CRPTproError, DatasetError
-from crptpro.loggers import RunLogger
+from crptpro.logging import RunLogger
+
+
+def refusal(code: str) -> str:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False).stderr
 
 
 @pytest.mark.parametrize("error", [CheckpointError, DatasetError])
@@ -20,11 +24,10 @@ def test_a_second_process_is_refused_and_a_dead_one_is_not_remembered(
     tmp_path: Path, error: type[CRPTproError]
 ) -> None:
     script = (
-        "import fcntl, sys, time\n"
-        "file = open(sys.argv[1], 'a')\n"
-        "fcntl.flock(file, fcntl.LOCK_EX); print('held', flush=True); time.sleep(60)"
+        "import sys, time; from crptpro.directory_lock import DirectoryLock\n"
+        "lock = DirectoryLock(sys.argv[1]); print('held', flush=True); time.sleep(60)"
     )
-    command = [sys.executable, "-c", script, str(tmp_path / ".lock")]
+    command = [sys.executable, "-c", script, str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
         assert holder.stdout is not None
         assert holder.stdout.readline() == "held\n"
@@ -35,8 +38,9 @@ def test_a_second_process_is_refused_and_a_dead_one_is_not_remembered(
         pass
 
 
-def test_a_released_directory_may_be_taken_again(tmp_path: Path) -> None:
-    lock = DirectoryLock(tmp_path / "new")
+def test_a_released_directory_may_be_taken_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    lock = DirectoryLock("~/new")
     with pytest.raises(CRPTproError, match="Another process"):
         DirectoryLock(tmp_path / "new")
     lock.release()
@@ -66,7 +70,7 @@ def test_who_can_wait_is_asked_to_until_the_directory_is_free_or_it_has_had_enou
 
 @pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOTSUP])
 def test_a_file_system_without_locks_is_not_taken_for_another_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, number: int
 ) -> None:
     def no_locks(*_: object) -> None:
         raise OSError(number, "no locks here")
@@ -74,6 +78,7 @@ def test_a_file_system_without_locks_is_not_taken_for_another_process(
     monkeypatch.setattr(fcntl, "flock", no_locks)
     with DirectoryLock(tmp_path), DirectoryLock(tmp_path):
         pass
+    assert "cannot be locked" in caplog.text
 
 
 def test_a_directory_that_cannot_be_made_is_named(tmp_path: Path) -> None:
@@ -83,21 +88,10 @@ def test_a_directory_that_cannot_be_made_is_named(tmp_path: Path) -> None:
 
 
 def test_holders_in_one_process_share_a_reentrant_lock_until_the_last_lets_go(tmp_path: Path) -> None:
-    script = f"from crptpro.directory_lock import DirectoryLock; DirectoryLock({str(tmp_path)!r}, is_reentrant=True)"
-    outer = DirectoryLock(tmp_path, is_reentrant=True)
-    with DirectoryLock(tmp_path, is_reentrant=True):
-        pass
-    refused = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-    assert "Another process is writing to" in refused.stderr
-    outer.release()
-    subprocess.run([sys.executable, "-c", script], check=True)
-
-
-def test_a_record_belongs_to_one_process(tmp_path: Path) -> None:
-    script = f"from crptpro.loggers import RunLogger; RunLogger({str(tmp_path)!r})"
-    with RunLogger(tmp_path) as logger:
-        logger.log({"loss": 1.0}, stream="pretrain", updates=1)
-        refused = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
-        assert "CheckpointError" in refused.stderr
-        assert "Another process is writing to" in refused.stderr
-    subprocess.run([sys.executable, "-c", script], check=True)
+    script = f"from crptpro.logging import RunLogger; RunLogger({str(tmp_path)!r})"
+    with RunLogger(tmp_path):
+        with DirectoryLock(tmp_path, is_reentrant=True):
+            pass
+        refused = refusal(script)
+        assert "CheckpointError: Another process is writing to" in refused
+    assert refusal(script) == ""

@@ -1,3 +1,5 @@
+"""The doctor: one thing that is wrong with a machine at a time, and how a domain that fails hides no other."""
+
 from __future__ import annotations
 
 import os
@@ -5,167 +7,131 @@ import shutil
 import sys
 from collections.abc import Iterator
 from types import SimpleNamespace
+from typing import Any
 from unittest import mock
 
 import pytest
 
 from crptpro import doctor
-from crptpro.doctor import check_versions, run_doctor
-from crptpro.envs import gl_process, render_check
-from crptpro.errors import UnknownNameError
+from crptpro.doctor import check_domain, check_versions, render_domains, run_doctor
+from crptpro.envs import rendering
+from crptpro.errors import CRPTproError, RenderingError, UnknownNameError
 
-ALIVE = {"domain": "cartpole", "reset_ms": 200.0, "agent_step_ms": 15.0, "alive": True, "error": ""}
-PROBE = """import json, os
-print(json.dumps(dict(gl_vendor='Mesa', gl_renderer='llvmpipe', gl_version='4.5', gl_kind='software', alive=True)))"""
+ALIVE = {"domain": "cartpole", "reset_ms": 200.0, "agent_step_ms": 15.0, "is_drawing": True, "error": ""}
+PROBE = """import os
+print('{"gl_vendor": "Mesa", "gl_renderer": "llvmpipe", "gl_kind": "software", "alive": true}')"""
+MACHINE = {"cpu": "x", "cpu_instructions": "AVX2", "cpu_cores": 2, "ram_bytes": 16e9, "gpus": []}
+
+
+def probe_with(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
+    monkeypatch.setattr(rendering, "PROBE_COMMAND", (sys.executable, "-S", "-c", code))
 
 
 @pytest.fixture(autouse=True)
 def _healthy_machine(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A machine on which everything works, without rendering anything; tests break one thing each."""
-    monkeypatch.setattr(gl_process, "PROBE_COMMAND", (sys.executable, "-S", "-c", PROBE))
-    monkeypatch.setattr(
-        render_check, "render_domains", lambda names, *_: tuple({**ALIVE, "domain": n} for n in names)
-    )
+    probe_with(monkeypatch, PROBE)
+    monkeypatch.setattr(doctor, "render_domains", lambda names, *_: [{**ALIVE, "domain": n} for n in names])
+    monkeypatch.setattr(rendering, "_imported_backend", lambda: None)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=100e9))
     monkeypatch.setattr(doctor.psutil, "virtual_memory", lambda: SimpleNamespace(available=16e9, total=16e9))
     with mock.patch.dict(os.environ):
-        for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
+        for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY", rendering.PROOF_VARIABLE):
             os.environ.pop(name, None)
         yield
 
 
-def test_a_healthy_machine_is_ok_and_every_domain_and_backend_is_shown() -> None:
+def test_a_healthy_machine_is_ok_and_every_domain_is_shown() -> None:
     report = run_doctor()
     assert report.ok
-    assert [check.backend for check in report.backends] == ["egl", "osmesa"]
-    assert [check.is_chosen for check in report.backends] == [True, False]
-    text = report.text()
-    for part in (
+    shown = (
         "mujoco",
         "torchrl",
-        "llvmpipe",
+        "egl (llvmpipe",
         "manipulation",
         "quadruped",
         "15.0",
         "100.0 GB",
         "would work",
-    ):
-        assert part in text
-    assert "error" not in text
-
-
-def test_a_machine_on_which_nothing_renders_is_not_ok(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        gl_process, "PROBE_COMMAND", (sys.executable, "-S", "-c", "raise SystemExit('no GL')")
     )
-    report = run_doctor(["cartpole"])
-    assert not report.ok
-    for part in ("No GL backend renders", "no GL", "apt-get install", "would not work"):
+    for part in shown:
         assert part in report.text()
-
-
-def test_one_backend_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    code = f"import os\nif os.environ['MUJOCO_GL'] == 'egl': raise SystemExit('no EGL')\n{PROBE}"
-    monkeypatch.setattr(gl_process, "PROBE_COMMAND", (sys.executable, "-S", "-c", code))
-    report = run_doctor(["cartpole"])
-    assert report.ok
-    assert [check.is_chosen for check in report.backends] == [False, True]
-    assert "no EGL" in report.text()
-
-
-def test_a_hung_backend_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    code = "import time; time.sleep(600)"
-    monkeypatch.setattr(gl_process, "PROBE_COMMAND", (sys.executable, "-S", "-c", code))
-    report = run_doctor(["cartpole"], backends=["egl"], timeout_s=0.5)
-    assert not report.ok
-    assert "did not arrive within 0.5 s" in report.text()
-
-
-def test_the_users_mujoco_gl_is_the_one_that_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    os.environ["MUJOCO_GL"] = "osmesa"
-    assert [check.backend for check in run_doctor(["cartpole"]).backends if check.is_chosen] == ["osmesa"]
-    code = f"import os\nif os.environ['MUJOCO_GL'] == 'osmesa': raise SystemExit('no OSMesa')\n{PROBE}"
-    monkeypatch.setattr(gl_process, "PROBE_COMMAND", (sys.executable, "-S", "-c", code))
-    report = run_doctor(["cartpole"])
-    assert not report.ok
-    assert "Unset MUJOCO_GL" in report.text()
-
-
-def test_a_wrong_mujoco_gl_is_reported_and_not_raised() -> None:
-    os.environ["MUJOCO_GL"] = "nonsense"
-    report = run_doctor(["cartpole"])
-    assert not report.ok
-    assert "MUJOCO_GL=nonsense" in report.text()
+    assert "error" not in report.text()
 
 
 @pytest.mark.parametrize(
-    ("entry", "words"),
+    ("code", "gl", "parts"),
     [
-        ({"alive": False}, "constant or do not change"),
-        ({"alive": False, "agent_step_ms": None, "reset_ms": None, "error": "boom"}, "boom"),
+        ("raise SystemExit('no GL')", None, ("No GL backend renders", "no GL", "apt-get install")),
+        ("import time; time.sleep(600)", None, ("did not arrive within 0.5 s", "MUJOCO_GL=osmesa")),
+        ("raise SystemExit('no GL')", "osmesa", ("MUJOCO_GL=osmesa was set by you", "Unset MUJOCO_GL")),
+        (PROBE, "nonsense", ("MUJOCO_GL=nonsense is not a GL backend",)),
+        (PROBE, "off", ("switches rendering off",)),
     ],
 )
-def test_dead_pixels_are_not_ok(
-    monkeypatch: pytest.MonkeyPatch, entry: dict[str, object], words: str
+def test_a_machine_on_which_nothing_renders_is_not_ok_and_told_why(
+    monkeypatch: pytest.MonkeyPatch, code: str, gl: str | None, parts: tuple[str, ...]
 ) -> None:
-    monkeypatch.setattr(render_check, "render_domains", lambda *_: ({**ALIVE, **entry},))
+    probe_with(monkeypatch, code)
+    os.environ.update({"MUJOCO_GL": gl} if gl else {})
+    report = run_doctor(["cartpole"], timeout_s=0.5 if "sleep" in code else None)
+    assert not report.ok
+    for part in (*parts, "would not work"):
+        assert part in report.text()
+
+
+def test_one_backend_is_enough(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    probe_with(
+        monkeypatch, f"import os\nif os.environ['MUJOCO_GL'] == 'egl': raise SystemExit('no EGL')\n{PROBE}"
+    )
+    report = run_doctor(["cartpole"])
+    assert report.ok
+    assert "rendering with osmesa" in report.text()
+    assert "no EGL" in caplog.text
+
+
+@pytest.mark.parametrize("is_drawing", [True, False])
+def test_a_domain_that_fails_is_an_error_and_what_it_lacks_is_not_blamed_on_the_backend(
+    monkeypatch: pytest.MonkeyPatch, is_drawing: bool
+) -> None:
+    entry = {**ALIVE, "agent_step_ms": None, "reset_ms": None, "error": "boom", "is_drawing": is_drawing}
+    monkeypatch.setattr(doctor, "render_domains", lambda *_: [entry])
     report = run_doctor(["cartpole"])
     assert not report.ok
-    assert words in report.text()
-
-
-def test_what_a_world_lacks_is_not_blamed_on_the_backend(monkeypatch: pytest.MonkeyPatch) -> None:
-    failed = {"alive": False, "agent_step_ms": None, "reset_ms": None, "error": "No module named 'pygame'"}
-    for is_drawing in (True, False):
-        entry = {**ALIVE, **failed, "is_drawing": is_drawing}
-        monkeypatch.setattr(render_check, "render_domains", lambda *_, entry=entry: (entry,))
-        assert ("Try another backend" in run_doctor(["cartpole"]).text()) == is_drawing
+    assert "cartpole with egl: boom" in report.text()
+    assert ("Try another backend" in report.text()) == is_drawing
 
 
 def test_letters_are_domains_and_unknown_names_are_refused_before_anything_is_drawn(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked = []
-    monkeypatch.setattr(render_check, "render_domains", lambda names, *_: asked.append(names) or ())
+    monkeypatch.setattr(doctor, "render_domains", lambda names, *_: asked.append(names) or [])
     run_doctor(["D"])
-    assert set(asked) == {("walker", "pendulum", "hopper")}
+    assert asked == [("walker", "pendulum", "hopper")]
     with pytest.raises(UnknownNameError, match="walkr"):
         run_doctor(["walkr"])
 
 
-def test_a_backend_that_there_is_not_is_an_error_with_its_name() -> None:
-    report = run_doctor(["cartpole"], backends=["vulkan"])
-    assert not report.ok
-    assert "vulkan is not a GL backend" in report.text()
-
-
-def test_a_backend_that_mujoco_gl_names_and_nobody_tried_is_not_ok() -> None:
-    os.environ["MUJOCO_GL"] = "egl"
-    report = run_doctor(["cartpole"], backends=["osmesa"])
-    assert not report.ok
-    assert not any(check.is_chosen for check in report.backends)
-    assert "A run would use egl, which MUJOCO_GL names, but only osmesa was tried." in report.text()
-
-
-def test_a_gpu_that_torch_cannot_use_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    machine = {
-        "cpu": "x",
-        "cpu_instructions": "AVX2",
-        "cpu_cores": 2,
-        "ram_bytes": 16e9,
-        "gpus": ["unusable: driver too old"],
-    }
-    monkeypatch.setattr(doctor.cards, "hardware", lambda: machine)
+@pytest.mark.parametrize(
+    ("gpu", "words"),
+    [
+        ("unusable: driver too old", "torch cannot use a GPU: unusable: driver too old."),
+        ("A GPU", "in software"),
+    ],
+)
+def test_a_gpu_that_is_not_used_is_a_warning(monkeypatch: pytest.MonkeyPatch, gpu: str, words: str) -> None:
+    monkeypatch.setattr(doctor.provenance, "hardware", lambda: {**MACHINE, "gpus": [gpu]})
     report = run_doctor(["cartpole"])
     assert report.ok
-    assert "warning: torch cannot use a GPU: unusable: driver too old." in report.text()
+    assert words in report.text()
 
 
 @pytest.mark.parametrize(
     ("ram", "disk", "severity"),
     [(16e9, 0.1e9, "error"), (16e9, 3e9, "warning"), (1e9, 100e9, "error"), (3e9, 100e9, "warning")],
 )
-def test_little_memory_or_disk_is_reported(
+def test_little_memory_or_disk_is_reported_with_its_remedy(
     monkeypatch: pytest.MonkeyPatch, ram: float, disk: float, severity: str
 ) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=disk))
@@ -176,57 +142,70 @@ def test_little_memory_or_disk_is_reported(
     assert report.ok == (severity == "warning")
 
 
-def test_a_software_renderer_beside_a_gpu_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
-    machine = {
-        "cpu": "x",
-        "cpu_instructions": "AVX2",
-        "cpu_cores": 2,
-        "ram_bytes": 16e9,
-        "gpus": ["Some GPU"],
-    }
-    monkeypatch.setattr(doctor.cards, "hardware", lambda: machine)
-    report = run_doctor(["cartpole"])
-    assert report.ok
-    assert "renders in software" in report.text()
-    assert "Some GPU" in report.text()
-
-
-def test_versions_in_range_are_no_findings() -> None:
-    assert (
-        check_versions({"mujoco": "3.17.0", "torch": "2.13.0+cpu"}, ["mujoco>=3.17,<4", "torch>=2.11"]) == []
-    )
-
-
 @pytest.mark.parametrize(
     ("installed", "severity", "words"),
     [
-        ({"mujoco": "4.0.0"}, "error", "mujoco 4.0.0"),
-        ({}, "error", "not installed"),
-        ({"mujoco": "3.17.0", "mujoco-core": "4.0.0"}, "warning", "mujoco-core"),
+        ({"mujoco": "3.17.0", "torch": "2.13.0+cpu"}, None, ""),
+        ({"mujoco": "4.0.0", "torch": "2.13.0"}, "error", "mujoco 4.0.0"),
+        ({"torch": "2.13.0"}, "error", "not installed"),
+        ({"mujoco": "3.17.0", "torch": "2.13.0", "mujoco-core": "4.0.0"}, "warning", "mujoco-core"),
+        ({"mujoco": "3.17.0", "torch": "2.20.0"}, "warning", "has not been tested"),
     ],
 )
-def test_a_breaking_mujoco_is_reported_with_its_remedy(
-    installed: dict[str, str], severity: str, words: str
+def test_versions_out_of_range_are_reported_with_their_remedy(
+    installed: dict[str, str], severity: str | None, words: str
 ) -> None:
-    (finding,) = check_versions(installed, ["mujoco>=3.17,<4"])
-    assert finding.severity == severity
-    assert words in finding.what
-    assert "pip" in finding.remedy
+    findings = check_versions(installed, ["mujoco>=3.17,<4", "torch>=2.11,<2.14"])
+    assert [finding.severity for finding in findings] == ([severity] if severity else [])
+    for finding in findings:
+        assert words in finding.what
+        assert "pip" in finding.remedy
 
 
-def test_an_untested_torch_is_only_a_warning() -> None:
-    (finding,) = check_versions({"torch": "2.20.0"}, ["torch>=2.11,<2.14"])
-    assert finding.severity == "warning"
+@pytest.mark.parametrize(
+    ("reason", "error", "is_drawing"),
+    [
+        (ValueError("Model is broken"), "ValueError: Model is broken", True),
+        (ModuleNotFoundError("pygame"), "ModuleNotFoundError: pygame", False),
+        (CRPTproError("no camera 7"), "no camera 7", False),
+        (RenderingError("black"), "black", True),
+    ],
+)
+def test_a_domain_that_raises_is_reported(
+    monkeypatch: pytest.MonkeyPatch, reason: Exception, error: str, is_drawing: bool
+) -> None:
+    def make_env(*_: Any, **__: Any) -> None:
+        raise reason
+
+    monkeypatch.setattr("crptpro.envs.make_env", make_env)
+    entry = check_domain("walker")
+    assert (entry["domain"], entry["error"], entry["is_drawing"]) == ("walker", error, is_drawing)
+
+
+def test_domains_after_one_that_ended_the_process_are_checked_by_another_unless_it_hung(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[tuple[str, ...]] = []
+    answers = iter([(1, "walker", "a\nboom\n"), (-11, "", ""), (0, "finger", ""), (None, "walker", "")])
+
+    def run_isolated(commands: Any, backend: str, *, timeout_s: float) -> Any:
+        asked.append(commands[0][3:])
+        status, name, err = next(answers)
+        return [(status, f'{{"domain": "{name}", "error": ""}}\n' if name else "", err)]
+
+    monkeypatch.setattr(rendering, "run_isolated", run_isolated)
+    monkeypatch.setattr(doctor, "loaded_plugins", tuple)  # none, whatever other tests have loaded
+    entries = render_domains(("walker", "cheetah", "dog", "finger"), "egl", 60.0)
+    assert [entry["error"] for entry in entries] == ["", "boom", "signal 11", ""]
+    assert asked[1:] == [("dog", "finger"), ("finger",)]
+    _, *others = render_domains(("walker", "cheetah", "dog"), "egl", 2.0)
+    assert [entry["error"] for entry in others] == ["no answer within 2 s"] * 2
+    assert len(asked) == 4
 
 
 @pytest.mark.gl
 def test_a_real_domain_is_rendered_and_timed_in_its_own_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
-    from crptpro.envs.rendering import select_backend
-
-    report = run_doctor(["cartpole"], backends=[select_backend()])
-    (check,) = report.backends
-    (entry,) = check.domains
-    assert entry["alive"]
+    (entry,) = render_domains(("cartpole",), rendering.select_backend(), 300.0)
+    assert entry["error"] == ""
     assert entry["agent_step_ms"] > 0
-    assert check.gl["gl_renderer"] in report.text()

@@ -1,9 +1,13 @@
 from __future__ import annotations
 
+import functools
 import logging
 import pickle
 import sys
+import types
 
+import gymnasium
+import numpy as np
 import pytest
 
 from crptpro import domains
@@ -16,6 +20,7 @@ from crptpro.domains import (
     get_domain,
     known_names,
     register_domain,
+    worker_obstacle,
 )
 from crptpro.errors import CRPTproError, UnknownNameError
 
@@ -93,22 +98,17 @@ def test_a_name_like_no_other_answers_with_the_domains() -> None:
         get_domain("zzzz")
 
 
-def test_a_registered_domain_is_found_by_name_and_by_task() -> None:
-    own = register_domain(Domain("lander", "lander_soft", make=make_nothing))
-    assert get_domain("lander") is own
-    assert get_domain("lander_soft") is own
-    assert "lander" in known_names()
-    with pytest.raises(UnknownNameError, match="lander"):
-        get_domain("landr")
-
-
 def test_tasks_of_one_own_domain_stay_known_beside_each_other() -> None:
     soft = register_domain(Domain("lander", "lander_soft", make=make_nothing))
+    assert get_domain("lander") is get_domain("lander_soft") is get_domain(soft) is soft
     hard = register_domain(Domain("lander", "lander_hard", make=make_nothing))
     assert get_domain("lander_soft") is soft
     assert get_domain("lander_hard") is get_domain("lander") is hard
     again = register_domain(Domain("lander", "lander_soft", camera=1, make=make_nothing))
     assert get_domain("lander_soft") is again
+    assert "lander" in known_names()
+    with pytest.raises(UnknownNameError, match="lander"):
+        get_domain("landr")
 
 
 def test_letters_stand_for_the_domains_of_their_group() -> None:
@@ -121,19 +121,38 @@ def test_letters_stand_for_the_domains_of_their_group() -> None:
         expand_groups(["E"])
 
 
-def test_a_domain_is_its_own_name() -> None:
-    own = Domain("lander", "lander", make=make_nothing)
-    assert get_domain(own) is own
+def test_numbers_of_a_domain_are_the_plain_numbers_they_mean() -> None:
+    domain = Domain("lander", "lander", make=make_nothing, action_repeat=np.int64(4), episode_env_steps=1e3)
+    assert repr((domain.action_repeat, domain.episode_env_steps)) == "(4, 1000)"
+    with pytest.raises(ValueError, match="action_repeat"):
+        Domain("lander", "lander", make=make_nothing, action_repeat=0)
 
 
 def test_a_domain_travels_to_another_process() -> None:
     for domain in (*PAPER_DOMAINS.values(), Domain("lander", "lander", make=make_nothing)):
         assert pickle.loads(pickle.dumps(domain)) == domain
+        assert worker_obstacle(domain) is None
+    assert worker_obstacle("gymnasium:HalfCheetah-v5") is None
 
 
-def test_registering_what_cannot_travel_warns(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_world_that_no_other_process_can_import_says_why(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    cell = types.ModuleType("__main__")  # a notebook's has no file
+    exec("def make_lander(seed): ...", cell.__dict__)
+    monkeypatch.setitem(sys.modules, "__main__", cell)
+    for make in (cell.make_lander, functools.partial(cell.make_lander, seed=1)):
+        obstacle = worker_obstacle(Domain("lander", "lander", make=make)) or ""
+        assert "make_lander is defined in a notebook or an interactive session" in obstacle
+        assert "top level of a file" in obstacle
+    gymnasium.register("CrptproCell-v0", cell.make_lander)
+    assert "notebook" in (worker_obstacle("gymnasium:CrptproCell-v0") or "")
+    del gymnasium.registry["CrptproCell-v0"]
+    cell.__file__ = __file__  # a script's is imported again by the other process
+    assert worker_obstacle(Domain("lander", "lander", make=cell.make_lander)) is None
     with caplog.at_level(logging.WARNING):
         register_domain(Domain("lander", "lander", make=lambda seed: None))  # type: ignore[arg-type,return-value]
+    assert "lander" in caplog.text
     assert "top level" in caplog.text
 
 

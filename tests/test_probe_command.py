@@ -1,21 +1,18 @@
 from __future__ import annotations
 
 import csv
-import functools
 import logging
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
-from toy_world import collection_request, random_episode, run_in_order
+from toy_world import collect_toy, random_episode, write_dataset
 
 from crptpro.cli import main
-from crptpro.data.collect_worker import EpisodeRoller
-from crptpro.data.collection import DomainCollection
-from crptpro.domains import get_domain
-from crptpro.envs import make_env
+from crptpro.data import collect_random
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import save_pretrained
@@ -47,20 +44,19 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
 
 @pytest.fixture
 def dataset(tmp_path: Path) -> Path:
-    path = tmp_path / "data" / "toy"
-    collection = DomainCollection(path, collection_request(transitions=60, image_size=SIZE))
-    for index in range(6):
-        collection.next_job()
-        collection.accept(index, random_episode(10, size=SIZE, seed=index))
-    return path
+    return write_dataset(
+        tmp_path / "data" / "toy", [random_episode(10, size=SIZE, seed=index) for index in range(6)]
+    )
 
 
 @pytest.fixture
 def encoder(tmp_path: Path) -> Path:
     torch.manual_seed(0)
     loss = ProtoLoss(PixelEncoder(image_size=SIZE), num_prototypes=16, latent_dim=4, hidden_dim=8)
-    loss.training_record = {"datasets": [{"domain": "toy"}]}
-    return save_pretrained(loss, tmp_path / "encoder")
+    training = {"datasets": [{"domain": "toy"}]}
+    return save_pretrained(
+        SimpleNamespace(loss=loss, method="crptpro", training=training), tmp_path / "encoder"
+    )
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -127,11 +123,9 @@ def test_an_encoder_of_other_images_and_data_without_state_are_refused(
     call: Call, encoder: Path, dataset: Path, tmp_path: Path
 ) -> None:
     small = tmp_path / "small"
-    run_in_order(DomainCollection(small, collection_request()), 0)
+    collect_toy(small)
     assert "image_size 16, not 8" in call(encoder, small)[2]
-    stateless = DomainCollection(tmp_path / "stateless", collection_request(transitions=9, image_size=SIZE))
-    stateless.next_job()
-    stateless.accept(0, random_episode(9, size=SIZE, state=False))
+    write_dataset(tmp_path / "stateless", [random_episode(9, size=SIZE, state=False)])
     assert "no physical state" in call("random-encoder", tmp_path / "stateless")[2]
     # What was measured before it came to the one that is refused is kept.
     file = tmp_path / "probe.csv"
@@ -142,27 +136,12 @@ def test_an_encoder_of_other_images_and_data_without_state_are_refused(
     assert len(rows(file)) > 4
 
 
-def test_what_the_parser_cannot_read_is_refused(call: Call) -> None:
-    status, _, err = call("random-encoder", "data/x", "--colors", "pink")
-    assert status == 2
-    assert "pink" in err
-
-
 @pytest.mark.gl
 def test_a_real_domain_is_probed_in_its_own_colours_and_with_its_background_reversed(
     call: Call, tmp_path: Path
 ) -> None:
-    domain = get_domain("pendulum")
-    settings = {"image_size": 24, "action_repeat": 20, "camera": 0, "quality": "fast"}
-    request = {"domain": "pendulum", "task": domain.task, "seed": 0, "transitions": 300, **settings}
-    collection = DomainCollection(tmp_path / "pendulum", request)
-    roller = EpisodeRoller(
-        functools.partial(make_env, domain, seed=0, frame_stack=1, physics_state=True, **settings)
-    )
-    while not collection.is_complete:
-        job = collection.next_job()
-        collection.accept(job.episode, roller.roll(job))
-    roller.close()
+    settings = {"image_size": 24, "action_repeat": 20, "quality": "fast", "progress": False}
+    collect_random("pendulum", tmp_path, transitions=300, **settings)
     file = tmp_path / "probe.csv"
     both = ("--colors", "normal", "reversed_background")
     status, out, err = call("random-encoder", tmp_path / "pendulum", "--samples", 150, *both, "--csv", file)

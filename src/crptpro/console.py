@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import logging
+import os
+import select
 import sys
 from collections.abc import Callable
+from typing import TextIO
 
 from tqdm import tqdm
 
@@ -33,12 +37,30 @@ def configure_logging(level: int = logging.INFO) -> None:
 def run_main(main: Callable[[], object]) -> None:
     """Run a program: expected errors become one line and exit status 1, Ctrl-C exits with 130.
 
-    Expected are this library's own errors, a setting it refuses, and a file that cannot be read or written.
-    Anything else is a defect and keeps its traceback.
+    Expected are this library's own errors, a setting it refuses, and a file that cannot be read or written. Anything
+    else is a defect and keeps its traceback. What a terminal cannot show is printed as escapes, and a reader that has
+    seen enough (``| head``) ends the program quietly, with the status of SIGPIPE.
     """
+    for stream in (sys.stdout, sys.stderr):  # a terminal without UTF-8 gets "?" for what it cannot show
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     configure_logging()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
-        main()
+        try:
+            main()
+        finally:
+            if sys.stdout is not None:
+                sys.stdout.flush()  # not at exit, where nobody could catch what comes of it
+    except BrokenPipeError:
+        unread = [stream for stream in (sys.stdout, sys.stderr) if _is_unread(stream)]
+        if not unread:
+            raise
+        for stream in unread:  # what is still in its buffer goes nowhere
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        raise SystemExit(128 + 13) from None
     except (CRPTproError, ValueError, OSError) as error:
         if not is_expected(error):
             raise
@@ -47,6 +69,16 @@ def run_main(main: Callable[[], object]) -> None:
     except KeyboardInterrupt:
         print("interrupted; the same command continues from the last checkpoint.", file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def _is_unread(stream: TextIO) -> bool:
+    """Whether a stream is a pipe that nobody reads any more."""
+    try:
+        poll = select.poll()
+        poll.register(stream.fileno(), 0)
+    except (AttributeError, OSError):  # not POSIX, or no file
+        return False
+    return bool(poll.poll(0))
 
 
 def is_expected(error: BaseException) -> bool:

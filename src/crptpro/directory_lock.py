@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
-import functools
+import errno
 import logging
-import os
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from crptpro.errors import CRPTproError
+from crptpro.values import as_path
 
-logger = logging.getLogger(__name__)
-
-_held: dict[Path, tuple[int, int, int]] = {}
-"""Re-entrant locks of this process: handle, holders, and the process that took it (a fork inherits this table)."""
+_LOG = logging.getLogger(__name__)
+_NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 
 
 class DirectoryLock:
@@ -43,73 +42,38 @@ class DirectoryLock:
         is_reentrant: bool = False,
         wait: Callable[[float], None] | None = None,
     ):
-        path = Path(directory)
-        self._handle: int | None = None
-        self._shared_as: Path | None = None
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            key = path.resolve()
-            if is_reentrant and key in _held and _held[key][2] == os.getpid():
-                handle, holders, process = _held[key]
-                _held[key] = (handle, holders + 1, process)
-                self._shared_as = key
-                return
-            self._handle = os.open(path / ".lock", os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as reason:
-            raise error(f"{path} cannot be written: {reason}.") from reason
+        path = as_path(directory)
+        self._lock: FileLock | None = None
         began = time.monotonic()
-        while not _take(self._handle):
+        while True:
             try:
+                path.mkdir(parents=True, exist_ok=True)
+                lock = FileLock(path.resolve() / ".lock", is_singleton=is_reentrant, thread_local=False)
+                lock.acquire(blocking=False)
+                self._lock = lock
+                return
+            except Timeout:
                 if wait is None:
                     raise error(
                         f"Another process is writing to {path}. Wait for it, end it, or choose another directory."
-                    )
+                    ) from None
                 wait(time.monotonic() - began)
-            except BaseException:
-                self.release()
-                raise
-        if is_reentrant:
-            _held[key] = (self._handle, 1, os.getpid())
-            self._handle, self._shared_as = None, key
+            except OSError as reason:
+                if reason.errno not in _NO_LOCKS:
+                    raise error(f"{path} cannot be written: {reason}.") from reason
+                _LOG.warning(
+                    "%s cannot be locked (%s): see to it that no two processes write to it.", path, reason
+                )
+                return
 
     def release(self) -> None:
         """Free the directory, once its last holder does; calling it twice is harmless."""
-        if self._shared_as is not None:
-            handle, holders, process = _held.pop(self._shared_as)
-            if holders > 1:
-                _held[self._shared_as] = (handle, holders - 1, process)
-            else:
-                self._handle = handle
-            self._shared_as = None
-        if self._handle is not None:
-            with contextlib.suppress(OSError):
-                os.close(self._handle)
-            self._handle = None
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
 
     def __enter__(self) -> DirectoryLock:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.release()
-
-
-def _take(handle: int) -> bool:
-    """Take the lock unless another process has it."""
-    try:
-        import fcntl
-
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except (ImportError, OSError) as reason:  # not POSIX, or a file system without locks: go on unguarded
-        _warn_unguarded(str(reason))
-    return True
-
-
-@functools.cache
-def _warn_unguarded(reason: str) -> None:
-    """Say once what nobody will prevent."""
-    logger.warning(
-        "Directories cannot be locked here (%s): see to it that no two processes write to the same one.",
-        reason,
-    )

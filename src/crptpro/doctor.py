@@ -1,26 +1,36 @@
-"""Would a run work on this machine? Versions, hardware and every domain on every backend, in plain words."""
+"""Would a run work on this machine? Versions, hardware, rendering and every domain's frames, in plain words.
+
+``python -m crptpro.doctor walker cheetah``, with ``MUJOCO_GL`` naming the backend, is what draws the domains: in a
+process of its own, which answers one JSON line per domain.
+"""
 
 from __future__ import annotations
 
 import importlib.metadata
+import json
 import os
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+import sys
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import psutil
 from packaging.requirements import Requirement
 
-from crptpro import cards
+from crptpro import provenance
 from crptpro.domains import PAPER_DOMAINS, expand_groups
-from crptpro.errors import CRPTproError, RenderingError
+from crptpro.errors import CRPTproError, RenderingError, WorldFailedError
+from crptpro.plugins import FLAG, load_plugin, loaded_plugins
 
 #: Outside their declared range these are known to break; others are merely untested.
 _BREAKING = ("mujoco", "dm-control", "torchrl", "tensordict")
 _LEFTOVERS = ("mujoco-core", "mujoco-studio")
 _GB = 1e9
+WARM_UP_AGENT_STEPS = 2
+TIMED_AGENT_STEPS = 6
 
 
 @dataclass(frozen=True)
@@ -33,33 +43,11 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class BackendCheck:
-    """How one GL backend did.
-
-    Args:
-        backend: Its name.
-        is_chosen: A run would use it.
-        gl: GL vendor, renderer, version and kind, from the driver; empty if it does not render.
-        domains: One entry per domain, as :func:`crptpro.envs.render_check.check_domain` describes.
-    """
-
-    backend: str
-    is_chosen: bool
-    gl: dict[str, Any]
-    domains: tuple[dict[str, Any], ...] = ()
-
-
-@dataclass(frozen=True)
 class DoctorReport:
-    """What :func:`run_doctor` found."""
+    """What :func:`run_doctor` found: lines of facts, then problems, the gravest first."""
 
-    versions: dict[str, str]
-    hardware: dict[str, Any]
-    free_ram_bytes: int
-    free_disk_bytes: int
-    disk: str
-    backends: tuple[BackendCheck, ...]
-    findings: tuple[Finding, ...] = field(default=())
+    facts: tuple[str, ...]
+    findings: tuple[Finding, ...]
 
     @property
     def ok(self) -> bool:
@@ -68,74 +56,52 @@ class DoctorReport:
 
     def text(self) -> str:
         """Return the report as plain text, a line per fact, problems and their remedies last."""
-        lines = ["versions", *_columns(self.versions.items()), "", "machine"]
-        gpus = ", ".join(self.hardware["gpus"]) or "none"
-        total = self.hardware["ram_bytes"]
-        lines += [
-            f"  CPU   {self.hardware['cpu']} ({self.hardware['cpu_instructions']}), {self.hardware['cpu_cores']} cores",
-            f"  GPU   {gpus}",
-            f"  RAM   {self.free_ram_bytes / _GB:.1f} GB free of {total / _GB:.1f} GB",
-            f"  disk  {self.free_disk_bytes / _GB:.1f} GB free at {self.disk}",
-            "",
-            "rendering, milliseconds per agent step (physics and one image)",
-        ]
-        for check in self.backends:
-            chosen = "  <- a run uses this one" if check.is_chosen else ""
-            kind = f"{check.gl['gl_renderer']}, {check.gl['gl_kind']}" if check.gl else "does not render"
-            lines.append(f"  {check.backend}: {kind}{chosen}")
-            lines += [f"    {_domain_line(entry)}" for entry in check.domains]
-        lines.append("")
+        lines = [*self.facts, ""]
         for finding in self.findings:
             lines.append(f"{finding.severity}: {finding.what}")
-            if finding.remedy:
-                lines.append(f"  what to do: {finding.remedy}")
+            lines += [f"  what to do: {finding.remedy}"] if finding.remedy else []
         return "\n".join([*lines, "A run would work." if self.ok else "A run would not work."])
 
 
 def run_doctor(
-    domains: Iterable[str] | None = None,
-    *,
-    backends: Sequence[str] | None = None,
-    root: str | Path = ".",
-    timeout_s: float | None = None,
+    domains: Iterable[str] | None = None, *, root: str | Path = ".", timeout_s: float | None = None
 ) -> DoctorReport:
-    """Check versions and hardware, and render every domain with every backend, each in a process of its own.
+    """Check versions, memory and disk, and render every domain with the backend that a run would use.
 
     Args:
         domains: As for :func:`crptpro.domains.expand_groups`; by default the paper's eight domains.
-        backends: By default EGL, OSMesa, the one that ``MUJOCO_GL`` names, and GLFW where there is a display.
         root: Where data would be written; its disk is looked at.
-        timeout_s: Seconds per backend; by default 60 for the first frame and 20 more for each domain.
+        timeout_s: Seconds for the first frame; by default 60, or ``CRPTPRO_GL_TIMEOUT_S``. A domain has 20 more.
 
     Raises:
         UnknownNameError: for a domain that nobody knows.
     """
     names = tuple(expand_groups(domains if domains is not None else PAPER_DOMAINS))
-    disk = _existing(Path(root))
-    free_disk = shutil.disk_usage(disk).free
-    free_ram = psutil.virtual_memory().available
-    findings = [*check_versions(_installed(), _requirements()), *_check_room(free_ram, free_disk, str(disk))]
-    hardware = cards.hardware()
-    checks: tuple[BackendCheck, ...] = ()
-    try:
-        checks, rendering = _check_rendering(names, backends, timeout_s, has_gpu=bool(hardware["gpus"]))
-        findings += rendering
-    except CRPTproError as reason:  # MUJOCO_GL is wrong: nothing can be tried before it is put right
-        findings.append(Finding("error", str(reason)))
-    unusable = [gpu for gpu in hardware["gpus"] if gpu.startswith(cards.UNUSABLE)]
-    for gpu in unusable:
-        findings.append(
-            Finding(
-                "warning",
-                f"torch cannot use a GPU: {gpu}.",
-                "Repair its driver (nvidia-smi), or hide it with CUDA_VISIBLE_DEVICES; --device cpu always works.",
-            )
-        )
-    if not hardware["gpus"]:
-        findings.append(Finding("note", "torch sees no GPU; training runs on the CPU."))
+    disk = Path(root).absolute()
+    while not disk.exists():
+        disk = disk.parent
+    free_disk, free_ram = shutil.disk_usage(disk).free, psutil.virtual_memory().available
+    machine = provenance.hardware()
+    facts = [
+        "versions",
+        *(f"  {name:<12}{version}" for name, version in provenance.versions().items()),
+        "",
+        "machine",
+        f"  CPU   {machine['cpu']} ({machine['cpu_instructions']}), {machine['cpu_cores']} cores",
+        f"  GPU   {', '.join(machine['gpus']) or 'none'}",
+        f"  RAM   {free_ram / _GB:.1f} GB free of {machine['ram_bytes'] / _GB:.1f} GB",
+        f"  disk  {free_disk / _GB:.1f} GB free at {disk}",
+        "",
+    ]
+    findings = [
+        *check_versions(_installed(), _requirements()),
+        *_check_room(free_ram, free_disk, str(disk)),
+        *_check_gpus(machine["gpus"]),
+    ]
+    drawn, problems = _check_rendering(names, timeout_s, has_gpu=bool(machine["gpus"]))
     order = ("error", "warning", "note")
-    findings.sort(key=lambda finding: order.index(finding.severity))
-    return DoctorReport(cards.versions(), hardware, free_ram, free_disk, str(disk), checks, tuple(findings))
+    findings = sorted([*findings, *problems], key=lambda finding: order.index(finding.severity))
+    return DoctorReport((*facts, *drawn), tuple(findings))
 
 
 def check_versions(installed: Mapping[str, str], requirements: Iterable[str]) -> list[Finding]:
@@ -154,111 +120,162 @@ def check_versions(installed: Mapping[str, str], requirements: Iterable[str]) ->
         if version is None:
             findings.append(Finding("error", f"{name} is not installed.", wanted))
         elif not requirement.specifier.contains(version, prereleases=True):
-            severity: Literal["error", "warning"] = "error" if name in _BREAKING else "warning"
             reach = f"{name} {version} is outside {requirement.specifier}"
-            why = ", which is known to break." if severity == "error" else ", which has not been tested."
-            findings.append(Finding(severity, reach + why, wanted))
+            if name in _BREAKING:
+                findings.append(Finding("error", f"{reach}, which is known to break.", wanted))
+            else:
+                findings.append(Finding("warning", f"{reach}, which has not been tested.", wanted))
     leftovers = [name for name in _LEFTOVERS if name in installed]
     if leftovers:
-        findings.append(
-            Finding(
-                "warning",
-                f"{' and '.join(leftovers)} belong to MuJoCo 4 and break the import of MuJoCo 3.",
-                f'pip uninstall -y {" ".join(leftovers)}; pip install --force-reinstall "mujoco>=3.17,<4"',
-            )
-        )
+        what = f"{' and '.join(leftovers)} belong to MuJoCo 4 and break the import of MuJoCo 3."
+        remedy = f'pip uninstall -y {" ".join(leftovers)}; pip install --force-reinstall "mujoco>=3.17,<4"'
+        findings.append(Finding("warning", what, remedy))
     return findings
+
+
+def check_domain(name: str) -> dict[str, Any]:
+    """Step a domain at random and look at its pixels.
+
+    Returns:
+        ``domain``; ``reset_ms`` (the first reset, which makes the render context) and ``agent_step_ms``
+        (physics and one image), wall-clock milliseconds, ``None`` if it failed; ``error``: why, or what is wrong with
+        its images, otherwise empty; ``is_drawing``: another backend may do better.
+    """
+    import gymnasium
+
+    from crptpro.envs import make_env
+
+    try:
+        env = make_env(name, seed=0, frame_stack=1)
+        try:
+            start = time.perf_counter()
+            first = last = env.reset()
+            reset_s = time.perf_counter() - start
+            for agent_step in range(WARM_UP_AGENT_STEPS + TIMED_AGENT_STEPS):
+                if agent_step == WARM_UP_AGENT_STEPS:
+                    start = time.perf_counter()
+                last = env.step(env.rand_action(last))["next"]
+            agent_step_s = (time.perf_counter() - start) / TIMED_AGENT_STEPS
+        finally:
+            env.close()
+    except Exception as reason:  # whatever one domain does, those that follow are checked too
+        cause = reason.__cause__ or reason
+        lacks = isinstance(cause, (ModuleNotFoundError, gymnasium.error.DependencyNotInstalled))
+        is_ours = isinstance(reason, CRPTproError)
+        is_named = is_ours or isinstance(reason, WorldFailedError)
+        error = str(reason) if is_named else f"{type(reason).__name__}: {reason}"
+        is_drawing = not lacks and (isinstance(reason, RenderingError) or not is_ours)
+        return _failed(name, error, is_drawing=is_drawing)
+    is_alive = first["pixels"].unique().numel() > 1 and not first["pixels"].equal(last["pixels"])
+    error = "" if is_alive else "its pixels are constant or do not change"
+    times = {"reset_ms": round(reset_s * 1e3, 1), "agent_step_ms": round(agent_step_s * 1e3, 2)}
+    return _failed(name, error) | times
+
+
+def render_domains(names: tuple[str, ...], backend: str, timeout_s: float) -> list[dict[str, Any]]:
+    """Check domains in a process of its own, and in another one those that follow a domain that ended it.
+
+    Args:
+        names: Domains.
+        backend: GL backend.
+        timeout_s: For all of them together.
+
+    Returns:
+        What :func:`check_domain` returns, for each name.
+    """
+    from crptpro.envs.rendering import run_isolated
+
+    entries: list[dict[str, Any]] = []
+    deadline = time.monotonic() + timeout_s
+    plugins = [part for name in loaded_plugins() for part in (FLAG, name)]
+    while len(entries) < len(names):
+        command = (sys.executable, "-m", "crptpro.doctor", *plugins, *names[len(entries) :])
+        left_s = max(0.0, deadline - time.monotonic())
+        ((returncode, stdout, stderr),) = run_isolated([command], backend, timeout_s=left_s)
+        lines = stdout.splitlines()
+        entries += [json.loads(line) for line in lines if line.startswith("{") and line.endswith("}")]
+        unanswered = names[len(entries) :]
+        if returncode is None:
+            return [*entries, *(_failed(name, f"no answer within {timeout_s:g} s") for name in unanswered)]
+        if unanswered:
+            how = f"signal {-returncode}" if returncode < 0 else f"exit status {returncode}"
+            entries.append(_failed(unanswered[0], (stderr.strip().splitlines() or [how])[-1]))
+    return entries
+
+
+def _failed(name: str, error: str, *, is_drawing: bool = True) -> dict[str, Any]:
+    return {
+        "domain": name, "reset_ms": None, "agent_step_ms": None, "error": error, "is_drawing": is_drawing,
+    }  # fmt: skip
 
 
 def _check_room(free_ram: int, free_disk: int, disk: str) -> list[Finding]:
     findings = []
     if free_ram < 4 * _GB:
-        findings.append(
-            Finding(
-                "error" if free_ram < 1.5 * _GB else "warning",
-                f"{free_ram / _GB:.1f} GB of RAM are free; pre-training at batch 512 and a replay of 40,000 "
-                "transitions want about 4 GB.",
-                "End other programs, or use smaller batches and a smaller replay.",
-            )
+        what = (
+            f"{free_ram / _GB:.1f} GB of RAM are free; pre-training at batch 512 and a replay of 40,000 "
+            "transitions want about 4 GB."
         )
+        remedy = "End other programs, or use smaller batches and a smaller replay."
+        findings.append(Finding("error" if free_ram < 1.5 * _GB else "warning", what, remedy))
     if free_disk < 7 * _GB:
-        findings.append(
-            Finding(
-                "error" if free_disk < 0.5 * _GB else "warning",
-                f"{free_disk / _GB:.1f} GB are free at {disk}; three domains of 100,000 transitions take 6.",
-                "Free space, write to another disk, or collect fewer transitions.",
-            )
-        )
+        what = f"{free_disk / _GB:.1f} GB are free at {disk}; three domains of 100,000 transitions take 6."
+        remedy = "Free space, write to another disk, or collect fewer transitions."
+        findings.append(Finding("error" if free_disk < 0.5 * _GB else "warning", what, remedy))
     return findings
 
 
-def _check_rendering(
-    names: tuple[str, ...], backends: Sequence[str] | None, timeout_s: float | None, *, has_gpu: bool
-) -> tuple[tuple[BackendCheck, ...], list[Finding]]:
-    # Imported late: the import itself complains about a wrong MUJOCO_GL.
-    from crptpro.envs.gl_process import attempt_backend, canonical_backend
-    from crptpro.envs.render_check import render_domains
-    from crptpro.envs.rendering import default_timeout_s, explain, platform_candidates
+def _check_gpus(gpus: list[str]) -> list[Finding]:
+    if not gpus:
+        return [Finding("note", "torch sees no GPU; training runs on the CPU.")]
+    remedy = (
+        "Repair its driver (nvidia-smi), or hide it with CUDA_VISIBLE_DEVICES; --device cpu always works."
+    )
+    unusable = [gpu for gpu in gpus if gpu.startswith(provenance.UNUSABLE)]
+    return [Finding("warning", f"torch cannot use a GPU: {gpu}.", remedy) for gpu in unusable]
 
-    requested = canonical_backend(os.environ["MUJOCO_GL"]) if "MUJOCO_GL" in os.environ else None
-    asked = platform_candidates() if backends is None else map(canonical_backend, backends)
-    backends = tuple(dict.fromkeys([*([requested] if requested and backends is None else []), *asked]))
-    if "off" in (requested, *backends):
-        raise RenderingError("MUJOCO_GL switches rendering off; unset it, or set it to egl or osmesa.")
-    first_frame_s = default_timeout_s() if timeout_s is None else timeout_s
-    checks: list[BackendCheck] = []
-    findings: list[Finding] = []
-    chosen: str | None = None
-    for backend in backends:
-        attempt = attempt_backend(backend, timeout_s=first_frame_s)
-        is_chosen = attempt.is_ok and (backend == requested if requested else chosen is None)
-        if not attempt.is_ok:
-            findings.append(_failed(explain(attempt, first_frame_s), is_requested=backend == requested))
-            checks.append(BackendCheck(backend, False, {}))
-            continue
-        chosen = backend if is_chosen else chosen
-        limit_s = first_frame_s + 20 * len(names) if timeout_s is None else timeout_s
-        entries = render_domains(names, backend, limit_s)
-        checks.append(BackendCheck(backend, is_chosen, attempt.answer, entries))
-        findings += [_dead(entry, backend, is_chosen) for entry in entries if not entry["alive"]]
-        if is_chosen and has_gpu and attempt.answer["gl_kind"] == "software":
-            findings.append(
-                Finding(
-                    "warning",
-                    f"There is a GPU, but {backend} renders in software, about twenty times slower.",
-                    "Install the GL parts of the GPU's driver; in a container start it with "
-                    "NVIDIA_DRIVER_CAPABILITIES=all.",
-                )
-            )
-    if chosen is None and requested is None:
-        findings.append(
-            Finding("error", "No GL backend renders a frame.", "Install one, see the notes below.")
+
+def _check_rendering(
+    names: tuple[str, ...], timeout_s: float | None, *, has_gpu: bool
+) -> tuple[list[str], list[Finding]]:
+    try:
+        from crptpro.envs import (
+            rendering,  # imported late: the import itself complains about a wrong MUJOCO_GL
         )
-    elif chosen is None and requested not in backends:
+
+        first_frame_s = rendering.default_timeout_s() if timeout_s is None else timeout_s
+        backend = rendering.select_backend(timeout_s=first_frame_s)
+    except RenderingError as reason:
+        remedy = "Unset MUJOCO_GL, or mend that backend." if "MUJOCO_GL" in os.environ else ""
+        return ["rendering: nothing renders"], [Finding("error", str(reason), remedy)]
+    findings: list[Finding] = []
+    gl = rendering.backend_card()
+    facts = [
+        f"rendering with {backend} ({gl['gl_renderer']}, {gl['gl_kind']}), milliseconds per agent step "
+        "(physics and one image)"
+    ]
+    if has_gpu and gl["gl_kind"] == "software":
         findings.append(
             Finding(
-                "error",
-                f"A run would use {requested}, which MUJOCO_GL names, but only {', '.join(backends)} was tried.",
-                f"Try {requested} as well, or set MUJOCO_GL to one that was tried.",
+                "warning",
+                f"There is a GPU, but {backend} renders in software, about twenty times slower.",
+                "Install the GL parts of the GPU's driver; in a container start it with "
+                "NVIDIA_DRIVER_CAPABILITIES=all.",
             )
         )
-    return tuple(checks), findings
-
-
-def _failed(explanation: str, *, is_requested: bool) -> Finding:
-    if not is_requested:
-        return Finding("note", explanation)
-    return Finding("error", f"MUJOCO_GL is set, and does not render. {explanation}", "Unset MUJOCO_GL.")
-
-
-def _dead(entry: dict[str, Any], backend: str, is_chosen: bool) -> Finding:
-    remedy = f"Nothing, as long as MUJOCO_GL={backend} is not set."
-    what = f"{entry['domain']} with {backend}: {entry['error'] or 'its pixels are constant or do not change'}"
-    if is_chosen and entry.get("is_drawing", True):
-        remedy = "Try another backend: MUJOCO_GL=osmesa or MUJOCO_GL=egl."
-    elif is_chosen:
-        remedy = "The message says what the world lacks; no other backend would help."
-    return Finding("error" if is_chosen else "note", what, remedy)
+    for entry in render_domains(names, backend, first_frame_s + 20 * len(names)):
+        if entry["agent_step_ms"] is None:
+            facts.append(f"  {entry['domain']:<24}   failed")
+        else:
+            facts.append(
+                f"  {entry['domain']:<24}{entry['agent_step_ms']:>8.1f}   reset {entry['reset_ms']:.0f}"
+            )
+        if entry["error"]:
+            remedy = "Try another backend: MUJOCO_GL=osmesa or MUJOCO_GL=egl."
+            if not entry["is_drawing"]:
+                remedy = "The message says what the world lacks; no other backend would help."
+            findings.append(Finding("error", f"{entry['domain']} with {backend}: {entry['error']}", remedy))
+    return facts, findings
 
 
 def _installed() -> dict[str, str]:
@@ -281,19 +298,11 @@ def _requirements() -> list[str]:
     return [text for text in declared if "extra ==" not in text]
 
 
-def _existing(path: Path) -> Path:
-    path = path.absolute()
-    while not path.exists():
-        path = path.parent
-    return path
-
-
-def _columns(items: Iterable[tuple[str, str]]) -> list[str]:
-    return [f"  {name:<12}{value}" for name, value in items]
-
-
-def _domain_line(entry: dict[str, Any]) -> str:
-    if entry["agent_step_ms"] is None:
-        return f"{entry['domain']:<24}   failed"
-    state = "" if entry["alive"] else "   pixels are dead"
-    return f"{entry['domain']:<24}{entry['agent_step_ms']:>8.1f}   reset {entry['reset_ms']:.0f}{state}"
+if __name__ == "__main__":
+    arguments = sys.argv[1:]
+    while arguments[:1] == [FLAG]:
+        load_plugin(arguments[1])
+        arguments = arguments[2:]
+    for domain_name in arguments:
+        sys.stdout.write(json.dumps(check_domain(domain_name)) + "\n")
+        sys.stdout.flush()

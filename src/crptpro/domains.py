@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import logging
+import os
 import pickle
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from crptpro.errors import CRPTproError, UnknownNameError
+from crptpro.values import as_int
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -38,15 +42,17 @@ class Domain:
         make: For a world of your own: a callable that is given, by keyword, those of ``seed`` (int),
             ``image_size`` (int, pixels), ``action_repeat`` (int), ``camera``, ``quality`` and
             ``physics_state`` (bool) that its signature names, and returns an unbatched TorchRL
-            environment on CPU whose ``pixels`` are one uint8 RGB image ``[H, W, 3]`` or ``[3, H, W]`` with
-            ``H = W = image_size``, whose ``action`` is continuous in [-1, 1], and whose reward has shape
+            environment on CPU whose ``pixels`` are one RGB image ``[H, W, 3]`` or ``[3, H, W]``, uint8 or floats in
+            [0, 1], with ``H = W = image_size``, whose ``action`` is continuous in [-1, 1], and whose reward has shape
             ``[1]``. An environment whose ``done_spec`` has no ``truncated`` is taken to end episodes by
             termination alone. It repeats the action
             itself if it names ``action_repeat``; otherwise an agent step is one env step. Frame stacking and the
             choice of dtypes are done by ``make_env``. With ``physics_state`` it may also emit ``qpos`` and
-            ``qvel``. Its ``set_seed`` must make the next ``reset`` reproducible.
-            It must be a module-level function (or ``functools.partial`` of one): worker processes receive the
-            ``Domain`` by pickling and import ``make`` by its module's name.
+            ``qvel``; what its own transforms read back (``step_count``) stays, other entries are dropped. Its
+            ``set_seed`` must make the next ``reset`` reproducible.
+            To be built in worker processes it must be a function at a module's top level, or a
+            ``functools.partial`` of one: they receive the ``Domain`` by pickling and import ``make`` by its module's
+            name (:func:`worker_obstacle`).
         episode_env_steps: Env steps of a full episode, ``None`` if unknown or unlimited; such an episode is
             truncated after 1000 agent steps.
         source: What ``task`` is loaded with; ``"own"`` goes with ``make``.
@@ -59,6 +65,12 @@ class Domain:
     make: Callable[..., EnvBase] | None = None
     episode_env_steps: int | None = None
     source: Literal["suite", "manipulation", "gymnasium", "own"] = "own"
+
+    def __post_init__(self) -> None:
+        for name in ("action_repeat", "episode_env_steps"):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, as_int(value, name, minimum=1))
 
 
 def _suite(name: str, task: str, camera: int = 0) -> Domain:
@@ -164,16 +176,38 @@ def register_domain(domain: Domain) -> Domain:
             raise CRPTproError(
                 f"{name!r} is one of the built-in names; register the domain under another one."
             )
-    try:
-        pickle.dumps(domain)
-    except Exception as reason:
-        logger.warning(
-            "Domain %r cannot be sent to worker processes (%s); define its make at a module's top level.",
-            domain.name, reason,
-        )  # fmt: skip
+    if obstacle := worker_obstacle(domain):
+        logger.warning("Domain %r cannot be built in worker processes: %s", domain.name, obstacle)
     for key in (domain.task, domain.name):
         _registered[key] = domain
     return domain
+
+
+def worker_obstacle(domain: str | Domain) -> str | None:
+    """Return why another process could not build a domain's world, and what to do; ``None`` if it could.
+
+    A worker process imports the code of a world by its module's name. A notebook cell and an interactive session have
+    no module that could be imported, whether or not a script guards its ``__main__``.
+    """
+    domain = get_domain(domain)
+    builder: Any = domain.make
+    if domain.source == "gymnasium":
+        import gymnasium
+
+        builder = gymnasium.spec(domain.task.removeprefix(GYMNASIUM_PREFIX)).entry_point
+    while isinstance(builder, functools.partial):
+        builder = builder.func
+    name, home = getattr(builder, "__qualname__", builder), getattr(builder, "__module__", None)
+    remedy = (
+        "Put it at the top level of a file of its own, and import it from there; or collect with one process."
+    )
+    if home == "__main__" and not os.path.isfile(getattr(sys.modules["__main__"], "__file__", None) or ""):
+        return f"{name} is defined in a notebook or an interactive session, which no other process can import. {remedy}"
+    try:
+        pickle.dumps(domain)
+    except Exception as reason:
+        return f"it cannot be pickled ({reason}). {remedy}"
+    return None
 
 
 def get_domain(name: str | Domain) -> Domain:

@@ -18,6 +18,17 @@ class RenderingError(CRPTproError):
     """No GL backend renders a live frame, or the first frame did not arrive in time."""
 
 
+class WorldError(CRPTproError):
+    """A world showed or answered what no world may; the message names it."""
+
+
+class WorldFailedError(RuntimeError):
+    """A world's own code raised an exception: the message is its own, with the name of the world and the call.
+
+    It is a defect of the world, not a setting that could be mended, and keeps its traceback on the command line.
+    """
+
+
 class WorkerLostError(CRPTproError):
     """A process that collects or evaluates ended without a word: killed, as a rule, for want of memory."""
 
@@ -43,7 +54,7 @@ class RecordError(CRPTproError):
 
 
 class NonFiniteError(CRPTproError):
-    """A loss or a gradient became NaN or infinite."""
+    """A loss, a gradient, or what a world answered became NaN or infinite."""
 
 
 class SubmissionError(CRPTproError):

@@ -95,7 +95,7 @@ def empty_batch(shape: Sequence[int], dtype: torch.dtype) -> Tensor:
     """
     size = math.prod(shape) * dtype.itemsize
     if size < SMALLEST_BLOCK:
-        return torch.empty(shape, dtype=dtype)
+        return torch.empty(shape, dtype=dtype, device="cpu")
     return torch.frombuffer(_POOL.take(size), dtype=dtype).view(*shape)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from crptpro.errors import CRPTproError
@@ -47,6 +47,32 @@ def load_plugin(name: str) -> None:
     kept = str(path.resolve()) if is_file else name
     if kept not in _loaded:
         _loaded.append(kept)
+
+
+def load_plugins(arguments: Sequence[str]) -> list[str]:
+    """Import every module that ``--plugin`` names, anywhere on a command line.
+
+    Args:
+        arguments: of the command.
+
+    Returns:
+        The other arguments.
+
+    Raises:
+        CRPTproError: nothing is named, or as of :func:`load_plugin`.
+    """
+    rest: list[str] = []
+    words = iter(arguments)
+    for word in words:
+        flag, equals, value = word.partition("=")
+        if flag != FLAG:
+            rest.append(word)
+            continue
+        name = value if equals else next(words, "")
+        if not name or name.startswith("-"):
+            raise CRPTproError(f"{FLAG} needs a module or a Python file, e.g. {FLAG} my_method.py.")
+        load_plugin(name)
+    return rest
 
 
 def load_again(names: Iterable[str]) -> None:

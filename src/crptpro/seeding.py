@@ -68,14 +68,9 @@ def global_rng_state() -> dict[str, Any]:
 
 
 def set_global_rng_state(state: dict[str, Any]) -> None:
-    """Restore what :func:`global_rng_state` returned, on as many GPUs as there are.
-
-    Generators that the state does not name, as those of earlier versions name torch's only, are left as they are.
-    """
-    if "python" in state:
-        random.setstate(state["python"])
-    if "numpy" in state:
-        np.random.set_state(state["numpy"])  # noqa: NPY002
+    """Restore what :func:`global_rng_state` returned, on as many GPUs as there are."""
+    random.setstate(state["python"])
+    np.random.set_state(state["numpy"])  # noqa: NPY002
     torch.set_rng_state(state["torch"].cpu())
     for device in range(min(len(state.get("cuda", ())), torch.cuda.device_count())):
         torch.cuda.set_rng_state(state["cuda"][device].cpu(), device)

@@ -23,25 +23,15 @@ def test_coverage_is_the_mean_log_of_one_plus_the_mean_neighbour_distance(k: int
     assert coverage(z, k=k) == pytest.approx(total / 80)
 
 
-def test_observations_that_look_alike_cover_nothing() -> None:
+def test_coverage_has_its_known_values_and_bounds() -> None:
     assert coverage(torch.ones(20, 3)) == 0
-
-
-def test_corners_of_a_cube_have_closed_form() -> None:
     corners = torch.tensor([[x, y, z] for x in (0.0, 1) for y in (0.0, 1) for z in (0.0, 1)])
     assert coverage(corners, k=3) == pytest.approx(math.log(2))
     assert coverage(corners, k=7) == pytest.approx(math.log(1 + (3 + 3 * 2**0.5 + 3**0.5) / 7))
-
-
-def test_coverage_grows_with_the_spread_and_ignores_order_and_place() -> None:
     z = points()
     assert coverage(2 * z) > coverage(z)
     assert coverage(z.flip(0) + 7) == pytest.approx(coverage(z))
-
-
-def test_unit_vectors_cover_at_most_log_three() -> None:
-    z = F.normalize(points(), dim=-1)
-    assert 0 < coverage(z) < math.log(3)
+    assert 0 < coverage(F.normalize(z, dim=-1)) < math.log(3)
 
 
 @pytest.mark.parametrize("count", [0, 12])

@@ -1,3 +1,5 @@
+"""Embeddings of sampled observations, and how they are spread."""
+
 from __future__ import annotations
 
 import pytest
@@ -6,7 +8,15 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from crptpro.analysis.embeddings import embed_pixels, embed_samples, principal_components
+from crptpro.analysis.embeddings import (
+    effective_rank,
+    embed_pixels,
+    gram_matrix,
+    mean_cosine,
+    principal_components,
+    sample_pixels,
+)
+from crptpro.objectives.functional import mean_pairwise_cosine
 
 
 def dataset(brightness: int) -> ReplayBuffer:
@@ -29,43 +39,32 @@ class Brightness(nn.Module):
         return self.weight * pixels.flatten(1).double().mean(1, keepdim=True)
 
 
-def test_embeddings_are_the_features_of_sampled_observations_by_domain() -> None:
-    embeddings = embed_samples(Brightness(), {"dark": dataset(10), "bright": dataset(200)}, samples=50)
-    assert list(embeddings) == ["dark", "bright"]
-    for name, low in (("dark", 10), ("bright", 200)):
-        points = embeddings[name]
-        assert points.shape == (50, 1)
-        assert points.dtype == torch.float32
-        assert not points.requires_grad
-        assert low <= points.min() < points.max() <= low + 9
+def test_embeddings_are_features_or_projections_encoded_where_the_encoder_lives_some_at_a_time() -> None:
+    pixels = torch.arange(150, dtype=torch.uint8).view(150, 1, 1, 1).expand(150, 9, 8, 8)
+    points = embed_pixels(Brightness(), pixels)
+    assert torch.equal(points, torch.arange(150.0).unsqueeze(1))
+    assert (points.dtype, points.requires_grad) == (torch.float32, False)
+    head = nn.Linear(1, 3, dtype=torch.float64)
+    assert embed_pixels(Brightness(), pixels, projector=head).shape == (150, 3)
+    encoder = Brightness().to("meta")
+    assert embed_pixels(encoder, pixels).device.type == encoder.seen == "meta"
 
 
-def test_a_projectors_outputs_are_the_embeddings_where_one_is_given() -> None:
-    domains = {"a": dataset(10)}
-    features = embed_samples(Brightness(), domains)["a"]
-    projected = embed_samples(Brightness(), domains, projector=nn.Linear(1, 3, dtype=torch.float64))["a"]
-    assert features.shape == (125, 1)
-    assert projected.shape == (125, 3)
-
-
-def test_the_seed_chooses_the_observations_and_the_datasets_own_stream_goes_on() -> None:
-    encoder, buffer, twin = Brightness(), dataset(0), dataset(0)
+def test_the_seed_chooses_the_observations_and_the_datasets_own_stream_is_left_alone() -> None:
+    buffer, twin = dataset(10), dataset(10)
     for each in (buffer, twin):
         each.set_rng(torch.Generator().manual_seed(5))
-    first, second, other = (embed_samples(encoder, {"a": buffer}, seed=seed)["a"] for seed in (1, 1, 2))
+    first, second, other = (sample_pixels(buffer, 50, seed=seed) for seed in (1, 1, 2))
+    assert first.shape == (50, 9, 8, 8)
     assert torch.equal(first, second)
     assert not torch.equal(first, other)
     assert torch.equal(buffer.sample(20)["pixels"], twin.sample(20)["pixels"])
-
-
-def test_a_dataset_that_follows_the_global_generator_still_does_afterwards() -> None:
-    buffer = dataset(0)
-    embed_samples(Brightness(), {"a": buffer})
-    draws = []
-    for _ in range(2):
-        torch.manual_seed(3)
-        draws.append(buffer.sample(20)["pixels"])
-    assert torch.equal(*draws)
+    follower = dataset(0)  # of the global generator
+    sample_pixels(follower, 50, seed=1)
+    torch.manual_seed(3)
+    first = follower.sample(20)["pixels"]
+    torch.manual_seed(3)
+    assert torch.equal(first, follower.sample(20)["pixels"])
 
 
 @pytest.mark.gpu
@@ -73,12 +72,7 @@ def test_a_dataset_on_a_gpu_is_drawn_from_there() -> None:
     storage = LazyTensorStorage(10, device="cuda")
     buffer = ReplayBuffer(storage=storage, batch_size=4)
     buffer.extend(dataset(10).sample(10).select("pixels").to("cuda"))
-    assert embed_samples(Brightness().cuda(), {"a": buffer})["a"].device.type == "cuda"
-
-
-def test_pixels_are_encoded_where_the_encoder_lives() -> None:
-    encoder = Brightness().to("meta")
-    assert embed_samples(encoder, {"a": dataset(0)})["a"].device.type == encoder.seen == "meta"
+    assert sample_pixels(buffer, 20, seed=0).device.type == "cuda"
 
 
 def test_components_explain_variance_in_decreasing_order_and_reconstruct_the_points() -> None:
@@ -86,33 +80,43 @@ def test_components_explain_variance_in_decreasing_order_and_reconstruct_the_poi
     points = torch.randn(40, 5, generator=generator, dtype=torch.float64) * torch.tensor([5.0, 3, 2, 1, 0.1])
     coordinates, explained = principal_components(points, components=5)
     assert (explained.diff() <= 0).all()
-    torch.testing.assert_close(explained.sum(), torch.ones((), dtype=torch.float64))
+    eigenvalues = torch.linalg.eigvalsh(torch.cov(points.T)).flip(0)
+    torch.testing.assert_close(coordinates.var(0), eigenvalues)
+    torch.testing.assert_close(explained, eigenvalues / eigenvalues.sum())
     centred = points - points.mean(0)
     torch.testing.assert_close(coordinates @ coordinates.T, centred @ centred.T)
 
 
-def test_components_agree_with_the_eigenvectors_of_the_covariance() -> None:
-    points = torch.randn(60, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    coordinates, explained = principal_components(points, components=2)
-    eigenvalues = torch.linalg.eigvalsh(torch.cov(points.T)).flip(0)
-    torch.testing.assert_close(coordinates.var(0), eigenvalues[:2])
-    torch.testing.assert_close(explained, eigenvalues[:2] / eigenvalues.sum())
+@pytest.mark.parametrize(("count", "components", "message"), [
+    (3, 4, r"at most min.* = 3, got 4"), (1, 1, "at least 2, got 1"), (0, 1, "at least 2, got 0"),
+])  # fmt: skip
+def test_more_components_than_there_are_are_refused(count: int, components: int, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        principal_components(torch.randn(count, 10), components=components)
 
 
-def test_too_many_components_are_refused_with_the_limit_in_the_message() -> None:
-    with pytest.raises(ValueError, match=r"at most min.* = 3, got 4"):
-        principal_components(torch.randn(3, 10), components=4)
+def test_inner_products_and_mean_cosine_are_those_of_all_pairs_and_change_nothing() -> None:
+    features = 0.3 + torch.randn(60, 5_000, generator=torch.Generator().manual_seed(0))
+    features[7] = 0
+    before = features.clone()
+    mean, scale = features.double().mean(0), 1 + features.double().std(0)
+    x = (features.double() - mean) / scale
+    torch.testing.assert_close(torch.from_numpy(gram_matrix(features, mean, scale)), x @ x.T)
+    unit = torch.nn.functional.normalize(features.double(), dim=-1)
+    assert mean_cosine(features) == pytest.approx(float(mean_pairwise_cosine(unit)), abs=1e-7)
+    assert mean_cosine(features[:1]) == 0
+    assert mean_cosine(torch.ones(3, 2)) == pytest.approx(1, abs=1e-6)
+    effective_rank(features)
+    assert features.equal(before)
 
 
-@pytest.mark.parametrize(("count", "components"), [(1, 1), (0, 1)])
-def test_fewer_than_two_points_have_no_components(count: int, components: int) -> None:
-    with pytest.raises(ValueError, match=f"at least 2, got {count}"):
-        principal_components(torch.randn(count, 4), components=components)
-
-
-def test_more_pixels_than_fit_at_once_give_the_same_embeddings() -> None:
-    encoder = Brightness()
-    pixels = torch.arange(150, dtype=torch.uint8).view(150, 1, 1, 1).expand(150, 9, 8, 8)
-    assert torch.equal(embed_pixels(encoder, pixels), torch.arange(150.0).unsqueeze(1))
-    projector = nn.Linear(1, 3, dtype=torch.float64)
-    assert embed_pixels(encoder, pixels, projector=projector).shape == (150, 3)
+def test_effective_rank_counts_directions() -> None:
+    axes = torch.cat([torch.eye(5), -torch.eye(5)])
+    assert effective_rank(axes) == pytest.approx(5)
+    assert effective_rank(axes + 100) == pytest.approx(5, rel=1e-4)  # of centred samples
+    assert effective_rank(torch.arange(6.0)[:, None] * torch.ones(1, 9)) == pytest.approx(1)
+    assert effective_rank(torch.ones(4, 3)) == 0
+    wide = torch.randn(8, 9_000)
+    singular = torch.linalg.svdvals((wide - wide.mean(0)).double())[:7]
+    entropy = torch.special.entr(singular / singular.sum()).sum()
+    assert effective_rank(wide) == pytest.approx(entropy.exp().item(), rel=1e-6)

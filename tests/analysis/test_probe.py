@@ -1,42 +1,50 @@
+"""What frozen features know of the simulator's state, judged on episodes that took no part."""
+
 from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor, nn
-from toy_world import collection_request, random_episode
+from toy_world import random_episode, write_dataset
 
-from crptpro.analysis.probe import ProbeSamples, probe, probe_embeddings, probe_frame_rows, probe_samples
-from crptpro.data import Episode, FrameDataset
-from crptpro.data.collection import DomainCollection
+from crptpro.analysis.probe import (
+    PENALTIES,
+    ProbeResult,
+    ProbeSamples,
+    probe,
+    probe_embeddings,
+    probe_frame_rows,
+    probe_samples,
+)
+from crptpro.data import FrameDataset
 from crptpro.errors import DatasetError
 
 SIZE = 6
 
 
-def shown_episode(index: int, length: int = 12) -> Episode:
+def shown_episode(index: int, length: int = 12) -> TensorDict:
     """Its picture shows qpos as brightness, a code of the episode that tells qvel of this episode only."""
     episode = random_episode(length, size=SIZE, seed=index)
     rng = np.random.default_rng(100 + index)
     qpos = np.concatenate([rng.uniform(0, 1, (length + 1, 3)), np.full((length + 1, 1), 2.0)], 1)
     qvel = np.repeat(rng.normal(size=(1, 3)), length + 1, 0) + 0.01 * rng.normal(size=(length + 1, 3))
-    pixels = np.zeros_like(episode.pixels)
+    pixels = np.zeros((length + 1, 3, SIZE, SIZE), np.uint8)
     pixels[:, :, 0, 0] = np.round(qpos[:, :3] * 255)
     pixels[:, 0].reshape(length + 1, -1)[:, 6 + index] = 255
-    values = {name: getattr(episode, name) for name in ("action", "reward", "terminated", "truncated")}
-    return Episode(pixels=pixels, state={"qpos": qpos, "qvel": qvel}, **values)
+    for name, values in {"pixels": pixels, "qpos": qpos, "qvel": qvel}.items():
+        episode[name], episode["next", name] = torch.from_numpy(values[:-1]), torch.from_numpy(values[1:])
+    return episode
 
 
 @pytest.fixture
 def dataset(tmp_path: Path) -> FrameDataset:
-    collection = DomainCollection(tmp_path, collection_request(transitions=144, image_size=SIZE))
-    for index in range(12):
-        collection.next_job()
-        collection.accept(index, shown_episode(index))
-    return FrameDataset.open(tmp_path)
+    return FrameDataset.open(write_dataset(tmp_path, map(shown_episode, range(12))))
 
 
 class Flatten(nn.Module):
@@ -61,7 +69,7 @@ def test_what_a_picture_shows_is_found_and_what_only_marks_an_episode_is_not(dat
     assert probe(leaking, Flatten())["features"].velocity_r2 > 0.9
 
 
-def test_no_episode_is_in_two_parts_and_every_sample_is_in_one(dataset: FrameDataset) -> None:
+def test_samples_are_split_by_episode_and_states_belong_to_the_newest_frame(dataset: FrameDataset) -> None:
     samples = probe_samples(dataset, samples=100)
     parts = [samples.train, samples.validation, samples.test]
     assert torch.cat(parts).sort().values.equal(torch.arange(100))
@@ -70,21 +78,13 @@ def test_no_episode_is_in_two_parts_and_every_sample_is_in_one(dataset: FrameDat
     episodes = [set(marks[part].tolist()) for part in parts]
     assert len(episodes[0] | episodes[1] | episodes[2]) == sum(map(len, episodes))
     assert len(episodes[2]) == 3
-
-
-def test_the_frames_that_samples_read_are_known_beforehand(dataset: FrameDataset) -> None:
-    samples = probe_samples(dataset, samples=50, seed=1)
-    rows = probe_frame_rows(dataset, samples=50, seed=1)
-    read = samples.pixels.reshape(-1, 3, SIZE, SIZE).unique(dim=0)
-    assert dataset.frames_at(rows).unique(dim=0).equal(read)
-    assert rows.diff().min() > 0
-
-
-def test_states_belong_to_the_newest_frame_of_their_stack(dataset: FrameDataset) -> None:
-    samples = probe_samples(dataset)
     newest = samples.pixels[:, -3:, 0, 0].double() / 255
     torch.testing.assert_close(newest, samples.positions[:, :3], atol=0.002, rtol=0)
-    assert samples.pixels.shape == (144, 9, SIZE, SIZE)
+    rows = probe_frame_rows(dataset, samples=100)  # what a sample reads is known beforehand
+    assert (
+        dataset.frames_at(rows).unique(dim=0).equal(samples.pixels.reshape(-1, 3, SIZE, SIZE).unique(dim=0))
+    )
+    assert rows.diff().min() > 0
 
 
 def test_the_same_seed_draws_the_same_samples_in_every_colour(dataset: FrameDataset) -> None:
@@ -107,13 +107,6 @@ def test_projections_are_probed_beside_the_features(dataset: FrameDataset) -> No
     assert results["z"].effective_rank == 0
 
 
-def test_a_coordinate_predicted_worse_than_by_a_constant_counts_as_unknown(dataset: FrameDataset) -> None:
-    samples = probe_samples(dataset)
-    result = probe_embeddings(samples, torch.randn(144, 30, generator=torch.Generator().manual_seed(0)))
-    assert min(result.velocities.values()) < 0
-    assert 0 <= result.velocity_r2 < 0.2
-
-
 def test_where_nothing_varies_there_is_nothing_to_know(dataset: FrameDataset) -> None:
     dataset.frames["qvel"].fill_(3.0)
     result = probe(probe_samples(dataset), Flatten())["features"]
@@ -121,15 +114,94 @@ def test_where_nothing_varies_there_is_nothing_to_know(dataset: FrameDataset) ->
     assert math.isnan(result.velocity_r2)
 
 
-def test_too_few_episodes_or_samples_are_refused(dataset: FrameDataset) -> None:
+def test_data_that_cannot_be_split_or_have_no_state_are_refused(
+    dataset: FrameDataset, tmp_path: Path
+) -> None:
     with pytest.raises(DatasetError, match=r"3 samples.*Collect more episodes"):
         probe_samples(dataset, samples=3)
-
-
-def test_a_dataset_without_physical_state_is_refused(tmp_path: Path) -> None:
-    collection = DomainCollection(tmp_path, collection_request(transitions=20, image_size=SIZE))
-    for index in range(2):
-        collection.next_job()
-        collection.accept(index, random_episode(10, state=False))
+    write_dataset(tmp_path / "stateless", [random_episode(10, state=False)] * 2)
     with pytest.raises(DatasetError, match="no physical state"):
-        probe_samples(FrameDataset.open(tmp_path))
+        probe_samples(FrameDataset.open(tmp_path / "stateless"))
+
+
+# --- the regression -----------------------------------------------------------------------------------------------
+
+ROWS = torch.arange(240)
+TRAIN, VALIDATION, TEST = ROWS[:120], ROWS[120:160], ROWS[160:]
+FITTED = ROWS[:160]
+
+
+def fit(features: Tensor, targets: Tensor, **parts: Any) -> ProbeResult:
+    names = [f"t{index}" for index in range(targets.shape[1])]
+    split = {"train": TRAIN, "validation": VALIDATION, "test": TEST, **parts}
+    nothing = torch.zeros(240, 0)
+    return probe_embeddings(
+        ProbeSamples(torch.zeros(240), targets.double(), nothing, names, [], held_out_episodes=1, **split),
+        features,
+    )
+
+
+def r2(features: Tensor, targets: Tensor) -> Tensor:
+    return torch.tensor(list(fit(features, targets).positions.values()))
+
+
+@pytest.fixture(autouse=True)
+def _seeded() -> None:
+    torch.manual_seed(0)
+
+
+def test_what_is_linear_in_the_features_is_predicted_and_noise_and_memorised_rows_are_not() -> None:
+    features = 3 + torch.randn(240, 20) * torch.logspace(-1, 1, 20)
+    assert (r2(features, 5 + features @ torch.randn(20, 3)) > 0.9999).all()
+    noise = r2(torch.randn(240, 1_000), torch.randn(240, 8))
+    assert (noise < 0.05).all()
+    assert noise.mean() > -0.3
+    assert (r2(torch.eye(240), torch.randn(240, 4)) < 0.05).all()
+    constant = r2(torch.ones(240, 7), torch.randn(240, 2))
+    assert ((constant <= 0) & (constant > -0.3)).all()
+
+
+def test_it_is_ridge_regression_with_the_penalty_that_predicts_the_validation_rows_best() -> None:
+    features, targets = torch.randn(240, 6).double(), torch.randn(240, 1).double()
+    targets += features[:, :1]
+    deviation = features[FITTED].std(0, correction=0)
+    x = (features - features[FITTED].mean(0)) / (deviation + deviation.square().mean().sqrt())
+
+    def predicted(penalty: float, rows: Tensor, asked: Tensor) -> Tensor:
+        own, mean = x[rows] - x[rows].mean(0), targets[rows].mean(0)
+        scale = own.square().sum() / len(rows)
+        weights = torch.linalg.solve(
+            own.T @ own + penalty * scale * torch.eye(6), own.T @ (targets[rows] - mean)
+        )
+        return (x[asked] - x[rows].mean(0)) @ weights + mean
+
+    def error(penalty: float) -> float:
+        return float((predicted(penalty, TRAIN, VALIDATION) - targets[VALIDATION]).square().sum())
+
+    residual = predicted(min(PENALTIES, key=error), FITTED, TEST) - targets[TEST]
+    expected = 1 - residual.square().sum() / (targets[TEST] - targets[TEST].mean(0)).square().sum()
+    assert fit(features, targets).position_r2 == pytest.approx(float(expected), abs=1e-8)
+
+
+def test_held_out_rows_take_no_part_in_standardising_or_choosing() -> None:
+    features, targets = torch.randn(240, 300), torch.randn(240, 2)
+    targets[:, 0] = features[:, :3].sum(1)
+    half = torch.arange(160, 200)
+    before = fit(features, targets, test=half).positions
+    features[200:] *= 100
+    targets[200:] *= 100
+    assert fit(features, targets, test=half).positions == before
+
+
+def test_a_feature_that_marks_single_samples_does_not_drown_the_others() -> None:
+    """ReLU features that are active in one sample of hundreds, by the hundreds."""
+    rare = torch.zeros(240, 5_000)
+    rare[torch.randint(0, 240, (5_000,)), torch.arange(5_000)] = 0.01
+    features = torch.cat([torch.randn(240, 5), rare], 1)
+    assert r2(features, features[:, :1] + 0.0).item() > 0.98
+
+
+def test_a_coordinate_predicted_worse_than_by_a_constant_counts_as_unknown() -> None:
+    result = fit(torch.randn(240, 30), torch.randn(240, 6))
+    assert min(result.positions.values()) < 0
+    assert 0 <= result.position_r2 < 0.2

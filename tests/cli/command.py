@@ -6,19 +6,15 @@ import csv
 from collections.abc import Callable
 from pathlib import Path
 
-from toy_world import FIXED, ToyEnv, fixed_length
-
-from crptpro.data.collect_worker import EpisodeRoller
-from crptpro.data.collection import DomainCollection
+from toy_world import FIXED, collect_toy
 
 SIZE = 16
 TASK = FIXED.task
-SMALL_DRQ = (
+SMALL = (
     "--env-steps", 60, "--random-agent-steps", 12, "--batch-size", 4, "--replay-capacity", 20,
     "--eval-episodes", 1, "--eval-interval-env-steps", 20, "--checkpoint-interval-env-steps", 20,
-    "--log-interval-env-steps", 10, "--precision", "fp32", "--hidden-dim", 32,
+    "--log-interval-env-steps", 10, "--precision", "fp32", "--hidden-dim", 32, "--queue-size", 512,
 )  # fmt: skip
-SMALL = (*SMALL_DRQ, "--queue-size", 512)
 
 Call = Callable[..., tuple[int, str, str]]
 
@@ -34,15 +30,7 @@ def refused(result: tuple[int, str, str]) -> str:
 
 
 def toy_dataset(path: Path, size: int = SIZE) -> Path:
-    settings = {"image_size": size, "action_repeat": 2, "camera": 0, "quality": "exact"}
-    request = {"domain": path.name, "task": f"{path.name}_go", "seed": 0, "transitions": 27, **settings}
-    collection = DomainCollection(path, request, 10)
-    roller = EpisodeRoller(lambda: ToyEnv(fixed_length, image_size=size))
-    while (job := collection.next_job()) is not None:
-        collection.accept(job.episode, roller.roll(job))
-    roller.close()
-    collection.close()
-    return path
+    return collect_toy(path, domain=path.name, task=f"{path.name}_go", image_size=size)
 
 
 def rows(path: Path) -> list[dict[str, str]]:

@@ -8,8 +8,7 @@ from torchrl.envs.transforms import Transform
 from torchrl.objectives import LossModule
 
 from crptpro.modules import PixelEncoder, Projector
-from crptpro.objectives import ExplorationDefaults, MethodDefaults, register_method
-from crptpro.training import register_intrinsic_reward
+from crptpro.objectives import Exploration, register_method
 
 
 class SlownessLoss(LossModule):
@@ -39,18 +38,20 @@ class Activity(Transform):
         return tensordict.set(("next", "intrinsic_reward"), features.std(dim=-1, keepdim=True))
 
 
-DEFAULTS = MethodDefaults(updates=2, batch_size=4, encoder_tau=None)
+DEFAULTS = {"updates": 2, "batch_size": 4, "encoder_tau": None}
 SMALL = {"channels": (4, 4), "strides": (2, 1)}
 
-register_method("slowness", SlownessLoss, DEFAULTS, encoder_options=SMALL)
+register_method("slowness", SlownessLoss, **DEFAULTS, encoder_options=SMALL)
 register_method(
     "slowness-active",
     SlownessLoss,
-    DEFAULTS,
+    **DEFAULTS,
     loss_options={"margin": 0.5},
     encoder_options=SMALL,
-    exploration=ExplorationDefaults(
-        reward="activity", env_steps=60, encoder_update_interval=5, random_agent_steps=10
+    exploration=Exploration(
+        reward=lambda loss, generator: Activity(),
+        env_steps=60,
+        encoder_update_interval=5,
+        random_agent_steps=10,
     ),
 )
-register_intrinsic_reward("activity", lambda loss, config, generator: Activity())

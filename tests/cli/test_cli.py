@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import importlib.util
 import os
 import re
 import subprocess
@@ -11,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from command import SIZE, SMALL, SMALL_DRQ, TASK, Call, refused, rows
+from command import SIZE, SMALL, TASK, Call, refused, rows, toy_dataset
 
 from crptpro.cli import main
 from crptpro.data import FrameDataset
@@ -19,8 +18,7 @@ from crptpro.pretrained import load_pretrained
 from crptpro.training import load_agent
 
 COMMANDS = (
-    "doctor", "collect", "pretrain", "finetune", "downstream", "drq", "evaluate", "probe", "reproduce", "report",
-    "import", "export", "trim",
+    "doctor", "collect", "pretrain", "finetune", "downstream", "evaluate", "probe", "reproduce", "report", "measure",
 )  # fmt: skip
 
 
@@ -28,21 +26,15 @@ COMMANDS = (
 
 
 @pytest.mark.parametrize(("command", "named"), [
-    ((), ["doctor", "collect", "pretrain", "finetune", "downstream", "drq", "evaluate", "probe"]),
-    (("doctor",), ["--domains"]),
-    (("collect",), ["--out", "--transitions", "--seed", "--workers", "--quality {exact,fast}", "group letters",
-                    "--colors"]),
-    (("pretrain",), ["--out", "--method", "--updates", "--batch-size", "--learning-rate", "--precision",
-                     "--device", "--logging.wandb", "crptpro 50,", "--explore.env-steps", "proto-rl-c", "--plugin",
-                     "--annealing-updates"]),
-    (("finetune",), ["--out", "--updates", "--batch-size", "--learning-rate", "--logging.wandb", "PATH PATH"]),
-    (("downstream",), ["--pretrained", "random-encoder", "--out", "--env-steps", "--replay-capacity",
-                       "--eval-episodes", "--features", "--logging.tensorboard", "(default: 500000)"]),
-    (("downstream", "--algorithm", "skill-ddpg"), ["(default: skill-ddpg)", "--skill-ddpg.n-step", "(default: 2000)"]),
-    (("drq",), ["--out", "--replay-capacity", "(default: 1000000)", "(default: 0.001)"]),
+    ((), COMMANDS),
+    (("collect",), ["--out", "--transitions", "--quality {exact,fast}", "group letters", "--colors"]),
+    (("pretrain",), ["--method", "--updates", "--batch-size", "--precision", "--loss", "--snapshots", "crptpro 50,"]),
+    (("pretrain", "--method", "apt-c"), ["--env-steps", "--hidden-dim"]),
+    (("finetune",), ["--out", "--updates", "--batch-size", "--logging.wandb"]),
+    (("downstream",), ["--pretrained", "random-encoder", "drq", "--replay-capacity", "--features", "500,000"]),
     (("evaluate",), ["random-policy", "--task", "--episodes", "--csv", "--video", "--colors"]),
-    (("report",), ["--out", "--bootstrap-seed", "--replicates", "(default: 2000)", "DIRECTORY/report"]),
-    (("probe",), ["random-encoder", "--samples", "--colors", "--csv", "(default: 2000)", "held-out"]),
+    (("report",), ["--out"]),
+    (("probe",), ["random-encoder", "--samples", "--colors", "--csv", "held-out"]),
 ])  # fmt: skip
 def test_help_names_every_argument(call: Call, command: tuple[str, ...], named: list[str]) -> None:
     status, out, err = call(*command, "--help")
@@ -52,22 +44,12 @@ def test_help_names_every_argument(call: Call, command: tuple[str, ...], named: 
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_says_every_default_once_and_in_words(
-    call: Call, monkeypatch: pytest.MonkeyPatch, command: str
-) -> None:
+def test_help_says_every_default_once(call: Call, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     text = re.sub(r"[\s│]+", " ", call(command, "--help")[1])
     assert "--help" in text
     assert "(default: )" not in text
     assert not re.findall(r"\(default: [^()]*\) \(default: (?!None\))", text)
-
-
-def test_drq_offers_nothing_of_other_algorithms(call: Call) -> None:
-    text = call("drq", "--help")[1]
-    for name in (
-        "--algorithm", "skill", "--intrinsic", "--knn-k", "queue", "--transfer-actor", "--features", "proto-rl",
-    ):  # fmt: skip
-        assert name not in text, name
 
 
 def test_the_installed_command_is_this_one() -> None:
@@ -81,7 +63,6 @@ def test_the_installed_command_is_this_one() -> None:
     (("evaluate", "random-policy", "--episodes", "many"), "many"),
     (("collect", "walker", "--quality", "best"), "best"),
     (("dance",), "dance"),
-    (("drq", "walker_run", "--out", "out", "--algorithm", "skill-ddpg"), "--algorithm"),
 ])  # fmt: skip
 def test_what_the_parser_cannot_read_is_named_with_status_2(
     call: Call, arguments: tuple[str, ...], named: str
@@ -101,7 +82,15 @@ def test_every_command_does_its_part_on_a_world_without_a_simulator(
 ) -> None:
     runs = tmp_path / "runs"
     few = ("--updates", 2, "--batch-size", 4, "--log-interval", 1)
-    first_stage = ("pretrain", dataset, "--out", runs / "pretrain", *few, "--assignment-temperature", 0.05)
+    first_stage = (
+        "pretrain",
+        dataset,
+        "--out",
+        runs / "pretrain",
+        *few,
+        "--loss",
+        "assignment_temperature=0.05",
+    )
     assert call(*first_stage)[0] == 0
     first = load_pretrained(runs / "pretrain" / "encoder")
     assert first.card["training"]["updates"] == 2
@@ -153,32 +142,44 @@ def test_every_command_does_its_part_on_a_world_without_a_simulator(
     line = refused(
         call("downstream", TASK, "--pretrained", runs / "down" / "agent", "--out", tmp_path / "out")
     )
-    assert "no pretrained encoder" in line
+    assert "is a 'crptpro-agent'" in line
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("command", "pretrained", "updates"), [
-    (("drq",), None, "48"),
-    (("downstream", "--algorithm=skill-ddpg", "--pretrained", "random-encoder", "--skill-ddpg.skill", 3),
-     "random-encoder", "24"),
-])  # fmt: skip
-def test_the_other_algorithms_leave_agents_that_evaluate(
-    call: Call, tmp_path: Path, command: tuple[object, ...], pretrained: str | None, updates: str
+def test_results_are_written_before_they_are_printed(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    small = SMALL_DRQ if command[0] == "drq" else SMALL
-    status, _, err = call(command[0], TASK, *command[1:], "--out", tmp_path / "run", *small)
+    def cannot_show(text: str) -> None:
+        raise UnicodeEncodeError("ascii", text, 0, 1, "a terminal of old")
+
+    monkeypatch.setattr("crptpro.cli.print", cannot_show, raising=False)
+    file = tmp_path / "a.csv"
+    with pytest.raises(UnicodeEncodeError):
+        call("evaluate", "random-policy", "--task", TASK, "--episodes", 2, "--csv", file)
+    assert [row["episode"] for row in rows(file)] == ["0", "1"]
+
+
+@pytest.mark.parametrize("pretrained", ["drq", "random-encoder"])
+def test_the_controls_leave_agents_that_evaluate(call: Call, tmp_path: Path, pretrained: str) -> None:
+    run = tmp_path / "run"
+    status, _, err = call("downstream", TASK, "--pretrained", pretrained, "--out", run, *SMALL)
     assert status == 0, err
-    assert rows(tmp_path / "run" / "eval.csv")[-1]["updates"] == updates
-    _, card = load_agent(tmp_path / "run" / "agent")
-    assert (card["pretrained"] or "None").split(":")[0] == str(pretrained)
-    status, out, _ = call("evaluate", tmp_path / "run" / "agent", "--episodes", 1)
+    assert {row["method"] for row in rows(run / "eval.csv")} == {pretrained}
+    status, out, _ = call("evaluate", run / "agent", "--episodes", 1)
     assert status == 0
     assert out.startswith(f"{TASK}: ")
 
 
+def test_an_untrained_encoder_is_written_as_any_other(call: Call, dataset: Path, tmp_path: Path) -> None:
+    for method in ("random-encoder", "random-encoder-standardised"):
+        assert call("pretrain", dataset, "--method", method, "--out", tmp_path / method)[0] == 0
+        loaded = load_pretrained(tmp_path / method / "encoder")
+        assert (loaded.method, loaded.encoder.image_size) == (method, SIZE)
+
+
 @pytest.mark.parametrize(("arguments", "message"), [
     (("collect", "walkr", "--out", "data"), "Nearest: walker"),
-    (("evaluate", "random-policy"), "name one with --task"),
+    (("evaluate", "random-policy"), "name one, e.g. --task"),
 ])  # fmt: skip
 def test_a_real_process_ends_with_the_same_line(
     tmp_path: Path, arguments: tuple[str, ...], message: str
@@ -229,3 +230,73 @@ def test_collect_pretrain_downstream_and_evaluate_on_a_real_domain(call: Call, t
     )
     line = refused(call("evaluate", runs / "d" / "agent", "--task", "gymnasium:Reacher-v5", "--episodes", 1))
     assert "trained for 1 actions (cartpole_balance), gymnasium:Reacher-v5 has 2" in line
+
+
+# --- what is refused: one line, a status, and nothing left behind -----------------------------------------------------
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (("collect", "cartpole", "walkr"), r"no domain or task 'walkr'\. Nearest: walker"),
+    (("collect",), r"Name at least one domain"),
+    (("collect", "cartpole", "--transitions", "0"), r"at least 1, got 0"),
+    (("collect", "cartpole", "--seed", "-1"), r"`seed` must be from 0 to 4294967295, got -1"),
+    (("pretrain",), r"at least one dataset directory"),
+    (("pretrain", "absent"), r"absent"),
+    (("pretrain", "walker", "--method", "proto-rl"), r"no method 'proto-rl'\. .*proto-rl-"),
+    (("pretrain", "walker"), r"walker is no directory.*`crptpro collect walker`"),
+    (("pretrain", "data/walker", "--method", "proto-rl-c"), r"proto-rl-c explores.*data/walker is a path\. Name"),
+    (("pretrain", "walkr", "--method", "apt-c"), r"'walkr'\. Nearest: walker"),
+    (("pretrain", "--method", "becl"), r"at least one domain, task or group \(A, B, C, D\)"),
+    (("pretrain", "A", "--method", "apt-s"), r"one domain, got 3 \(cheetah, walker, quadruped\)"),
+    (("pretrain", TASK, "--method", "proto-rl-c", "--queue-size", "7"), r"queue_size.* multiple"),
+    (("finetune", "absent", "absent"), r"absent"),
+    (("downstream", "walker_rum", "--pretrained", "random-encoder"), r"'walker_rum'\. Nearest: walker_run"),
+    (("downstream", TASK, "--pretrained", "absent"), r"absent does not exist"),
+    (("downstream", TASK, "--pretrained", "random-encoder", "--device", "abacus"), r"'abacus' cannot be used"),
+    (("downstream", TASK, "--pretrained", "random-encoder", "--discount", "2"), r"discount.*got 2"),
+    (("--plugin", "absent.py", "pretrain", TASK), r"--plugin absent\.py: there is no such file"),
+])  # fmt: skip
+def test_a_request_that_cannot_be_met_leaves_nothing_behind(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    line = refused(call(*arguments, "--out", tmp_path / "out"))
+    assert re.search(message, line), line
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("arguments", "message"), [
+    (("random-policy",), "name one, e.g. --task"),
+    (("absent",), "absent does not exist"),
+    (("random-policy", "--task", "walker_rum"), "Nearest: walker_run"),
+    (("random-policy", "--task", TASK, "--episodes", "0"), "at least 1, got 0"),
+    (("random-policy", "--task", TASK, "--colors", "reversed_background"), "colors='reversed_image'"),
+])  # fmt: skip
+def test_an_evaluation_that_cannot_run_says_why(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert message in refused(call("evaluate", *arguments, "--csv", "out/returns.csv"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_datasets_that_do_not_fit_are_refused(
+    call: Call, dataset: Path, encoder: Path, tmp_path: Path
+) -> None:
+    other, out = toy_dataset(tmp_path / "data" / "other", SIZE + 2), tmp_path / "out"
+    line = refused(call("pretrain", dataset, other, "--out", out))
+    assert f"{dataset} has 16 px" in line
+    assert f"{other} has 18 px" in line
+    assert "image_size 16, not 18" in refused(call("finetune", encoder, other, "--out", out))
+    file = next(dataset.rglob("pixels.memmap"))
+    os.truncate(file, file.stat().st_size - 1)
+    assert str(file) in refused(call("pretrain", dataset, "--out", out))
+    assert not out.exists()
+
+
+def test_a_run_with_other_settings_is_not_continued(call: Call, dataset: Path, tmp_path: Path) -> None:
+    common = ("pretrain", dataset, "--out", tmp_path / "out", "--updates", 2, "--log-interval", 1)
+    assert call(*common, "--batch-size", 4)[0] == 0
+    before = (tmp_path / "out" / "pretrain.csv").read_bytes()
+    assert "batch_size was 4, now 6" in refused(call(*common, "--batch-size", 6))
+    assert (tmp_path / "out" / "pretrain.csv").read_bytes() == before

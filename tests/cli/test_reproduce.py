@@ -1,87 +1,75 @@
-"""``crptpro reproduce``: the plan, refusals, and an experiment of a plugin's from nothing to an interrupted end."""
+"""``crptpro reproduce``: the plan, refusals, what failed, and a small reproduction from nothing to its tables."""
 
 from __future__ import annotations
 
+import io
 import json
-import os
-import signal
-import subprocess
+import math
 import sys
-import time
-from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import psutil
+import pandas as pd
 import pytest
 from command import Call, refused
 
-import crptpro
+from crptpro.artifact import read_json
+from crptpro.cli import main
 from crptpro.errors import CRPTproError
-from crptpro.experiments.catalogue import EXPERIMENTS
-from crptpro.experiments.goals import Goal, Request
-from crptpro.experiments.launching import Failure
-from crptpro.experiments.plan import Plan
+from crptpro.experiments.jobs import Plan, load_results
+from crptpro.experiments.launch import Failure
+from crptpro.experiments.measure import PROBE_COLUMNS, read_rows
 
-MAIN = "from crptpro.cli import main; main()"
-FAKE_EXPERIMENT = Path(__file__).parents[1] / "experiments" / "launching" / "fake_experiment.py"
+PART = ("--groups", "A", "--tasks", "walker_run")
 
 
-def numbers(out: str, pieces: str) -> list[str]:
-    """Needed, done and to do, of a kind of pieces in a plan."""
-    [row] = [line for line in out.splitlines() if line.startswith(pieces)]
-    return row.removeprefix(pieces).split()[:3]
+def numbers(out: str, jobs: str) -> list[str]:
+    """Needed, done and to do, of a kind of jobs in a plan."""
+    [row] = [line for line in out.splitlines() if line.startswith(jobs)]
+    return row.removeprefix(jobs).split()[:3]
 
 
-def test_a_dry_run_prints_the_plan_and_makes_nothing(call: Call, tmp_path: Path) -> None:
+def test_a_dry_run_prints_the_plan_and_writes_nothing(call: Call, tmp_path: Path) -> None:
     status, out, err = call("reproduce", "seen", "--scale", "tiny", "--dry-run", "--out", tmp_path / "root")
     assert (status, err) == (0, "")
     assert numbers(out, "datasets of random transitions") == ["8", "0", "8"]
-    # Twelve tasks and eleven methods, of which four do not ask for the group that four tasks are in twice.
-    assert numbers(out, "downstream runs") == [str(12 * 11 - 4 * 4), "0", str(12 * 11 - 4 * 4)]
-    assert "at a time" in out
+    # Twelve tasks and twelve methods, of which four do not ask for the group that four tasks are in twice.
+    assert numbers(out, "downstream runs") == [str(12 * 12 - 4 * 4), "0", str(12 * 12 - 4 * 4)]
+    assert "2,080" in next(line for line in out.splitlines() if line.startswith("datasets"))  # env steps
+    assert "the disk needs" in out
+    assert "Runs behind each score: 1; the paper has 6" in out
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_part_of_an_experiment_has_a_smaller_plan(call: Call, tmp_path: Path) -> None:
-    part = (
-        "--methods",
-        "crptpro",
-        "random-encoder",
-        "--groups",
-        "A",
-        "--tasks",
-        "walker_run",
-        "--seeds",
-        3,
-        4,
-    )
-    asked = ("reproduce", "seen", "--scale", "tiny", *part, "--encoder-seeds", 0, 1)
-    _, out, _ = call(*asked, "--dry-run", "--out", tmp_path)
+    part = ("--methods", "crptpro", "random-encoder", *PART, "--seeds", 3, 4, 5, "--encoder-seeds", 0, 1)
+    _, out, _ = call("reproduce", "seen", "--scale", "tiny", *part, "--dry-run", "--out", tmp_path)
     assert numbers(out, "downstream runs") == [
-        "8",
+        "12",
         "0",
-        "8",
-    ]  # two methods, two encoders each, two runs on each
+        "12",
+    ]  # two methods, two encoders each, three runs on each
+    assert "Runs behind" not in out
 
 
-def test_what_an_experiment_does_not_read_is_said(call: Call, tmp_path: Path) -> None:
-    options = ("--scale", "tiny", "--groups", "A", "--dry-run", "--out", tmp_path)
-
-    def idle(*arguments: object) -> str:
-        status, out, _ = call("reproduce", *arguments, *options)
-        assert status == 0
-        return "".join(line for line in out.splitlines() if line.startswith("Without effect on "))
-
-    named = idle("seen", "--tasks", "walker_run", "hopper_hop", "--methods", "crptpro")
-    assert named == "Without effect on seen: --tasks hopper_hop."
-    named = idle("prototypes", "--methods", "atc", "crptpro", "--seeds", 5)
-    assert named == "Without effect on prototypes: --methods atc, --seeds 5."
-    assert idle("efficiency", "--tasks", "hopper_hop").endswith("--tasks hopper_hop.")
-    assert idle("seen", "--colors-by", "image", "--seeds", 3).endswith("seen: --colors-by image.")
-    # What one of several reads has an effect.
-    assert (
-        idle("seen", "prototypes", "--methods", "atc", "crptpro", "--tasks", "walker_run", "--seeds", 0) == ""
+@pytest.mark.parametrize(("arguments", "idle"), [
+    (("seen", "--tasks", "walker_run", "hopper_hop", "--methods", "crptpro"), "seen: --tasks hopper_hop."),
+    (("prototypes", "--methods", "atc", "crptpro", "--seeds", 5), "prototypes: --methods atc, --seeds 5."),
+    (("seen", "--colors-by", "image", "--seeds", 3), "seen: --colors-by image."),
+    (("seen", "prototypes", "--methods", "atc", "crptpro", "--tasks", "walker_run", "--seeds", 0), ""),
+])  # fmt: skip
+def test_what_an_experiment_does_not_read_is_said(
+    call: Call, tmp_path: Path, arguments: tuple[object, ...], idle: str
+) -> None:
+    status, out, _ = call(
+        "reproduce", *arguments, "--scale", "tiny", "--groups", "A", "--dry-run", "--out", tmp_path
     )
+    said = [
+        line.removeprefix("Without effect on ")
+        for line in out.splitlines()
+        if line.startswith("Without effect")
+    ]
+    assert (status, said) == (0, [idle] if idle else [])
 
 
 def test_all_means_the_experiments_that_have_something_of_what_is_asked_for(
@@ -91,36 +79,32 @@ def test_all_means_the_experiments_that_have_something_of_what_is_asked_for(
     status, out, _ = call("reproduce", "all", "--groups", "B", *options)
     assert status == 0
     assert "Nothing of unseen, colors is among" in out
-    assert "\nseen, " in out
-    nothing = ("--methods", "drq", "--groups", "B", "--tasks", "quadruped_run")
-    line = refused(call("reproduce", "all", *nothing, *options))
-    assert "Nothing of seen, unseen" in line
     line = refused(call("reproduce", "all", "colors", "--groups", "B", *options))
     assert "Nothing of unseen, colors" in line
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
-    (("sen", "--scale", "tiny"), "no experiment 'sen'. Did you mean 'seen'?"),
-    (("seen", "--scale", "tiny", "--methods", "atcc"), "'atcc'"),
-    (("seen", "--scale", "tiny", "--groups", "E"), "no group 'E'"),
-    (("seen", "--scale", "tiny", "--groups", "A", "--tasks", "hopper_hop"), "Nothing of seen"),
-    (("seen", "--scale", "tiny", "--partition", "gpu"), "--partition is for --launcher slurm; --launcher local does"),
-    (("seen", "--scale", "tiny", "--launcher", "slurm", "--ray-address", "x:1"), "--ray-address is for --launcher ray"),
-    (("seen", "--scale", "tiny", "--launcher", "inline", "--jobs", "2"), "one piece at a time, not --jobs 2"),
-    (("seen", "--scale", "tiny", "--jobs-per-gpu", "2"), "--jobs-per-gpu is for --device cuda, not cpu"),
-    (("seen", "--scale", "tiny", "--launcher", "ray", "--device", "cuda:1"), "write --device cuda, not cuda:1"),
-    (("seen", "--scale", "tiny", "--jobs", "0"), "--jobs must be at least 1, got 0"),
-    (("seen", "--scale", "tiny", "--attempts", "0"), "--attempts must be at least 1, got 0"),
-    (("seen", "--scale", "tiny", "--device", "cuda:99"), "cuda:99"),
-    (("seen", "--scale", "tiny", "--launcher", "slurm", "--hours", "0"), "--hours must be at least a minute"),
-    (("seen", "--scale", "tiny", "--launcher", "slurm", "--memory-gb", "0.1"), "--memory-gb must be at least 1"),
-    (("seen", "--scale", "tiny", "--launcher", "slurm", "--sbatch", "qos"), "--sbatch qos: write key=value"),
+    (("sen",), "no experiment 'sen'. Did you mean 'seen'?"),
+    (("seen", "--methods", "atcc"), "'atcc'"),
+    (("seen", "--groups", "E"), "no group 'E'"),
+    (("seen", "--groups", "A", "--tasks", "hopper_hop"), "Nothing of seen"),
+    (("seen", "--partition", "gpu"), "--partition is for --launcher slurm; --launcher local does"),
+    (("seen", "--launcher", "slurm", "--ray-address", "x:1"), "--ray-address is for --launcher ray"),
+    (("seen", "--launcher", "inline", "--jobs", "2"), "one job at a time, not --jobs 2"),
+    (("seen", "--jobs-per-gpu", "2"), "--jobs-per-gpu is for --device cuda, not cpu"),
+    (("seen", "--launcher", "ray", "--device", "cuda:1"), "write --device cuda, not cuda:1"),
+    (("seen", "--jobs", "0"), "--jobs must be at least 1, got 0"),
+    (("seen", "--attempts", "0"), "--attempts must be at least 1, got 0"),
+    (("seen", "--device", "cuda:99"), "cuda:99"),
+    (("seen", "--launcher", "slurm", "--hours", "0"), "--hours must be at least a minute"),
+    (("seen", "--launcher", "slurm", "--memory-gb", "0.1"), "--memory-gb must be at least 1"),
+    (("seen", "--launcher", "slurm", "--sbatch", "qos"), "--sbatch qos: write key=value"),
+    (("seen", "--out", ""), "`out` is empty"),
 ])  # fmt: skip
 def test_a_request_that_cannot_be_met_leaves_nothing_behind(
     call: Call, tmp_path: Path, arguments: tuple[str, ...], message: str
 ) -> None:
-    line = refused(call("reproduce", *arguments, "--out", tmp_path / "root"))
-    assert message in line
+    assert message in refused(call("reproduce", "--scale", "tiny", "--out", tmp_path / "root", *arguments))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -128,172 +112,170 @@ def test_without_the_extra_nothing_is_written(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    status, out, err = call(
-        "reproduce", "seen", "--scale", "tiny", "--launcher", "ray", "--out", tmp_path / "root"
-    )
+    part = ("--scale", "tiny", *PART, "--launcher", "ray")
+    status, out, err = call("reproduce", "seen", *part, "--out", tmp_path / "root")
     assert status == 1
     assert "downstream runs" in out
     assert "pip install 'crptpro[ray]'" in err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_failures_are_listed_also_where_an_error_ends_the_command(
-    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def ended(plan: Plan, *_: object, failures: list[Failure], **__: object) -> None:
-        failures.append(Failure(plan.missing[0], "it will never do", tmp_path / "log.txt", 1))
-        raise CRPTproError("There is no queue any more.")
-
-    monkeypatch.setattr("crptpro.experiments.launching.run_pieces", ended)
-    options = ("--scale", "tiny", "--groups", "A", "--launcher", "inline", "--out", tmp_path / "root")
-    status, out, err = call("reproduce", "seen", *options)
-    assert status == 1
-    assert "1 failed:" in out
-    assert "it will never do" in out
-    assert "There is no queue any more." in err
-
-
 def test_a_plan_that_the_disk_cannot_hold_is_refused(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shutil.disk_usage", lambda path: type("Usage", (), {"free": 10**9})())
-    status, _, err = call(
-        "reproduce", "seen", "--scale", "paper", "--launcher", "inline", "--out", tmp_path / "root"
-    )
+    part = ("--scale", "paper", "--launcher", "inline")
+    status, _, err = call("reproduce", "seen", *part, "--out", tmp_path / "root")
     assert status == 1
     assert "has 1.00 GB free" in err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_colours_are_reversed_by_background_or_image(
+def test_failures_are_listed_with_their_logs_also_where_an_error_ends_the_command(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    usual, asked = EXPERIMENTS["colors"], []
+    def ended(plan: Plan, *_: object, failures: list[Failure], **__: object) -> None:
+        failures += [
+            Failure("run-a", "it will never do", tmp_path / "log.txt", 3), Failure("run-b", "needs run-a"),
+        ]  # fmt: skip
+        raise CRPTproError("There is no queue any more.")
 
-    def goals(request: Request) -> list[Goal]:
-        asked.append({goal.piece.colors for goal in usual.goals(request)})  # type: ignore[attr-defined]
-        return usual.goals(request)
-
-    monkeypatch.setitem(EXPERIMENTS, "colors", replace(usual, goals=goals))
-    part = ("--methods", "random-encoder", "--scale", "tiny")
-    for by in ("background", "image"):
-        asked.clear()
-        assert call("reproduce", "colors", *part, "--colors-by", by, "--dry-run", "--out", tmp_path)[0] == 0
-        assert asked[0] == {f"reversed_{by}"}
-
-
-# --- an experiment that takes seconds -----------------------------------------------------------------------------
+    monkeypatch.setattr("crptpro.experiments.launch.run_jobs", ended)
+    options = ("--scale", "tiny", *PART, "--launcher", "inline", "--out", tmp_path / "root")
+    status, out, err = call("reproduce", "seen", *options)
+    assert status == 1
+    assert f"1 failed:\n  run-a (tried 3 times)\n    it will never do\n    log: {tmp_path}/log.txt\n" in out
+    assert "1 not started, because they need one that failed:\n  run-b" in out
+    assert "There is no queue any more." in err
 
 
-class Command:
-    """The command in a process of its own, the first of a process group as in a terminal."""
-
-    def __init__(self, root: Path, *arguments: object) -> None:
-        command = [sys.executable, "-c", MAIN, "--plugin", FAKE_EXPERIMENT, "reproduce", *arguments]
-        source = str(Path(crptpro.__file__).parents[1])
-        path = os.pathsep.join([source, os.environ.get("PYTHONPATH", "")])
-        self.root = root
-        self.process = subprocess.Popen(
-            [*map(str, command), "--scale", "tiny", "--out", str(root)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-            env={**os.environ, "PYTHONPATH": path},
-        )
-
-    def end(self) -> tuple[int, str, str]:
-        out, err = self.process.communicate(timeout=120)
-        return self.process.returncode, out, err
-
-    def counts(self) -> dict[str, int]:
-        return {
-            path.parent.name.split("-")[1]: int(path.read_text())
-            for path in self.root.glob("pieces/*/count.txt")
-        }
-
-    def jobs_of(self, *names: str) -> list[psutil.Process]:
-        """All processes that the command has started, once the jobs of these pieces have begun."""
-        deadline = time.monotonic() + 90
-        while time.monotonic() < deadline and not set(names) <= set(self.counts()):
-            time.sleep(0.05)
-        return psutil.Process(self.process.pid).children(recursive=True)
+def test_what_a_terminal_cannot_show_degrades(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", terminal)
+    root = tmp_path / "Läufe"
+    arguments = ("reproduce", "seen", "--scale", "tiny", *PART, "--dry-run", "--out", str(root))
+    monkeypatch.setattr(sys, "argv", ["crptpro", *arguments])
+    main()
+    terminal.flush()
+    assert rb"L\xe4ufe" in terminal.buffer.getvalue()  # type: ignore[attr-defined]
 
 
-def alive(processes: list[psutil.Process], *, within_s: float) -> list[psutil.Process]:
-    """Those that have not ended by then; nobody may be there to collect orphans."""
-    deadline = time.monotonic() + within_s
-    while (left := [p for p in processes if _lives(p)]) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    return left
+# --- a reproduction -------------------------------------------------------------------------------------------------
 
 
-def _lives(process: psutil.Process) -> bool:
-    try:
-        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False
+def reproduce(root: Path, *arguments: str) -> int:
+    """Run a part of a tiny reproduction in this process; returns the exit status."""
+    part = ("--scale", "tiny", *PART, "--launcher", "inline", "--cores-per-job", "1", "--attempts", "1")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["crptpro", "reproduce", *arguments, *part, "--out", str(root)])
+        try:
+            main()
+        except SystemExit as end:
+            return int(end.code or 0)
+    return 0
 
 
-def begun(root: Path) -> dict[str, list[int]]:
-    """What the attempts at each long piece counted on from."""
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A reduced reproduction: every kind of job but fine-tuning, which ``seen`` would add in the same way."""
+    root = tmp_path_factory.mktemp("tiny")
+    methods = ("crptpro", "crptpro-no-bonus", "drq", "random-encoder")
+    assert reproduce(root, "seen", "--methods", *methods) == 0
+    assert reproduce(root, "prototypes", "coverage", "visualize", "--methods", "crptpro", "proto-rl-s") == 0
+    assert reproduce(root, "efficiency", "--methods", "crptpro", "proto-rl-s") == 0
+    assert reproduce(root, "probe", "--methods", "random-encoder") == 0
+    return root
+
+
+def files(root: Path, kind: str, name: str, **facts: Any) -> list[Path]:
+    jobs = load_results(root).jobs
+    chosen = jobs[(jobs.kind == kind) & jobs.done]
+    return [path / name for path, f in zip(chosen.path, chosen.facts) if facts.items() <= f.items()]
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+def test_every_cell_of_a_reproduction_is_filled(tiny: Path) -> None:
+    results = load_results(tiny)
+    assert results.cells.done.all()
+    assert results.jobs.done.all()
+    assert set(results.cells.label[results.cells.experiment == "seen"]) == {
+        "crptpro", "crptpro-no-bonus", "drq", "random-encoder",
+    }  # fmt: skip
+    for path in results.jobs.path:
+        assert (path / "log.txt").read_text().splitlines()[-1] == "finished"
+        assert not {"checkpoints", "clock.json", "timed"} & {each.name for each in path.iterdir()}
+    for path, facts in zip(*(results.jobs[results.jobs.kind == "run"][name] for name in ("path", "facts"))):
+        rows = read_rows(path / "eval.csv")
+        assert {int(row["env_steps"]) for row in rows} == {0, 60}
+        assert {row["method"] for row in rows} == {facts["method"].removesuffix("-no-bonus")}
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+def test_the_same_command_finds_everything_finished(tiny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in tiny.glob("jobs/*/*")}
+    assert reproduce(tiny, "seen", "--methods", "crptpro", "drq") == 0
+    out = capsys.readouterr().out
+    assert numbers(out, "downstream runs") == ["2", "2", "0"]
+    assert "All of it is there" in out
+    assert {path: path.stat().st_mtime_ns for path in tiny.glob("jobs/*/*")} == before
+    labels = [
+        cell["label"] for cell in json.loads((tiny / "experiments" / "seen-tiny.json").read_text())["cells"]
+    ]
+    assert set(labels) == {
+        "crptpro",
+        "crptpro-no-bonus",
+        "drq",
+        "random-encoder",
+    }  # nothing asked for before is lost
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+def test_measurements_of_encoders_and_data(tiny: Path) -> None:
+    for path in files(tiny, "prototypes", "prototypes.csv"):
+        rows = read_rows(path)
+        assert int(rows[-1]["updates"]) > 0
+        assert all(math.isfinite(float(rows[-1][name])) for name in ("ane", "kne_3", "kne_half", "intr"))
+    assert {f["has_dispersion"] for p in files(tiny, "prototypes", "prototypes.csv") for f in read_rows(p)} == {
+        "True", "False",
+    }  # fmt: skip
+    [covered] = files(tiny, "coverage", "coverage.csv")
+    frame = pd.read_csv(covered)
+    assert set(frame.source) == {"random", "explorer"}
+    assert (frame.coverage > 0).all()
+    assert set(frame.domain) == {"walker"}
+    [embedded] = files(tiny, "embeddings", "embeddings.csv")
+    points = pd.read_csv(embedded)
+    assert points.source.value_counts().to_dict() == dict.fromkeys(
+        ("cheetah random", "walker random", "quadruped random", "walker explorer"), 8
+    )
+    explained = read_json(embedded.with_name("explained.json"))["explained_variance_ratio"]
+    assert 0 < sum(explained) <= 1
+    probes = files(tiny, "probe", "probe.csv", method="random-encoder")
+    assert len(probes) == 2
+    rows = [row for path in probes for row in read_rows(path)]
+    assert {row["colors"] for row in rows} == {"normal", "reversed_background"}
+    assert tuple(rows[0]) == PROBE_COLUMNS
+    assert {row["embedding"] for row in rows} == {"features", "z"}
+    assert {row["seen"] for row in rows} == {"no"}
+
+
+@pytest.mark.slow
+@pytest.mark.gl
+def test_timings_are_projected_to_whole_budgets(tiny: Path) -> None:
     found = {}
-    for path in root.glob("pieces/*/attempts.txt"):
-        name = path.parent.name.split("-")[1]
-        found[name] = [int(line.split()[0].removeprefix("from=")) for line in path.read_text().splitlines()]
-    return {name: values for name, values in found.items() if name in ("crptpro", "atc")}
-
-
-@pytest.mark.slow
-def test_ctrl_c_stops_the_jobs_at_a_checkpoint_and_the_same_command_continues(tmp_path: Path) -> None:
-    root = tmp_path / "root"
-    first = Command(root, "fake", "--jobs", 2)
-    jobs = first.jobs_of("crptpro", "atc")
-    os.killpg(first.process.pid, signal.SIGINT)  # as a terminal does
-    status, out, err = first.end()
-    assert status == 130, err
-    assert "the same command continues" in err
-    assert not alive(jobs, within_s=1)
-    counts = first.counts()
-    assert 1 <= counts["crptpro"] < 40
-    assert not list(root.glob("pieces/*/*.partial"))
-    assert len(list(root.glob("pieces/*/done.json"))) == 1
-    asked = json.loads((root / "experiments" / "fake-tiny.json").read_text())
-    assert [goal["label"] for goal in asked["goals"]] == ["crptpro", "atc"]
-
-    status, out, err = Command(root, "fake", "--jobs", 2).end()
-    assert status == 0, err
-    assert f"crptpro report {root}" in out
-    # The jobs wrote a checkpoint when they were stopped, and went on from it.
-    assert begun(root) == {name: [0, counts[name]] for name in ("crptpro", "atc")}
-
-
-@pytest.mark.slow
-def test_jobs_whose_command_was_killed_leave_a_checkpoint_and_the_same_command_continues(
-    tmp_path: Path,
-) -> None:
-    root = tmp_path / "root"
-    first = Command(root, "fake", "--jobs", 2)
-    jobs = first.jobs_of("crptpro", "atc")
-    assert len(jobs) >= 2
-    first.process.kill()
-    first.process.wait()
-    assert not alive(jobs, within_s=10)
-    counts = first.counts()
-    assert 1 <= counts["crptpro"] < 40
-    assert not list(root.glob("pieces/*/*.partial"))
-    assert "is gone" in next(root.glob("pieces/*-crptpro-*/log.txt")).read_text()
-    status, _, err = Command(root, "fake", "--jobs", 2).end()
-    assert status == 0, err
-    assert begun(root) == {name: [0, counts[name]] for name in ("crptpro", "atc")}
-
-
-@pytest.mark.slow
-def test_failures_are_listed_with_their_logs_and_the_exit_status_says_so(tmp_path: Path) -> None:
-    status, out, err = Command(tmp_path / "root", "broken", "--launcher", "local").end()
-    assert status == 1, err
-    assert "1 failed:" in out
-    assert "missing-data will never do." in out
-    [log] = [Path(line.split("log: ")[1]) for line in out.splitlines() if "log: " in line]
-    assert "error: missing-data will never do." in log.read_text()
-    assert "1 skipped" in out
+    for path in files(tiny, "timing", "timing.csv"):
+        [row] = read_rows(path)
+        found[row["method"], int(row["domains"])] = row
+    assert set(found) == {(method, count) for method in ("crptpro", "proto-rl-s") for count in (1, 2, 3)}
+    for (method, count), row in found.items():
+        assert float(row["seconds_per_update"]) > 0
+        per_budget = float(row["seconds_per_update"]) * int(row["budget_updates"])
+        assert float(row["projected_hours"]) == pytest.approx(per_budget / 3600)
+        assert int(row["encoder_updates"]) >= 2
+        assert (int(row["decisions"]) > 0) == (method == "proto-rl-s")
+        assert row["paper_projected_hours"] == ""  # this scale does not time the paper's batches
+        assert int(row["paper_updates"]) == (50_000 if method == "crptpro" else count * 124_500)
+        assert (row["collection_seconds"] != "") == (method == "crptpro")

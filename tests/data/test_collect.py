@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import logging
-import multiprocessing.connection
 import os
 import random
 import signal
@@ -12,216 +11,292 @@ import textwrap
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from torchrl.modules import RandomPolicy
+from toy_gymnasium import PAINTER
 from toy_world import (
     DYING,
     FAILING,
     FIXED,
     HANGING,
+    SLOW,
     VARIABLE,
     ToyEnv,
+    collect_toy,
     data_bytes,
-    fixed_length,
-    run_in_order,
     variable_length,
 )
-from toy_world import collection_request as request
 
-from crptpro.data import FrameDataset, collect_group, collect_random
-from crptpro.data.collect_worker import EpisodeRoller
-from crptpro.data.collection import DomainCollection
-from crptpro.data.incoming import INCOMING, dataset_path, write_incoming
-from crptpro.errors import CRPTproError, DatasetError, DiskSpaceError, RenderingError, WorkerLostError
+from crptpro.data import FrameDataset, collect, collect_group, collect_random
+from crptpro.data.collect import dataset_path
+from crptpro.domains import Domain
+from crptpro.envs import make_env, rendering
+from crptpro.errors import (
+    CRPTproError,
+    DatasetError,
+    DiskSpaceError,
+    RenderingError,
+    WorkerLostError,
+    WorldFailedError,
+)
 from crptpro.seeding import derive_seed
 
-HERE = Path(__file__).parent
-SMALL = {"image_size": 8, "progress": False}
+SMALL: dict[str, Any] = {"image_size": 8, "progress": False}
+ASKED: dict[str, Any] = {"transitions": 65, "seed": 3, **SMALL}
+FIRST_REVISION = {
+    "toy-fixed": [
+        2961366900, 1284719691, 1983237467, 1242808112, 4291167092, 2937522498, 3541912588,
+    ],
+    "toy-variable": [
+        1040481690, 2348184973, 1751305901, 303258704, 940671958, 4116191101, 570147265,
+        1315976133, 2738915121, 4239802705,
+    ],
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
-def collected(tmp_path_factory):
-    """Two domains, one with episodes of unknown length, by one process."""
-    return collect_group([FIXED, VARIABLE], tmp_path_factory.mktemp("one"), transitions=65, seed=3, **SMALL)
+def collected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Two domains, one with episodes of unknown length, in this process."""
+    return collect_group([FIXED, VARIABLE], tmp_path_factory.mktemp("one"), **ASKED)
 
 
-def test_the_number_of_workers_does_not_change_the_data(collected, tmp_path):
-    again = collect_group([VARIABLE, FIXED], tmp_path, transitions=65, seed=3, workers=2, **SMALL)
+# --- the data
+
+
+def test_the_same_seed_gives_the_data_that_earlier_revisions_collected(collected: dict[str, Path]) -> None:
+    """Checksums of the first revision: committed datasets name theirs."""
+    cards = {name: FrameDataset.open(path).card for name, path in collected.items()}
+    assert cards["toy-fixed"]["crc32"] == FIRST_REVISION["toy-fixed"]
+    assert cards["toy-variable"]["crc32"] == FIRST_REVISION["toy-variable"]
+
+
+@pytest.mark.slow
+def test_the_number_of_workers_does_not_change_the_data(collected: dict[str, Path], tmp_path: Path) -> None:
+    again = collect_group([VARIABLE, FIXED], tmp_path, workers=2, **ASKED)
     for name, path in collected.items():
         assert data_bytes(again[name]) == data_bytes(path)
 
 
-def test_an_episode_is_what_its_seeds_say(collected):
+def test_an_episode_is_what_its_seeds_say_whatever_was_drawn_before(collected: dict[str, Path]) -> None:
     dataset = FrameDataset.open(collected["toy-variable"])
-    env = ToyEnv(lambda seed: 3 + seed % 9, seed=derive_seed(3, "collect", "toy-variable", 2))
+    env = ToyEnv(variable_length, seed=derive_seed(3, "collect", "toy-variable", 2))
     env.reset()
     torch.manual_seed(derive_seed(3, "collect-actions", "toy-variable", 2))
-    inside = dataset.transitions["episode"] == 2
-    rollout = env.rollout(100)  # draws its actions as RandomPolicy does
-    assert torch.equal(dataset[inside]["action"], rollout["action"])
-    assert torch.equal(dataset[inside]["next", "pixels"][:, -3:], rollout["next", "pixels"])
+    rollout = env.rollout(100)
+    stored = dataset[dataset.transitions["episode"] == 2]
+    assert torch.equal(stored["action"], rollout["action"])
+    assert torch.equal(stored["next", "pixels"][:, -3:], rollout["next", "pixels"])
 
 
-def test_the_last_episode_is_cut_to_the_transitions_asked_for(collected):
+def test_the_global_generators_are_left_as_they_were(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    expected = torch.rand(3)
+    torch.manual_seed(0)
+    collect_random(FIXED, tmp_path, transitions=12, **SMALL)
+    assert torch.equal(torch.rand(3), expected)
+
+
+def test_the_last_episode_is_cut_to_the_transitions_asked_for(collected: dict[str, Path]) -> None:
     dataset = FrameDataset.open(collected["toy-fixed"])
-    assert len(dataset) == 65
-    assert dataset.card["last_episode_cut"]
-    assert dataset.card["episodes"] == 7
-    last = dataset[-1]
-    assert (last["step"].item(), last["next", "truncated"].item(), last["next", "terminated"].item()) == (
-        4,
-        True,
-        False,
-    )
-    natural = dataset[9]
-    assert natural["next", "truncated"].item()
+    last, following = dataset[-1], dataset[-1]["next"]
+    assert (len(dataset), dataset.card["episodes"], dataset.card["last_episode_cut"]) == (65, 7, True)
+    flags = (following["truncated"].item(), following["terminated"].item())
+    assert (last["step"].item(), *flags) == (4, True, False)
     dataset.verify()
 
 
-def test_actions_are_uniform(collected):
-    actions = FrameDataset.open(collected["toy-fixed"]).transitions["action"]
+def test_actions_are_uniform_and_physics_is_stored_beside_each_frame(collected: dict[str, Path]) -> None:
+    dataset = FrameDataset.open(collected["toy-fixed"])
+    actions = dataset.transitions["action"]
     assert actions.abs().max() <= 1
     assert actions.mean().abs() < 0.2
     assert ((actions**2).mean() - 1 / 3).abs() < 0.1
-
-
-def test_physics_is_stored_beside_each_frame(collected):
-    dataset = FrameDataset.open(collected["toy-fixed"])
     physics = dataset.physics_at(torch.arange(11))
     assert physics["qpos"][:, 0].tolist() == list(range(11))
     assert physics["qvel"].unique().item() == derive_seed(3, "collect", "toy-fixed", 0)
 
 
-def test_a_complete_dataset_is_returned_as_it_is(collected, caplog):
-    written = {path: path.stat().st_mtime_ns for path in collected["toy-fixed"].rglob("*")}
-    with caplog.at_level(logging.INFO, "crptpro"):
-        again = collect_group([FIXED], collected["toy-fixed"].parent, transitions=65, seed=3, **SMALL)
-    assert {path: path.stat().st_mtime_ns for path in collected["toy-fixed"].rglob("*")} == written
-    assert again == {"toy-fixed": collected["toy-fixed"]}
-    assert "is complete" in caplog.text
+def endless(seed: int) -> int:
+    return 10**9
 
 
-@pytest.mark.parametrize(("asked", "message"), [
-    ({"seed": 4}, "seed 3 there, 4 asked for"),
-    ({"transitions": 70}, "transitions 65 there, 70 asked for"),
-    ({"quality": "fast"}, "quality 'exact' there, 'fast' asked for"),
-    ({"image_size": 9}, "image_size 8 there, 9 asked for"),
-])  # fmt: skip
-def test_another_request_for_the_same_place_is_refused(collected, asked, message):
-    request = {"transitions": 65, "seed": 3, **SMALL} | asked
-    with pytest.raises(DatasetError, match=f"{message}.*choose another directory"):
-        collect_random(FIXED, collected["toy-fixed"].parent, **request)
+def make_endless(*, seed: int, image_size: int) -> ToyEnv:
+    return ToyEnv(endless, seed=seed, image_size=image_size)
 
 
-def test_a_directory_with_something_else_is_left_alone(tmp_path):
-    (tmp_path / "toy-fixed").mkdir()
-    (tmp_path / "toy-fixed" / "thesis.tex").write_text("x")
-    with pytest.raises(DatasetError, match="not empty and not a collection"):
-        collect_random(FIXED, tmp_path, transitions=5, **SMALL)
-    assert [file.name for file in (tmp_path / "toy-fixed").iterdir()] == ["thesis.tex"]
-
-
-def test_nobody_else_may_collect_into_the_same_place(tmp_path):
-    collection = DomainCollection(tmp_path / "toy", request())
-    with pytest.raises(DatasetError, match="Another process is writing"):
-        DomainCollection(tmp_path / "toy", request())
-    collection.close()
-    DomainCollection(tmp_path / "toy", request()).close()
-
-
-def test_what_the_disk_cannot_hold_is_refused_before_anything_is_written(tmp_path):
-    with pytest.raises(DiskSpaceError, match=r"Collecting toy-fixed, toy-variable needs .* GB"):
-        collect_group([FIXED, VARIABLE], tmp_path, transitions=10**9)
-    assert not list(tmp_path.rglob("*.memmap"))
-
-
-def test_two_tasks_of_one_domain_are_not_mixed(tmp_path):
-    with pytest.raises(DatasetError, match="Two of the domains"):
-        collect_group([FIXED, replace(FIXED, task="toy_other")], tmp_path, transitions=5, **SMALL)
-
-
-def test_what_two_letters_share_is_collected_once(tmp_path, monkeypatch):
-    letters = {"X": (FIXED,), "Y": (FIXED, VARIABLE)}
-    monkeypatch.setattr("crptpro.domains.GROUPS", letters)
-    paths = collect_group(["X", "Y"], tmp_path, transitions=5, **SMALL)
-    assert list(paths) == [FIXED.name, VARIABLE.name]
-
-
-def test_a_domain_name_makes_a_safe_directory(tmp_path):
-    assert dataset_path(tmp_path, "gymnasium:Half/Cheetah-v5") == tmp_path / "gymnasium-Half-Cheetah-v5"
-
-
-def test_a_failing_environment_gives_one_clear_error(tmp_path):
-    with pytest.raises(CRPTproError, match=r"episode 0 of toy-failing.*failed: the simulator exploded"):
-        collect_random(FAILING, tmp_path, transitions=50, **SMALL)
-
-
-def test_a_dying_process_gives_one_clear_error(tmp_path):
-    with pytest.raises(
-        WorkerLostError, match=r"episode 0 of toy-dying.* exited with status 7.*run the same command"
-    ):
-        collect_random(DYING, tmp_path, transitions=50, **SMALL)
-
-
-def test_a_process_that_dies_in_the_middle_of_a_message_gives_one_clear_error(tmp_path, monkeypatch):
-    def torn(connection):
-        raise OSError("got end of file during message")
-
-    monkeypatch.setattr(multiprocessing.connection.Connection, "recv", torn)
-    with pytest.raises(CRPTproError, match="Every finished episode is kept: run the same command again"):
-        collect_random(DYING, tmp_path, transitions=50, **SMALL)
-
-
-def test_a_hanging_process_is_noticed_and_ended(tmp_path):
-    with pytest.raises(RenderingError, match=r"episode 0 of toy-hanging.*no sign of life.*MUJOCO_GL"):
-        collect_random(HANGING, tmp_path, transitions=50, stall_timeout_s=5, **SMALL)
-
-
-@pytest.mark.parametrize("usual_length", [None, 10, 4, 50])
-def test_order_of_arrival_and_wrong_lengths_do_not_change_the_data(tmp_path, usual_length):
-    reference = DomainCollection(tmp_path / "reference", request(), 10)
-    run_in_order(reference, 0)
-    for order in range(4):
-        path = tmp_path / str(order)
-        collection = DomainCollection(path, request(), usual_length)
-        run_in_order(collection, order)
-        assert data_bytes(path) == data_bytes(tmp_path / "reference")
-        assert not (path / INCOMING).exists()
-
-
-def test_no_more_is_stepped_than_needed_when_the_length_is_known(tmp_path):
-    jobs = run_in_order(DomainCollection(tmp_path, request(), 10), 0)
-    assert [job.limit for job in jobs] == [27, 17, 7]
-
-
-def test_an_endless_episode_is_cut(tmp_path, monkeypatch):
-    monkeypatch.setattr("crptpro.data.collection.LONGEST_EPISODE_AGENT_STEPS", 12)
-    run_in_order(DomainCollection(tmp_path, request()), 0, lambda seed: 10**9)
-    dataset = FrameDataset.open(tmp_path)
+def test_an_endless_episode_is_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collect, "LONGEST_EPISODE_AGENT_STEPS", 12)
+    domain = Domain("endless", "endless_go", make=make_endless)
+    dataset = FrameDataset.open(collect_random(domain, tmp_path, transitions=27, **SMALL))
     assert dataset.transitions["next", "truncated"].squeeze(-1).nonzero().flatten().tolist() == [11, 23, 26]
     assert not dataset.transitions["next", "terminated"].any()
 
 
-def test_an_episode_that_waits_for_an_earlier_one_survives_a_kill(tmp_path):
-    reference = DomainCollection(tmp_path / "reference", request(), 10)
-    run_in_order(reference, 0)
-    collection = DomainCollection(tmp_path / "killed", request(), 10)
-    roller = EpisodeRoller(lambda: ToyEnv(fixed_length))
-    jobs = [collection.next_job() for _ in range(3)]
-    collection.accept(0, roller.roll(jobs[0]))
-    collection.accept(2, roller.roll(jobs[2]))
-    collection.close()
-    write_incoming(tmp_path / "killed", 5, roller.roll(jobs[2]))
-    (tmp_path / "killed" / INCOMING / "000005.npz").write_bytes(b"torn")
-    resumed = DomainCollection(tmp_path / "killed", request(), 10)
-    job = resumed.next_job()
-    assert job == jobs[1]
-    assert resumed.next_job() is None
-    resumed.accept(1, roller.roll(job))
-    roller.close()
-    assert resumed.is_complete
-    assert data_bytes(tmp_path / "killed") == data_bytes(tmp_path / "reference")
+@pytest.mark.parametrize("order", range(4))
+def test_the_order_in_which_episodes_finish_does_not_change_the_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, collected: dict[str, Path], order: int
+) -> None:
+    class Shuffled(collect._ThisProcess):
+        """Three episodes under way, of which any may be the next to finish."""
+
+        def __init__(self, factories: Any, workers: int):
+            super().__init__(factories)
+            self.steps += [0] * (workers - 1)
+            self.random = random.Random(order)
+
+        def finished(self, running: Any) -> list[Any]:
+            return [self.random.choice(list(running))]
+
+    monkeypatch.setattr(collect, "_Pool", Shuffled)
+    again = collect_group([VARIABLE, FIXED], tmp_path, workers=3, **ASKED)
+    for name, path in collected.items():
+        assert data_bytes(again[name]) == data_bytes(path)
+
+
+# --- requests
+
+
+def test_a_complete_dataset_is_returned_as_it_is(
+    collected: dict[str, Path], caplog: pytest.LogCaptureFixture
+) -> None:
+    path = collected["toy-fixed"]
+    written = {file: file.stat().st_mtime_ns for file in path.rglob("*")}
+    with caplog.at_level(logging.INFO, "crptpro"):
+        assert collect_group([FIXED], path.parent, **ASKED) == {"toy-fixed": path}
+    assert {file: file.stat().st_mtime_ns for file in path.rglob("*")} == written
+    assert "is complete" in caplog.text
+    with pytest.raises(DatasetError, match=r"image_size 8 there, 9 asked for.*choose another directory"):
+        collect_random(FIXED, path.parent, **ASKED | {"image_size": 9})
+
+
+def test_numbers_are_taken_as_they_are_meant_and_the_dataset_can_be_read(tmp_path: Path) -> None:
+    meant = {
+        "transitions": 1e1,
+        "seed": np.int64(3),
+        "action_repeat": torch.tensor(1),
+        "image_size": np.float32(8),
+    }
+    path = collect_random(FIXED, tmp_path, workers=np.int32(1), progress=False, **meant)
+    card = FrameDataset.open(path).card
+    assert [card[name] for name in meant] == [10, 3, 1, 8]
+    assert collect_random(FIXED, tmp_path, transitions=10, seed=3, action_repeat=1, **SMALL) == path
+
+
+@pytest.mark.parametrize(("asked", "message"), [
+    ({"transitions": 0}, "`transitions` must be at least 1, got 0"),
+    ({"transitions": 1.5}, "`transitions` must be a whole number, got 1.5"),
+    ({"workers": 0}, "`workers` must be at least 1, got 0"),
+    ({"seed": -1}, "`seed` must be from 0"),
+    ({"root": ""}, "`root` is empty"),
+    ({"root": "bad\udcff"}, "`root` is not UTF-8"),
+])  # fmt: skip
+def test_what_cannot_be_meant_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: dict[str, Any], message: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    request = {"root": "data", "transitions": 5} | asked
+    with pytest.raises((ValueError, CRPTproError), match=message):
+        collect_random(FIXED, request.pop("root"), **request)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_home_directory_is_meant_by_its_sign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert collect_random(FIXED, "~/data", transitions=5, **SMALL) == tmp_path / "data" / "toy-fixed"
+
+
+def test_what_the_disk_cannot_hold_is_refused_and_does_not_block_less(tmp_path: Path) -> None:
+    with pytest.raises(DiskSpaceError, match=r"Collecting toy-fixed, toy-variable needs .* GB"):
+        collect_group([FIXED, VARIABLE], tmp_path, transitions=10**9)
+    assert not list(tmp_path.rglob("*.memmap"))
+    assert len(FrameDataset.open(collect_random(FIXED, tmp_path, transitions=5, **SMALL))) == 5
+
+
+def test_domains_are_collected_once_each_into_safe_directories(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(DatasetError, match="Two of the domains"):
+        collect_group([FIXED, replace(FIXED, task="toy_other")], tmp_path, transitions=5, **SMALL)
+    monkeypatch.setattr("crptpro.domains.GROUPS", {"X": (FIXED,), "Y": (FIXED, VARIABLE)})
+    assert list(collect_group(["X", "Y"], tmp_path, transitions=5, **SMALL)) == [FIXED.name, VARIABLE.name]
+    assert dataset_path(tmp_path, "gymnasium:Half/Cheetah-v5") == tmp_path / "gymnasium-Half-Cheetah-v5"
+
+
+def test_a_world_that_draws_by_itself_is_collected_without_gl(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rendering, "select_backend", lambda **_: pytest.fail("a GL backend was proven"))
+    card = FrameDataset.open(collect_random(PAINTER, tmp_path, transitions=5, quality="fast", **SMALL)).card
+    assert card["render"]["backend"] == "none"
+    assert (card["pixels"], card["quality"], card["image_size"]) == ("uint8 0..255", "fast", 8)
+    assert {"torch", "torchrl", "mujoco", "python"} <= set(card["versions"])
+    assert card["sessions"][0]["versions"] == card["versions"]
+
+
+def test_progress_is_logged_where_the_output_is_no_terminal(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.INFO, "crptpro"):
+        collect_random(FIXED, tmp_path, transitions=100, image_size=8)
+    lines = [record.message for record in caplog.records if "transitions/s" in record.message]
+    assert len(lines) == 10
+    assert lines[-1].startswith("toy-fixed: 100 of 100 transitions, ")
+
+
+# --- what goes wrong
+
+
+def test_a_world_that_fails_is_named_with_its_cause_and_does_not_block_the_repaired_one(
+    tmp_path: Path,
+) -> None:
+    with pytest.raises(
+        CRPTproError, match=r"Episode 0 of toy-failing failed: the simulator exploded"
+    ) as failure:
+        collect_random(FAILING, tmp_path, transitions=50, **SMALL)
+    assert isinstance(failure.value.__cause__, WorldFailedError)
+    assert isinstance(failure.value.__cause__.__cause__, ValueError)
+    repaired = Domain(FAILING.name, FAILING.task, make=FIXED.make)
+    card = FrameDataset.open(collect_random(repaired, tmp_path, transitions=5, **SMALL)).card
+    assert len(card["sessions"]) == 1  # the failed one contributed nothing
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_gives_one_clear_error_and_one_that_fails_its_cause(tmp_path: Path) -> None:
+    died = r"episode 0 of toy-dying.* exited with status 7.*run the same command"
+    with pytest.raises(WorkerLostError, match=died):
+        collect_random(DYING, tmp_path, transitions=50, workers=2, **SMALL)
+    with pytest.raises(CRPTproError, match=r"Episode . of toy-failing failed: the simulator exploded"):
+        collect_random(FAILING, tmp_path, transitions=50, workers=2, **SMALL)
+
+
+@pytest.mark.slow
+def test_processes_that_hang_are_noticed_and_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collect, "STALL_S", 60.0)
+    with pytest.raises(RenderingError, match=r"episode 0 of toy-hanging.*no sign of life.*MUJOCO_GL"):
+        collect_random(HANGING, tmp_path, transitions=50, workers=2, **SMALL)
+
+
+def test_a_world_that_no_other_process_can_import_is_collected_in_this_one_which_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def of_a_cell(*, seed: int, image_size: int) -> ToyEnv:
+        return ToyEnv(variable_length, seed=seed, image_size=image_size)
+
+    main = sys.modules["__main__"]
+    monkeypatch.delattr(main, "__file__", raising=False)  # as in a notebook
+    monkeypatch.setattr(main, "make_of_a_notebook", of_a_cell, raising=False)
+    for name, make in {"closure": of_a_cell, "notebook": of_a_cell}.items():
+        if name == "notebook":
+            make.__module__, make.__qualname__ = "__main__", "make_of_a_notebook"
+        domain = Domain(name, f"{name}_go", make=make)
+        path = collect_random(domain, tmp_path, transitions=20, workers=2, **SMALL)
+        assert len(FrameDataset.open(path)) == 20
+        assert f"{name} is collected in this process: no other one can import its `make`" in caplog.text
+    assert len([record for record in caplog.records if record.levelname == "WARNING"]) == 2
 
 
 PROGRAM = """
@@ -229,25 +304,21 @@ PROGRAM = """
     sys.path.insert(0, {here!r})
     from toy_world import SLOW
     from crptpro.data import collect_random
+    {more}
     if __name__ == "__main__":
-        collect_random(SLOW, {root!r}, transitions=400, seed=1, workers=2, image_size=8)
+        {limit}
+        collect_random(SLOW, {root!r}, transitions=400, seed=1, workers={workers}, image_size=8)
 """
 
 
-def group_has_ended(group: int) -> bool:
-    """Whether no process of the group is left, given a moment to end."""
-    for _ in range(200):
-        try:
-            os.killpg(group, 0)
-        except ProcessLookupError:
-            return True
-        time.sleep(0.05)
-    return False
-
-
-def start_collecting(tmp_path, root):
+def start(
+    tmp_path: Path, root: Path, *, workers: int = 2, limit: str = "pass", more: str = ""
+) -> subprocess.Popen:
     program = tmp_path / f"{root.name}.py"
-    program.write_text(textwrap.dedent(PROGRAM.format(here=str(HERE), root=str(root))))
+    text = PROGRAM.format(
+        here=str(Path(__file__).parent), root=str(root), workers=workers, limit=limit, more=more
+    )
+    program.write_text(textwrap.dedent(text))
     # A group of its own, so that one kill ends the program and all its processes; and Ctrl-C heeded, although a
     # test suite that a script started in the background inherits that it is ignored.
     return subprocess.Popen(
@@ -258,41 +329,81 @@ def start_collecting(tmp_path, root):
     )
 
 
-def stop_while_collecting(process, journal, how, delay_s):
-    """Send a signal to all processes of a collection, some time after it finished a further episode."""
+def stop_while_collecting(process: subprocess.Popen, journal: Path, how: int, *, whole_group: bool) -> bytes:
+    """Send a signal some time after a further episode was finished; afterwards no process of the group is left."""
     before = journal.stat().st_size if journal.exists() else 0
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while not (journal.exists() and journal.stat().st_size > before):
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.01)
-    time.sleep(delay_s)
-    assert process.poll() is None
-    os.killpg(process.pid, how)
-    return process.communicate(timeout=60)[1]
+    time.sleep(random.uniform(0, 0.5))
+    os.killpg(process.pid, how) if whole_group else os.kill(process.pid, how)
+    errors = process.communicate(timeout=60)[1]
+    for _ in range(400):
+        try:
+            os.killpg(process.pid, 0)
+        except ProcessLookupError:
+            return errors
+        time.sleep(0.05)
+    pytest.fail("a process of the group is left")
 
 
 @pytest.mark.slow
-def test_interrupted_killed_and_started_again_gives_the_same_bytes(tmp_path):
+def test_interrupted_ended_killed_and_started_again_gives_the_same_bytes(tmp_path: Path) -> None:
     whole, path = tmp_path / "whole", tmp_path / "data" / "toy-slow"
-    run_in_order(
-        DomainCollection(whole, request(domain="toy-slow", seed=1, transitions=400)), 0, variable_length
-    )
-    rng = random.Random()
+    settings = {"domain": "toy-slow", "seed": 1, "transitions": 400}
+    collect_toy(whole, variable_length, **settings)
+    journal = path / "journal.jsonl"
 
-    process = start_collecting(tmp_path, path.parent)
-    errors = stop_while_collecting(process, path / "journal.jsonl", signal.SIGINT, rng.uniform(0, 0.5))
+    errors = stop_while_collecting(start(tmp_path, path.parent), journal, signal.SIGINT, whole_group=True)
     assert errors.count(b"Traceback") == 1  # as Ctrl-C does: the program's own, none of its processes'
     assert b"KeyboardInterrupt" in errors
-    assert group_has_ended(process.pid)
     with pytest.raises(DatasetError, match="is unfinished"):
         FrameDataset.open(path)
-
-    process = start_collecting(tmp_path, path.parent)
-    stop_while_collecting(process, path / "journal.jsonl", signal.SIGKILL, rng.uniform(0, 0.5))
+    stop_while_collecting(start(tmp_path, path.parent), journal, signal.SIGTERM, whole_group=False)
+    stop_while_collecting(start(tmp_path, path.parent, workers=1), journal, signal.SIGKILL, whole_group=True)
     assert not (path / "card.json").exists()
 
-    assert start_collecting(tmp_path, path.parent).wait(120) == 0
+    assert (
+        len(FrameDataset.open(collect_random(SLOW, path.parent, transitions=400, seed=1, image_size=8)))
+        == 400
+    )
     assert data_bytes(path) == data_bytes(whole)
     cards = [json.loads((root / "card.json").read_text()) for root in (whole, path)]
     assert cards[0]["crc32"] == cards[1]["crc32"]
+
+
+@pytest.mark.slow
+def test_processes_that_cannot_be_started_are_an_error_that_says_why(tmp_path: Path) -> None:
+    few = "import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (32, 32))"
+    errors = start(tmp_path, tmp_path / "few", workers=8, limit=few).communicate(timeout=300)[1]
+    assert b"This shell allows 32 open files: raise that (`ulimit -n 4096`), or use fewer workers" in errors
+    unguarded = 'collect_random(SLOW, sys.argv[0] + "data", transitions=400, workers=2, image_size=8)'
+    errors = start(tmp_path, tmp_path / "unguarded", more=unguarded).communicate(timeout=300)[1]
+    assert b'needs `if __name__ == "__main__":` around its main program' in errors
+
+
+# --- with the real renderer
+
+
+@pytest.mark.gl
+def test_pixels_are_those_of_the_live_environment_whatever_the_number_of_workers(tmp_path: Path) -> None:
+    settings = {"transitions": 18, "seed": 7, "quality": "fast", "action_repeat": 200, "progress": False}
+    path = collect_random("cartpole", tmp_path / "one", **settings)  # four episodes of five, the last one cut
+    two = collect_random("cartpole", tmp_path / "two", workers=2, **settings)
+    assert data_bytes(two) == data_bytes(path)
+    dataset = FrameDataset.open(path)
+    env = make_env("cartpole_swingup_sparse", seed=0, quality="fast", action_repeat=200)
+    env.set_seed(derive_seed(7, "collect", "cartpole", 2))
+    first = env.reset()
+    torch.manual_seed(derive_seed(7, "collect-actions", "cartpole", 2))
+    live = env.rollout(10, RandomPolicy(env.full_action_spec), auto_reset=False, tensordict=first)
+    env.close()
+    stored = dataset[dataset.transitions["episode"] == 2]
+    for key in ("pixels", ("next", "pixels"), "action", ("next", "reward"), ("next", "truncated")):
+        assert torch.equal(stored[key], live[key]), key
+    assert dataset.physics_at(torch.arange(3))["qpos"].shape == (3, 2)
+    render = dataset.card["render"]
+    assert render["backend"] in ("egl", "osmesa", "glfw")
+    assert render["gl_renderer"] not in ("", "unknown")

@@ -1,310 +1,468 @@
 from __future__ import annotations
 
+import copy
+import errno
 import json
+import math
 import multiprocessing
+import os
+import pickle
 import shutil
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.collectors import Collector
 from torchrl.data import RandomSampler, ReplayBuffer, SliceSampler
 from torchrl.envs import CatFrames, TransformedEnv
-from toy_world import ToyEnv, random_episode, variable_length
+from toy_world import (
+    ToyEnv,
+    collect_toy,
+    collection_request,
+    data_bytes,
+    random_episode,
+    rollout_of,
+    variable_length,
+    write_dataset,
+)
 
-from crptpro.data import EpisodeWriter, FrameDataset, FrameStorage
-from crptpro.data.collect_worker import episode_from_rollout
-from crptpro.data.layout import COLLECTION_FILE, FORMAT, VERSION, write_tensordict_metadata
-from crptpro.errors import DatasetError
+from crptpro.data import FrameDataset
+from crptpro.data.storage import CARD_FILE, COLLECTION_FILE, JOURNAL_FILE
+from crptpro.errors import DatasetError, DiskSpaceError, NonFiniteError
+from crptpro.modules import PixelEncoder
+from crptpro.transforms import FrozenEncoder
 
 LENGTHS = (4, 1, 7, 2, 12)
-
-
-def write_dataset(path, episodes):
-    """A finished dataset of these episodes, as collection leaves it."""
-    with EpisodeWriter(path, episodes[0].layout) as writer:
-        for episode in episodes:
-            writer.append(episode)
-        write_tensordict_metadata(path, writer.layout, writer.transitions, writer.frames)
-        card = {
-            "format": FORMAT,
-            "version": VERSION,
-            "domain": "toy",
-            "task": "toy_go",
-            "seed": 0,
-            "quality": "exact",
-            "action_repeat": 2,
-            "frame_stack": 3,
-            "transitions": writer.transitions,
-            "frames": writer.frames,
-            "episodes": writer.episodes,
-            "layout": writer.layout.to_dict(),
-            "crc32": [entry.crc32 for entry in writer.entries],
-        }
-    (path / "card.json").write_text(json.dumps(card))
-    return path
+TOTAL = sum(LENGTHS)
 
 
 @pytest.fixture(scope="module")
-def episodes():
+def episodes() -> list[TensorDict]:
     return [random_episode(length, seed=index) for index, length in enumerate(LENGTHS)]
 
 
 @pytest.fixture(scope="module")
-def path(tmp_path_factory, episodes):
+def path(tmp_path_factory: pytest.TempPathFactory, episodes: list[TensorDict]) -> Path:
     return write_dataset(tmp_path_factory.mktemp("dataset") / "toy", episodes)
 
 
 @pytest.fixture
-def dataset(path):
+def dataset(path: Path) -> FrameDataset:
     return FrameDataset.open(path)
 
 
+@pytest.fixture
+def duplicate(path: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(path, tmp_path / "copy"))
+
+
+# --- reading
+
+
 @pytest.mark.parametrize("frame_stack", [1, 2, 3, 4])
-def test_stacks_equal_a_live_stack_at_every_step(tmp_path, frame_stack):
-    rollouts, collected = [], []
-    for seed in range(4):
-        stacked = TransformedEnv(
-            ToyEnv(variable_length, seed=seed),
-            CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"),
-        )
+def test_stacks_equal_a_live_stack_at_every_step(tmp_path: Path, frame_stack: int) -> None:
+    def rollout(env: Any, seed: int) -> TensorDict:
         torch.manual_seed(seed)
-        rollouts.append(stacked.rollout(100))
-        torch.manual_seed(seed)
-        collected.append(episode_from_rollout(ToyEnv(variable_length, seed=seed).rollout(100)))
-    dataset = FrameDataset.open(write_dataset(tmp_path / "toy", collected), frame_stack=frame_stack)
-    live = torch.cat(rollouts)
-    assert len(dataset) == len(live)
-    everything = dataset[:]
+        return env.rollout(100)
+
+    catframes = CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same")
+    worlds = [ToyEnv(variable_length, seed=seed) for seed in range(4)]
+    live = torch.cat([rollout(TransformedEnv(world, catframes.clone()), 7) for world in worlds])
+    path = write_dataset(tmp_path, [rollout(world, 7) for world in worlds])
+    everything = FrameDataset.open(path, frame_stack=frame_stack)[:]
     for key in ("pixels", ("next", "pixels"), "action", ("next", "reward"), ("next", "done")):
         assert torch.equal(everything[key], live[key]), key
-    first = torch.cat([rollouts[1]["pixels"], rollouts[1]["next", "pixels"][-1:]])
-    assert torch.equal(dataset.episode_stacks(1), first)
 
 
-def test_no_pair_crosses_an_episode(dataset, episodes):
-    everything = dataset[:]
-    flat = {name: value for name, value in everything.items() if name in ("episode", "step")}
-    for i in range(len(dataset)):
-        episode, step = episodes[int(flat["episode"][i])], int(flat["step"][i])
-        for key, newest in (("pixels", step), (("next", "pixels"), step + 1)):
-            frames = [episode.pixels[max(0, newest - age)] for age in (2, 1, 0)]
-            assert torch.equal(everything[key][i], torch.cat([torch.from_numpy(frame) for frame in frames]))
-    is_last = everything["next", "done"].squeeze(-1).nonzero().squeeze(-1)
-    assert (is_last + 1).tolist() == torch.tensor(LENGTHS).cumsum(0).tolist()
-
-
-def test_sampling_is_uniform_over_all_pairs(dataset):
+def test_sampling_is_uniform_over_all_pairs_and_no_pair_crosses_an_episode(
+    dataset: FrameDataset, episodes: list[TensorDict]
+) -> None:
     dataset.set_rng(torch.Generator().manual_seed(0))
-    draws = 26_000
-    batch = dataset.sample(draws)
-    index = batch["row"] - batch["episode"]
-    counts = torch.bincount(index, minlength=len(dataset))
-    expected = draws / len(dataset)
-    chi_square = ((counts - expected) ** 2 / expected).sum()
-    assert chi_square < 60  # 25 degrees of freedom: exceeded once in 10,000 seeds
+    counts = torch.bincount(dataset.sample(26_000)["index"], minlength=TOTAL)
+    assert ((counts - 1000.0) ** 2 / 1000).sum() < 60  # 25 degrees of freedom: once in 10,000 seeds
+    for row in dataset[:]:
+        episode, step = episodes[int(row["episode"])], int(row["step"])
+        frames = torch.cat([episode["pixels"][:1], episode["next", "pixels"]])
+        for pixels, newest in ((row["pixels"], step), (row["next", "pixels"], step + 1)):
+            assert torch.equal(pixels, torch.cat([frames[max(0, newest - age)] for age in (2, 1, 0)]))
+        assert row["next", "done"].item() == (step == len(episode) - 1)
 
 
-def test_pixels_are_uint8_and_do_not_alias(dataset):
-    batch = dataset.sample(5)
+def test_samples_are_uint8_and_alias_neither_each_other_nor_the_files(path: Path) -> None:
+    dataset = FrameDataset.open(path)
+    batch, before = dataset.sample(5), dataset.frames["pixels"].clone()
     assert batch["pixels"].dtype == batch["next", "pixels"].dtype == torch.uint8
     assert batch["pixels"].shape == (5, 9, 6, 6)
-    assert batch["pixels"].is_contiguous()
-    before = dataset.frames["pixels"].clone()
     following = batch["next", "pixels"].clone()
     batch["pixels"].zero_()
     assert torch.equal(batch["next", "pixels"], following)
     assert torch.equal(dataset.frames["pixels"], before)
-
-
-def test_writing_to_the_mapped_frames_leaves_the_file_alone(path):
-    dataset = FrameDataset.open(path)
     dataset.frames["pixels"].zero_()
     assert FrameDataset.open(path).frames["pixels"].any()
 
 
-def test_the_same_generator_gives_the_same_batches(path):
-    def batches():
-        dataset = FrameDataset.open(path, batch_size=4)
-        dataset.set_rng(torch.Generator().manual_seed(3))
-        return [dataset.sample() for _ in range(3)]
-
-    for first, second in zip(batches(), batches()):
-        assert (first == second).all()
-
-
-def test_a_sample_without_pixels_names_the_frames_that_a_sample_with_pixels_shows(path):
-    whole, bare = (FrameDataset.open(path, generator=torch.Generator().manual_seed(3)) for _ in range(2))
-    shown, named = whole.sample(40), bare.sample(40, pixels=False)
-    assert "pixels" not in named.keys() and ("next", "pixels") not in named.keys(True)  # noqa: SIM118, PT018
-    for key, rows in bare.stack_rows_of(named).items():
-        assert torch.equal(bare.frames["pixels"][rows].flatten(1, 2), shown[key])
-    for key in ("row", "action", ("next", "reward")):
-        assert torch.equal(named[key], shown[key])
-    assert "pixels" in bare.sample(2).keys()  # noqa: SIM118
+def test_numbers_read_the_observations_of_a_sample(dataset: FrameDataset) -> None:
+    dataset.set_rng(torch.Generator().manual_seed(3))
+    shown = dataset.sample(40)
+    dataset.set_rng(torch.Generator().manual_seed(3))
+    named = dataset.sample_transitions(40)
+    assert "pixels" not in named.keys()  # noqa: SIM118
+    for part, other in ((named, shown), (named["next"], shown["next"])):
+        assert torch.equal(part["number"], other["number"])
+        assert torch.equal(dataset.observations(part["number"]), other["pixels"])
+        rows = dataset.stack_rows_of(part["number"])
+        assert torch.equal(dataset.frames["pixels"][rows].flatten(1, 2), other["pixels"])
+    with pytest.raises(DatasetError, match="Observation 31 is not stored"):
+        dataset.observations(torch.tensor([TOTAL + len(LENGTHS)]))
 
 
-def test_plain_torchrl_buffers_read_it(path):
-    storage = FrameStorage.open(path)
-    rb = ReplayBuffer(storage=storage, sampler=RandomSampler(), batch_size=6)
-    assert rb.sample()["next", "pixels"].shape == (6, 9, 6, 6)
-    assert len(rb) == sum(LENGTHS)
+def test_plain_torchrl_buffers_and_samplers_read_it(dataset: FrameDataset) -> None:
+    options = {"storage": dataset.storage, "collate_fn": lambda rows: rows}
+    assert ReplayBuffer(sampler=RandomSampler(), batch_size=6, **options).sample()["pixels"].shape == (
+        6,
+        9,
+        6,
+        6,
+    )
     sampler = SliceSampler(slice_len=2, traj_key="episode", strict_length=False, truncated_key=None)
-    slices = ReplayBuffer(storage=storage, sampler=sampler, batch_size=8).sample()
-    assert len(slices) <= 8
-    assert slices["pixels"].shape[1:] == (9, 6, 6)
+    assert ReplayBuffer(sampler=sampler, batch_size=8, **options).sample()["pixels"].shape[1:] == (9, 6, 6)
 
 
-def test_a_torchrl_transform_sees_the_stacks(path):
-    from torchrl.envs.transforms import ToTensorImage
+def test_attached_transforms_run_in_sample(path: Path) -> None:
+    torch.manual_seed(0)
+    encoder = PixelEncoder(channels=(4, 4), strides=(1, 1), image_size=6).requires_grad_(False)
+    dataset = FrameDataset.open(path, batch_size=3, transform=FrozenEncoder(encoder), prefetch=1)
+    batch = dataset.sample()
+    torch.testing.assert_close(batch["features"], encoder(dataset.observations(batch["number"])))
 
-    keys = ["pixels", ("next", "pixels")]
-    dataset = FrameDataset.open(path, batch_size=3, transform=ToTensorImage(in_keys=keys), prefetch=1)
-    assert dataset.sample()["next", "pixels"].dtype == torch.float32
+
+def test_threads_that_sample_one_dataset_each_get_what_they_ask_for(dataset: FrameDataset) -> None:
+    def whole(_: int) -> bool:
+        batch = dataset.sample(16)
+        return torch.equal(batch["pixels"], dataset.observations(batch["number"]))
+
+    def bare(_: int) -> bool:
+        return "pixels" not in dataset.sample_transitions(16).keys()  # noqa: SIM118
+
+    with ThreadPoolExecutor(2) as threads:
+        one, two = threads.map(whole, range(200)), threads.map(bare, range(200))
+        assert all(one)
+        assert all(two)
+
+
+def test_it_is_sampled_under_a_default_device_that_is_not_the_cpu(path: Path) -> None:
+    torch.set_default_device("meta")
+    try:
+        dataset = FrameDataset.open(path)
+        batch = dataset.sample(4)
+        assert batch["pixels"].device.type == batch["action"].device.type == "cpu"
+        assert dataset.observations(batch["number"]).device.type == "cpu"
+    finally:
+        torch.set_default_device(None)
 
 
 @pytest.mark.parametrize("index", [3, -1, slice(2, 9, 3), [0, 5], torch.tensor([[1, 2], [3, 4]]), range(3)])
-def test_indexing_follows_tensors(dataset, index):
+def test_indexing_follows_tensors(dataset: FrameDataset, index: Any) -> None:
     expected = dataset.transitions["row"][list(index) if isinstance(index, range) else index]
-    assert torch.equal(dataset[index]["row"], expected)
-
-
-def test_a_mask_selects_and_an_index_out_of_range_is_refused(dataset):
-    mask = dataset.transitions["episode"] == 2
-    assert len(dataset[mask]) == LENGTHS[2]
+    assert torch.equal(dataset[index]["number"], expected)
+    assert len(dataset[dataset.transitions["episode"] == 2]) == LENGTHS[2]
     with pytest.raises(IndexError, match="26 transitions"):
         dataset[26]
 
 
-def test_frames_and_physics_are_read_by_row(dataset, episodes):
+def test_frames_and_physics_are_read_by_row(
+    dataset: FrameDataset, episodes: list[TensorDict], tmp_path: Path
+) -> None:
     rows = torch.tensor([[0, 4], [5, 7]])
-    assert dataset.frames_at(rows).shape == (2, 2, 3, 6, 6)
-    assert torch.equal(dataset.frames_at(rows)[1, 0], torch.from_numpy(episodes[1].pixels[0]))
-    physics = dataset.physics_at(rows)
-    assert physics["qpos"].dtype == torch.float64
-    assert torch.equal(physics["qvel"][1, 0], torch.from_numpy(episodes[1].state["qvel"][0]))
-
-
-def test_a_domain_without_physics_says_so(tmp_path):
-    dataset = FrameDataset.open(write_dataset(tmp_path / "toy", [random_episode(3, state=False)]))
+    assert torch.equal(dataset.frames_at(rows)[1, 0], episodes[1]["pixels"][0])
+    assert torch.equal(dataset.physics_at(rows)["qvel"][1, 0], episodes[1]["qvel"][0])
+    stateless = FrameDataset.open(write_dataset(tmp_path, [random_episode(3, state=False)]))
     with pytest.raises(DatasetError, match="no physical state"):
-        dataset.physics_at(torch.tensor([0]))
+        stateless.physics_at(rows)
 
 
-def test_tensordict_opens_both_stores(path, episodes):
+def test_tensordict_opens_both_stores(path: Path, episodes: list[TensorDict]) -> None:
     frames, transitions = (TensorDict.load_memmap(path / part) for part in ("frames", "transitions"))
-    assert frames["pixels"].shape == (sum(LENGTHS) + len(LENGTHS), 3, 6, 6)
-    assert torch.equal(transitions["action"][4], torch.from_numpy(episodes[1].action[0]))
-    assert transitions["next", "done"].sum() == len(LENGTHS)
+    assert frames["pixels"].shape == (TOTAL + len(LENGTHS), 3, 6, 6)
+    assert torch.equal(transitions["action"][4], episodes[1]["action"][0])
 
 
-def _sample_in_another_process(path, connection):
-    dataset = FrameDataset.open(path)
-    dataset.set_rng(torch.Generator().manual_seed(1))
+def _sample_in_another_process(path: Path, connection: Any) -> None:
+    dataset = FrameDataset.open(path, generator=torch.Generator().manual_seed(1))
     connection.send(dataset.sample(8)["pixels"].numpy())
 
 
-def test_two_processes_open_it_at_once(path):
-    dataset = FrameDataset.open(path)
+def test_two_processes_open_it_at_once(path: Path) -> None:
+    dataset = FrameDataset.open(path, generator=torch.Generator().manual_seed(1))
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_sample_in_another_process, args=(path, theirs))
     process.start()
-    dataset.set_rng(torch.Generator().manual_seed(1))
     mine = dataset.sample(8)["pixels"]
     assert torch.equal(torch.from_numpy(ours.recv()), mine)
     process.join()
 
 
-def test_pickling_a_storage_reopens_the_file(path):
-    import pickle
-
-    content = pickle.dumps(FrameStorage.open(path, frame_stack=2))
-    assert len(content) < 1000
-    assert pickle.loads(content).frame_stack == 2
-
-
-def test_it_cannot_be_written(dataset):
-    with pytest.raises(RuntimeError, match="doesn't allow writing"):
-        dataset.extend(dataset.sample(2))
-    with pytest.raises(DatasetError, match="read-only"):
-        dataset[0] = dataset[1]
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda dataset: pickle.loads(pickle.dumps(dataset))])
+def test_a_copy_samples_what_the_original_samples(path: Path, copied: Any) -> None:
+    dataset = FrameDataset.open(path, generator=torch.Generator().manual_seed(1), frame_stack=2)
+    assert (copied(dataset).sample(8) == dataset.sample(8)).all()
+    assert len(pickle.dumps(dataset.storage)) < 1000  # the receiver opens the files
 
 
-def test_a_checkpoint_refers_to_the_dataset(dataset, tmp_path, episodes):
+def test_a_checkpoint_refers_to_the_dataset(
+    dataset: FrameDataset, tmp_path: Path, episodes: list[TensorDict]
+) -> None:
     dataset.dumps(tmp_path / "checkpoint")
-    assert (
-        sum(file.stat().st_size for file in (tmp_path / "checkpoint").rglob("*") if file.is_file()) < 10_000
-    )
+    files = [file for file in (tmp_path / "checkpoint").rglob("*") if file.is_file()]
+    assert sum(file.stat().st_size for file in files) < 10_000
     dataset.loads(tmp_path / "checkpoint")
     other = FrameDataset.open(write_dataset(tmp_path / "other", episodes[:3]))
     with pytest.raises(DatasetError, match="another dataset: transitions was 26"):
         other.loads(tmp_path / "checkpoint")
 
 
-@pytest.fixture
-def copy(path, tmp_path):
-    return shutil.copytree(path, tmp_path / "copy")
+# --- what is no dataset
 
 
 @pytest.mark.parametrize(
     "file", ["frames/pixels.memmap", "frames/qpos.memmap", "transitions/next/done.memmap"]
 )
-def test_a_missing_or_truncated_file_is_named(copy, file):
-    content = (copy / file).read_bytes()
-    (copy / file).write_bytes(content[:-1])
+def test_a_missing_or_truncated_file_is_named(duplicate: Path, file: str) -> None:
+    content = (duplicate / file).read_bytes()
+    (duplicate / file).write_bytes(content[:-1])
     with pytest.raises(
         DatasetError, match=f"{file} is truncated: {len(content) - 1:,} bytes.*{len(content):,}"
     ):
-        FrameDataset.open(copy)
-    (copy / file).unlink()
+        FrameDataset.open(duplicate)
+    (duplicate / file).unlink()
     with pytest.raises(DatasetError, match=f"{file} is missing"):
-        FrameDataset.open(copy)
+        FrameDataset.open(duplicate)
 
 
-def test_what_is_no_dataset_is_named(copy, tmp_path):
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"format": "safetensors"}, "its format is 'safetensors'"),
+    ({"version": 99}, "format version is 99, this release reads 1"),
+    ({"pixels": "float32 0..1"}, r"pixels of .* are 'float32 0..1', this release reads 'uint8 0..255'"),
+    ({"frames": 5}, "damaged.*frames"),
+    ({"transitions": "many"}, "damaged.*transitions"),
+    ({"layout": {}}, "damaged.*layout"),
+    ({"layout": None}, "damaged.*layout"),
+])  # fmt: skip
+def test_a_card_that_cannot_be_is_refused(duplicate: Path, changes: dict[str, Any], message: str) -> None:
+    card = json.loads((duplicate / CARD_FILE).read_text())
+    (duplicate / CARD_FILE).write_text(json.dumps(card | changes))
+    with pytest.raises(DatasetError, match=message):
+        FrameDataset.open(duplicate)
+
+
+def test_what_is_no_dataset_is_named(duplicate: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="is not a directory"):
         FrameDataset.open(tmp_path / "nowhere")
     with pytest.raises(DatasetError, match=r"not a dataset. Did you mean one of its datasets: copy\?"):
         FrameDataset.open(tmp_path)
-    (copy / "card.json").write_text('{"format": "safetensors"}')
-    with pytest.raises(DatasetError, match="its format is 'safetensors'"):
-        FrameDataset.open(copy)
-    (copy / "card.json").write_text('{"format": "crptpro-frames", "version": 99}')
-    with pytest.raises(DatasetError, match="version 99, this release reads version 1"):
-        FrameDataset.open(copy)
-    (copy / "card.json").write_text("{")
-    with pytest.raises(DatasetError, match="damaged or foreign"):
-        FrameDataset.open(copy)
-
-
-@pytest.mark.parametrize(
-    ("field", "value"), [("frames", 5), ("transitions", "many"), ("layout", {}), ("layout", None)]
-)
-def test_a_card_that_cannot_be_is_refused(copy, field, value):
-    card = json.loads((copy / "card.json").read_text())
-    (copy / "card.json").write_text(json.dumps(card | {field: value}))
-    with pytest.raises(DatasetError, match=f"damaged.*{field}"):
-        FrameDataset.open(copy)
-
-
-def test_an_unfinished_collection_says_how_far_it_is(copy):
-    (copy / "card.json").unlink()
-    (copy / COLLECTION_FILE).write_text('{"request": {"transitions": 100}}')
-    with pytest.raises(DatasetError, match=r"26 of 100 transitions.*same collect command"):
-        FrameDataset.open(copy)
-
-
-def test_an_impossible_frame_stack_is_refused(path):
     with pytest.raises(DatasetError, match="frame_stack must be at least 1, got 0"):
-        FrameDataset.open(path, frame_stack=0)
+        FrameDataset.open(duplicate, frame_stack=0)
+    (duplicate / CARD_FILE).write_text("{")
+    with pytest.raises(DatasetError, match="damaged or foreign"):
+        FrameDataset.open(duplicate)
 
 
-def test_verify_finds_a_flipped_bit(copy):
-    dataset = FrameDataset.open(copy)
-    dataset.verify()
-    pixels = copy / "frames/pixels.memmap"
+def test_verify_finds_a_flipped_bit(duplicate: Path) -> None:
+    FrameDataset.open(duplicate).verify()
+    pixels = duplicate / "frames/pixels.memmap"
     content = bytearray(pixels.read_bytes())
     content[6 * 6 * 3 * 8] ^= 1  # frame row 8 belongs to episode 2
     pixels.write_bytes(content)
     with pytest.raises(DatasetError, match="Episode 2 of"):
-        FrameDataset.open(copy).verify()
+        FrameDataset.open(duplicate).verify()
+
+
+# --- writing
+
+
+def test_a_torchrl_collector_fills_a_dataset_that_can_be_sampled_meanwhile(tmp_path: Path) -> None:
+    env, seen = ToyEnv(variable_length, seed=4, physics_state=True), []
+    dataset = FrameDataset.create(tmp_path, domain="mine", transitions=45)
+    for rollout in Collector(env, frames_per_batch=10, total_frames=-1):
+        seen.append(rollout.clone())
+        dataset.extend(rollout)
+        if len(dataset):
+            assert dataset.sample(4)["pixels"].shape == (4, 9, 8, 8)
+        if dataset.is_complete:
+            break
+    expected, again = torch.cat(seen)[:45], FrameDataset.open(tmp_path, frame_stack=1)
+    assert len(again) == len(dataset) == 45
+    for key in ("pixels", ("next", "pixels"), "action", ("next", "reward")):
+        assert torch.equal(again[:][key], expected[key]), key
+    assert again[44]["next", "done"].item()  # the last episode was cut to fit
+    assert torch.equal(again.physics_at(again[:]["number"])["qpos"], expected["qpos"])
+    again.verify()
+    with pytest.raises(DatasetError, match="complete and read-only"):
+        dataset.extend(rollout)
+    with pytest.raises(DatasetError, match="use extend"):
+        dataset[0] = dataset[1]
+
+
+@pytest.mark.parametrize("kind", [np.int64, torch.tensor, float, int])
+def test_counts_are_taken_as_the_numbers_they_mean_and_what_is_written_can_be_read(
+    tmp_path: Path, kind: Any
+) -> None:
+    asked = collection_request(seed=3, action_repeat=2)
+    dataset = FrameDataset.create(
+        tmp_path, **asked | {name: kind(asked[name]) for name in ("transitions", "seed")}
+    )
+    dataset.extend(random_episode(asked["transitions"], size=8))
+    again = FrameDataset.open(tmp_path)
+    assert (again.card["transitions"], again.card["seed"]) == (27, 3)
+    assert type(again.card["request"]["seed"]) is int
+
+
+def test_numbers_that_are_not_finite_never_enter_a_dataset(tmp_path: Path) -> None:
+    dataset = FrameDataset.create(tmp_path, **collection_request())
+    dataset.extend(random_episode(5, size=8))
+    for name, value in (("reward", math.nan), ("action", math.inf)):
+        rows = random_episode(6, size=8)
+        (rows["next"] if name == "reward" else rows)[name][3] = value
+        with pytest.raises(NonFiniteError, match=f"The {name} of transition 3 is"):
+            dataset.extend(rows)
+    assert len(dataset) == 5
+
+
+def test_rows_of_another_shape_or_without_a_reset_are_refused_and_leave_no_trace(tmp_path: Path) -> None:
+    dataset = FrameDataset.create(tmp_path, **collection_request())
+    dataset.extend(random_episode(5, size=8))
+    with pytest.raises(DatasetError, match="Collect it into another directory"):
+        dataset.extend(random_episode(5, size=8, action_dim=3))
+    late = random_episode(3, size=8)
+    for part in (late, late["next"]):
+        part["pixels"] = torch.randint(0, 256, (3, 9, 8, 8), dtype=torch.uint8)
+    with pytest.raises(ValueError, match="begins at its reset"):
+        dataset.extend(late)
+    dataset.close()
+    resumed = FrameDataset.create(tmp_path, **collection_request())
+    for _ in range(3):
+        resumed.extend(random_episode(10, size=8))
+    FrameDataset.open(tmp_path).verify()
+
+
+@pytest.mark.parametrize(
+    "killed_at", ["nothing", "bytes", "half a line", "a damaged episode", "before the card"]
+)
+def test_killed_anywhere_the_same_request_continues_to_the_same_bytes(tmp_path: Path, killed_at: str) -> None:
+    whole = collect_toy(tmp_path / "whole", variable_length, transitions=40)
+    path = collect_toy(tmp_path / "killed", variable_length, transitions=40, episodes=3)
+    if killed_at == "bytes":  # of an episode whose journal line was not written
+        for file in path.rglob("*.memmap"):
+            file.write_bytes(file.read_bytes() + b"some")
+    elif killed_at == "half a line":
+        with open(path / JOURNAL_FILE, "ab") as file:
+            file.write(b'{"episode": 3, "transi')
+    elif killed_at == "a damaged episode":
+        pixels = path / "frames/pixels.memmap"
+        pixels.write_bytes(pixels.read_bytes()[:-1] + b"\0")
+    elif killed_at == "before the card":
+        shutil.rmtree(path)
+        shutil.copytree(whole, path)
+        (path / CARD_FILE).unlink()
+    with pytest.raises(DatasetError, match=r"\d+ of 40 transitions.*same collect command"):
+        FrameDataset.open(path)
+    collect_toy(path, variable_length, transitions=40)
+    assert data_bytes(path) == data_bytes(whole)
+    assert FrameDataset.open(path).card["crc32"] == FrameDataset.open(whole).card["crc32"]
+
+
+def test_files_that_are_damaged_from_the_first_episode_on_are_left_alone(tmp_path: Path) -> None:
+    path = collect_toy(tmp_path, episodes=1)
+    pixels = path / "frames/pixels.memmap"
+    pixels.write_bytes(b"\0" + pixels.read_bytes()[1:])
+    before = data_bytes(path)
+    with pytest.raises(DatasetError, match="damaged from the first one on"):
+        collect_toy(path)
+    assert data_bytes(path) == before
+
+
+@pytest.mark.parametrize("finished", [True, False])
+@pytest.mark.parametrize(("asked", "message"), [
+    ({"seed": 4}, "seed 0 there, 4 asked for"),
+    ({"transitions": 70}, "transitions 27 there, 70 asked for"),
+    ({"colors": "reversed_image"}, "colors 'normal' there, 'reversed_image' asked for"),
+])  # fmt: skip
+def test_another_request_for_the_same_place_is_refused(
+    tmp_path: Path, finished: bool, asked: dict[str, Any], message: str
+) -> None:
+    collect_toy(tmp_path, episodes=None if finished else 1)
+    with pytest.raises(DatasetError, match=f"{message}.*choose another directory"):
+        FrameDataset.create(tmp_path, **collection_request(**asked))
+
+
+@pytest.mark.parametrize("left", [[], [".lock"], [".lock", ".collection.json.k2j3h4x_"], [COLLECTION_FILE]])
+def test_what_holds_no_episode_yet_blocks_no_request(tmp_path: Path, left: list[str]) -> None:
+    for name in left:
+        (tmp_path / name).write_text('{"format"')
+    if left == [COLLECTION_FILE]:
+        (tmp_path / COLLECTION_FILE).unlink()
+        FrameDataset.create(tmp_path, **collection_request(seed=5)).close()
+    assert len(FrameDataset.open(collect_toy(tmp_path))) == 27
+    assert not list(tmp_path.glob(".collection.json.*"))
+
+
+def test_a_directory_with_something_else_or_another_writer_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("x")
+    with pytest.raises(DatasetError, match="not empty and not a collection"):
+        FrameDataset.create(tmp_path / "full", **collection_request())
+    assert [file.name for file in (tmp_path / "full").iterdir()] == ["thesis.tex"]
+    first = FrameDataset.create(tmp_path / "toy", **collection_request())
+    with pytest.raises(DatasetError, match="Another process is writing"):
+        FrameDataset.create(tmp_path / "toy", **collection_request())
+    first.close()
+    FrameDataset.create(tmp_path / "toy", **collection_request()).close()
+
+
+def test_a_full_disk_is_named_and_what_was_kept_continues(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    collect_toy(tmp_path / "disk", episodes=1)
+    dataset = FrameDataset.create(tmp_path / "disk", **collection_request())
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full)
+        with pytest.raises(DiskSpaceError, match="is full after 10 transitions"):
+            dataset.extend(random_episode(10, size=8, state=False))
+    dataset.close()
+    collect_toy(tmp_path / "disk")
+    assert data_bytes(tmp_path / "disk") == data_bytes(collect_toy(tmp_path / "whole"))
+
+
+@pytest.mark.parametrize(("now", "message"), [
+    ({"backend": "osmesa", "gl_renderer": "llvmpipe"}, "backend 'egl', now it is 'osmesa'.*MUJOCO_GL=egl"),
+    ({"backend": "egl", "gl_renderer": "NVIDIA H200"}, "'llvmpipe', now it is 'NVIDIA H200'.*pixels differ"),
+])  # fmt: skip
+def test_another_backend_or_renderer_may_not_continue(
+    tmp_path: Path, now: dict[str, str], message: str
+) -> None:
+    rendered = {"backend": "egl", "gl_renderer": "llvmpipe"}
+    for renderer in (now, rendered):  # before the first episode any may begin
+        dataset = FrameDataset.create(tmp_path, **collection_request())
+        dataset.note_environment(renderer)
+        dataset.close() if renderer == now else dataset.extend(random_episode(10, size=8))
+    dataset.close()
+    resumed = FrameDataset.create(tmp_path, **collection_request())
+    resumed.note_environment(rendered)
+    with pytest.raises(DatasetError, match=message):
+        resumed.note_environment(now)
+    resumed.close()
+
+
+def test_a_dataset_takes_21_kb_per_transition(tmp_path: Path) -> None:
+    frames = torch.zeros(101, 3, 84, 84, dtype=torch.uint8)
+    path = write_dataset(tmp_path, [rollout_of(frames, action=torch.zeros(100, 6))])
+    size = sum(file.stat().st_size for file in path.rglob("*.memmap"))
+    assert size / 100 < 1.01 * (3 * 84 * 84) + 100

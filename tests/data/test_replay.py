@@ -1,332 +1,477 @@
 from __future__ import annotations
 
+import copy
 import errno
-import fcntl
+import itertools
+import math
 import os
+import pickle
 import subprocess
 import sys
 import textwrap
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import CatFrames, TransformedEnv
+from toy_world import ToyEnv, rollout_of, variable_length
 
-from crptpro.data import FrameReplay, mapped_file
-from crptpro.errors import CheckpointError, DiskSpaceError
+from crptpro.data import FrameReplay, StoredReplay, stack_frames, storage
+from crptpro.errors import CheckpointError, DatasetError, DiskSpaceError, NonFiniteError
+from crptpro.modules import PixelEncoder
+from crptpro.transforms import FrozenEncoder
+
+GAMMA = 0.9
 
 
 def frame(number: int) -> torch.Tensor:
     return torch.full((3, 2, 2), number % 251, dtype=torch.uint8)
 
 
+def small(capacity: int = 20, **options: Any) -> FrameReplay:
+    return FrameReplay(capacity, frame_shape=(3, 2, 2), action_dim=1, **options)
+
+
 class Driver:
     """Writes episodes whose frames, rewards and actions count up, and knows what must be in the replay."""
 
-    def __init__(self, replay: FrameReplay, length: int = 9):
-        self.replay, self.length, self.number = replay, length, 0
+    def __init__(self, replay: FrameReplay, length: int = 9, chunk: int = 1):
+        self.replay, self.length, self.chunk, self.number = replay, length, chunk, 0
         self.episode: list[int] = []
-        self.history: list[
-            tuple[list[int], int]
-        ] = []  # stack of an observation and of its successor, by number
+        self.history: list[tuple[list[int], int]] = []
+
+    def step(self) -> TensorDict:
+        if not self.episode:
+            self.episode = [self.number]
+            self.number += 1
+        padded = [self.episode[0]] * 3 + self.episode
+        self.episode.append(self.number)
+        is_last = len(self.episode) == self.length + 1
+        end = ("terminated" if self.number % 2 else "truncated") if is_last else ""
+        value = torch.tensor([[float(self.number)]])
+        row = rollout_of(torch.stack([frame(0)] * 2), action=value, reward=value, end=end)[0]
+        row["pixels"] = torch.cat([frame(n) for n in padded[-3:]])
+        row["next", "pixels"] = torch.cat([frame(n) for n in [*padded, self.number][-3:]])
+        self.history.append((list(self.episode), self.number))
+        self.number += 1
+        if is_last:
+            self.episode = []
+        return row
 
     def write(self, transitions: int) -> Driver:
-        for _ in range(transitions):
-            if not self.episode:
-                self.replay.begin_episode(frame(self.number))
-                self.episode = [self.number]
-                self.number += 1
-            step = len(self.episode)
-            is_last = step == self.length
-            self.replay.append(
-                torch.tensor([float(self.number)]), self.number, is_last and self.number % 2 == 0,
-                is_last and self.number % 2 == 1, frame(self.number),
-            )  # fmt: skip
-            self.episode.append(self.number)
-            self.history.append((list(self.episode), self.number))
-            self.number += 1
-            if is_last:
-                self.episode = []
+        rows = [self.step() for _ in range(transitions)]
+        for begin in range(0, len(rows), self.chunk):
+            part = rows[begin : begin + self.chunk]
+            self.replay.add(part[0]) if self.chunk == 1 else self.replay.extend(torch.stack(part))
         return self
 
     def check(self) -> None:
         everything = self.replay[:]
-        expected = self.history[len(self.history) - len(self.replay) :]
-        for i, (episode, number) in enumerate(expected):
+        for i, (episode, number) in enumerate(self.history[len(self.history) - len(self.replay) :]):
             padded = [episode[0]] * 3 + episode
-            following = torch.cat([frame(n) for n in padded[-3:]])
-            current = torch.cat([frame(n) for n in padded[-4:-1]])
-            assert torch.equal(everything["next", "pixels"][i], following)
-            assert torch.equal(everything["pixels"][i], current)
+            assert torch.equal(everything["pixels"][i], torch.cat([frame(n) for n in padded[-4:-1]]))
+            assert torch.equal(everything["next", "pixels"][i], torch.cat([frame(n) for n in padded[-3:]]))
             assert everything["next", "reward"][i].item() == everything["action"][i].item() == number
-            done = everything["next", "done"][i]
+            done, ended = everything["next", "done"][i], len(episode) == self.length + 1
             assert done == (everything["next", "terminated"][i] | everything["next", "truncated"][i])
-            assert done.item() == (len(episode) == self.length + 1)
+            assert done.item() == ended
+
+    def windows(self, n: int) -> dict[float, tuple[float, float]]:
+        """First reward of a window -> n-step return and discount, by the loop of url_benchmark."""
+        valid = self.history[len(self.history) - len(self.replay) :]
+        found = {}
+        for i in range(len(valid) - n + 1):
+            episodes = [valid[i + j][0] for j in range(n)]
+            if any(later[:-1] != earlier for earlier, later in itertools.pairwise(episodes)):
+                continue
+            reward, discount = 0.0, 1.0
+            for episode, number in valid[i : i + n]:
+                reward += discount * number
+                terminated = len(episode) == self.length + 1 and number % 2 == 1
+                discount *= (0.0 if terminated else 1.0) * GAMMA
+            found[float(valid[i][1])] = (reward, discount)
+        return found
 
 
 @pytest.mark.parametrize("length", [1, 2, 9, 1000])
-@pytest.mark.parametrize("on_disk", [False, True])
-def test_content_is_the_newest_transitions_with_live_stacks(tmp_path, length, on_disk):
-    path = tmp_path / "ring" if on_disk else None
-    replay = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=path, slack=5)
-    driver = Driver(replay, length)
+@pytest.mark.parametrize(("on_disk", "chunk"), [(False, 1), (True, 1), (False, 7), (False, 50)])
+def test_content_is_the_newest_transitions_with_live_stacks_however_they_come(
+    tmp_path: Path, length: int, on_disk: bool, chunk: int
+) -> None:
+    replay = small(path=tmp_path / "ring" if on_disk else None, slack=5)
+    driver = Driver(replay, length, chunk)
     for transitions in (1, 3, 30, 17, 44, 1):
         driver.write(transitions).check()
         assert len(replay) <= 20
     assert len(replay) == 20 or length == 1  # very short episodes cost a frame more per transition
 
 
-def test_interrupted_episodes_are_not_joined():
-    replay = FrameReplay(10, frame_shape=(3, 2, 2), action_dim=1)
-    replay.begin_episode(frame(1))
-    replay.append(torch.zeros(1), 0.0, False, False, frame(2))
-    replay.begin_episode(frame(100))
-    replay.append(torch.zeros(1), 0.0, False, False, frame(101))
-    assert replay[:]["next", "pixels"][:, ::3, 0, 0].tolist() == [[1, 1, 2], [100, 100, 101]]
+@pytest.mark.parametrize("stacked", [False, True])
+def test_what_a_torchrl_collector_hands_out_is_stored_and_sampled_as_catframes_showed_it(
+    stacked: bool,
+) -> None:
+    catframes = CatFrames(N=3, dim=-3, in_keys=["pixels"], padding="same")
+    env, seen = TransformedEnv(ToyEnv(variable_length, seed=4), catframes), []
+    replay = FrameReplay(100, frame_shape=(3, 8, 8), action_dim=2)
+    for rollout in Collector(env, frames_per_batch=10, total_frames=60):
+        seen.append(rollout.clone())
+        if not stacked:  # as an environment without CatFrames
+            for part in (rollout, rollout["next"]):
+                part["pixels"] = part["pixels"][:, -3:]
+        replay.extend(rollout)
+    expected, everything = torch.cat(seen), replay[:]
+    for key in ("pixels", ("next", "pixels"), "action", ("next", "reward"), ("next", "done")):
+        assert torch.equal(everything[key], expected[key]), key
 
 
-def test_misuse_is_refused_in_words():
-    replay = FrameReplay(10, frame_shape=(3, 2, 2), action_dim=1)
-    with pytest.raises(RuntimeError, match="No episode is running"):
-        replay.append(torch.zeros(1), 0.0, False, False, frame(0))
-    with pytest.raises(RuntimeError, match="begin_episode"):
-        replay.extend(torch.zeros(3))
-    with pytest.raises(RuntimeError, match="begin_episode"):
-        replay[0] = 1
-    with pytest.raises(ValueError, match=r"must be uint8 \(3, 2, 2\).*got torch.float32"):
-        replay.begin_episode(frame(0).float())
-    with pytest.raises(ValueError, match=r"got torch.uint8 \(9, 2, 2\)"):
-        replay.begin_episode(torch.cat([frame(0)] * 3))
-    with pytest.raises(ValueError, match="at least 1"):
-        FrameReplay(0, action_dim=1)
+def test_what_does_not_continue_begins_an_episode() -> None:
+    replay = small()
+    replay.extend(rollout_of(torch.stack([frame(1), frame(2)]), end=""))
+    replay.extend(rollout_of(torch.stack([frame(100), frame(101)]), end=""))  # another one, nothing was done
+    late = rollout_of(torch.stack([frame(7), frame(8)]), end="")
+    late["pixels"] = torch.cat([frame(5), frame(6), frame(7)]).unsqueeze(0)  # joins an episode under way
+    late["next", "pixels"] = torch.cat([frame(6), frame(7), frame(8)]).unsqueeze(0)
+    assert replay.extend(late).tolist() == [6]
+    shown = replay[:]
+    assert shown["pixels"][:, ::3, 0, 0].tolist() == [[1, 1, 1], [100, 100, 100], [5, 6, 7]]
+    assert shown["next", "pixels"][:, ::3, 0, 0].tolist() == [[1, 1, 2], [100, 100, 101], [6, 7, 8]]
 
 
-def test_sampling_is_uniform_over_valid_transitions():
-    replay = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, generator=torch.Generator().manual_seed(0))
+def test_misuse_is_refused_in_words_and_stores_nothing() -> None:
+    replay, good = small(), rollout_of(torch.stack([frame(1), frame(2)]))
+    refusals = [
+        (good.clone().set("pixels", good["pixels"].float()), "takes uint8 pixels"),
+        (good.clone().set("action", torch.zeros(1, 2)), r"action of shape \(1,\), got \(2,\)"),
+        (good.exclude("action"), "needs 'action' with every transition"),
+        (good.unsqueeze(0), "one environment in temporal order"),
+        (good.clone().set("pixels", torch.zeros(1, 12, 2, 2, dtype=torch.uint8)), "takes uint8 pixels"),
+        (rollout_of(torch.zeros(2, 3, 4, 4, dtype=torch.uint8)), "holds pixels of shape"),
+    ]
+    for data, message in refusals:
+        with pytest.raises(ValueError, match=message):
+            replay.extend(data)
+    with pytest.raises(DatasetError, match="use extend"):
+        replay[0] = good[0]
+    for options in ({"capacity": 0}, {"slack": -1}, {"n_step": 0}, {"frame_stack": 0}, {"discount": 2}):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            small(**options)
+    for name in ("reward", "next", "row_of", "discount"):
+        with pytest.raises(ValueError, match=name):
+            small(extra_columns={name: ((1,), torch.float32)})
+    assert len(replay) == 0
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_numbers_that_are_not_finite_never_enter_a_replay(value: float) -> None:
+    replay = small()
+    for name in ("reward", "action"):
+        rows = rollout_of(torch.stack([frame(number) for number in range(4)]), end="")
+        rows["next", "reward"][1] = value if name == "reward" else 0
+        rows["action"][1] = value if name == "action" else 0
+        with pytest.raises(NonFiniteError, match=f"The {name} of transition 1 is "):
+            replay.extend(rows)
+    assert len(replay) == 0
+
+
+def test_sampling_is_uniform_over_valid_transitions() -> None:
+    replay = small(generator=torch.Generator().manual_seed(0), returns_pixels=False)
     Driver(replay).write(47)
-    counts = torch.bincount(replay.sample(20_000, pixels=False)["index"], minlength=20)
+    counts = torch.bincount(replay.sample(20_000)["index"], minlength=20)
     assert ((counts - 1000.0) ** 2 / 1000).sum() < 50  # 19 degrees of freedom: once in 7,000 seeds
 
 
-def test_slots_address_the_observations(tmp_path):
-    replay = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
-    Driver(replay, length=7).write(90)
-    batch = replay.sample(64)
-    slots = torch.cat([batch["row"], batch["next", "row"]])
-    assert slots.min() >= 0
-    assert slots.max() < replay.frame_slots
-    assert torch.equal(replay.observations_at(batch["row"]), batch["pixels"])
-    assert torch.equal(replay.observations_at(batch["next", "row"]), batch["next", "pixels"])
-    everything = replay[:]
-    referred = set(everything["row"].tolist()) | set(everything["next", "row"].tolist())
-    assert referred <= set(replay.live_slots().tolist())
+def test_numbers_identify_observations_and_are_never_reused(tmp_path: Path) -> None:
+    replay = small(path=tmp_path)
+    driver, seen = Driver(replay, length=7), dict[int, bytes]()
+    for _ in range(12):
+        batch = driver.write(9).replay.sample(32)
+        for part in (batch, batch["next"]):
+            assert torch.equal(replay.observations(part["number"]), part["pixels"])
+            for number, pixels in zip(part["number"].tolist(), part["pixels"]):
+                assert seen.setdefault(number, pixels.numpy().tobytes()) == pixels.numpy().tobytes()
+        held = replay[:]
+        held = torch.cat([held["number"], held["next", "number"]]).unique()
+        assert len((held % replay.window).unique()) == len(held)
+    assert replay.frames_written - 1 == held[-1]
+    for gone in (0, replay.frames_written):
+        with pytest.raises(DatasetError, match=f"Observation {gone} is not stored"):
+            replay.observations(torch.tensor([gone]))
 
 
-def test_numbers_of_live_observations_differ_modulo_the_window(tmp_path):
-    replay = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path, slack=13)
-    driver = Driver(replay, length=7)
-    for _ in range(40):
-        driver.write(3)
-        numbers = replay.numbers_at(replay.live_slots())
-        assert len((numbers % replay.window).unique()) == len(numbers)
-        assert numbers[-1] == driver.number - 1
-
-
-def test_written_slots_are_the_sampled_ones():
-    replay = FrameReplay(10, frame_shape=(3, 2, 2), action_dim=1)
-    first = replay.begin_episode(frame(0))
-    second = replay.append(torch.zeros(1), 0.0, False, True, frame(1))
-    batch = replay.sample(1)
-    assert (batch["row"].item(), batch["next", "row"].item()) == (first, second)
-
-
-def test_pixels_can_be_left_unread():
-    replay = FrameReplay(10, frame_shape=(3, 2, 2), action_dim=1)
+def test_pixels_can_be_left_unread() -> None:
+    replay = small(returns_pixels=False)
     Driver(replay).write(5)
-    assert "pixels" not in replay.sample(2, pixels=False)
-    assert ("next", "pixels") not in replay.sample(2, pixels=False).keys(True)
-    assert "pixels" in replay.sample(2)
+    batch = replay.sample(2)
+    assert "pixels" not in batch
+    assert ("next", "pixels") not in batch.keys(True)
+    assert replay.observations(batch["number"]).shape == (2, 9, 2, 2)
 
 
-def test_extra_columns_belong_to_the_transition_and_are_sampled_at_the_root(tmp_path):
-    spec = {"code": ((2,), torch.bfloat16)}
-    replay = FrameReplay(10, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path, extra_columns=spec)
-    replay.begin_episode(frame(0))
-    for i in range(3):
-        replay.append(torch.zeros(1), i, False, False, frame(i), code=torch.tensor([i, i + 0.5]))
-    everything = replay[:]
-    assert everything["code"].tolist() == [[0.0, 0.5], [1.0, 1.5], [2.0, 2.5]]
-    assert everything["code"].dtype == torch.bfloat16
-    assert "code" not in everything["next"]
+def test_extra_columns_belong_to_the_transition_and_are_sampled_at_the_root(tmp_path: Path) -> None:
+    replay = small(10, path=tmp_path, extra_columns={"code": ((2,), torch.bfloat16)}, n_step=3)
+    code = torch.tensor([[i, i + 0.5] for i in range(3)])
+    replay.extend(rollout_of(torch.stack([frame(i) for i in range(4)]), code=code))
     # Of a window it is the first transition's: what was in force at the observation.
-    assert replay.sample(4, n_step=3)["code"].tolist() == [[0.0, 0.5]] * 4
-    with pytest.raises(ValueError, match=r"needs \['code'\], got \[\]"):
-        replay.append(torch.zeros(1), 0.0, False, False, frame(1))
-    with pytest.raises(ValueError, match=r"got \['code', 'cod'\]|got \['cod', 'code'\]"):
-        replay.append(torch.zeros(1), 0.0, False, False, frame(1), code=torch.zeros(2), cod=1)
-    assert len(replay) == 3
+    assert replay.sample(4)["code"].tolist() == [[0.0, 0.5]] * 4
+    assert replay.sample(4)["code"].dtype == torch.bfloat16
+    with pytest.raises(ValueError, match="needs 'code'"):
+        replay.extend(rollout_of(torch.stack([frame(1), frame(2)])))
 
 
-@pytest.mark.parametrize("name", ["reward", "next", "row_of", "discount"])
-def test_an_extra_column_may_not_hide_what_a_sample_has_anyway(name):
-    with pytest.raises(ValueError, match=name):
-        FrameReplay(10, action_dim=1, extra_columns={name: ((1,), torch.float32)})
+@pytest.mark.parametrize("n", [2, 3, 5])
+@pytest.mark.parametrize("length", [6, 9, 1000])
+def test_windows_and_their_returns_are_those_of_the_published_loop(n: int, length: int) -> None:
+    replay = small(40, n_step=n, discount=GAMMA, generator=torch.Generator().manual_seed(0))
+    driver = Driver(replay, length)
+    for transitions in (13, 20, 60):
+        expected = driver.write(transitions).windows(n)
+        batch = replay.sample(600)
+        assert {float(action) for action in batch["action"]} == set(expected)
+        for row in batch:
+            reward, discount = expected[float(row["action"])]
+            assert row["next", "reward"].item() == pytest.approx(reward, rel=1e-6)
+            assert row["next", "discount"].item() == pytest.approx(discount, rel=1e-6)
+        assert torch.equal(batch["next", "number"], batch["number"] + n)
+        assert torch.equal(replay.observations(batch["next", "number"]), batch["next", "pixels"])
+        driver.check()  # indexing reads single transitions
+
+
+def test_a_window_longer_than_every_episode_is_refused_in_words() -> None:
+    replay = small(n_step=5)
+    with pytest.raises(RuntimeError):
+        replay.sample(2)
+    Driver(replay, 4).write(12)
+    with pytest.raises(DatasetError, match=r"n_step=5.*random_agent_steps"):
+        replay.sample(2)
+
+
+def test_attached_transforms_run_in_sample_and_leave_the_frames_alone() -> None:
+    torch.manual_seed(0)
+    encoder = PixelEncoder(channels=(4, 4), strides=(2, 1), image_size=16).requires_grad_(False)
+    frames = torch.randint(0, 256, (9, 3, 16, 16), dtype=torch.uint8)
+    plain, fitted = (FrameReplay(20, frame_shape=(3, 16, 16), action_dim=1, batch_size=6) for _ in range(2))
+    fitted.append_transform(
+        FrozenEncoder(
+            encoder, in_keys=["pixels", ("next", "pixels")], out_keys=["features", ("next", "features")]
+        )
+    )
+    for replay in (plain, fitted):
+        replay.extend(rollout_of(frames))
+        replay.set_rng(torch.Generator().manual_seed(1))
+    batch, bare = fitted.sample(), plain.sample()
+    for name in ("features", ("next", "features")):
+        source = "pixels" if name == "features" else ("next", "pixels")
+        torch.testing.assert_close(batch[name], encoder(bare[source]))
+
+
+def test_threads_that_sample_two_views_or_extend_meanwhile_never_mix_what_they_get() -> None:
+    replay = small(200, n_step=3, discount=1.0)
+    driver = Driver(replay, 50).write(200)
+
+    def sample(_: int) -> bool:
+        batch = replay.sample(64)
+        first = batch["action"]
+        return bool(
+            (batch["next", "reward"] == 3 * first + 3).all()
+            and (batch["pixels"][:, -1, 0, 0] == (first.squeeze(-1) - 1) % 251).all()
+            and (batch["next", "pixels"][:, -1, 0, 0] == (first.squeeze(-1) + 2) % 251).all()
+        )
+
+    with ThreadPoolExecutor(3) as threads:
+        writing = threads.submit(driver.write, 400)
+        assert all(threads.map(sample, range(300)))
+        writing.result()
+
+
+@pytest.mark.parametrize("on_disk", [False, True])
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda replay: pickle.loads(pickle.dumps(replay))])
+def test_copies_hold_what_the_original_holds_and_live_apart(
+    tmp_path: Path, on_disk: bool, copied: Any
+) -> None:
+    replay = small(path=tmp_path if on_disk else None, generator=torch.Generator().manual_seed(3))
+    driver = Driver(replay).write(33)
+    other = copied(replay)
+    assert (other[:] == replay[:]).all()
+    assert (other.sample(8) == replay.sample(8)).all()
+    before = other[:].clone()
+    driver.write(20)
+    assert (other[:] == before).all()
+    continued = Driver(other)
+    continued.number, continued.history, continued.episode = 1000, list(driver.history[:33]), []
+    continued.write(15).check()
+
+
+def test_it_works_under_a_default_device_that_is_not_the_cpu() -> None:
+    with torch.device("meta"):
+        replay = small(n_step=2, generator=torch.Generator("cpu"))
+    rows = rollout_of(torch.stack([frame(number) for number in range(9)]))
+    torch.set_default_device("meta")
+    try:
+        replay.extend(rows)
+        batch = replay.sample(4)
+        assert replay.observations(batch["number"]).device.type == batch["pixels"].device.type == "cpu"
+    finally:
+        torch.set_default_device(None)
 
 
 @pytest.mark.parametrize("before", [4, 33, 100])
 @pytest.mark.parametrize("length", [1, 6, 1000])
-def test_an_old_state_restores_the_content_of_its_moment(tmp_path, before, length):
+def test_an_old_state_restores_the_content_of_its_moment(tmp_path: Path, before: int, length: int) -> None:
     def build() -> FrameReplay:
-        return FrameReplay(
-            20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path, slack=16,
-            generator=torch.Generator().manual_seed(5),
-        )  # fmt: skip
+        return small(path=tmp_path, slack=16, generator=torch.Generator().manual_seed(5))
 
     replay = build()
     driver = Driver(replay, length).write(before)
     state, content = replay.state_dict(), replay[:].clone()
     assert "content" not in state["ring"]
     driver.write(8)  # at most 16 frames, with an episode start before each
-    restored = build()
+    restored, again = build(), build()
     restored.load_state_dict(state)
     assert (restored[:] == content).all()
     first = restored.sample(7)
-    again = build()
     again.load_state_dict(state)
     assert (again.sample(7) == first).all()
-    # The restored ring goes on like one that was never interrupted.
+    # The restored ring continues like one that was never interrupted.
     continued = Driver(restored, length)
     continued.number, continued.history = driver.number, list(driver.history[:before])
     continued.write(60).check()
 
 
-def test_a_state_older_than_the_slack_is_refused(tmp_path):
-    replay = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path, slack=5)
+def test_a_state_that_the_files_cannot_give_back_is_refused(tmp_path: Path) -> None:
+    replay = small(path=tmp_path / "a", slack=5)
     driver = Driver(replay).write(60)
     state = replay.state_dict()
+    with pytest.raises(CheckpointError, match="are gone: the files were removed or replaced"):
+        small(path=tmp_path / "b", slack=5).load_state_dict(state)
+    with pytest.raises(CheckpointError, match="Use the capacity and slack"):
+        small(21, path=tmp_path / "c").load_state_dict(state)
+    with pytest.raises(CheckpointError, match="a replay of another size"):
+        small(21, path=tmp_path / "a")
     driver.write(30)
     with pytest.raises(CheckpointError, match=r"slack of 5.*checkpoint_interval_env_steps"):
         replay.load_state_dict(state)
 
 
-def test_a_state_without_its_files_or_of_another_size_is_refused(tmp_path):
-    replay = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path / "a")
-    Driver(replay).write(10)
-    state = replay.state_dict()
-    with pytest.raises(CheckpointError, match=r"are gone: the files were removed or replaced; put them back"):
-        FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path / "b").load_state_dict(state)
-    with pytest.raises(CheckpointError, match="Use the capacity and slack"):
-        FrameReplay(21, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path / "c").load_state_dict(state)
-    with pytest.raises(CheckpointError, match="a replay of another size"):
-        FrameReplay(21, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path / "a")
-    replay.load_state_dict(state)
-
-
-def test_a_ring_in_ram_carries_its_content_in_the_state(tmp_path):
-    replay = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1)
+def test_a_ring_in_ram_carries_its_content_in_the_state(tmp_path: Path) -> None:
+    replay = small()
     driver = Driver(replay).write(33)
     torch.save(replay.state_dict(), tmp_path / "state.pt")
     replay.dumps(tmp_path / "dump")
     content = replay[:].clone()
     driver.write(50)
-    restored = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1)
+    restored, loaded = small(), small()
     restored.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
-    assert (restored[:] == content).all()
-    loaded = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1)
     loaded.loads(tmp_path / "dump")
+    assert (restored[:] == content).all()
     assert (loaded[:] == content).all()
+    replay.empty()
+    assert len(replay) == 0
 
 
-def test_a_killed_process_leaves_a_ring_that_restores(tmp_path):
+def test_a_killed_process_leaves_a_ring_that_restores_and_half_a_file_that_any_replay_replaces(
+    tmp_path: Path,
+) -> None:
     program = f"""
         import os, signal, sys, torch
-        sys.path.insert(0, {str(__file__.rsplit("/", 1)[0])!r})
-        from test_replay import Driver, FrameReplay
-        path = {str(tmp_path / "ring")!r}
-        replay = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=path, slack=10)
-        driver = Driver(replay).write(50)
-        torch.save((replay.state_dict(), replay[:].clone().to_dict()), {str(tmp_path / "state.pt")!r})
+        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        from test_replay import Driver, small, storage
+        driver = Driver(small(path={str(tmp_path / "ring")!r}, slack=10)).write(50)
+        torch.save((driver.replay.state_dict(), driver.replay[:].clone().to_dict()), {str(tmp_path / "state.pt")!r})
         driver.write(6)
-        os.kill(os.getpid(), signal.SIGKILL)
+        def half(file, offset, size):
+            os.ftruncate(file, size // 2)
+            os.kill(os.getpid(), signal.SIGKILL)
+        storage.os.posix_fallocate = half
+        small(path={str(tmp_path / "half")!r})
     """
-    ended = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], timeout=120)
+    ended = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], timeout=300)
     assert ended.returncode == -9
     state, content = torch.load(tmp_path / "state.pt", weights_only=False)
-    replay = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path / "ring", slack=10)
+    replay = small(path=tmp_path / "ring", slack=10)
     replay.load_state_dict(state)
     assert torch.equal(replay[:]["next", "pixels"], content["next"]["pixels"])
+    Driver(small(10, path=tmp_path / "half")).write(15)
+    assert not list((tmp_path / "half").glob(".*"))
 
 
-def test_a_ring_that_the_disk_cannot_hold_is_refused(tmp_path):
+def test_what_the_disk_cannot_hold_is_refused_and_nothing_of_it_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(DiskSpaceError, match="A replay of 1000000000 transitions"):
         FrameReplay(1_000_000_000, action_dim=1, path=tmp_path / "ring")
 
+    def half(file: int, offset: int, size: int) -> None:
+        os.ftruncate(file, size // 2)
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-def test_frames_are_stored_once(tmp_path):
+    with monkeypatch.context() as patched:
+        patched.setattr(storage.os, "posix_fallocate", half)
+        with pytest.raises(DiskSpaceError, match="No space left"):
+            small(path=tmp_path)
+    assert not [file for file in tmp_path.iterdir() if file.is_file()]
+    small(path=tmp_path)
+
+
+def test_frames_are_stored_once(tmp_path: Path) -> None:
     FrameReplay(1000, action_dim=6, path=tmp_path)
     size = sum(file.stat().st_size for file in tmp_path.iterdir())
     assert size / 1000 < 1.05 * (3 * 84 * 84 + 100)
 
 
-def test_a_disk_that_fills_up_while_rows_are_reserved_keeps_none_of_them(tmp_path, monkeypatch):
-    def half(file, offset, size):
-        os.ftruncate(file, size // 2)
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(mapped_file.os, "posix_fallocate", half)
-    with pytest.raises(DiskSpaceError, match="No space left"):
-        FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
-    assert not list(tmp_path.glob("*.memmap*"))
-    assert not list(tmp_path.glob(".*"))
-    monkeypatch.undo()
-    FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
-
-
-def test_rows_are_reserved_where_the_system_has_to_write_them_one_by_one(tmp_path, monkeypatch):
-    """It does so on network file systems that reserve nothing, and not in a file that is appended to."""
-    reserve, refused = os.posix_fallocate, []
-
-    def without_support(file, offset, size):
-        if fcntl.fcntl(file, fcntl.F_GETFL) & os.O_APPEND:
-            refused.append(file)
-            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
-        reserve(file, offset, size)
-
-    monkeypatch.setattr(mapped_file.os, "posix_fallocate", without_support)
-    replay = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
-    Driver(replay).write(15)
-    state, content = replay.state_dict(), replay[:]["next", "pixels"].clone()
-    again = FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)  # what is there stays
-    again.load_state_dict(state)
-    assert torch.equal(again[:]["next", "pixels"], content)
-    assert not refused
+def test_a_buffer_of_single_frames_becomes_one_of_stacks() -> None:
+    live = TransformedEnv(
+        ToyEnv(variable_length, seed=2), CatFrames(N=4, dim=-3, in_keys=["pixels"], padding="same")
+    )
+    torch.manual_seed(0)
+    expected = live.rollout(40, break_when_any_done=False)
+    torch.manual_seed(0)
+    single = ReplayBuffer(storage=LazyTensorStorage(40))
+    single.extend(ToyEnv(variable_length, seed=2).rollout(40, break_when_any_done=False))
+    stacked = stack_frames(single, frame_stack=4)
+    for key in ("pixels", ("next", "pixels"), "action", ("next", "done")):
+        assert torch.equal(stacked[:][key], expected[key]), key
+    with pytest.raises(ValueError, match="empty"):
+        stack_frames(ReplayBuffer(storage=LazyTensorStorage(4)))
 
 
-def test_a_kill_while_rows_are_reserved_leaves_a_directory_that_any_replay_can_use(tmp_path):
-    program = f"""
-        import os, signal
-        from crptpro.data import FrameReplay, mapped_file
-        def half(file, offset, size):
-            os.ftruncate(file, size // 2)
-            os.kill(os.getpid(), signal.SIGKILL)
-        mapped_file.os.posix_fallocate = half
-        FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path={str(tmp_path)!r})
-    """
-    ended = subprocess.run([sys.executable, "-c", textwrap.dedent(program)], timeout=120)
-    assert ended.returncode == -9
-    replay = FrameReplay(10, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
-    Driver(replay).write(15)
-    assert not list(tmp_path.glob(".*"))
+# --- what a run left behind ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("number", "kind", "message"), [
-    (errno.EDQUOT, DiskSpaceError, "Free space"),
-    (errno.EFBIG, DiskSpaceError, "File too large.*smaller capacity"),
-    (errno.EIO, OSError, "Input/output error"),
-])  # fmt: skip
-def test_an_error_of_reserving_is_named_as_what_it_is(tmp_path, monkeypatch, number, kind, message):
-    def fail(file, offset, size):
-        raise OSError(number, os.strerror(number))
+def shown(replay: StoredReplay) -> list[list[int]]:
+    return replay.observations(torch.arange(len(replay)))[:, ::3, 0, 0].tolist()
 
-    monkeypatch.setattr(mapped_file.os, "posix_fallocate", fail)
-    with pytest.raises(kind, match=message) as caught:
-        FrameReplay(20, frame_shape=(3, 2, 2), action_dim=1, path=tmp_path)
-    assert f"{tmp_path}/" in str(caught.value)
+
+@pytest.mark.parametrize(("transitions", "length"), [(9, 4), (70, 30), (70, 7), (2, 1000)])
+def test_a_stored_replay_shows_every_observation_that_was_decided_on_in_order(
+    tmp_path: Path, transitions: int, length: int
+) -> None:
+    driver = Driver(small(path=tmp_path, slack=5), length).write(transitions)
+    driver.replay.flush()
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    stored = StoredReplay(tmp_path)
+    assert min(transitions, 20) <= len(stored) <= transitions
+    expected = [([episode[0]] * 3 + episode)[-4:-1] for episode, _ in driver.history[-len(stored) :]]
+    assert shown(stored) == expected
+    stored.observations(torch.arange(len(stored))).zero_()
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+def test_what_is_no_stored_replay_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match=r"absent holds no replay: number.memmap"):
+        StoredReplay(tmp_path / "absent")
+    driver = Driver(small(path=tmp_path / "new"))
+    with pytest.raises(DatasetError, match="no transition"):
+        StoredReplay(tmp_path / "new")
+    driver.write(5)
+    driver.replay._storage.number[2] = 0
+    with pytest.raises(DatasetError, match="lost rows"):
+        StoredReplay(tmp_path / "new")
+    with open(tmp_path / "new" / "pixels.memmap", "ab") as file:
+        file.write(b"x")
+    with pytest.raises(DatasetError, match="square RGB"):
+        StoredReplay(tmp_path / "new")

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import os
-import random
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,10 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from crptpro.data import Episode
-from crptpro.data.collect_worker import EpisodeJob, EpisodeRoller
-from crptpro.data.collection import DomainCollection
+from crptpro.data import FrameDataset
+from crptpro.data.collect import collect_episode
 from crptpro.domains import Domain
+from crptpro.seeding import derive_seed
 
 
 class ToyEnv(EnvBase):
@@ -137,22 +136,38 @@ HANGING = Domain("toy-hanging", "toy-hanging_go", make=make_hanging)
 FAILING = Domain("toy-failing", "toy-failing_go", make=make_failing)
 
 
+def rollout_of(
+    frames: torch.Tensor,
+    *,
+    action: torch.Tensor | None = None,
+    reward: torch.Tensor | None = None,
+    end: str = "truncated",
+    **extra: torch.Tensor,
+) -> TensorDict:
+    """The rollout ``[T]`` of T + 1 frames; it ends by ``"truncated"``, ``"terminated"`` or not at all (``""``)."""
+    length = len(frames) - 1
+    flags = {name: torch.zeros(length, 1, dtype=torch.bool) for name in ("done", "terminated", "truncated")}
+    if end:
+        flags["done"][-1] = flags[end][-1] = True
+    action = torch.zeros(length, 1) if action is None else action
+    reward = torch.zeros(length, 1) if reward is None else reward.reshape(length, 1)
+    following = TensorDict({"pixels": frames[1:], "reward": reward, **flags}, [length])
+    return TensorDict({"pixels": frames[:-1], "action": action, "next": following, **extra}, [length])
+
+
 def random_episode(
     length: int, *, size: int = 6, seed: int = 0, action_dim: int = 2, state: bool = True
-) -> Episode:
-    """An episode of random bytes; ends by truncation."""
+) -> TensorDict:
+    """The rollout ``[length]`` of an episode of random bytes; ends by truncation."""
     rng = np.random.default_rng(seed)
-    truncated = np.zeros(length, dtype=bool)
-    truncated[-1] = True
     physics = {"qpos": rng.normal(size=(length + 1, 4)), "qvel": rng.normal(size=(length + 1, 3))}
-    return Episode(
-        pixels=rng.integers(0, 256, (length + 1, 3, size, size), dtype=np.uint8),
-        action=rng.uniform(-1, 1, (length, action_dim)).astype(np.float32),
-        reward=rng.normal(size=length).astype(np.float32),
-        terminated=np.zeros(length, dtype=bool),
-        truncated=truncated,
-        state=physics if state else {},
-    )
+    frames = torch.from_numpy(rng.integers(0, 256, (length + 1, 3, size, size), dtype=np.uint8))
+    action = torch.from_numpy(rng.uniform(-1, 1, (length, action_dim)).astype(np.float32))
+    reward = torch.from_numpy(rng.normal(size=length).astype(np.float32))
+    rollout = rollout_of(frames, action=action, reward=reward)
+    for name, values in physics.items() if state else ():
+        rollout[name], rollout["next", name] = torch.from_numpy(values[:-1]), torch.from_numpy(values[1:])
+    return rollout
 
 
 def data_bytes(path: Path) -> dict[str, bytes]:
@@ -161,32 +176,39 @@ def data_bytes(path: Path) -> dict[str, bytes]:
 
 
 def collection_request(**changes: Any) -> dict[str, Any]:
-    """What a collection of a toy world is asked for."""
-    settings = {"image_size": 8, "action_repeat": 2, "camera": 0, "quality": "exact"}
+    """What ``FrameDataset.create`` is asked for by the collection of a toy world."""
+    settings = {"image_size": 8, "action_repeat": 2, "camera": 0, "quality": "exact", "colors": "normal"}
     return {"domain": "toy", "task": "toy_go", "seed": 0, "transitions": 27, **settings} | changes
 
 
-def run_in_order(
-    collection: DomainCollection,
-    order_seed: int,
-    lengths: Callable[[int], int] = fixed_length,
-    *,
-    episodes: int | None = None,
-    on_job: Callable[[EpisodeJob], None] = lambda job: None,
-) -> list[EpisodeJob]:
-    """Collect in this process with jobs that finish in random order; all, or only so many ``episodes``."""
-    rng = random.Random(order_seed)
-    roller = EpisodeRoller(lambda: ToyEnv(lengths))
-    running: list[EpisodeJob] = []
-    jobs = []
-    finished = 0
-    while not collection.is_complete and finished != episodes:
-        while len(running) < 3 and (job := collection.next_job()) is not None:
-            running.append(job)
-            jobs.append(job)
-            on_job(job)
-        job = running.pop(rng.randrange(len(running)))
-        collection.accept(job.episode, roller.roll(job))
-        finished += 1
-    roller.close()
-    return jobs
+def write_dataset(path: Path, episodes: Iterable[TensorDict], **request: Any) -> Path:
+    """Write rollouts of whole episodes as collection does, as a complete dataset unless ``transitions`` are more."""
+    episodes = list(episodes)
+    asked = collection_request(
+        transitions=sum(map(len, episodes)), image_size=episodes[0]["pixels"].shape[-1]
+    )
+    dataset = FrameDataset.create(path, **asked | request)
+    for episode in episodes:
+        dataset.extend(episode)
+        dataset.end_episode()
+    dataset.close()
+    return path
+
+
+def collect_toy(
+    path: Path, lengths: Callable[[int], int] = fixed_length, *, episodes: int | None = None, **request: Any
+) -> Path:
+    """Collect a toy world as ``collect_random`` does, all of it, or only so many episodes."""
+    asked = collection_request(**request)
+    dataset = FrameDataset.create(path, **asked)
+    env = ToyEnv(lengths, image_size=asked["image_size"])
+    while not dataset.is_complete and dataset.episodes != episodes:
+        seeds = [
+            derive_seed(asked["seed"], kind, asked["domain"], dataset.episodes)
+            for kind in ("collect", "collect-actions")
+        ]
+        missing = dataset.target - len(dataset)
+        dataset.extend(collect_episode(env, env_seed=seeds[0], action_seed=seeds[1], limit=missing))
+        dataset.end_episode()
+    dataset.close()
+    return path

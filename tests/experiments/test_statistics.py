@@ -1,152 +1,175 @@
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.stats import mannwhitneyu, trim_mean
 
+from crptpro.experiments import statistics
 from crptpro.experiments.statistics import (
-    evaluation_means,
-    expert_normalized,
-    final_score,
+    COVERAGE,
+    MIN_RUNS,
+    estimate,
     iqm,
-    last_evaluations_score,
     mean,
     median,
     optimality_gap,
-    performance_profile,
     probability_of_improvement,
+    relative_mean,
+    resample,
 )
 
-AGGREGATES = [iqm, mean, median, optimality_gap]
+TWO_TASKS = [np.array([1.0, 2.0, 3.0, 10.0]), np.array([0.0, 0.5, 0.5, 3.0])]
 
 
-def tasks(*counts: int, seed: int = 0) -> list[np.ndarray]:
-    rng = np.random.default_rng(seed)
-    return [rng.normal(0.8, 0.4, count) for count in counts]
+def runs(scores: dict[str, list[float]], encoders: dict[str, list[str]] | None = None) -> pd.DataFrame:
+    """A row per run; each has an encoder of its own unless they are told."""
+    rows = []
+    for task, values in scores.items():
+        for place, score in enumerate(values):
+            name = f"{task} {place}"
+            encoder = name if encoders is None else encoders[task][place]
+            rows.append({"task": task, "encoder": encoder, "run": name, "score": score})
+    return pd.DataFrame(rows)
 
 
-# --- one run ----------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("aggregate", "by_hand"), [
+    (mean, (4.0 + 1.0) / 2),
+    (median, (4.0 + 1.0) / 2),
+    (iqm, (0.5 + 1.0 + 2.0 + 3.0) / 4),  # of 0, 0.5, 0.5, 1, 2, 3, 3, 10
+    (optimality_gap, (0.0 + (1.0 + 0.5 + 0.5) / 4) / 2),
+])  # fmt: skip
+def test_aggregates_are_what_a_hand_computes(aggregate: Callable, by_hand: float) -> None:
+    assert aggregate(TWO_TASKS) == pytest.approx(by_hand)
+    # Replicates and curves are further axes before the runs.
+    stacked = [np.stack([task, task + 1]) for task in TWO_TASKS]
+    np.testing.assert_allclose(aggregate(stacked)[0], by_hand)
 
 
-def test_a_final_score_is_the_mean_of_the_last_evaluation_whatever_the_order_of_rows() -> None:
-    steps, returns = [1000, 0, 1000, 500], [10.0, 99.0, 20.0, 77.0]
-    assert final_score(steps, returns) == 15.0
-    places, means = evaluation_means(steps, returns)
-    assert places.tolist() == [0, 500, 1000]
-    assert means.tolist() == [99.0, 77.0, 15.0]
+def test_tasks_count_the_same_whatever_their_runs_and_the_middle_half_is_scipys() -> None:
+    uneven = [np.array([1.0]), np.array([2.0, 4.0, 6.0])]
+    assert mean(uneven) == pytest.approx((1.0 + 4.0) / 2)
+    assert iqm(uneven) == pytest.approx(trim_mean([1, 2, 4, 6], 0.25))
+    assert median([np.array([1.0]), np.array([5.0]), np.array([2.0, 4.0])]) == pytest.approx(3.0)
 
 
-def test_the_last_evaluations_count_the_same_whatever_their_number_of_episodes() -> None:
-    steps, returns = [0, 1, 2, 2, 2], [1000.0, 4.0, 7.0, 8.0, 9.0]
-    assert last_evaluations_score(steps, returns, evaluations=2) == 6.0
-    assert last_evaluations_score(steps, returns, evaluations=10) == pytest.approx(1012 / 3)
+def test_the_probability_of_improvement_counts_pairs_and_halves_ties() -> None:
+    x, y = [np.array([1.0, 3.0])], [np.array([1.0, 2.0, 2.0])]
+    assert probability_of_improvement(x, y) == pytest.approx((0.5 + 0 + 0 + 3) / 6)
+    assert probability_of_improvement(x, y) == pytest.approx(mannwhitneyu(x[0], y[0]).statistic / 6)
+    assert probability_of_improvement(y, x) == pytest.approx(1 - 3.5 / 6)
+    alike = [np.ones(3)]
+    assert probability_of_improvement(alike, alike) == 0.5
+    assert relative_mean(x, y) == pytest.approx(2 / (5 / 3))
 
 
-@pytest.mark.parametrize(
-    ("steps", "returns", "message"),
-    [
-        ([0, 1], [1.0, float("nan")], r"episode_returns\[1\] is nan"),
-        ([0, 1], [float("inf"), 1.0], r"episode_returns\[0\] is inf"),
-        ([], [], "one at least"),
-        ([0], [1.0, 2.0], "as many env steps"),
-    ],
-)
-def test_a_run_without_a_score_is_refused_by_name(steps: list, returns: list, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        final_score(steps, returns)
+RLIABLE = json.loads(Path(__file__).with_name("rliable_values.json").read_text())
+"""What google-research/rliable 1.2.0 computes on :func:`fixed_scores`, with 20,000 replicates."""
 
 
-def test_normalizing_divides_by_the_experts_score_and_names_a_task_without_one() -> None:
-    scores = {"walker_run": [485.0, 970.0], "hopper_hop": [0.0]}
-    normalized = expert_normalized(scores, {"walker_run": 485, "hopper_hop": 283, "finger_spin": 938})
-    assert normalized["walker_run"].tolist() == [1.0, 2.0]
-    assert normalized["hopper_hop"].tolist() == [0.0]
-    with pytest.raises(ValueError, match="no expert's score on hopper_hop"):
-        expert_normalized(scores, {"walker_run": 485})
-    with pytest.raises(ValueError, match="got 0 on hopper_hop"):
-        expert_normalized(scores, {"walker_run": 485, "hopper_hop": 0})
+def fixed_scores(name: str, more: int = 0, shift: float = 0.0) -> pd.DataFrame:
+    """Scores between 0 and 1.5, a tie here and there; of "5x12" five runs of twelve tasks."""
+    count, tasks = map(int, name.split("x"))
+    index = np.arange((count + more) * tasks).reshape(-1, tasks)
+    matrix = np.round(0.75 + 0.75 * np.sin(1.7 * index**1.1 + 0.3), 2) + shift
+    return runs({f"task_{i:02d}": list(column) for i, column in enumerate(matrix.T)})
 
 
-# --- many runs: closed forms ------------------------------------------------------------------------------------
+@pytest.mark.parametrize("case", RLIABLE)
+def test_values_and_intervals_are_rliables(case: str) -> None:
+    found, own = RLIABLE[case], fixed_scores(case)
+    for name, value in found["values"].items():
+        ours = estimate(getattr(statistics, name), own, replicates=20_000, seed=1)
+        assert ours.value == pytest.approx(value, abs=1e-12), name
+        if int(case[0]) >= MIN_RUNS:  # both are Monte Carlo
+            np.testing.assert_allclose([ours.low[0], ours.high[0]], found["intervals"][name], atol=0.02)
+    above = pd.DataFrame({str(t): (own["score"] > t) * 1.0 for t in (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5)})
+    profile = estimate(mean, pd.concat([own, above], axis=1), columns=list(above))
+    np.testing.assert_allclose(profile.value, found["profile"], atol=1e-12)
+    better = estimate(probability_of_improvement, fixed_scores(case, 1, 0.1), own)
+    assert better.value == pytest.approx(found["improvement"], abs=1e-12)
+    if better.low is not None:  # few runs give few values, which jump
+        np.testing.assert_allclose([better.low[0], better.high[0]], found["improvement_interval"], atol=0.05)
 
 
-def test_aggregates_of_known_numbers() -> None:
-    scores = [np.array([0.0, 1.0]), np.array([0.2, 0.4]), np.array([1.0, 5.0])]
-    assert mean(scores) == pytest.approx((0.5 + 0.3 + 3.0) / 3)
-    assert median(scores) == pytest.approx(0.5)
-    assert iqm(scores) == pytest.approx((0.2 + 0.4 + 1.0 + 1.0) / 4)
-    assert optimality_gap(scores) == pytest.approx((1.0 + 0.8 + 0.6) / 6)
-    assert optimality_gap(scores, target=5.0) == pytest.approx(5 - mean(scores))
+def test_below_five_runs_on_any_task_there_is_no_interval() -> None:
+    few = runs({"a": [1.0] * 6, "b": [1.0, 2.0, 3.0, 4.0]})
+    assert (estimate(mean, few).low, estimate(mean, few).high) == (None, None)
+    assert f"{estimate(mean, few):.1f}" == "1.8"
+    enough = runs({"a": [1.0] * 6, "b": [1.0, 2.0, 3.0, 4.0, 5.0]})
+    assert estimate(mean, enough).low is not None
+    assert f"{estimate(mean, enough):.1f}".startswith("2.0 [")
+    # The other method's runs count, too.
+    assert estimate(probability_of_improvement, enough, few).low is None
 
 
-@pytest.mark.parametrize("aggregate", AGGREGATES)
-def test_a_single_run_is_its_own_aggregate(aggregate) -> None:
-    assert aggregate([np.array([0.25])]) == pytest.approx(0.75 if aggregate is optimality_gap else 0.25)
+def test_the_same_runs_give_the_same_interval_in_any_order_and_another_seed_another() -> None:
+    own = fixed_scores("6x3")
+    first = estimate(iqm, own)
+    again = estimate(iqm, own.sample(frac=1, random_state=3))
+    assert (first.low, first.high) == (again.low, again.high)
+    assert estimate(iqm, own, seed=1).low != first.low
 
 
-@pytest.mark.parametrize("runs", range(1, 10))
-@pytest.mark.parametrize("number", [1, 2, 3, 12])
-def test_the_interquartile_mean_is_scipys_trimmed_mean(number: int, runs: int) -> None:
-    scores = tasks(*[runs] * number)
-    assert iqm(scores) == pytest.approx(trim_mean(np.concatenate(scores), 0.25))
+def test_intervals_of_a_mean_hold_the_truth_as_often_as_is_said() -> None:
+    for count, share in COVERAGE.items():
+        draws = pd.DataFrame(np.random.default_rng(0).normal(size=(count, 1_000)))  # a column per repetition
+        own = pd.concat([runs({"a": [0.0] * count}), draws], axis=1)
+        found = estimate(mean, own, columns=list(draws))
+        assert ((found.low <= 0) & (found.high >= 0)).mean() == pytest.approx(share, abs=0.03)
 
 
-@pytest.mark.parametrize("aggregate", AGGREGATES)
-@pytest.mark.parametrize("counts", [(4, 4), (4, 8), (2, 4, 16)])
-def test_a_task_whose_runs_are_all_there_twice_counts_no_more(aggregate, counts: tuple[int, ...]) -> None:
-    scores = tasks(4, 4, 4)[: len(counts)]
-    repeated = [np.repeat(s, 16) for s in scores]
-    unequal = [np.repeat(s, count) for s, count in zip(scores, counts)]
-    assert aggregate(unequal) == pytest.approx(aggregate(repeated), abs=1e-12)
+def test_runs_that_share_encoders_have_the_wider_interval_of_their_encoders() -> None:
+    # Three encoders that differ, three alike runs on each: nine runs tell no more than three encoders do.
+    scores = {"a": [0.0] * 3 + [1.0] * 3 + [2.0] * 3}
+    shared = estimate(mean, runs(scores, {"a": ["x"] * 3 + ["y"] * 3 + ["z"] * 3}))
+    alone = estimate(mean, runs(scores))
+    assert (shared.encoders, alone.encoders, shared.runs) == (3, 9, 9)
+    assert shared.value == alone.value
+    assert shared.high[0] - shared.low[0] > 1.4 * (alone.high[0] - alone.low[0])
+    one = estimate(mean, runs(scores, {"a": ["x"] * 9}))  # these runs of this encoder
+    np.testing.assert_allclose([one.low, one.high], [alone.low, alone.high], atol=0.12)
 
 
-def test_the_interquartile_mean_of_unequal_counts_ignores_outliers_at_both_ends() -> None:
-    calm = [np.full(7, 0.5), np.full(3, 0.5)]
-    wild = [np.array([-1e6, *[0.5] * 5, 1e6]), np.full(3, 0.5)]
-    assert iqm(wild) == pytest.approx(iqm(calm))
+def test_an_encoder_is_drawn_once_for_all_tasks_and_its_runs_for_each() -> None:
+    rng = np.random.default_rng(0)
+    encoders = [["x", "x", "y", "y"], ["x", "y", "y", "x"]]
+    first, second = resample(encoders, [list("abcd"), list("efgh")], replicates=4_000, rng=rng)
+    drawn = [np.array(labels)[index] for labels, index in zip(encoders, (first, second))]
+    assert (drawn[0][:, 0] == drawn[0][:, 1]).all()  # a place keeps one encoder
+    assert (drawn[0][:, 0] == drawn[1][:, 0]).all()  # and it is the same on the other task
+    assert (first[:, 0] != first[:, 1]).any()
+    assert (drawn[0][:, 0] == "x").mean() == pytest.approx(0.5, abs=0.03)
+    apart = resample([["x", "y"], ["u", "v"]], [["a", "b"], ["c", "d"]], replicates=4_000, rng=rng)
+    assert (apart[0] == apart[1]).mean() == pytest.approx(
+        0.5, abs=0.03
+    )  # tasks that share none are independent
 
 
-@pytest.mark.parametrize("aggregate", AGGREGATES)
-@pytest.mark.parametrize("counts", [(3, 3), (2, 5)])
-def test_leading_axes_are_many_samples_at_once(aggregate, counts: tuple[int, ...]) -> None:
-    many = [np.random.default_rng(i).normal(size=(4, 6, count)) for i, count in enumerate(counts)]
-    together = aggregate(many)
-    assert together.shape == (4, 6)
-    one_by_one = [[aggregate([m[i, j] for m in many]) for j in range(6)] for i in range(4)]
-    np.testing.assert_allclose(together, one_by_one)
+def test_a_run_that_stands_under_two_tasks_is_drawn_alike_and_counts_once() -> None:
+    own = runs({"A walker_run": [1.0, 2.0, 3.0, 4.0, 5.0]})
+    both = pd.concat([own, own.assign(task="D walker_run")])
+    alone, twice = estimate(mean, own), estimate(mean, both)
+    assert twice.runs == 5
+    np.testing.assert_allclose([twice.low, twice.high], [alone.low, alone.high])
 
 
-@pytest.mark.parametrize("aggregate", [iqm, mean, median])
-def test_aggregates_move_and_scale_with_the_scores(aggregate) -> None:
-    scores = tasks(3, 5, 4)
-    assert aggregate([2 * s + 3 for s in scores]) == pytest.approx(2 * aggregate(scores) + 3)
+def test_a_curve_has_an_interval_at_each_point() -> None:
+    own = runs({"a": [1.0, 2.0, 3.0, 4.0, 5.0]}).assign(late=[5.0, 5.0, 5.0, 5.0, 5.0])
+    found = estimate(mean, own, columns=["score", "late"])
+    np.testing.assert_allclose(found.value, [3.0, 5.0])
+    assert found.low[0] < 3.0 < found.high[0]
+    assert found.low[1] == found.high[1] == 5.0
 
 
-def test_a_profile_counts_runs_above_each_threshold() -> None:
-    scores = [np.array([0.0, 0.5, 0.5, 1.0]), np.array([2.0])]
-    profile = performance_profile(scores, [-1.0, 0.0, 0.5, 1.0, 2.0])
-    np.testing.assert_allclose(profile, [1.0, (0.75 + 1) / 2, (0.25 + 1) / 2, 0.5, 0.0])
-
-
-def test_the_area_under_a_profile_is_the_mean() -> None:
-    scores = [s.clip(0, 2) for s in tasks(3, 5)]
-    thresholds = np.linspace(0, 2, 20_001)
-    area = performance_profile(scores, thresholds).mean() * 2
-    assert area == pytest.approx(mean(scores), abs=1e-3)
-
-
-def test_improvement_is_the_mann_whitney_statistic_over_all_pairs() -> None:
-    x, y = tasks(4, 5), tasks(6, 2, seed=1)
-    expected = [mannwhitneyu(a, b).statistic / (len(a) * len(b)) for a, b in zip(x, y)]
-    assert probability_of_improvement(x, y) == pytest.approx(np.mean(expected))
-    assert probability_of_improvement(y, x) == pytest.approx(1 - np.mean(expected))
-
-
-def test_improvement_counts_ties_as_half() -> None:
-    one, zero = np.ones(3), np.zeros(2)
-    assert probability_of_improvement([one], [zero]) == 1
-    assert probability_of_improvement([zero], [one]) == 0
-    assert probability_of_improvement([one], [one]) == 0.5
-    assert probability_of_improvement([one, one], [zero, one]) == 0.75
-    with pytest.raises(ValueError, match="got 1 and 2"):
-        probability_of_improvement([one], [one, one])
+def test_what_cannot_be_estimated_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match=r"Run a 1 on a has a score that is not finite"):
+        estimate(mean, runs({"a": [1.0, float("nan")]}))
+    with pytest.raises(ValueError, match="no runs"):
+        estimate(mean, runs({"a": [1.0]}).iloc[:0])
+    with pytest.raises(ValueError, match="Only one of the methods has runs on b"):
+        estimate(probability_of_improvement, runs({"a": [1.0]}), runs({"a": [1.0], "b": [2.0]}))

@@ -1,16 +1,30 @@
-"""Actor and critic: arithmetic of the released agents, saturation, initialisation."""
+"""Actors and critics: arithmetic of the released agents, saturation, initialisation, TorchRL's exploration."""
 
 from __future__ import annotations
 
+import json
 import math
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torch.distributions import Normal, TanhTransform, TransformedDistribution
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import ProbabilisticActor
 
-from crptpro.modules import SquashedGaussianActor, TwinCritic, set_compute_dtype
-from crptpro.modules.actor_critic import squash_log_std, squashed_gaussian
+from crptpro.modules import (
+    DeterministicActor,
+    FixedSkillActor,
+    PixelCritic,
+    PixelEncoder,
+    SquashedGaussianActor,
+    TwinCritic,
+    set_compute_dtype,
+)
+from crptpro.modules.actor_critic import SquashedGaussian, squashed_gaussian
 
 
 def actor(**options) -> SquashedGaussianActor:
@@ -18,17 +32,22 @@ def actor(**options) -> SquashedGaussianActor:
     return SquashedGaussianActor(40, 3, bottleneck_dim=10, hidden_dim=32, **options)
 
 
-def critic() -> TwinCritic:
+def critic(**options) -> TwinCritic:
     torch.manual_seed(0)
-    return TwinCritic(40, 3, bottleneck_dim=10, hidden_dim=32)
+    return TwinCritic(40, 3, bottleneck_dim=10, hidden_dim=32, **options)
+
+
+def skilled() -> DeterministicActor:
+    torch.manual_seed(0)
+    return DeterministicActor(40, 3, skill_dim=4, bottleneck_dim=10, hidden_dim=32)
 
 
 def test_golden_values_of_the_squashed_gaussian() -> None:
-    log_std = squash_log_std(torch.tensor([0.2], dtype=torch.float64), (-10, 2))
-    action, log_prob = squashed_gaussian(
-        torch.tensor([0.3], dtype=torch.float64), log_std.exp(), torch.tensor([0.5], dtype=torch.float64)
-    )
-    assert log_std.item() == pytest.approx(-2.815748, abs=1e-6)
+    one = actor().double()
+    one.mlp.forward = lambda inputs: torch.tensor([[0.3, 0.2]], dtype=torch.float64)  # type: ignore[method-assign]
+    loc, scale = one(torch.zeros(1, 40, dtype=torch.float64))
+    action, log_prob = squashed_gaussian(loc, scale, torch.tensor([[0.5]], dtype=torch.float64))
+    assert scale.log().item() == pytest.approx(-2.815748, abs=1e-6)
     assert action.item() == pytest.approx(0.318458, abs=1e-6)
     assert log_prob.item() == pytest.approx(1.878744, abs=1e-6)
 
@@ -54,47 +73,32 @@ def test_log_probability_and_gradient_are_right_at_saturation() -> None:
     assert loc.grad.item() == pytest.approx(2.0)
 
 
-def test_actor_is_linear_layernorm_and_three_layers_without_tanh() -> None:
-    policy, features = actor(), torch.rand(4, 40)
+@pytest.mark.parametrize("has_tanh", [False, True])
+def test_actor_is_linear_layernorm_and_three_layers(has_tanh: bool) -> None:
+    policy, features = actor(has_tanh=has_tanh), torch.rand(4, 40)
     hidden = F.layer_norm(features @ policy.trunk.linear.weight.T, (10,))
+    hidden = torch.tanh(hidden) if has_tanh else hidden
     for layer in (policy.mlp.first, policy.mlp.middle):
         hidden = (hidden @ layer.weight.T).clamp_min(0)
     loc, raw = (hidden @ policy.mlp.last.weight.T).split(3, dim=-1)
-    std = torch.exp(-10 + 6 * (torch.tanh(raw) + 1))
-    torch.testing.assert_close(policy(features), (loc, std))
+    torch.testing.assert_close(policy(features), (loc, torch.exp(-10 + 6 * (torch.tanh(raw) + 1))))
     torch.testing.assert_close(policy.mode(features), torch.tanh(loc))
 
 
-def test_sample_uses_the_given_noise_and_zero_noise_is_the_mode() -> None:
+def test_samples_come_from_the_noise_or_the_generator_and_are_reparameterised() -> None:
     policy, features = actor(), torch.rand(4, 40)
     action, log_prob = policy.sample(features, noise=torch.zeros(4, 3))
     assert torch.equal(action, policy.mode(features))
     assert log_prob.shape == (4,)
-
-
-def test_sample_draws_from_its_generator_and_not_from_the_global_one() -> None:
-    policy, features = actor(), torch.rand(4, 40)
     before = torch.get_rng_state()
-    first, _ = policy.sample(features, generator=torch.Generator().manual_seed(5))
-    again, _ = policy.sample(features, generator=torch.Generator().manual_seed(5))
-    other, _ = policy.sample(features, generator=torch.Generator().manual_seed(6))
+    first, again, other = (
+        policy.sample(features, generator=torch.Generator().manual_seed(seed))[0] for seed in (5, 5, 6)
+    )
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
     assert torch.equal(torch.get_rng_state(), before)
-
-
-def test_sample_is_reparameterised() -> None:
-    policy = actor()
-    action, _ = policy.sample(torch.rand(4, 40))
-    action.sum().backward()
-    assert policy.trunk.linear.weight.grad.abs().sum() > 0
-
-
-def test_log_std_bounds_are_respected_and_checked() -> None:
-    raw = torch.tensor([-1e6, 0.0, 1e6])
-    torch.testing.assert_close(squash_log_std(raw, (-10, 2)), torch.tensor([-10.0, -4.0, 2.0]))
-    with pytest.raises(ValueError, match="low < high"):
-        actor(log_std_bounds=(2, -10))
+    first.sum().backward()
+    assert policy.trunk.linear.weight.grad.any()
 
 
 def test_both_heads_share_one_trunk() -> None:
@@ -108,18 +112,18 @@ def test_both_heads_share_one_trunk() -> None:
         values.append(hidden @ head.last.weight.T)
     torch.testing.assert_close(twin(features, action), torch.cat(values, dim=-1))
     assert not torch.equal(values[0], values[1])
-    assert sum("trunk.linear.weight" in name for name, _ in twin.named_parameters()) == 1
-
-
-def test_full_size_critic_has_one_trunk_of_39200_by_50() -> None:
-    twin = TwinCritic(39_200, 6)
-    trunk = 39_200 * 50 + 50 + 100
+    full = TwinCritic(39_200, 6)
     head = 57 * 1024 + 1025 * 1024 + 1025
-    # The first layer has 50 + 6 inputs and a bias.
-    assert sum(p.numel() for p in twin.parameters()) == trunk + 2 * head
+    assert sum(p.numel() for p in full.parameters()) == 39_200 * 50 + 50 + 100 + 2 * head
 
 
-@pytest.mark.parametrize("make", [actor, critic])
+def test_a_pixel_critic_refuses_a_head_of_other_features() -> None:
+    encoder = PixelEncoder(3, channels=(4,), strides=(2,), image_size=9)
+    with pytest.raises(ValueError, match="build it with feature_dim=64"):
+        PixelCritic(encoder, critic())
+
+
+@pytest.mark.parametrize("make", [actor, critic, skilled])
 def test_linear_layers_are_orthogonal_with_zero_bias(make) -> None:
     for layer in make().modules():
         if isinstance(layer, torch.nn.Linear):
@@ -131,15 +135,13 @@ def test_linear_layers_are_orthogonal_with_zero_bias(make) -> None:
 def test_bfloat16_is_close_and_returns_float32() -> None:
     policy, twin = actor(), critic()
     features, action = torch.rand(64, 40), torch.rand(64, 3)
-    loc, _ = policy(features)
-    values = twin(features, action)
-    set_compute_dtype(policy, torch.bfloat16)
-    set_compute_dtype(twin, torch.bfloat16)
-    low_loc, low_scale = policy(features.to(torch.bfloat16))
-    low_values = twin(features.to(torch.bfloat16), action)
-    assert low_loc.dtype == low_scale.dtype == low_values.dtype == torch.float32
-    assert (low_loc - loc).norm() / loc.norm() < 0.03
-    assert (low_values - values).norm() / values.norm() < 0.03
+    expected = [policy(features)[0], twin(features, action)]
+    for network in (policy, twin):
+        set_compute_dtype(network, torch.bfloat16)
+    found = [policy(features.bfloat16())[0], twin(features.bfloat16(), action)]
+    for one, two in zip(found, expected):
+        assert one.dtype == torch.float32
+        assert (one - two).norm() / two.norm() < 0.03
 
 
 def test_leading_dimensions_are_kept_and_one_row_is_legal() -> None:
@@ -148,6 +150,92 @@ def test_leading_dimensions_are_kept_and_one_row_is_legal() -> None:
     assert actor().mode(torch.rand(40)).shape == (3,)
 
 
-def test_config_rebuilds_the_networks() -> None:
-    SquashedGaussianActor(**actor().config).load_state_dict(actor().state_dict())
-    TwinCritic(**critic().config).load_state_dict(critic().state_dict())
+@pytest.mark.parametrize(
+    "make",
+    [SquashedGaussianActor, TwinCritic, lambda *a, **k: DeterministicActor(*a, skill_dim=np.int8(4), **k)],
+)
+def test_sizes_of_any_number_type_become_plain_integers_in_the_card(make) -> None:
+    module = make(np.int64(6), 2.0, hidden_dim=torch.tensor(8))
+    assert json.loads(json.dumps(module.config)) == module.config
+    type(module)(**module.config).load_state_dict(module.state_dict())
+    with pytest.raises(ValueError, match="`action_dim` must be at least 1"):
+        make(6, 0)
+
+
+def test_log_std_bounds_must_ascend() -> None:
+    with pytest.raises(ValueError, match="low < high"):
+        actor(log_std_bounds=(2, -10))
+
+
+# DDPG with skills ----------------------------------------------------------------------------------------
+
+
+def test_the_skill_policy_clips_its_noise_and_lets_the_gradient_through_the_bound() -> None:
+    policy, inputs = skilled(), torch.rand(6, 44)
+    mean = policy(inputs)
+    assert mean.abs().max() <= 1
+    noise = torch.full((6, 3), 50.0)
+    torch.testing.assert_close(policy.sample(inputs, noise=noise * 0.01), mean + 0.1)
+    torch.testing.assert_close(policy.sample(inputs, noise=noise * 0.01, noise_clip=0.05), mean + 0.05)
+    action = policy.sample(inputs, noise=noise)
+    torch.testing.assert_close(action, torch.full((6, 3), 1 - 1e-6), rtol=0, atol=2e-6)
+    action.sum().backward()
+    assert policy.mlp.last.weight.grad.any()
+
+
+def test_a_fixed_skill_acts_as_the_policy_with_that_skill() -> None:
+    policy, features = skilled(), torch.rand(5, 40)
+    fixed = FixedSkillActor(policy, 2)
+    code = torch.tensor([0.0, 0, 1, 0]).expand(5, 4)
+    assert torch.equal(fixed.mode(features), policy(torch.cat([features, code], -1)))
+    assert not torch.equal(fixed.explore(features), fixed.mode(features))
+    assert FixedSkillActor.from_config(**fixed.config).action_dim == 3
+    with pytest.raises(ValueError, match="There are 4 skills"):
+        FixedSkillActor(policy, 4)
+
+
+# The distribution in TorchRL's form ----------------------------------------------------------------------
+
+
+def test_own_samples_are_scored_before_the_tanh_and_others_inverted() -> None:
+    saturated = SquashedGaussian(torch.full((1, 1), 40.0), torch.ones(1, 1))
+    action = saturated.rsample()
+    assert action.item() == 1.0
+    assert saturated.log_prob(action).item() > 70
+    assert saturated.log_prob(action.clone()).item() < 0  # a stranger's action is inverted with a margin
+    policy = SquashedGaussian(torch.zeros(3, 2).double(), torch.ones(3, 2).double())
+    action = policy.rsample()
+    torch.testing.assert_close(policy.log_prob(action.clone()), policy.log_prob(action), rtol=1e-5, atol=1e-5)
+    assert policy.log_prob(policy.sample((4,))).shape == (4, 3)
+
+
+def test_gradients_of_own_samples_are_those_of_the_score_and_of_the_reparameterisation() -> None:
+    draws = torch.Generator().manual_seed(0)
+    loc, raw = torch.randn(2, 5, 3, generator=draws, dtype=torch.float64)
+    torch.manual_seed(0)
+    loc, scale = loc.requires_grad_(), (0.3 * raw).exp().requires_grad_()
+    policy = SquashedGaussian(loc, scale)
+    action = policy.sample()
+    own = torch.autograd.grad(policy.log_prob(action).sum(), (loc, scale))
+    given = torch.autograd.grad(policy.log_prob(action.clone()).sum(), (loc, scale))
+    torch.testing.assert_close(own, given, rtol=1e-4, atol=1e-6)
+    torch.manual_seed(0)
+    through = torch.autograd.grad(policy.log_prob(policy.rsample()).sum(), (loc, scale))
+    torch.manual_seed(0)
+    noise = torch.randn_like(loc)
+    expected = torch.autograd.grad(squashed_gaussian(loc, scale, noise)[1].sum(), (loc, scale))
+    torch.testing.assert_close(through, expected)
+
+
+def test_probabilistic_actor_follows_the_exploration_type() -> None:
+    network = actor()
+    policy = ProbabilisticActor(
+        TensorDictModule(network, ["features"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=SquashedGaussian,
+    )
+    td = TensorDict({"features": torch.randn(4, 40)}, [4])
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert torch.equal(policy(td.copy())["action"], network.mode(td["features"]))
+    with set_exploration_type(ExplorationType.RANDOM):
+        assert not torch.equal(policy(td.copy())["action"], policy(td.copy())["action"])

@@ -1,20 +1,23 @@
-"""The encoder: shapes, initialisation, and equality of its fast paths with plain convolutions."""
+"""The encoder: shapes, initialisation, what it is shown, and equality of its fast paths with plain convolutions."""
 
 from __future__ import annotations
 
+import copy
 import json
+import logging
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from crptpro.modules import PixelEncoder
+from crptpro.modules import PixelEncoder, set_channels_last
 
 
 def small(**options) -> PixelEncoder:
     torch.manual_seed(0)
-    return PixelEncoder(3, channels=(8, 8, 8), strides=(2, 1, 1), image_size=21, **options)
+    return PixelEncoder(3, **{"channels": (8, 8, 8), "strides": (2, 1, 1), "image_size": 21, **options})
 
 
 def pixels(count: int = 5, channels: int = 3, size: int = 21) -> Tensor:
@@ -31,24 +34,33 @@ def plain(encoder: PixelEncoder) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Flatten())
 
 
-def test_default_encoder_has_39200_features_and_30368_parameters() -> None:
+def relative_error(actual: Tensor, expected: Tensor) -> float:
+    return ((actual.float() - expected).norm() / expected.norm().clamp_min(1e-12)).item()
+
+
+def test_default_encoder_is_the_papers() -> None:
     encoder = PixelEncoder()
     assert encoder.feature_dim == 39_200
     assert encoder.feature_map_shape == (32, 35, 35)
     assert sum(p.numel() for p in encoder.parameters()) == 30_368
-    assert encoder(pixels(2, 9, 84)).shape == (2, 39_200)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_a_parameter_or_a_pixel_that_is_not_a_number_is_seen_in_the_features(dtype: torch.dtype) -> None:
-    encoder = small()
-    encoder.compute_dtype = dtype
-    images = pixels().float()
-    images[0, 0, 0, 0] = float("nan")
-    assert encoder(images)[0].isnan().any()
+    images = pixels(2, 9, 84)
     with torch.no_grad():
-        encoder.conv_layers[0].weight.view(-1)[0] = float("nan")
-    assert encoder(pixels()).isnan().any(dim=1).all()
+        torch.testing.assert_close(encoder(images), plain(encoder)(images / 255), rtol=0, atol=1e-5)
+    for conv in encoder.convs:
+        flat = conv.weight.flatten(1)
+        torch.testing.assert_close(flat @ flat.T, 2 * torch.eye(32), rtol=0, atol=1e-4)
+        assert not conv.bias.any()
+        # Delta-orthogonal kernels would be zero off the centre.
+        assert conv.weight[:, :, 0, 0].abs().sum() > 0
+
+
+def test_atcs_own_strides_give_its_published_sizes() -> None:
+    x, sizes = torch.zeros(1, 9, 84, 84), []
+    for conv in PixelEncoder(strides=(2, 2, 2, 1)).conv_layers:
+        x = conv(x)
+        sizes.append(x.shape[-1])
+    assert sizes == [41, 20, 9, 7]
+    assert PixelEncoder(strides=(2, 2, 2, 1)).feature_map_shape == (32, 7, 7)
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.5])
@@ -66,13 +78,6 @@ def test_float32_features_and_gradients_equal_plain_convolutions(offset: float) 
     for conv, twin in zip(encoder.convs, reference[::2]):
         torch.testing.assert_close(conv.weight.grad, twin.weight.grad, rtol=1e-4, atol=1e-4)
         torch.testing.assert_close(conv.bias.grad, twin.bias.grad, rtol=1e-4, atol=1e-4)
-
-
-def test_full_size_float32_features_equal_plain_convolutions() -> None:
-    encoder = PixelEncoder()
-    images = pixels(3, 9, 84)
-    with torch.no_grad():
-        torch.testing.assert_close(encoder(images), plain(encoder)(images / 255), rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.5])
@@ -95,32 +100,25 @@ def test_bfloat16_features_are_within_two_percent_and_gradients_within_five(offs
         assert relative_error(parameter.grad, gradient) < 0.05
 
 
-def test_bfloat16_input_loses_nothing_of_raw_pixels() -> None:
-    values = torch.arange(256)
-    assert torch.equal(values.to(torch.bfloat16).long(), values)
-    assert torch.equal(((values.to(torch.bfloat16) - 127.5) * 2).long(), 2 * values - 255)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_chunk_length_does_not_change_features(dtype: torch.dtype) -> None:
+def test_chunks_and_layout_change_rounding_only(dtype: torch.dtype) -> None:
     encoder = small()
     encoder.compute_dtype = dtype
     whole = encoder(pixels(7))
     encoder.micro_batch = 3
     torch.testing.assert_close(encoder(pixels(7)), whole, rtol=1e-2, atol=1e-5)
+    usual = set_channels_last(copy.deepcopy(encoder), False)
+    torch.testing.assert_close(usual(pixels(7)), whole, rtol=2e-2, atol=1e-2)
+    for each, is_last in ((encoder, True), (usual, False)):
+        maps = each.feature_map(pixels(2))
+        assert maps.is_contiguous(memory_format=torch.channels_last) is is_last
 
 
-def test_features_are_flattened_in_channel_row_column_order() -> None:
+def test_features_are_flattened_in_channel_row_column_order_and_maps_may_be_larger() -> None:
     encoder = small()
-    images = pixels(2)
-    feature_map = encoder.feature_map(images)
-    assert feature_map.shape == (2, *encoder.feature_map_shape)
-    features = encoder(images).reshape(2, *encoder.feature_map_shape)
-    assert torch.equal(features, feature_map)
-
-
-def test_feature_map_takes_images_of_another_size() -> None:
-    assert small().feature_map(pixels(2, size=31)).shape[-1] == 11
+    features = encoder(pixels(2)).reshape(2, *encoder.feature_map_shape)
+    assert torch.equal(features, encoder.feature_map(pixels(2)))
+    assert encoder.feature_map(pixels(2, size=31)).shape[-1] == 11
 
 
 def test_leading_dimensions_are_kept_and_an_empty_batch_is_legal() -> None:
@@ -128,24 +126,71 @@ def test_leading_dimensions_are_kept_and_an_empty_batch_is_legal() -> None:
     images = pixels(6)
     assert torch.equal(encoder(images.reshape(2, 3, 3, 21, 21)), encoder(images).reshape(2, 3, -1))
     assert encoder(images[0]).shape == (encoder.feature_dim,)
-    assert encoder(images[:0]).shape == (0, encoder.feature_dim)
+    for nothing in (images[:0], images[:0].float()):
+        assert encoder(nothing).shape == (0, encoder.feature_dim)
 
 
-def test_float_pixels_equal_uint8_pixels_and_are_not_changed() -> None:
-    encoder = small()
-    images = pixels().float()
-    before = images.clone()
-    assert torch.equal(encoder(images), encoder(pixels()))
-    assert torch.equal(images, before)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("offset", [0.0, 0.5])
+def test_floating_pixels_in_the_unit_interval_are_never_scaled_twice_and_that_is_said_once(
+    caplog: pytest.LogCaptureFixture, dtype: torch.dtype, offset: float
+) -> None:
+    encoder = small(pixel_offset=offset)
+    encoder.compute_dtype = dtype
+    scaled = pixels().float().div(255)
+    with caplog.at_level(logging.WARNING):
+        found = encoder(scaled)
+        encoder(scaled)
+    assert [record.message for record in caplog.records] == [
+        "PixelEncoder is given float32 pixels in [0, 1]; they are taken as divided by 255 already."
+    ]
+    torch.testing.assert_close(
+        found, encoder(pixels()), rtol=2e-2, atol=1e-5 if dtype == torch.float32 else 2e-2
+    )
 
 
-def test_kernels_are_orthogonal_with_gain_sqrt_two_and_biases_zero() -> None:
-    for conv in PixelEncoder().convs:
-        flat = conv.weight.flatten(1)
-        torch.testing.assert_close(flat @ flat.T, 2 * torch.eye(32), rtol=0, atol=1e-4)
-        assert not conv.bias.any()
-        # Delta-orthogonal kernels would be zero off the centre.
-        assert conv.weight[:, :, 0, 0].abs().sum() > 0
+@pytest.mark.parametrize(
+    ("images", "named"),
+    [
+        (torch.full((1, 3, 21, 21), 255.0), r"in \[0, 1\], got values from 255 to 255; pass 0..255 as uint8"),
+        (torch.full((1, 3, 21, 21), -0.1), "from -0.1"),
+        (torch.full((1, 3, 21, 21), float("nan")), "nan"),
+        (torch.zeros(1, 3, 21, 21, dtype=torch.int64), "int64"),
+        (torch.zeros(1, 3, 21, 21, dtype=torch.uint16), "uint16"),
+        (torch.zeros(2, 3, 20, 20, dtype=torch.uint8), r"\[\*, 3, 21, 21\], got \(2, 3, 20, 20\)"),
+    ],
+)
+def test_images_that_are_neither_uint8_nor_in_the_unit_interval_are_refused_by_name(
+    images: Tensor, named: str
+) -> None:
+    with pytest.raises(ValueError, match=named):
+        small()(images)
+
+
+def test_sizes_of_any_number_type_become_plain_integers_in_the_card() -> None:
+    encoder = PixelEncoder(
+        np.int64(3),
+        channels=np.array([4, 4]),
+        strides=(torch.tensor(2), 1.0),
+        image_size=np.float64(21.0),
+        pixel_scale=np.float32(0.5),
+    )
+    assert json.loads(json.dumps(encoder.config)) == encoder.config
+    assert {type(value) for key in ("channels", "strides") for value in encoder.config[key]} == {int}
+    assert type(encoder.feature_dim) is type(encoder.image_size) is int
+    with pytest.raises(ValueError, match=r"`image_size` must be a whole number, got 21\.5"):
+        PixelEncoder(3, image_size=21.5)
+    with pytest.raises(ValueError, match="`channels` must be at least 1"):
+        PixelEncoder(3, channels=(0,), strides=(2,))
+
+
+def test_impossible_geometry_is_refused() -> None:
+    with pytest.raises(ValueError, match="equal length"):
+        PixelEncoder(channels=(8, 8), strides=(2,))
+    with pytest.raises(ValueError, match="image_size 5 is too small"):
+        PixelEncoder(image_size=5)
+    with pytest.raises(ValueError, match="init must be one of orthogonal, kaiming, got 'xavier'"):
+        PixelEncoder(init="xavier")
 
 
 def test_same_seed_draws_the_same_encoder_and_another_seed_does_not() -> None:
@@ -156,18 +201,48 @@ def test_same_seed_draws_the_same_encoder_and_another_seed_does_not() -> None:
     assert not torch.equal(PixelEncoder(3, image_size=21).convs[1].weight, first)
 
 
-def test_config_survives_json_and_rebuilds_the_encoder() -> None:
-    encoder = small(pixel_offset=0.5)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_a_standardised_encoder_gives_features_of_mean_zero_and_deviation_one(dtype: torch.dtype) -> None:
+    encoder = small()
+    raw = encoder(pixels(64)).detach()
+    mean, scale = raw.mean(0), raw.std(0).clamp_min(0.1)
+    encoder.compute_dtype = dtype
+    assert encoder.standardise(mean, scale) is encoder
+    features = encoder(pixels(64))
+    assert features.dtype == dtype
+    torch.testing.assert_close(
+        features.float(), (raw - mean) / scale, rtol=0, atol=1e-4 if dtype == torch.float32 else 0.2
+    )
     twin = PixelEncoder(**json.loads(json.dumps(encoder.config)))
     twin.load_state_dict(encoder.state_dict())
+    twin.compute_dtype = dtype
     assert torch.equal(twin(pixels()), encoder(pixels()))
+    assert torch.equal(copy.deepcopy(encoder)(pixels()), encoder(pixels()))
 
 
-def test_functional_call_uses_the_given_parameters() -> None:
-    encoder, other = small(), PixelEncoder(3, channels=(8, 8, 8), strides=(2, 1, 1), image_size=21)
-    expected, own = other(pixels()), encoder(pixels())
+@pytest.mark.parametrize(
+    ("mean", "scale", "named"),
+    [
+        (torch.zeros(3), torch.ones(3), "one per feature"),
+        (torch.full((288,), float("nan")), torch.ones(288), "`mean` must hold 288 finite"),
+        (torch.zeros(288), torch.zeros(288), "`scale` must be positive"),
+    ],
+)
+def test_a_standardisation_that_gives_no_numbers_is_refused(mean: Tensor, scale: Tensor, named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        small(image_size=21).standardise(mean, scale)
+
+
+def test_config_rebuilds_the_encoder_and_foreign_parameters_can_be_used() -> None:
+    encoder, other = small(pixel_offset=0.5), small(pixel_offset=0.5)
+    with torch.no_grad():
+        other.conv_layers[0].weight.mul_(2)
+    twin = PixelEncoder(**encoder.config)
+    twin.load_state_dict(encoder.state_dict())
+    own = encoder(pixels())
+    assert torch.equal(twin(pixels()), own)
     with TensorDict.from_module(other).to_module(encoder, preserve_module_state=False):
-        assert torch.equal(encoder(pixels()), expected)
+        assert torch.equal(encoder(pixels()), other(pixels()))
     assert torch.equal(encoder(pixels()), own)
 
 
@@ -179,30 +254,11 @@ def test_compiled_encoder_equals_eager(dtype: torch.dtype) -> None:
     torch.testing.assert_close(compiled(pixels()), encoder(pixels()))
 
 
-def test_double_parameters_compute_in_double() -> None:
+def test_double_parameters_compute_in_double_and_nan_parameters_show() -> None:
     assert small().double()(pixels()).dtype == torch.float64
-
-
-def test_atcs_own_strides_give_its_published_sizes() -> None:
-    x, sizes = torch.zeros(1, 9, 84, 84), []
-    for conv in PixelEncoder(strides=(2, 2, 2, 1)).conv_layers:
-        x = conv(x)
-        sizes.append(x.shape[-1])
-    assert sizes == [41, 20, 9, 7]
-    assert PixelEncoder(strides=(2, 2, 2, 1)).feature_map_shape == (32, 7, 7)
-
-
-def test_wrong_image_shape_is_named() -> None:
-    with pytest.raises(ValueError, match=r"\[\*, 3, 21, 21\], got \(2, 3, 20, 20\)"):
-        small()(pixels(2, size=20))
-
-
-def test_impossible_geometry_is_refused() -> None:
-    with pytest.raises(ValueError, match="equal length"):
-        PixelEncoder(channels=(8, 8), strides=(2,))
-    with pytest.raises(ValueError, match="image_size 5 is too small"):
-        PixelEncoder(image_size=5)
-
-
-def relative_error(actual: Tensor, expected: Tensor) -> float:
-    return ((actual.float() - expected).norm() / expected.norm().clamp_min(1e-12)).item()
+    for dtype in (torch.float32, torch.bfloat16):
+        encoder = small()
+        encoder.compute_dtype = dtype
+        with torch.no_grad():
+            encoder.conv_layers[0].weight.view(-1)[0] = float("nan")
+        assert encoder(pixels()).isnan().any(dim=1).all()

@@ -7,14 +7,18 @@ from pathlib import Path
 
 import pytest
 import torch
-import torch.nn.functional as F
 
+from crptpro.errors import CRPTproError
 from crptpro.modules import (
     PixelEncoder,
     SquashedGaussianActor,
     TwinCritic,
+    computing,
+    is_channels_last,
+    resolve_channels_last,
     resolve_precision,
     set_compute_dtype,
+    usable_device,
 )
 from crptpro.modules import precision as precision_module
 from crptpro.modules.precision import linear_in
@@ -104,12 +108,34 @@ def test_set_compute_dtype_reaches_the_networks_of_a_loss() -> None:
     assert all(p.dtype == torch.float32 for p in [*loss.parameters(), *actor.parameters()])
 
 
-def test_other_dtypes_are_refused() -> None:
+def test_other_names_are_refused() -> None:
     with pytest.raises(ValueError, match="float16"):
         set_compute_dtype(PixelEncoder(3, image_size=21), torch.float16)
+    assert resolve_channels_last("auto")
+    assert not resolve_channels_last("off")
+    with pytest.raises(ValueError, match="`channels_last` must be 'auto', 'on' or 'off', got 'never'"):
+        resolve_channels_last("never")  # type: ignore[arg-type]
+    with pytest.raises(CRPTproError, match="'cpu' always works"):
+        usable_device("nowhere")
 
 
 def test_linear_in_adds_the_bias_in_full_precision() -> None:
-    x, weight, bias = torch.zeros(1, 4), torch.randn(2, 4), torch.tensor([1.0009765625, 0.1])
-    assert torch.equal(linear_in(x, weight, bias, torch.bfloat16)[0], bias)
-    torch.testing.assert_close(linear_in(x, weight, None, torch.float32), F.linear(x, weight))
+    layer = torch.nn.Linear(4, 2)
+    layer.bias.data = torch.tensor([1.0009765625, 0.1])
+    assert torch.equal(linear_in(torch.zeros(1, 4), layer, torch.bfloat16)[0], layer.bias)
+
+
+def test_computing_reaches_networks_that_a_loss_hides_and_ends_whatever_happens_inside() -> None:
+    encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=12)
+    loss = ProtoLoss(encoder, num_prototypes=8, latent_dim=4, hidden_dim=8)
+
+    def break_off() -> None:
+        with computing(loss, torch.bfloat16, channels_last=False):
+            assert (encoder.compute_dtype, encoder.channels_last) == (torch.bfloat16, False)
+            assert not is_channels_last(loss)
+            raise RuntimeError("inside")
+
+    with pytest.raises(RuntimeError, match="inside"):
+        break_off()
+    assert (encoder.compute_dtype, encoder.channels_last) == (torch.float32, True)
+    assert is_channels_last(loss)

@@ -1,37 +1,32 @@
+"""Learning a task on a frozen encoder: evaluations, resuming, features, the bonus, refusals."""
+
 from __future__ import annotations
 
-import csv
 import dataclasses
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from torchrl.envs import CatFrames, EnvBase, TransformedEnv
-from toy_world import ToyEnv
+from torch import Tensor, nn
+from worlds import EPISODE, SIZE, make_encoder, make_pretrained, make_toy_env, record
 
 from crptpro.errors import CheckpointError, NonFiniteError, PretrainedError
-from crptpro.loggers import RunLogger, WandbOptions
-from crptpro.modules import PixelEncoder, Projector, Prototypes, set_compute_dtype
-from crptpro.objectives import ProtoLoss
-from crptpro.pretrained import (
-    Pretrained,
-    load_pretrained,
-    random_pretrained,
-    save_pretrained,
-    trim_pretrained,
-)
-from crptpro.training import DownstreamConfig, load_agent, train_downstream
-from crptpro.training.downstream import _replay_capacity
-from crptpro.training.downstream_run import DownstreamRun
-from crptpro.training.rad_sac_learner import RADSACLearner
+from crptpro.modules import SquashedGaussianActor
+from crptpro.pretrained import Pretrained, random_pretrained
+from crptpro.training import DownstreamConfig, DownstreamResult, load_agent, train_downstream
 
-EPISODE = 10
 SMALL = DownstreamConfig(
     env_steps=120,
     batch_size=8,
     replay_capacity=40,
     random_agent_steps=12,
     queue_size=16,
+    hidden_dim=16,
     eval_interval_env_steps=40,
     eval_episodes=2,
     checkpoint_interval_env_steps=20,
@@ -41,34 +36,22 @@ SMALL = DownstreamConfig(
 )
 
 
-def small_pretrained() -> Pretrained:
-    torch.manual_seed(0)
-    encoder = PixelEncoder(channels=(4, 4), strides=(2, 1), image_size=16)
-    return Pretrained(encoder, projector=Projector(encoder.feature_dim, 4), prototypes=Prototypes(8, 4))
+def train(run_dir: Path | None, pretrained: Pretrained | None = None, **options: Any) -> DownstreamResult:
+    artifact = make_pretrained() if pretrained is None else pretrained
+    defaults: dict[str, Any] = {"config": SMALL, "env_factory": make_toy_env, "progress": False}
+    return train_downstream("toy", artifact, run_dir=run_dir, **{**defaults, **options})
 
 
-def toy_env(task: str, *, seed: int, image_size: int, frame_stack: int, **settings: object) -> EnvBase:
-    env = ToyEnv(lambda _: EPISODE, seed=seed, image_size=image_size)
-    return TransformedEnv(env, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
+def weights(result: DownstreamResult) -> dict[str, Tensor]:
+    return result.agent.actor.state_dict()
 
 
-def world_of_16(task: str, *, image_size: int, **settings: object) -> EnvBase:
-    """A world that draws at a size of its own."""
-    return toy_env(task, image_size=16, **settings)  # type: ignore[arg-type]
+def same_weights(one: DownstreamResult, two: DownstreamResult) -> bool:
+    return all(torch.equal(value, weights(two)[key]) for key, value in weights(one).items())
 
 
-def train(run_dir: Path | None, pretrained: Pretrained | None = None, **overrides: object):
-    return train_downstream(
-        "toy",
-        small_pretrained() if pretrained is None else pretrained,
-        run_dir=run_dir,
-        progress=False,
-        **{"config": SMALL, "env_factory": toy_env, **overrides},
-    )
-
-
-def rows_without_time(rows: list[dict]) -> list[dict]:
-    return [{k: v for k, v in row.items() if "time" not in k} for row in rows]
+def losses(run_dir: Path) -> Tensor:
+    return torch.tensor([float(row["loss_qvalue"]) for row in record(run_dir / "train.csv")])
 
 
 def test_a_run_evaluates_at_every_interval_and_at_both_ends(tmp_path: Path) -> None:
@@ -76,237 +59,227 @@ def test_a_run_evaluates_at_every_interval_and_at_both_ends(tmp_path: Path) -> N
     assert result.env_steps == 120
     assert [row["env_steps"] for row in result.evaluations] == [0, 0, 40, 40, 80, 80, 120, 120]
     assert {row["episode"] for row in result.evaluations} == {0, 1}
+    assert {row["method"] for row in result.evaluations} == {"crptpro"}
     assert result.evaluations[-1]["updates"] == 60 - 12
+    assert len(record(tmp_path / "eval.csv")) == 8
+    assert [row["episode_agent_steps"] for row in record(tmp_path / "episodes.csv")] == [str(EPISODE)] * 6
     agent, card = load_agent(tmp_path / "agent")
-    pixels = torch.randint(0, 256, (9, 16, 16), dtype=torch.uint8)
-    torch.testing.assert_close(agent(pixels), result.policy(pixels), rtol=0, atol=0)
-    assert card["task"] == "toy"
+    pixels = torch.randint(0, 256, (9, SIZE, SIZE), dtype=torch.uint8)
+    assert torch.equal(agent(pixels), result.agent(pixels))
+    assert (card["task"], card["env_steps"], card["config"]["seed"]) == ("toy", 120, 0)
 
 
-@pytest.mark.parametrize("channels_last", ["on", "off"])
-def test_a_saved_agent_acts_in_the_arithmetic_of_its_run(tmp_path: Path, channels_last: str) -> None:
-    result = train(tmp_path, env_steps=40, precision="bf16", channels_last=channels_last)
-    agent, card = load_agent(tmp_path / "agent")
-    assert card["config"]["precision"] == "bf16"
-    pixels = torch.randint(0, 256, (9, 16, 16), dtype=torch.uint8)
-    assert agent.encoder.channels_last is (channels_last == "on")
-    torch.testing.assert_close(agent(pixels), result.policy(pixels), rtol=0, atol=0)
-    set_compute_dtype(agent.actor, torch.float32)
-    set_compute_dtype(agent.encoder, torch.float32)
-    assert not torch.equal(agent(pixels), result.policy(pixels))
+def test_the_encoder_stays_as_it_was_and_sac_learns() -> None:
+    pretrained = make_pretrained()
+    before = {key: value.clone() for key, value in pretrained.encoder.state_dict().items()}
+    result = train(None, pretrained)
+    assert all(torch.equal(value, before[key]) for key, value in pretrained.encoder.state_dict().items())
+    assert all(torch.equal(value, before[key]) for key, value in result.agent.encoder.state_dict().items())
+    assert not same_weights(result, train(None, pretrained, env_steps=20))
 
 
-def test_training_changes_the_actor_and_leaves_the_encoder_projector_and_prototypes_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    "settings", [{}, {"features": "reencode"}, {"features": "dense-bf16"}, {"method": "drq"}]
+)
+def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(
+    tmp_path: Path, settings: dict[str, Any]
 ) -> None:
-    runs: list[DownstreamRun] = []
-
-    def noted(*args: object, **options: object) -> DownstreamRun:
-        runs.append(DownstreamRun(*args, **options))  # type: ignore[arg-type]
-        return runs[-1]
-
-    monkeypatch.setattr("crptpro.training.downstream.DownstreamRun", noted)
-    train(tmp_path / "a", env_steps=20)  # 10 decisions: no update yet
-    train(tmp_path / "b")
-    first, later = runs
-    assert (first.updates, later.updates) == (0, 60 - 12)
-    before, after = (run.parts.agent().actor.state_dict() for run in runs)
-    assert any(not torch.equal(before[k], after[k]) for k in before)
-    untouched, parts = small_pretrained(), later.parts
-    for trained, reference in (
-        (parts.encoder, untouched.encoder),
-        (parts.bonus.projector, untouched.projector),
-        (parts.bonus.prototypes, untouched.prototypes),
-    ):
-        for key, value in reference.state_dict().items():
-            torch.testing.assert_close(trained.state_dict()[key], value, rtol=0, atol=0)
+    settings = dict(settings)
+    pretrained = make_pretrained(settings.pop("method", "crptpro"))
+    whole = train(tmp_path / "whole", pretrained, **settings)
+    train(tmp_path / "parts", pretrained, **settings, env_steps=60)
+    resumed = train(tmp_path / "parts", pretrained, **settings)
+    assert same_weights(resumed, whole)
+    rows = [row for row in record(tmp_path / "parts" / "eval.csv") if row["env_steps"] != "60"]
+    assert rows == record(tmp_path / "whole" / "eval.csv")
+    assert record(tmp_path / "parts" / "train.csv") == record(tmp_path / "whole" / "train.csv")
+    again = train(tmp_path / "parts", pretrained, **settings)
+    assert same_weights(again, whole)
+    assert record(tmp_path / "parts" / "train.csv") == record(tmp_path / "whole" / "train.csv")
 
 
-def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path: Path) -> None:
-    first, second, other = train(tmp_path / "a"), train(tmp_path / "b"), train(tmp_path / "c", seed=1)
-    assert rows_without_time(first.evaluations) == rows_without_time(second.evaluations)
-    assert rows_without_time(first.evaluations) != rows_without_time(other.evaluations)
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+import test_downstream, worlds
+steps = 0
+def make(task, **settings):
+    env = worlds.make_toy_env(task, **settings)
+    step = env.base_env._step
+    def count(td):
+        global steps
+        steps += 1
+        if steps == int(sys.argv[2]):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return step(td)
+    env.base_env._step = count
+    return env
+test_downstream.train(Path(sys.argv[1]), env_factory=make)
+"""
 
 
-def test_dense_and_reencoded_features_train_the_same_agent(tmp_path: Path) -> None:
-    first_rows = []
-    for mode in ("dense", "reencode"):
-        train(tmp_path / mode, features=mode)
-        with open(tmp_path / mode / "train.csv", newline="") as file:
-            first_rows.append(next(csv.DictReader(file)))
-    dense, reencoded = first_rows
-    assert dense.keys() == reencoded.keys()
-    for key in ("loss_qvalue", "loss_actor", "q_mean", "entropy", "intrinsic_reward"):
-        assert float(dense[key]) == pytest.approx(float(reencoded[key]), rel=1e-3), key
+@pytest.mark.parametrize("at_step", [25, 77])
+def test_a_killed_run_continues_with_the_same_command(tmp_path: Path, at_step: int) -> None:
+    path = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[1] / "data"), *sys.path])
+    killed = subprocess.run(
+        [sys.executable, "-c", KILLED, str(tmp_path / "parts"), str(at_step)],
+        env={**os.environ, "PYTHONPATH": path}, capture_output=True, check=False,
+    )  # fmt: skip
+    assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()
+    resumed, whole = train(tmp_path / "parts"), train(tmp_path / "whole")
+    assert same_weights(resumed, whole)
+    for name in ("eval.csv", "train.csv", "episodes.csv"):
+        assert record(tmp_path / "parts" / name) == record(tmp_path / "whole" / name)
 
 
-@pytest.mark.parametrize("features", ["dense", "reencode"])
-def test_kept_and_computed_embeddings_give_the_same_bonus(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, features: str
-) -> None:
-    settings = {"batch_size": 20, "shift_pad": 1, "features": features, "env_steps": 60}
-    kept = train(tmp_path / "kept", **settings)
-    monkeypatch.setattr("crptpro.training.downstream_parts.worth_keeping_projections", lambda config: False)
-    computed = train(tmp_path / "computed", **settings)
-    rows = []
-    for run in ("kept", "computed"):
-        with open(tmp_path / run / "train.csv", newline="") as file:
-            rows.append([float(row["intrinsic_reward"]) for row in csv.DictReader(file)])
-    assert len(rows[0]) >= 2
-    assert rows[0] == pytest.approx(rows[1], rel=1e-4)
-    assert kept.env_steps == computed.env_steps
+def test_dense_maps_and_encoding_anew_are_the_same_run_up_to_rounding(tmp_path: Path) -> None:
+    for features in ("dense", "reencode", "dense-bf16"):
+        train(tmp_path / features, features=features)
+    train(tmp_path / "other", seed=1)
+    other = (losses(tmp_path / "other") - losses(tmp_path / "reencode")).abs().mean()
+    for features, share in (("dense", 1e-3), ("dense-bf16", 0.3)):
+        difference = (losses(tmp_path / features) - losses(tmp_path / "reencode")).abs().mean()
+        assert difference < share * other, features
 
 
-def test_an_artifact_without_prototypes_trains_without_bonus_and_says_so_once(
+def test_workers_of_their_own_evaluate_the_same_episodes(tmp_path: Path) -> None:
+    here = train(tmp_path / "here")
+    beside = train(tmp_path / "beside", eval_workers=2)
+    left_out = ("unix_time_s",)
+    rows = [
+        [{k: v for k, v in row.items() if k not in left_out} for row in r.evaluations] for r in (here, beside)
+    ]
+    assert rows[0] == rows[1]
+    assert same_weights(here, beside)
+
+
+def test_the_bonus_is_added_where_there_are_prototypes_and_a_coefficient(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    encoder = {"channels": (4, 4), "strides": (2, 1), "image_size": 16}
+    bonus, none = train(tmp_path / "bonus"), train(tmp_path / "none", intrinsic_reward_coef=0)
+    assert not same_weights(bonus, none)
+    encoder_only = dataclasses.replace(make_pretrained(), projector=None, prototypes=None)
     with caplog.at_level("INFO", logger="crptpro"):
-        train(tmp_path, random_pretrained(seed=0, **encoder))
-    assert caplog.text.count("no exploration bonus") == 1
-    assert "intrinsic_reward" not in (tmp_path / "train.csv").read_text()
+        assert same_weights(train(None, encoder_only), none)
+    assert "no exploration bonus" in caplog.text
 
 
-def test_the_bonus_is_logged_when_there_are_prototypes(tmp_path: Path) -> None:
-    train(tmp_path)
-    assert "intrinsic_reward" in (tmp_path / "train.csv").read_text().splitlines()[0]
+def test_the_random_encoder_is_the_control_without_bonus(tmp_path: Path) -> None:
+    control = random_pretrained(0, in_channels=9, image_size=SIZE, channels=(4, 4), strides=(2, 1))
+    result = train(tmp_path, control)
+    assert {row["method"] for row in result.evaluations} == {"random-encoder"}
 
 
-def test_an_agent_is_refused_as_a_pretrained_encoder(tmp_path: Path) -> None:
-    train(tmp_path, env_steps=40)
-    with pytest.raises(PretrainedError, match="agent"):
-        train(tmp_path / "next", tmp_path / "agent")
+def test_drq_trains_its_encoder(tmp_path: Path) -> None:
+    pretrained = make_pretrained("drq")
+    before = {key: value.clone() for key, value in pretrained.encoder.state_dict().items()}
+    result = train(tmp_path, pretrained)
+    assert all(torch.equal(value, before[key]) for key, value in pretrained.encoder.state_dict().items())
+    moved = result.agent.encoder.state_dict()
+    assert any(not torch.equal(value, moved[key]) for key, value in before.items())
+    agent, _ = load_agent(tmp_path / "agent")
+    pixels = torch.randint(0, 256, (9, SIZE, SIZE), dtype=torch.uint8)
+    assert torch.equal(agent(pixels), result.agent(pixels))
 
 
-def test_a_run_that_is_refused_frees_its_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    closed: list[EnvBase] = []
-    monkeypatch.setattr(ToyEnv, "close", lambda env, **options: closed.append(env))
-    with pytest.raises(PretrainedError, match="image"):
-        train(
-            None,
-            random_pretrained(seed=0, channels=(4, 4), strides=(2, 1), image_size=20),
-            env_factory=world_of_16,
-        )
-    assert len(closed) == 1
+def test_an_actor_that_explored_the_task_is_where_learning_begins() -> None:
+    torch.manual_seed(1)
+    actor = SquashedGaussianActor(make_encoder(9).feature_dim, 2, hidden_dim=16)
+    with_actor = dataclasses.replace(make_pretrained(), actor=actor)
+    begun = train(None, with_actor, env_steps=20)
+    for key, value in actor.state_dict().items():
+        assert torch.equal(weights(begun)[key], value)
 
 
-def test_without_a_directory_nothing_is_kept_but_the_result(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+class OwnEncoder(nn.Module):
+    """Any module that maps pixels to features."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.feature_dim, self.image_size, self.in_channels = 12, SIZE, 9
+        self.layers = nn.Sequential(nn.Conv2d(9, 3, 8, 8), nn.Flatten())
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        return self.layers(pixels.float() / 255)
+
+
+def test_any_module_serves_as_a_frozen_encoder_and_is_encoded_anew(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr("tempfile.tempdir", None)
-    result = train(None, env_steps=40)
-    assert result.agent_path is None
-    assert len(result.evaluations) == 4
-    assert list(tmp_path.iterdir()) == []
+    with caplog.at_level("INFO", logger="crptpro"):
+        result = train(tmp_path, Pretrained(OwnEncoder(), card={"method": "mine"}))
+    assert result.evaluations[-1]["updates"] == 48
+    assert "re-encoding" in caplog.text
+    agent, _ = load_agent(tmp_path / "agent", encoder=OwnEncoder())
+    pixels = torch.randint(0, 256, (9, SIZE, SIZE), dtype=torch.uint8)
+    assert torch.equal(agent(pixels), result.agent(pixels))
+    with pytest.raises(CheckpointError, match="acts on a OwnEncoder, which only its author can build"):
+        load_agent(tmp_path / "agent")
+
+
+def test_a_run_of_other_settings_is_refused_by_name(tmp_path: Path) -> None:
+    train(tmp_path, env_steps=40)
+    with pytest.raises(CheckpointError, match="batch_size was 8, now 4"):
+        train(tmp_path, batch_size=4)
+    with pytest.raises(CheckpointError, match="pretrained was"):
+        train(tmp_path, make_pretrained("proto-rl-c"))
+
+
+def test_a_run_whose_replay_is_gone_says_so(tmp_path: Path) -> None:
+    train(tmp_path, env_steps=40)
+    (tmp_path / "replay").rename(tmp_path / "elsewhere")
+    with pytest.raises(CheckpointError, match=r"to continue it needs its frames, and .* is gone"):
+        train(tmp_path)
+    train(tmp_path, env_steps=40)  # complete: nothing is needed
+
+
+def test_an_encoder_of_another_image_size_is_refused() -> None:
+    def world(task: str, *, image_size: int, **settings: Any) -> Any:
+        return make_toy_env(task, image_size=24, **settings)
+
+    with pytest.raises(PretrainedError, match="image_size 16, not 24"):
+        train(None, env_factory=world)
+
+
+def test_a_reward_that_is_not_finite_never_enters_the_replay() -> None:
+    def world(task: str, **settings: Any) -> Any:
+        env = make_toy_env(task, **settings)
+        step = env.base_env._step
+
+        def poisoned(td: Any) -> Any:
+            out = step(td)
+            if env.base_env.steps == 17:
+                out["reward"] = torch.full((1,), float("nan"))
+            return out
+
+        env.base_env._step = poisoned
+        return env
+
+    with pytest.raises(NonFiniteError, match="reward"):
+        train(None, env_factory=world)
 
 
 @pytest.mark.parametrize(
-    ("setting", "value"),
+    ("setting", "value", "message"),
     [
-        ("batch_size", 0),
-        ("discount", 1.5),
-        ("learning_rate", 0.0),
-        ("random_agent_steps", 50),
-        ("random_agent_steps", 0),
+        ("env_steps", 0, "`env_steps` must be at least 1, got 0"),
+        ("batch_size", "8", "`batch_size` must be a whole number"),
+        ("discount", 1.5, "`discount` must be at most 1"),
+        ("features", "sparse", "`features` must be auto, dense, dense-bf16 or reencode"),
+        ("replay_capacity", 5, "`replay_capacity` .5. must hold the 1000 transitions"),
     ],
 )
-def test_settings_that_cannot_run_are_named_with_their_value(setting: str, value: float) -> None:
-    with pytest.raises(ValueError, match=rf"`?{setting}`?.*{value}|{value}.*`{setting}`"):
-        dataclasses.replace(SMALL, **{setting: value})
+def test_an_impossible_setting_is_refused_by_name(setting: str, value: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        DownstreamConfig(**{setting: value})
 
 
-def test_every_logged_mean_is_over_the_updates_that_reported_it(tmp_path: Path) -> None:
-    # 7 updates a row, every third with an actor step: rows hold two or three of those.
-    train(
-        tmp_path,
-        log_interval_env_steps=14,
-        actor_update_interval=3,
-        initial_temperature=0.25,
-        learning_rate=1e-9,
-    )
-    with open(tmp_path / "train.csv", newline="") as file:
-        alphas = [float(row["alpha"]) for row in csv.DictReader(file)]
-    assert alphas == pytest.approx([0.25] * len(alphas))
-
-
-@pytest.mark.parametrize(
-    ("network", "message"),
-    [
-        ("critic", r"After update \d+ the parameter .*trunk.* is not finite"),
-        ("actor", r"the policy of toy acts \[nan"),
-    ],
-)
-def test_a_spoilt_weight_reaches_neither_a_checkpoint_nor_the_simulator(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, network: str, message: str
-) -> None:
-    train(tmp_path, env_steps=40)
-    kept = sorted((tmp_path / "checkpoints").iterdir())
-
-    def spoil(learner: RADSACLearner, *args: object, **options: object) -> dict[str, torch.Tensor]:
-        with torch.no_grad():
-            getattr(learner.loss, network).trunk.linear.weight.fill_(float("nan"))
-        return {}
-
-    monkeypatch.setattr(RADSACLearner, "update", spoil)
-    with pytest.raises(NonFiniteError, match=message):
-        train(tmp_path, env_steps=60)
-    assert sorted((tmp_path / "checkpoints").iterdir()) == kept
-
-
-def test_videos_and_mirrors_receive_the_run(tmp_path: Path) -> None:
-    with RunLogger(tmp_path, tensorboard=True, wandb=WandbOptions(mode="offline")) as logger:
-        train(tmp_path, logger=logger, env_steps=40, video_episodes=1)
-    videos = sorted(path.name for path in (tmp_path / "videos").iterdir())
-    assert videos == ["env_steps_00000000_episode_0.mp4", "env_steps_00000040_episode_0.mp4"]
-    assert {path.name for path in (tmp_path / "tensorboard").iterdir()} == {"train", "episodes", "eval"}
-    assert list((tmp_path / "wandb").glob("offline-run-*/*.wandb"))
-
-
-@pytest.mark.parametrize(("method", "capacity"), [("proto-rl-c", 100_000), ("atc", 40_000), ("own", 40_000)])
-def test_a_run_keeps_as_many_transitions_as_the_method_of_its_encoder(method: str, capacity: int) -> None:
-    pretrained = small_pretrained()
-    pretrained.card["method"] = method
-    assert _replay_capacity(pretrained, dataclasses.replace(SMALL, replay_capacity=None)) == capacity
-    assert _replay_capacity(pretrained, SMALL) == SMALL.replay_capacity
-
-
-def test_other_colours_reach_every_environment_the_card_and_what_must_agree(tmp_path: Path) -> None:
-    asked = []
-
-    def colored(task: str, **settings: object) -> EnvBase:
-        asked.append(settings.get("colors"))
-        return toy_env(task, **settings)  # type: ignore[arg-type]
-
-    train(tmp_path / "normal", env_factory=colored)
-    assert set(asked) == {None}  # a factory need not know of colours
-    asked.clear()
-    config = dataclasses.replace(SMALL, colors="reversed_image")
-    train(tmp_path / "reversed", env_factory=colored, config=config)
-    assert len(asked) > 1
-    assert set(asked) == {"reversed_image"}
-    _, card = load_agent(tmp_path / "reversed" / "agent")
-    assert card["config"]["colors"] == "reversed_image"
-    with pytest.raises(CheckpointError, match="colors was 'normal', now 'reversed_image'"):
-        train(tmp_path / "normal", env_factory=toy_env, config=config)
-
-
-def test_a_trimmed_artifact_gives_the_numbers_of_the_one_it_comes_from(tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    encoder = PixelEncoder(channels=(4, 4), strides=(2, 1), image_size=16)
-    loss = ProtoLoss(encoder, num_prototypes=8, latent_dim=4, hidden_dim=8)
-    whole = load_pretrained(save_pretrained(loss, tmp_path / "whole"))
-    trimmed = load_pretrained(trim_pretrained(whole, tmp_path / "trimmed"))
-    results = {name: train(tmp_path / f"run_{name}", kind) for name, kind in (("a", whole), ("b", trimmed))}
-    one, two = (rows_without_time(result.evaluations) for result in results.values())
-    assert one == two
-    tables = []
-    for name in results:
-        with open(tmp_path / f"run_{name}" / "train.csv", newline="") as file:
-            rows = list(csv.DictReader(file))
-        unmeasured = ("time", "_per_s", "bytes", "seconds")
-        tables.append([{k: v for k, v in row.items() if not any(u in k for u in unmeasured)} for row in rows])
-        assert float(rows[-1]["intrinsic_reward"]) > 0
-    assert tables[0] == tables[1]
-    cards = [load_agent(tmp_path / f"run_{name}" / "agent")[1]["pretrained"] for name in results]
-    assert cards == [whole.identity()] * 2
+def test_what_is_left_open_is_the_methods_own() -> None:
+    own = DownstreamConfig().resolved("walker_run", make_pretrained("crptpro"))
+    assert (own.env_steps, own.replay_capacity, own.learning_rate) == (500_000, 40_000, 1e-4)
+    assert (own.intrinsic_reward_coef, own.action_repeat) == (0.2, 2)
+    drq = DownstreamConfig().resolved("walker_run", make_pretrained("drq"))
+    assert (drq.env_steps, drq.replay_capacity, drq.learning_rate) == (1_000_000, 100_000, 1e-3)
+    proto = DownstreamConfig(env_steps=10).resolved("walker_run", make_pretrained("proto-rl-c"))
+    assert (proto.env_steps, proto.replay_capacity, proto.intrinsic_reward_coef) == (10, 100_000, 0.2)
+    assert DownstreamConfig().resolved("walker_run", make_pretrained("atc")).intrinsic_reward_coef == 0

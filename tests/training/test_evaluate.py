@@ -1,95 +1,132 @@
+"""Deterministic evaluation of whole episodes."""
+
 from __future__ import annotations
+
+import os
+from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
-from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
+from worlds import EPISODE, make_encoder, make_toy_env
 
-from crptpro.seeding import derive_seed
-from crptpro.training.evaluate import Episode, evaluate, summarize, uniform_policy
-
-
-class CountingPixels(EnvBase):
-    """Ends after three decisions; the reward is the action plus a number that depends on the seed."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.observation_spec = Composite(pixels=Bounded(0, 255, (9, 4, 4), dtype=torch.uint8))
-        self.action_spec = Bounded(-1, 1, (2,))
-        self.reward_spec = Unbounded((1,))
-        self.seeds: list[int] = []
-
-    def _set_seed(self, seed: int | None) -> None:
-        self.seeds.append(seed)
-
-    def _pixels(self) -> torch.Tensor:
-        return torch.full((9, 4, 4), self.count, dtype=torch.uint8)
-
-    def _reset(self, tensordict: TensorDict | None) -> TensorDict:
-        self.count = 0
-        return TensorDict({"pixels": self._pixels()}, [])
-
-    def _step(self, tensordict: TensorDict) -> TensorDict:
-        self.count += 1
-        done = torch.tensor([self.count == 3])
-        reward = tensordict["action"].sum().reshape(1) + self.seeds[-1] % 7
-        return TensorDict(
-            {"pixels": self._pixels(), "reward": reward, "done": done, "terminated": done & False}, []
-        )
+from crptpro.errors import NonFiniteError
+from crptpro.modules import SquashedGaussianActor
+from crptpro.training import PixelAgent, evaluate, summarize, uniform_policy
+from crptpro.training.evaluate import Episode, Evaluator
 
 
-def test_returns_are_summed_per_episode_and_each_episode_has_its_own_seed() -> None:
-    env = CountingPixels()
-    episodes, videos = evaluate(
-        lambda pixels: torch.tensor([0.25, 0.25]), env, episodes=2, seed=5, progress=False
-    )
-    seeds = [derive_seed(5, "episode", e) for e in range(2)]
-    assert [e.seed for e in episodes] == seeds
-    assert [e.episode_return for e in episodes] == [3 * (0.5 + s % 7) for s in seeds]
-    assert [e.agent_steps for e in episodes] == [3, 3]
-    assert videos == []
+def make_agent(seed: int = 0) -> PixelAgent:
+    torch.manual_seed(seed)
+    encoder = make_encoder(9).requires_grad_(False)
+    return PixelAgent(encoder, SquashedGaussianActor(encoder.feature_dim, 2, hidden_dim=16))
 
 
-def test_recorded_pictures_are_the_newest_of_each_observation() -> None:
-    _, videos = evaluate(
-        lambda pixels: torch.zeros(2), CountingPixels(), episodes=2, record_episodes=1, progress=False
-    )
-    assert len(videos) == 1
-    assert videos[0].shape == (4, 3, 4, 4)
-    assert videos[0][:, 0, 0, 0].tolist() == [0, 1, 2, 3]
+def make_env() -> Any:
+    return make_toy_env("toy", seed=0)
 
 
-def test_policy_sees_the_observation_it_acts_on() -> None:
-    seen = []
-    evaluate(
-        lambda p: seen.append(int(p[0, 0, 0])) or torch.zeros(2), CountingPixels(), episodes=1, progress=False
-    )
-    assert seen == [0, 1, 2]
+def test_an_evaluation_is_the_same_whatever_was_evaluated_before() -> None:
+    env, agent = make_env(), make_agent()
+    first = evaluate(agent, env, episodes=3, seed=5, progress=False)
+    evaluate(agent, env, episodes=2, seed=9, progress=False)
+    assert evaluate(agent, env, episodes=3, seed=5, progress=False) == first
+    assert [episode.agent_steps for episode in first] == [EPISODE] * 3
+    assert len({episode.seed for episode in first}) == 3
 
 
-def test_the_uniform_policy_covers_the_action_range_and_follows_its_seed() -> None:
-    env = CountingPixels()
-    policy, again, other = (
-        uniform_policy(env, seed=0),
-        uniform_policy(env, seed=0),
-        uniform_policy(env, seed=1),
-    )
-    actions = torch.stack([policy(torch.empty(0)) for _ in range(400)])
-    assert actions.shape == (400, 2)
-    assert actions.min() < -0.9
-    assert actions.max() > 0.9
-    assert actions.abs().max() <= 1
-    torch.testing.assert_close(again(torch.empty(0)), actions[0])
-    assert not torch.equal(other(torch.empty(0)), actions[0])
+def test_chance_is_uniform_and_seeded() -> None:
+    env = make_env()
+    one, two = (evaluate(uniform_policy(env, seed=s), env, episodes=2, progress=False) for s in (0, 0))
+    assert one == two
+    assert evaluate(uniform_policy(env, seed=1), env, episodes=2, progress=False) != one
 
 
-def test_summary_of_known_returns() -> None:
-    episodes = [Episode(i, r, 1, 0) for i, r in enumerate([1.0, 2.0, 6.0])]
-    assert summarize(episodes) == pytest.approx({"mean": 3.0, "std": 7**0.5, "min": 1.0, "max": 6.0})
+def test_a_summary_has_the_unbiased_deviation() -> None:
+    episodes = [Episode(index, value, 10, 0) for index, value in enumerate((1.0, 2.0, 6.0))]
+    assert summarize(episodes) == {"mean": 3.0, "std": pytest.approx(7.0**0.5), "min": 1.0, "max": 6.0}
     assert summarize(episodes[:1])["std"] == 0.0
 
 
-def test_zero_episodes_are_refused() -> None:
-    with pytest.raises(ValueError, match="`episodes` must be at least 1, got 0"):
-        evaluate(lambda pixels: pixels, CountingPixels(), episodes=0)
+def test_a_non_finite_action_names_the_episode_and_the_decision() -> None:
+    calls = 0
+
+    def policy(pixels: torch.Tensor) -> torch.Tensor:
+        nonlocal calls
+        calls += 1
+        return torch.full((2,), float("nan") if calls == EPISODE + 4 else 0.1)
+
+    with pytest.raises(NonFiniteError, match="episode 1, decision 3: the policy acts"):
+        evaluate(policy, make_env(), episodes=2, progress=False)
+
+
+@pytest.mark.parametrize("episodes", [0, 1.5, "2"])
+def test_an_impossible_number_of_episodes_is_refused(episodes: Any) -> None:
+    with pytest.raises(ValueError, match="`episodes` must be"):
+        evaluate(make_agent(), make_env(), episodes=episodes, progress=False)
+
+
+def collect(workers: int, make: Any = make_env) -> tuple[Evaluator, list[Any]]:
+    results: list[Any] = []
+    evaluator = Evaluator(
+        make, episodes=3, seed=1, workers=workers, progress=False,
+        on_result=lambda episodes, counters: results.append((episodes, dict(counters))),
+    )  # fmt: skip
+    return evaluator, results
+
+
+def test_workers_evaluate_a_snapshot_and_hand_it_out_when_asked() -> None:
+    here, found = collect(0)
+    agent = make_agent()
+    here.start(agent, env_steps=40)
+    beside, results = collect(2)
+    beside.start(agent, env_steps=40)
+    with torch.no_grad():
+        for parameter in agent.actor.parameters():
+            parameter.zero_()
+    assert results == []
+    beside.finish()
+    assert results == found
+    assert results[0][1] == {"env_steps": 40}
+    for evaluator in (here, beside):
+        evaluator.close()
+
+
+def test_an_evaluation_under_way_is_part_of_a_checkpoint() -> None:
+    beside, results = collect(2)
+    beside.agent = make_agent()
+    beside.start(beside.agent, env_steps=40)
+    state = beside.state_dict()
+    beside.finish()
+    again, repeated = collect(0)
+    again.agent = make_agent(seed=7)
+    again.load_state_dict(state)
+    again.finish()
+    # The encoder is frozen and the run's own; only what learns is in the state.
+    assert [counters for _, counters in repeated] == [counters for _, counters in results]
+    assert again.state_dict() == {}
+    for evaluator in (beside, again):
+        evaluator.close()
+
+
+def die() -> Any:
+    os._exit(3)
+
+
+def test_lost_workers_are_replaced_by_this_process(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evaluator, results = collect(1, die)
+    evaluator.start(make_agent(), env_steps=0)
+    monkeypatch.setattr(evaluator, "make_env", make_env)
+    with caplog.at_level("WARNING", logger="crptpro"):
+        evaluator.finish()
+    assert len(results) == 1
+    assert "evaluating in this process from here on" in caplog.text
+    evaluator.close()
+
+
+def test_a_world_that_no_worker_can_build_is_evaluated_here() -> None:
+    evaluator, results = collect(2, lambda: make_env())
+    evaluator.start(make_agent(), env_steps=0)
+    assert len(results) == 1
+    evaluator.close()

@@ -70,3 +70,23 @@ def small_heads(
     encoder: PixelEncoder, prototypes: int = 8, latent_dim: int = 5
 ) -> tuple[Projector, Prototypes]:
     return Projector(encoder.feature_dim, latent_dim), Prototypes(prototypes, latent_dim)
+
+
+class FakeReplay:
+    """Observations by number, as a replay hands them out; remembers what it was asked for."""
+
+    def __init__(self, count: int = 12, window: int | None = None, size: int = SIZE) -> None:
+        self.window = count if window is None else window
+        self.frames = torch.randint(0, 256, (count, 9, size, size), dtype=torch.uint8)
+        self.asked: list[int] = []
+
+    def observations(self, numbers: torch.Tensor) -> torch.Tensor:
+        self.asked += numbers.tolist()
+        return self.frames[numbers % len(self.frames)]
+
+    def batch(self, *lead: int, first: int = 0) -> TensorDict:
+        """Numbers and pixels of random transitions."""
+        number = torch.randint(first, first + len(self.frames) - 1, lead)
+        rows = number % len(self.frames)
+        following = {"number": number + 1, "pixels": self.frames[(rows + 1) % len(self.frames)]}
+        return TensorDict({"number": number, "pixels": self.frames[rows], "next": following}, lead)

@@ -4,7 +4,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from crptpro.transforms import ColorSwap, swap_colors
+from crptpro.transforms import ColorSwap
+from crptpro.transforms.color_swap import swap_colors
 
 
 def test_every_frame_of_a_stack_has_its_channels_reversed_and_none_changes_place() -> None:

@@ -1,3 +1,5 @@
+"""The frozen encoder: any module, any batch, environments and buffers, never a gradient."""
+
 from __future__ import annotations
 
 import pytest
@@ -8,28 +10,75 @@ from torch import nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import SerialEnv, TransformedEnv
 
-from crptpro.transforms import FrozenEncoder
+from crptpro.transforms import FrozenEncoder, choose_feature_mode
 
 
 def images(*lead):
     return torch.randint(0, 256, (*lead, 9, SIZE, SIZE), dtype=torch.uint8)
 
 
+class ResNet(nn.Module):
+    """A residual network with batch normalisation, as those of torchvision; it does not tell its feature_dim."""
+
+    def __init__(self):
+        super().__init__()
+        self.stem = nn.Sequential(nn.Conv2d(9, 8, 3, 2, 1), nn.BatchNorm2d(8), nn.ReLU())
+        self.block = nn.Sequential(nn.Conv2d(8, 8, 3, 1, 1), nn.BatchNorm2d(8))
+
+    def forward(self, pixels):
+        hidden = self.stem(pixels.float() / 255)
+        return (hidden + self.block(hidden)).relu().mean((-2, -1))
+
+
+class VisionTransformer(nn.Module):
+    """Patches, a class token, attention; the class token's output is the feature."""
+
+    feature_dim = 16
+
+    def __init__(self):
+        super().__init__()
+        self.patches = nn.Conv2d(9, 16, 5, 5)
+        self.token = nn.Parameter(torch.randn(1, 1, 16))
+        self.layer = nn.TransformerEncoderLayer(16, 2, 32, dropout=0.5, batch_first=True)
+
+    def forward(self, pixels):
+        tokens = self.patches(pixels.float() / 255).flatten(2).transpose(1, 2)
+        return self.layer(torch.cat([self.token.expand(len(tokens), -1, -1), tokens], 1))[:, 0]
+
+
+@pytest.mark.parametrize("make", [small_encoder, ResNet, VisionTransformer])
 @pytest.mark.parametrize("lead", [(), (3,), (2, 3)])
-def test_features_equal_a_direct_call_for_any_batch(lead):
-    encoder = small_encoder()
+def test_any_module_is_an_encoder_for_any_batch_and_stays_frozen(make, lead):
+    torch.manual_seed(0)
+    encoder = make()
+    state = {name: value.clone() for name, value in encoder.state_dict().items()}
+    transform = FrozenEncoder(encoder).train()
     td = TensorDict({"pixels": images(*lead)}, batch_size=lead)
-    features = FrozenEncoder(encoder)(td)["features"]
-    assert features.shape == (*lead, encoder.feature_dim)
-    direct = encoder(td["pixels"].reshape(-1, 9, SIZE, SIZE)).reshape(features.shape)
-    assert torch.equal(features, direct.detach())
-
-
-def test_no_gradient_leaves_the_transform_and_the_encoder_stays_trainable():
-    encoder = small_encoder()
-    features = FrozenEncoder(encoder)(TensorDict(pixels=images(2)))["features"]
+    features = transform(td)["features"]
+    with torch.no_grad():
+        direct = encoder.eval()(td["pixels"].reshape(-1, 9, SIZE, SIZE))
+    assert torch.equal(features, direct.reshape(features.shape))
+    assert features.shape[:-1] == lead
     assert not features.requires_grad
     assert all(parameter.requires_grad for parameter in encoder.parameters())
+    assert all(torch.equal(value, state[name]) for name, value in encoder.state_dict().items())
+
+
+@pytest.mark.parametrize("make", [ResNet, VisionTransformer])
+def test_an_encoder_without_dense_maps_is_encoded_anew_with_a_one_line_reason(make):
+    mode, reason = choose_feature_mode("auto", make(), 100)
+    assert mode == "reencode"
+    assert f"got {make.__name__}; encode shifted images instead" in reason
+    assert "\n" not in reason
+
+
+def test_an_encoder_that_returns_no_tensor_is_named():
+    class Pair(nn.Module):
+        def forward(self, pixels):
+            return pixels, pixels
+
+    with pytest.raises(TypeError, match="Pair returned tuple, not a tensor"):
+        FrozenEncoder(Pair())(TensorDict(pixels=images(1)))
 
 
 def test_several_keys_are_encoded_in_a_replay_buffer():
@@ -44,16 +93,6 @@ def test_several_keys_are_encoded_in_a_replay_buffer():
         assert torch.equal(sample["next", "features"], encoder(sample["next", "pixels"]))
 
 
-def test_an_environment_has_features_after_reset_and_after_step():
-    encoder = small_encoder()
-    env = TransformedEnv(FakePixelEnv(), FrozenEncoder(encoder))
-    with torch.no_grad():
-        td = env.reset()
-        assert torch.equal(td["features"], encoder(td["pixels"]))
-        td = env.step(env.rand_action(td))
-        assert torch.equal(td["next", "features"], encoder(td["next", "pixels"]))
-
-
 def test_partial_resets_of_a_batched_environment_renew_only_what_was_reset():
     encoder = small_encoder()
     env = TransformedEnv(SerialEnv(2, FakePixelEnv), FrozenEncoder(encoder))
@@ -66,20 +105,17 @@ def test_partial_resets_of_a_batched_environment_renew_only_what_was_reset():
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_the_spec_says_what_the_rollout_returns(dtype):
+def test_the_spec_says_what_reset_and_step_return(dtype):
     encoder = small_encoder()
     encoder.compute_dtype = dtype
     env = TransformedEnv(FakePixelEnv(), FrozenEncoder(encoder, out_keys=("agent", "features")))
     spec = env.observation_spec["agent", "features"]
-    rollout = env.rollout(2)
-    assert spec.shape == rollout["agent", "features"].shape[1:] == (encoder.feature_dim,)
-    assert spec.dtype == rollout["agent", "features"].dtype == dtype
-
-
-def test_an_encoder_for_plain_batches_works_without_a_batch():
-    encoder = nn.Sequential(nn.Conv2d(9, 2, 3), nn.Flatten())
-    td = FrozenEncoder(encoder)(TensorDict(pixels=images().float()))
-    assert td["features"].shape == (2 * (SIZE - 2) ** 2,)
+    with torch.no_grad():
+        td = env.rand_step(env.reset())
+        for part in (td, td["next"]):
+            assert torch.equal(part["agent", "features"], encoder(part["pixels"]))
+            assert spec.shape == part["agent", "features"].shape
+            assert spec.dtype == part["agent", "features"].dtype == dtype
 
 
 class _ElsewhereEncoder(nn.Module):
@@ -97,8 +133,7 @@ class _ElsewhereEncoder(nn.Module):
 
 def test_pixels_go_to_the_encoders_device_and_features_come_back():
     encoder = _ElsewhereEncoder()
-    transform = FrozenEncoder(encoder)
-    assert transform(TensorDict(pixels=images(2)))["features"].device.type == "cpu"
+    assert FrozenEncoder(encoder)(TensorDict(pixels=images(2)))["features"].device.type == "cpu"
     assert encoder.seen == ["meta"]
     with pytest.raises(NotImplementedError, match="copy out of meta"):  # the way back is attempted
         FrozenEncoder(small_encoder().to("meta"))(TensorDict(pixels=images(2)))
@@ -109,5 +144,5 @@ def test_missing_pixels_are_named():
         FrozenEncoder(small_encoder(), in_keys="frames")(TensorDict(pixels=images(1)))
     with pytest.raises(KeyError, match="frames"):
         TransformedEnv(FakePixelEnv(), FrozenEncoder(small_encoder(), in_keys="frames")).observation_spec  # noqa: B018
-    with pytest.raises(ValueError, match="length"):
+    with pytest.raises(ValueError, match="pair up"):
         FrozenEncoder(small_encoder(), in_keys=["a", "b"])

@@ -1,13 +1,10 @@
 from __future__ import annotations
 
-import pickle
-
 import pytest
 import torch
 import torch.nn.functional as F
 from fake_pixel_env import FakePixelEnv
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import TransformedEnv
 
 from crptpro.transforms import RandomShift, draw_offsets, random_shift
@@ -95,7 +92,7 @@ def test_shapes_that_do_not_fit_are_refused():
         random_shift(torch.zeros(2, 1, 8, 8), torch.zeros(3, 2, dtype=torch.int64))
     with pytest.raises(ValueError, match="pad"):
         RandomShift(pad=-1)
-    with pytest.raises(ValueError, match="length"):
+    with pytest.raises(ValueError, match="pair up"):
         RandomShift(in_keys=["a", "b"], out_keys=["c"])
 
 
@@ -120,56 +117,12 @@ def test_samples_draw_independent_shifts():
     assert len(shifted.flatten(1).unique(dim=0)) > 30
 
 
-@pytest.mark.parametrize("lead", [(), (5,), (2, 3)])
-def test_any_leading_batch_is_accepted(lead):
-    td = batch(*lead)
-    shifted = RandomShift(generator=torch.Generator().manual_seed(3))(td.clone())["pixels"]
-    offsets = draw_offsets(td.numel(), 4, torch.Generator().manual_seed(3))
-    flat = td["pixels"].reshape(-1, 9, 12, 12)
-    assert torch.equal(shifted, random_shift(flat, offsets).reshape(td["pixels"].shape))
-
-
-def test_evaluation_mode_changes_nothing():
-    td = batch(16)
-    on, off = (RandomShift(generator=torch.Generator().manual_seed(5)) for _ in range(2))
-    assert torch.equal(on.train()(td.clone())["pixels"], off.eval()(td.clone())["pixels"])
-    assert not torch.equal(off(td.clone())["pixels"], td["pixels"])
-
-
 def test_next_pixels_are_optional_by_default_but_named_keys_are_required():
     RandomShift()(TensorDict(pixels=torch.zeros(2, 3, 8, 8)))
     with pytest.raises(KeyError, match="next"):
         RandomShift(in_keys=["pixels", ("next", "pixels")])(TensorDict(pixels=torch.zeros(2, 3, 8, 8)))
     with pytest.raises(KeyError, match="pixels"):
         RandomShift()(TensorDict(frames=torch.zeros(2, 3, 8, 8)))
-
-
-def test_a_new_out_key_keeps_the_original():
-    td = batch(4)
-    before = td["pixels"].clone()
-    RandomShift(in_keys="pixels", out_keys=("augmented", "pixels"))(td)
-    assert torch.equal(td["pixels"], before)
-    assert td["augmented", "pixels"].shape == before.shape
-
-
-def test_a_replay_buffer_shifts_samples_and_leaves_its_storage_alone():
-    buffer = ReplayBuffer(storage=LazyTensorStorage(32), batch_size=16)
-    stored = batch(32)
-    buffer.extend(stored.clone())
-    buffer.append_transform(RandomShift(generator=torch.Generator().manual_seed(0)))
-    for read in (buffer.sample, lambda: buffer[torch.arange(32)], lambda: buffer[:20], lambda: buffer[3]):
-        sampled = read()
-        assert sampled["pixels"].dtype == torch.uint8
-        assert not torch.equal(sampled["pixels"], stored["pixels"][: len(sampled["pixels"])])
-        for key in ("pixels", ("next", "pixels")):
-            assert torch.equal(buffer._storage[:][key], stored[key])
-
-
-def test_reading_the_whole_of_a_full_buffer_hands_over_the_storage_as_documented():
-    buffer = ReplayBuffer(storage=LazyTensorStorage(32), batch_size=16)
-    buffer.extend(batch(32))
-    buffer.append_transform(RandomShift())
-    assert torch.equal(buffer[:]["pixels"], buffer._storage[:]["pixels"])
 
 
 def test_an_environment_shifts_resets_and_steps():
@@ -179,14 +132,6 @@ def test_an_environment_shifts_resets_and_steps():
         for original, shifted in zip(td["pixels"], td["shifted"]):
             candidates = random_shift(original.expand(81, *original.shape), every_offset(4))
             assert (candidates == shifted).flatten(1).all(1).any()
-
-
-def test_pickling_keeps_the_place_in_the_random_stream():
-    transform = RandomShift(generator=torch.Generator().manual_seed(2))
-    transform(batch(3))
-    copy = pickle.loads(pickle.dumps(transform))
-    td = batch(8)
-    assert torch.equal(transform(td.clone())["pixels"], copy(td.clone())["pixels"])
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.bfloat16])

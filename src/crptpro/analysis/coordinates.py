@@ -68,7 +68,7 @@ def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
 
 def _load_undrawn(domain: Domain) -> dm_env.Environment:
     """Load a dm_control world for its model alone: one of the suite where nothing renders, too."""
-    from crptpro.envs.dm_stack import load_dm_env
+    from crptpro.envs.dm_control import load_dm_env
     from crptpro.envs.rendering import select_backend
 
     try:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from crptpro.objectives.functional import knn_distances
-from crptpro.objectives.particles import particle_entropy
+from crptpro.objectives.functional import knn_distances, particle_entropy
 
 NEIGHBOURS = 12
 """Nearest other observations that an estimate looks at, as APT's reward does."""

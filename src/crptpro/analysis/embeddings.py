@@ -1,16 +1,17 @@
-"""Embeddings of a frozen encoder on sampled observations, and their principal components."""
+"""Embeddings of a frozen encoder on sampled observations, and how they are spread."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
-from crptpro.modules.placement import device_of
+from crptpro.modules.precision import device_of
 
 _BATCH = 64
+FEATURES = 4096
+"""That are taken to float64 at a time: all at once would take gigabytes."""
 
 
 def sample_pixels(dataset: ReplayBuffer, samples: int, *, seed: int) -> Tensor:
@@ -55,38 +56,6 @@ def embed_pixels(encoder: nn.Module, pixels: Tensor, *, projector: nn.Module | N
     return torch.cat(parts)
 
 
-@torch.no_grad()
-def embed_samples(
-    encoder: nn.Module,
-    datasets: Mapping[str, ReplayBuffer],
-    *,
-    projector: nn.Module | None = None,
-    samples: int = 125,
-    seed: int = 0,
-) -> dict[str, Tensor]:
-    """Encode random observations of every dataset, without augmentation, where the encoder lives.
-
-    Args:
-        encoder: maps uint8 ``[B, C, H, W]`` to features ``[B, D]``.
-        datasets: domain name to replay buffer whose samples hold ``pixels``; on any device. Their generators are
-            left as they were.
-        projector: if given, embeddings are its outputs, else the features themselves.
-        samples: observations per domain (125 in the paper's figure).
-        seed: which observations.
-
-    Returns:
-        Domain name to float32 embeddings ``[samples, D]`` on the encoder's device.
-
-    Raises:
-        ValueError: images of another shape than the encoder takes.
-    """
-    embeddings = {}
-    for name, dataset in datasets.items():
-        pixels = sample_pixels(dataset, samples, seed=seed)
-        embeddings[name] = embed_pixels(encoder, pixels, projector=projector)
-    return embeddings
-
-
 def principal_components(points: Tensor, *, components: int = 3) -> tuple[Tensor, Tensor]:
     """Project centred points on their leading principal directions.
 
@@ -113,3 +82,63 @@ def principal_components(points: Tensor, *, components: int = 3) -> tuple[Tensor
     coordinates = coordinates * coordinates[largest, torch.arange(components)].sign()
     variance = singular.square()
     return coordinates.to(points.dtype), (variance[:components] / variance.sum()).to(points.dtype)
+
+
+def gram_matrix(features: Tensor, mean: Tensor, scale: Tensor) -> np.ndarray:
+    """Return the inner products of ``(features - mean) / scale``, summed in float64.
+
+    Args:
+        features: ``[N, D]``, any floating dtype, on the CPU.
+        mean: ``[D]``.
+        scale: ``[D]``.
+
+    Returns:
+        float64 ``[N, N]``.
+    """
+    from scipy.linalg.blas import dsyrk
+
+    upper = np.zeros((len(features), len(features)), order="F")
+    for block, m, s in zip(*(each.split(FEATURES, dim=-1) for each in (features, mean, scale))):
+        standardized = (block.double() - m) / s
+        upper = dsyrk(1.0, standardized.numpy().T, beta=1.0, c=upper, trans=1, overwrite_c=1)
+    return np.triu(upper) + np.triu(upper, 1).T
+
+
+def effective_rank(features: Tensor) -> float:
+    """Return the exponential of the entropy of the centred samples' normalised singular values.
+
+    Between 1 (all on a line) and min(N - 1, D); 0 if all samples coincide. Source: Roy and Vetterli, "The effective
+    rank: a measure of effective dimensionality", 2007.
+
+    Args:
+        features: ``[N, D]``.
+
+    Examples:
+        >>> round(effective_rank(torch.tensor([[1.0, 0], [-1, 0], [0, 1], [0, -1]])), 6)
+        2.0
+    """
+    mean = features.mean(0, dtype=torch.float64)
+    gram = gram_matrix(features, mean, torch.ones_like(mean))
+    singular = np.sqrt(np.linalg.eigvalsh(gram).clip(min=0))
+    # Squaring has cost half of the digits: what is below is rounding.
+    singular = singular[singular > 1e-7 * singular.max()]
+    if not len(singular):
+        return 0.0
+    shares = singular / singular.sum()
+    return float(np.exp(-(shares * np.log(shares)).sum()))
+
+
+def mean_cosine(features: Tensor) -> float:
+    """Return the mean cosine between different samples' features; 1 if all point the same way, 0 for one sample.
+
+    A sample whose features are all 0 has the cosine 0 with every other.
+
+    Args:
+        features: ``[N, D]``, any floating dtype.
+    """
+    count = len(features)
+    if count < 2:
+        return 0.0
+    unit = nn.functional.normalize(features, dim=1)
+    of_sum = unit.sum(0, dtype=torch.float64).square().sum()
+    return float(of_sum - unit.square().sum(dtype=torch.float64)) / (count * (count - 1))

@@ -4,25 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from crptpro.analysis.coordinates import Joint, joints_of, position_coordinates, velocity_coordinates
-from crptpro.analysis.ridge import effective_rank, fit_ridge, mean_cosine, standardized_gram
-from crptpro.colors import Colors
+from crptpro.analysis.embeddings import FEATURES, effective_rank, embed_pixels, gram_matrix, mean_cosine
 from crptpro.data import FrameDataset
-from crptpro.data.drawn_frames import DrawnFrames
-from crptpro.data.frame_stacks import stack_rows
-from crptpro.data.redraw import redraw
+from crptpro.data.redraw import DrawnFrames, redraw
+from crptpro.data.storage import stack_rows
 from crptpro.errors import DatasetError
-from crptpro.modules.placement import device_of
 from crptpro.seeding import derive_seed
+from crptpro.values import Colors
 
 HELD_OUT = 0.25
 """Part of the episodes that are held out, and of the others by which the penalty is chosen."""
 LEAST_SPREAD = 1e-3
 """Standard deviation (m, rad, m/s, rad/s; 1 for sines and rotations) below which a coordinate counts as constant."""
-_BATCH = 64
+PENALTIES = tuple(10.0**power for power in range(-6, 3))
+"""Ridge penalties that are tried, in units of the mean eigenvalue of the fitted samples' Gram matrix."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class ProbeResult:
         positions: R2 on held-out episodes by coordinate.
         velocities: Likewise.
         left_out: Coordinates that hardly vary, in the training or in the held-out episodes.
-        effective_rank: Of the embeddings, see :func:`~crptpro.analysis.ridge.effective_rank`.
+        effective_rank: Of the embeddings, see :func:`~crptpro.analysis.embeddings.effective_rank`.
         mean_cosine: Mean cosine between different observations' embeddings; 1 if all point the same way.
     """
 
@@ -172,41 +172,74 @@ def probe(
     Returns:
         By ``"features"`` and, with a projector, ``"z"``.
     """
-    device = device_of(encoder) or samples.pixels.device
-    features, latents = [], []
-    for batch in samples.pixels.split(_BATCH):
-        encoded = encoder(batch.to(device))
-        features.append(encoded.float().cpu())
-        if projector is not None:
-            latents.append(projector(encoded).float().cpu())
-    results = {"features": probe_embeddings(samples, torch.cat(features))}
-    if latents:
-        results["z"] = probe_embeddings(samples, torch.cat(latents))
+    results = {"features": probe_embeddings(samples, embed_pixels(encoder, samples.pixels).cpu())}
+    if projector is not None:
+        latents = embed_pixels(encoder, samples.pixels, projector=projector)
+        results["z"] = probe_embeddings(samples, latents.cpu())
     return results
 
 
 @torch.no_grad()
 def probe_embeddings(samples: ProbeSamples, embeddings: Tensor) -> ProbeResult:
     """Predict the state from embeddings ``[N, D]`` of the samples, see :func:`probe`."""
-    fitted = torch.cat([samples.train, samples.validation])
-    gram = standardized_gram(embeddings, fitted)
-    targets = torch.cat([samples.positions, samples.velocities], 1)
+    from sklearn.metrics import r2_score
+
+    train, validation, test = (part.numpy() for part in (samples.train, samples.validation, samples.test))
+    fitted = np.concatenate([train, validation])
+    targets = torch.cat([samples.positions, samples.velocities], 1).double().numpy()
     # A velocity may bear the name of its position.
     names = [
         *(("position", name) for name in samples.position_names),
         *(("velocity", name) for name in samples.velocity_names),
     ]
-    spread = torch.stack([targets[part].std(0) for part in (samples.train, fitted, samples.test)]).amin(0)
-    varies = (spread > LEAST_SPREAD).nonzero().squeeze(-1)
-    fit = fit_ridge(gram, targets[:, varies], samples.train, samples.validation, samples.test)
-    scores = {names[index]: float(r2) for index, r2 in zip(varies.tolist(), fit.r2)}
+    spread = np.stack([targets[part].std(0, ddof=1) for part in (train, fitted, test)]).min(0)
+    varies = (spread > LEAST_SPREAD).nonzero()[0]
+    targets = targets[:, varies]
+    gram = _standardized_gram(embeddings, torch.from_numpy(fitted))
+    tried = _predictions(gram, targets, train, validation)
+    best = np.square(tried - targets[validation]).sum(1).argmin(0)
+    predicted = _predictions(gram, targets, fitted, test)[best, :, np.arange(len(varies))].T
+    r2 = r2_score(targets[test], predicted, multioutput="raw_values") if len(varies) else []
+    scores = {names[index]: float(value) for index, value in zip(varies, r2)}
     return ProbeResult(
-        positions={name: r2 for (kind, name), r2 in scores.items() if kind == "position"},
-        velocities={name: r2 for (kind, name), r2 in scores.items() if kind == "velocity"},
+        positions={name: value for (kind, name), value in scores.items() if kind == "position"},
+        velocities={name: value for (kind, name), value in scores.items() if kind == "velocity"},
         left_out=tuple(f"{kind} {name}" for kind, name in names if (kind, name) not in scores),
         effective_rank=effective_rank(embeddings),
         mean_cosine=mean_cosine(embeddings),
     )
+
+
+def _standardized_gram(features: Tensor, fitted: Tensor) -> np.ndarray:
+    """Return the inner products ``[N, N]`` of all samples' standardised features.
+
+    Each feature is centred at the fitted samples' mean and divided by their standard deviation plus the root mean
+    square of all features' deviations. That summand matters for ReLU features: one that is active in a handful of
+    samples would become a large number that says which sample this is. Without it, the R2 of velocities from 39,200
+    features fell from 0.6 to 0.
+    """
+    blocks = features[fitted].split(FEATURES, dim=1)
+    moments = [torch.std_mean(block.double(), 0, correction=0) for block in blocks]
+    deviation, mean = (torch.cat(each) for each in zip(*moments))
+    usual = deviation.square().mean().sqrt()
+    return gram_matrix(features, mean, deviation + usual if usual else torch.ones_like(mean))
+
+
+def _predictions(gram: np.ndarray, targets: np.ndarray, fitted: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    """Predict targets ``[P, A, T]`` for each penalty; features are centred at the fitted samples' mean."""
+    from sklearn.kernel_ridge import KernelRidge
+    from sklearn.preprocessing import KernelCenterer
+
+    inner, across = gram[np.ix_(fitted, fitted)], gram[np.ix_(asked, fitted)]
+    centre = KernelCenterer().fit(inner)
+    inner, across = centre.transform(inner), centre.transform(across)
+    scale = np.trace(inner) / len(fitted) or 1.0  # features that say nothing predict the mean
+    mean = targets[fitted].mean(0)
+    fits = [
+        KernelRidge(alpha=penalty * scale, kernel="precomputed").fit(inner, targets[fitted] - mean)
+        for penalty in PENALTIES
+    ]
+    return np.stack([mean + fit.predict(across) for fit in fits])
 
 
 def _mean(scores: dict[str, float]) -> float:

@@ -1,32 +1,45 @@
-"""The ``crptpro`` command: a thin, typed shell over the library's functions."""
+"""The ``crptpro`` command: a thin, typed shell over the library's functions.
+
+Every stage's settings are the dataclass that its function takes; nothing is named, defaulted or explained twice.
+"""
 
 from __future__ import annotations
 
+import itertools
 import logging
 import sys
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
-from tyro.conf import Positional, arg, subcommand
+from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from crptpro.cards import cpu_cores
-from crptpro.cli.downstream import Downstream, DrQ
-from crptpro.cli.evaluate import Evaluate
-from crptpro.cli.originals import Export, Import
-from crptpro.cli.plugins import load_plugins
-from crptpro.cli.pretraining import Finetune, Pretrain
 from crptpro.cli.probe import Probe
 from crptpro.cli.report import Report
 from crptpro.cli.reproduce import Reproduce
-from crptpro.cli.trim import Trim
-from crptpro.colors import Colors
+from crptpro.cli.request import Logging, explored_domains, image_format, named_values, require_writable
 from crptpro.console import run_main
 from crptpro.domains import expand_groups
-from crptpro.quality import Quality
+from crptpro.errors import CRPTproError
+from crptpro.experiments.measure import Measure
+from crptpro.logging import RunLogger
+from crptpro.plugins import load_plugins
+from crptpro.provenance import cpu_cores
+from crptpro.training.downstream import DownstreamConfig
+from crptpro.training.explore import ExploreConfig
+from crptpro.training.pretrain import PretrainConfig
+from crptpro.values import Colors, Quality, as_path
 
 logger = logging.getLogger(__name__)
+
+FINETUNE_UPDATES = 2_000
+DESCRIPTION = """Cross-domain random pre-training with prototypes for reinforcement learning from pixels.
+Start with `crptpro doctor`, then collect, pretrain and downstream; each stage continues where it was killed.
+Or `crptpro reproduce` a whole experiment of the paper.
+With `--plugin FILE.py` (or a module) any command runs a file of yours first: methods and domains that it registers
+then have names here."""
 
 
 @dataclass(frozen=True)
@@ -73,47 +86,297 @@ class Collect:
         """Collect, or continue collecting."""
         from crptpro.data import collect_group
 
-        paths = collect_group(
-            expand_groups(self.domains),
-            self.out,
-            transitions=self.transitions,
-            seed=self.seed,
-            workers=self.workers,
-            quality=self.quality,
-            colors=self.colors,
-            action_repeat=self.action_repeat,
-        )
-        for name, path in paths.items():
+        settings = {k: v for k, v in vars(self).items() if k not in ("domains", "out")}
+        for name, path in collect_group(expand_groups(self.domains), self.out, **settings).items():
             logger.info("%s: %s", name, path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pretraining:
+    """What `pretrain` asks of every method."""
+
+    sources: Annotated[Positional[tuple[str, ...]], arg(help_behavior_hint="")] = ()
+    """dataset directories, e.g. data/walker data/cartpole; for methods that explore domains, tasks or group letters"""
+    out: Path
+    """run directory: records and checkpoints, and the encoder in OUT/encoder"""
+    method: str = "crptpro"
+    """crptpro, atc or random-encoder (on datasets), proto-rl-c, proto-rl-s, apt-c, apt-s or becl (exploring), a preset
+    such as crptpro-fast, or one of your own with --plugin FILE.py; settings: see --method NAME --help"""
+    loss: Annotated[
+        tuple[str, ...], arg(metavar="[NAME=VALUE ...]", help_behavior_hint="(default: the method's)")
+    ] = ()
+    """options of the method's loss, e.g. num_prototypes=128 intr_loss_coef=0"""
+    encoder: Annotated[
+        tuple[str, ...], arg(metavar="[NAME=VALUE ...]", help_behavior_hint="(default: the method's)")
+    ] = ()
+    """options of the encoder, e.g. pixel_offset=0.5"""
+    logging: Logging = field(default_factory=Logging)
+    """mirrors"""
+
+    def build(self, seed: int, *, image_size: int = 84, frame_stack: int = 3) -> Any:
+        """Return the method's loss on a fresh encoder."""
+        from crptpro.objectives import get_method
+        from crptpro.seeding import seed_everything
+
+        method = get_method(self.method)
+        seed_everything(seed)
+        encoder = method.build_encoder(
+            in_channels=3 * frame_stack, image_size=image_size, **named_values("--encoder", self.encoder)
+        )
+        return method.build(encoder, **named_values("--loss", self.loss))
+
+    def keep(self, result: Any, records: RunLogger | None) -> None:
+        """Write the encoder, and copy it to the mirrors."""
+        from crptpro.pretrained import save_pretrained
+
+        path = save_pretrained(result, self.out / "encoder")
+        if records is not None:
+            records.artifact(path, name=f"encoder_{self.out.name}", kind="encoder")
+        logger.info("pretrained encoder: %s", path)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pretrain(Pretraining):
+    """Pre-train one encoder for several domains on their datasets, one update per domain in turn."""
+
+    config: Annotated[PretrainConfig, arg(name="")] = field(default_factory=PretrainConfig)
+    """every number of the stage"""
+
+    def run(self) -> None:
+        """Pre-train, or continue, and write the artifact."""
+        from crptpro.objectives import get_method
+        from crptpro.pretrained import random_pretrained, save_pretrained
+        from crptpro.training import pretrain
+
+        datasets = [as_path(source, "sources") for source in self.sources]
+        is_control = get_method(self.method).loss_class is None
+        image_size, frame_stack = image_format(datasets) if datasets or not is_control else (84, 3)
+        if is_control:
+            encoder = random_pretrained(
+                self.config.seed,
+                method=self.method,
+                datasets=datasets,
+                image_size=image_size,
+                in_channels=3 * frame_stack,
+            )
+            logger.info("untrained encoder: %s", save_pretrained(encoder, self.out / "encoder"))
+            return
+        loss = self.build(self.config.seed, image_size=image_size, frame_stack=frame_stack)
+        with self.logging.open(self.out, self) as records:
+            result = pretrain(
+                loss, datasets, method=self.method, run_dir=self.out, config=self.config, records=records
+            )
+            self.keep(result, records)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explore(Pretraining):
+    """Pre-train one encoder on what exploring agents see: one decision per domain in turn."""
+
+    config: Annotated[ExploreConfig, arg(name="")] = field(default_factory=ExploreConfig)
+    """every number of the stage"""
+
+    def run(self) -> None:
+        """Pre-train, or continue, and write the artifact."""
+        from crptpro.training import pretrain_active
+
+        domains = explored_domains(self.sources, self.method)
+        loss = self.build(self.config.seed)
+        with self.logging.open(self.out, self) as records:
+            result = pretrain_active(
+                loss, domains, method=self.method, run_dir=self.out, config=self.config, records=records
+            )
+            self.keep(result, records)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finetune:
+    """Continue pre-training on one domain from a pretrained encoder."""
+
+    pretrained: Positional[str]
+    """directory of the pretrained encoder, or the name of one that ships"""
+    dataset: Positional[Path]
+    """dataset directory of the one domain"""
+    out: Path
+    """run directory: records and checkpoints, and the encoder in OUT/encoder"""
+    config: Annotated[PretrainConfig, arg(name="")] = field(default_factory=PretrainConfig)
+    """every number of the stage; the paper's updates: pendulum and manipulation 2,000, cartpole 3,000, cheetah 1,000,
+    walker 500"""
+    logging: Logging = field(default_factory=Logging)
+    """mirrors"""
+
+    def run(self) -> None:
+        """Fine-tune, or continue, and write the artifact."""
+        from crptpro.pretrained import load_pretrained
+        from crptpro.training import finetune
+
+        image_size, frame_stack = image_format([self.dataset])
+        pretrained = load_pretrained(self.pretrained).require(image_size=image_size, frame_stack=frame_stack)
+        with self.logging.open(self.out, self) as records:
+            config = replace(self.config, updates=self.config.updates or FINETUNE_UPDATES)
+            result = finetune(pretrained, self.dataset, run_dir=self.out, config=config, records=records)
+            Pretraining.keep(self, result, records)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class Downstream:
+    """Learn a task with SAC on a frozen encoder and the prototype-kNN bonus, or with DrQ from scratch."""
+
+    task: Positional[str]
+    """task to learn, e.g. walker_run, reach_duplo, gymnasium:HalfCheetah-v5"""
+    pretrained: str
+    """directory of the pretrained encoder, the name of one that ships, `random-encoder` for the untrained control, or
+    `drq` to learn the encoder with the task"""
+    out: Path
+    """run directory: eval.csv, train.csv, checkpoints, and the agent in OUT/agent"""
+    config: Annotated[DownstreamConfig, arg(name="")] = field(default_factory=DownstreamConfig)
+    """every number of the stage"""
+    logging: Logging = field(default_factory=Logging)
+    """mirrors"""
+
+    def run(self) -> None:
+        """Train, or continue."""
+        from crptpro.domains import get_domain
+        from crptpro.training import train_downstream
+
+        get_domain(self.task)  # an unknown name is refused before the run directory is made
+        with self.logging.open(self.out, self) as records:
+            result = train_downstream(
+                self.task, self.pretrained, run_dir=self.out, config=self.config, records=records
+            )
+        logger.info("agent: %s", result.agent_path)
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Evaluate a trained agent, or the uniform random policy, for whole episodes."""
+
+    agent: Positional[str]
+    """directory of an agent (OUT/agent of a downstream run), or `random-policy`"""
+    task: str | None = None
+    """task to act in (default: the agent's own)"""
+    episodes: int = 10
+    """whole episodes"""
+    seed: int = 0
+    """seeds the episodes"""
+    quality: Quality | None = None
+    """render quality (default: the one the agent was trained with; exact for the random policy)"""
+    colors: Colors | None = None
+    """colours of the world (default: those the agent was trained in; normal for the random policy)"""
+    action_repeat: int | None = None
+    """simulator steps per decision (default: what the agent was trained with; the domain's for the random policy)"""
+    csv: Path | None = None
+    """write one row per episode here"""
+    video: Path | None = None
+    """write the first episode as MP4 here (needs the `video` extra)"""
+
+    def run(self) -> None:
+        """Write what was asked for, and print mean and deviation."""
+        from crptpro.envs import make_env
+        from crptpro.training import evaluate, load_agent, summarize, uniform_policy
+        from crptpro.training.evaluate import episode_seed, run_episode
+
+        is_random = self.agent == "random-policy"
+        if is_random and self.task is None:
+            raise CRPTproError("The random policy has no task of its own; name one, e.g. --task walker_run.")
+        for path, option in ((self.csv, "--csv"), (self.video, "--video")):
+            if path is not None:
+                require_writable(path, option)  # before an hour of episodes
+        agent, card = (None, {}) if is_random else load_agent(self.agent)
+        task, trained_with = self.task or card["task"], card.get("config", {})
+        settings: dict[str, Any] = {
+            "quality": self.quality or trained_with.get("quality", "exact"),
+            "colors": self.colors or trained_with.get("colors", "normal"),
+            "action_repeat": self.action_repeat or trained_with.get("action_repeat"),
+            # Chance does not look; without a video there is nothing to draw.
+            "render": agent is not None or self.video is not None,
+        }
+        if agent is not None:
+            encoder: Any = agent.encoder
+            settings |= {"image_size": encoder.image_size, "frame_stack": encoder.in_channels // 3}
+        env = make_env(task, seed=self.seed, **settings)
+        try:
+            action_dim = env.action_spec.shape[-1]
+            if agent is not None and agent.actor.config["action_dim"] != action_dim:
+                raise CRPTproError(
+                    f"The agent was trained for {agent.actor.config['action_dim']} actions ({card['task']}), {task} "
+                    f"has {action_dim}; choose a task of the agent's own domain."
+                )
+            policy = agent or uniform_policy(env, seed=self.seed)
+            episodes = evaluate(policy, env, episodes=self.episodes, seed=self.seed)
+            if self.csv is not None:
+                import pandas
+
+                from crptpro.artifact import write_whole
+
+                rows = [{"task": task, "agent": self.agent, **vars(episode)} for episode in episodes]
+                write_whole(self.csv, pandas.DataFrame(rows).to_csv(index=False))
+            if self.video is not None:
+                frames: list[Any] = []
+                seed = episode_seed(self.seed, 0)
+                run_episode(uniform_policy(env, seed=self.seed) if agent is None else agent, env, episode=0, seed=seed,
+                            on_frame=frames.append)  # fmt: skip
+                write_video(frames, self.video)
+        finally:
+            env.close()
+        scores = summarize(episodes)
+        print(
+            f"{task}: {scores['mean']:.1f} ± {scores['std']:.1f} "
+            f"({scores['min']:.1f} to {scores['max']:.1f}) over {len(episodes)} episodes"
+        )
+
+
+def write_video(frames: Sequence[Any], path: Path) -> None:
+    """Write RGB pictures, uint8 ``[3, H, W]``, as an MP4 at 25 pictures a second.
+
+    Raises:
+        CRPTproError: the ``video`` extra is missing, or encoding failed.
+    """
+    try:
+        import imageio.v2 as imageio
+        import imageio_ffmpeg  # noqa: F401 - the encoder behind the FFMPEG format
+        import torch
+
+        # Nearest-neighbour enlargement keeps 84 pixels visible on a screen; the codec wants even sizes.
+        large = (
+            torch.stack(list(frames)).repeat_interleave(4, -1).repeat_interleave(4, -2).permute(0, 2, 3, 1)
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        aside = path.with_name(f".{path.name}")
+        imageio.mimwrite(aside, list(large.numpy()), format="FFMPEG", fps=25, macro_block_size=4)
+        aside.replace(path)
+    except ImportError:
+        raise CRPTproError("--video needs the `video` extra: pip install 'crptpro[video]'.") from None
+    except (OSError, RuntimeError, ValueError) as reason:
+        raise CRPTproError(f"--video {path} was not written: {reason}") from reason
+
+
+def pretrain_command(arguments: Sequence[str]) -> type[Pretrain] | type[Explore]:
+    """Return which settings ``pretrain`` has: those of the method that the command line names."""
+    words = " ".join(arguments).replace("=", " ").split()
+    names = [after for word, after in itertools.pairwise(words) if word == "--method"]
+    if not names or "pretrain" not in arguments:
+        return Pretrain
+    from crptpro.objectives import get_method
+
+    return Pretrain if get_method(names[-1]).exploration is None else Explore
 
 
 def main() -> None:
     """Entry point of the ``crptpro`` command."""
-    commands = tyro.conf.OmitSubcommandPrefixes[
-        Annotated[Doctor, subcommand("doctor")]
-        | Annotated[Collect, subcommand("collect")]
-        | Annotated[Pretrain, subcommand("pretrain")]
-        | Annotated[Finetune, subcommand("finetune")]
-        | Annotated[Downstream, subcommand("downstream")]
-        | Annotated[DrQ, subcommand("drq")]
-        | Annotated[Evaluate, subcommand("evaluate")]
-        | Annotated[Probe, subcommand("probe")]
-        | Annotated[Reproduce, subcommand("reproduce")]
-        | Annotated[Report, subcommand("report")]
-        | Annotated[Import, subcommand("import")]
-        | Annotated[Export, subcommand("export")]
-        | Annotated[Trim, subcommand("trim")]
-    ]
 
     def run() -> None:
         arguments = load_plugins(sys.argv[1:])
-        tyro.cli(commands, prog="crptpro", description=DESCRIPTION, args=arguments).run()
+        commands: dict[str, Any] = {
+            "doctor": Doctor, "collect": Collect, "pretrain": pretrain_command(arguments), "finetune": Finetune,
+            "downstream": Downstream, "evaluate": Evaluate, "probe": Probe, "reproduce": Reproduce, "report": Report,
+            "measure": Measure,
+        }  # fmt: skip
+        union: Any = None
+        for name, command in commands.items():
+            each: Any = Annotated[command, subcommand(name)]
+            union = each if union is None else union | each
+        stage: Any = OmitSubcommandPrefixes[union]  # type: ignore[misc]
+        tyro.cli(stage, prog="crptpro", description=DESCRIPTION, args=arguments).run()
 
     run_main(run)
-
-
-DESCRIPTION = """Cross-domain random pre-training with prototypes for reinforcement learning from pixels.
-Start with `crptpro doctor`, then collect, pretrain and downstream; each stage continues where it was killed.
-Or `crptpro reproduce` a whole experiment of the paper.
-With `--plugin FILE.py` (or a module) any command runs a file of yours first: methods, rewards and domains that it
-registers then have names here."""

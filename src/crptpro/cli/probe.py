@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
-from crptpro.cli.downstream import RANDOM_ENCODER
 from crptpro.cli.request import image_format, require_writable
-from crptpro.colors import Colors
+from crptpro.values import Colors
 
 if TYPE_CHECKING:
     from crptpro.pretrained import Pretrained
@@ -30,6 +29,8 @@ class Probe:
     """colours; what a dataset was not collected in is drawn again from its physical state"""
     seed: int = 0
     """which observations, which episodes are held out, and the random encoder's initialisation"""
+    redrawn: Path | None = None
+    """observations of the one dataset that `crptpro measure redrawn` has drawn in other colours, which are probed"""
     csv: Path | None = None
     """write every number here, each coordinate's R2 among them"""
     device: str = "cpu"
@@ -38,10 +39,9 @@ class Probe:
     def run(self) -> None:
         """Print a table, and write what was asked for."""
         from crptpro.data import FrameDataset
+        from crptpro.data.redraw import DrawnFrames
         from crptpro.errors import CRPTproError
-        from crptpro.experiments.markdown import markdown_table
-        from crptpro.experiments.probing import COLUMNS, probe_rows
-        from crptpro.experiments.row_files import write_rows
+        from crptpro.experiments.measure import PROBE_COLUMNS, probe_rows, write_rows
         from crptpro.modules import usable_device
 
         if self.samples < 1:
@@ -55,29 +55,33 @@ class Probe:
         if pretrained.projector is not None:
             pretrained.projector.to(self.device)
         datasets = [FrameDataset.open(path) for path in self.datasets]
+        drawn = None if self.redrawn is None else DrawnFrames.load(self.redrawn)
+        every = self.colors if drawn is None else (drawn.colors,)
         table, measures = [], []
         try:
             for dataset in datasets:
-                for colors in dict.fromkeys(self.colors):
-                    found = probe_rows(
+                for colors in dict.fromkeys(every):
+                    rows, numbers = probe_rows(
                         pretrained,
                         dataset,
                         encoder=self.encoder,
                         colors=colors,
                         samples=self.samples,
                         seed=self.seed,
+                        drawn=drawn,
                     )
-                    table += found.table
-                    measures += found.measures
+                    table += rows
+                    measures += numbers
                     if self.csv is not None:
-                        write_rows(self.csv, COLUMNS, measures)
+                        write_rows(self.csv, measures, PROBE_COLUMNS)
         finally:  # a later dataset may be refused, and writing may fail
             if table:
-                print(markdown_table(table))
+                lines = [list(table[0]), ["---"] * len(table[0]), *(list(row.values()) for row in table)]
+                print("\n".join(f"| {' | '.join(line)} |" for line in lines))
 
     def _load(self, image_size: int, frame_stack: int) -> Pretrained:
         from crptpro.pretrained import load_pretrained, random_pretrained
 
-        if self.encoder == RANDOM_ENCODER:
+        if self.encoder == "random-encoder":
             return random_pretrained(self.seed, image_size=image_size, in_channels=3 * frame_stack)
-        return load_pretrained(self.encoder, expect={"image_size": image_size})
+        return load_pretrained(self.encoder).require(image_size=image_size)

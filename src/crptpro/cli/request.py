@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import os
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,7 +14,7 @@ from tyro.conf import arg
 
 from crptpro.domains import GROUPS, GYMNASIUM_PREFIX, PAPER_DOMAINS, TASKS, expand_groups, known_names
 from crptpro.errors import CRPTproError, DatasetError
-from crptpro.loggers import RunLogger, WandbOptions
+from crptpro.logging import RunLogger, WandbOptions
 
 
 @dataclass(frozen=True)
@@ -21,23 +23,47 @@ class Logging:
 
     wandb: Literal["off", "auto", "offline", "online"] = "off"
     """mirror to Weights & Biases; auto is online when logged in, else offline"""
-    wandb_project: str = "crptpro"
-    """W&B project"""
+    wandb_project: str | None = None
+    """W&B project (default: $WANDB_PROJECT, or crptpro)"""
     wandb_group: str | None = None
-    """W&B group"""
+    """W&B group (default: $WANDB_RUN_GROUP, or none)"""
     wandb_tags: Annotated[tuple[str, ...], arg(help_behavior_hint="(default: none)")] = ()
     """W&B tags"""
     tensorboard: bool = False
     """also write TensorBoard event files"""
 
-    def open(self, run_dir: Path, config: Any) -> RunLogger:
-        """Open the record of a run, and its mirrors."""
+    def open(self, run_dir: Path, config: Any) -> AbstractContextManager[RunLogger | None]:
+        """Open the record of a run and its mirrors; without mirrors the run opens its record itself, when it starts."""
+        if self.wandb == "off" and not self.tensorboard:
+            return nullcontext()
         options = None
         if self.wandb != "off":
             options = WandbOptions(
                 project=self.wandb_project, group=self.wandb_group, tags=self.wandb_tags, mode=self.wandb
             )
         return RunLogger(run_dir, config=config, wandb=options, tensorboard=self.tensorboard)
+
+
+def named_values(option: str, words: Sequence[str]) -> dict[str, Any]:
+    """Read settings given as ``NAME=VALUE``.
+
+    Raises:
+        CRPTproError: naming what is none.
+
+    Examples:
+        >>> named_values("--loss", ["num_prototypes=16", "intr_loss_coef=5e-3", "kind=mean"])
+        {'num_prototypes': 16, 'intr_loss_coef': 0.005, 'kind': 'mean'}
+    """
+    found = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not name.isidentifier() or not equals:
+            raise CRPTproError(f"{option} {word}: write NAME=VALUE, e.g. num_prototypes=128.")
+        try:
+            found[name] = ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            found[name] = value
+    return found
 
 
 def explored_domains(names: Sequence[str], method: str) -> list[str]:
@@ -79,7 +105,7 @@ def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
                 "data/... by default."
             )
     opened = {path: FrameDataset.open(path) for path in datasets}
-    sizes = {path: (dataset.card["image_size"], dataset.frame_stack) for path, dataset in opened.items()}
+    sizes = {path: (dataset.image_size, dataset.frame_stack) for path, dataset in opened.items()}
     if len(set(sizes.values())) > 1:
         listed = ", ".join(f"{path} has {size} px, {stack} frames" for path, (size, stack) in sizes.items())
         raise DatasetError(f"One encoder needs images of one size and stack: {listed}.")

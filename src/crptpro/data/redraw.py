@@ -1,28 +1,88 @@
-"""Frames of a dataset drawn again from their stored physical state, in other colours."""
+"""Frames of a dataset drawn again from their stored physical state, in other colours, and kept."""
 
 from __future__ import annotations
 
 import logging
-from typing import Any
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 
-from crptpro.colors import Colors, is_drawn
+from crptpro.artifact import read_artifact, write_artifact
 from crptpro.data.dataset import FrameDataset
-from crptpro.data.drawn_frames import DrawnFrames
 from crptpro.domains import get_domain
 from crptpro.errors import DatasetError
 from crptpro.seeding import derive_seed
 from crptpro.transforms.color_swap import swap_colors
+from crptpro.values import Colors, is_drawn
 
 logger = logging.getLogger(__name__)
+
+FORMAT, VERSION = "crptpro-drawn-frames", 1
 
 PROOFS = 4
 """Episodes whose first and last wanted frames are drawn in the dataset's own colours and compared."""
 TOLERANCE = 1.0
 """Mean difference, grey levels, that another GL renderer may cause (measured: none on the same machine)."""
+
+
+@dataclass(frozen=True)
+class DrawnFrames:
+    """Some frames of one dataset in other colours, see :func:`~crptpro.data.redraw.redraw`.
+
+    Args:
+        domain: of the dataset.
+        colors: that the frames have.
+        rows: int64 ``[N]``, frame rows of the dataset, ascending, each once.
+        frames: uint8 ``[N, C, H, W]``.
+    """
+
+    domain: str
+    colors: Colors
+    rows: Tensor
+    frames: Tensor
+
+    def __post_init__(self) -> None:
+        """Refuse rows that :meth:`at` could not find."""
+        if len(self.rows) != len(self.frames):
+            raise ValueError(f"There are {len(self.rows)} rows for {len(self.frames)} frames.")
+        if len(self.rows) > 1 and not (self.rows.diff() > 0).all():
+            raise ValueError("The rows must ascend, each once.")
+
+    def have(self, rows: Tensor) -> Tensor:
+        """Return which rows ``[M]`` are among these, as bool ``[M]``."""
+        return torch.isin(rows, self.rows)
+
+    def at(self, rows: Tensor) -> Tensor:
+        """Return the frames uint8 ``[M, C, H, W]`` of rows ``[M]``, all of which must be among these."""
+        return self.frames[torch.searchsorted(self.rows, rows)]
+
+    def save(self, path: str | Path) -> Path:
+        """Write a directory, whole or not at all.
+
+        Args:
+            path: to write or replace.
+
+        Raises:
+            DiskSpaceError: if the disk is full; frames there are kept.
+        """
+        about = {"domain": self.domain, "colors": self.colors, "count": len(self.rows)}
+        content = {"drawn": {"rows": self.rows, "frames": self.frames}}
+        return write_artifact(path, content, card=about, format_name=FORMAT, version=VERSION)
+
+    @classmethod
+    def load(cls, path: str | Path) -> DrawnFrames:
+        """Read what :meth:`save` wrote.
+
+        Raises:
+            DatasetError: naming what is missing, damaged, of another kind or too new.
+        """
+        card, tensors = read_artifact(path, format_name=FORMAT, version=VERSION, error=DatasetError)
+        colors = cast(Colors, card["colors"])
+        return cls(card["domain"], colors, tensors["drawn.rows"], tensors["drawn.frames"])
 
 
 def redraw(
@@ -95,22 +155,20 @@ def _draw(dataset: FrameDataset, rows: dict[int, Tensor], colors: Colors) -> Ten
     is_swapped = colors == "reversed_image"
     settings["colors"] = "normal" if is_swapped else colors
     env = make_env(get_domain(card["task"]), seed=0, frame_stack=1, **settings)
-    base = env.base_env if isinstance(env, TransformedEnv) else env
-    simulator: Any = getattr(base, "simulator", None)
+    base: Any = env.base_env if isinstance(env, TransformedEnv) else env
     images = []
     try:
-        if not hasattr(simulator, "set_state"):
+        if not hasattr(base, "draw_state"):
             raise DatasetError(
                 f"The frames of {card['domain']!r} cannot be drawn again from their physical state: that is known for "
                 "dm_control's worlds alone. The colours 'reversed_image' need no drawing."
             )
         for episode, own in rows.items():
             env.set_seed(derive_seed(card["seed"], "collect", card["domain"], episode))
-            simulator.reset()
+            env.reset()
             states = dataset.physics_at(own)
             for qpos, qvel in zip(states["qpos"].numpy(), states["qvel"].numpy()):
-                simulator.set_state(qpos, qvel)
-                images.append(torch.from_numpy(simulator.render().transpose(2, 0, 1).copy())[None])
+                images.append(base.draw_state(qpos, qvel)[None])
     finally:
         env.close()
     return swap_colors(torch.cat(images)) if is_swapped else torch.cat(images)

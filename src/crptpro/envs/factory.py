@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import logging
 from typing import Any
 
-from torchrl.envs import CatFrames, EnvBase
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import Bounded, Composite
+from torchrl.envs import CatFrames, Compose, DoubleToFloat, EnvBase, Transform, TransformedEnv
+from torchrl.envs.transforms import SelectTransform
 
-from crptpro.colors import COLORS, Colors
 from crptpro.domains import GYMNASIUM_PREFIX, LONGEST_EPISODE_AGENT_STEPS, Domain, get_domain
-from crptpro.envs.dm_stack import FAST_SHADOW_SIZE, DmControlSimulator, SceneCamera, load_dm_env
-from crptpro.envs.episode_limit import EpisodeLimit
-from crptpro.envs.gymnasium_env import GymnasiumSimulator
-from crptpro.envs.own_env import fixed_action_repeat, make_own_env, repeats_actions, with_transform
-from crptpro.envs.pixel_env import PixelEnv
 from crptpro.envs.rendering import backend_card, first_frame_watchdog, select_backend
+from crptpro.envs.worlds import CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError
-from crptpro.quality import QUALITIES, Quality
-from crptpro.seeding import require_seed
+from crptpro.values import COLORS, QUALITIES, Colors, Quality, as_int
 
 logger = logging.getLogger(__name__)
+
+#: What the ``make`` of a domain of one's own may name in its signature.
+OFFERED = ("seed", "image_size", "action_repeat", "camera", "quality", "physics_state")
 
 
 def make_env(
@@ -37,17 +40,23 @@ def make_env(
 ) -> EnvBase:
     """Build an unbatched CPU environment that renders once per agent step.
 
+    dm_control's worlds are TorchRL's ``DMControlWrapper`` (:class:`~crptpro.envs.dm_control.DMControlPixelEnv`),
+    Gymnasium's its ``GymWrapper``, your own what their ``make`` returns; ``CatFrames`` stacks the frames.
+
     Output keys: ``pixels`` uint8 ``[3 * frame_stack, H, W]``, oldest to newest (a reset repeats its first
     frame); ``action`` float32 ``[A]`` in [-1, 1]; ``("next", "reward")`` float32 ``[1]``, summed over the
     repeated env steps; ``done``, ``terminated``, ``truncated`` (time limits truncate; where a world has none,
     1000 agent steps do). Consecutive frames are ``action_repeat`` env steps apart. ``env.set_seed(s)``
     re-seeds the simulator without resetting, and the next ``reset`` starts the episode that belongs to ``s``.
     ``env.card()`` says what shaped the pixels (not in worlds of your own).
-    ``env.close()`` frees the render context.
+    ``env.close()`` frees the render context; at the interpreter's exit it is called for whatever is open.
+
+    Whatever the world, it is watched as :class:`~crptpro.envs.worlds.CheckedWorld` says: rewards that are not finite,
+    exceptions of its own, images of another kind, and episodes in which nothing moves are reported with its name.
 
     Args:
         task: Any name that :func:`crptpro.domains.get_domain` knows, or a :class:`~crptpro.domains.Domain`.
-        seed: Seed of the simulator's first episode.
+        seed: Seed of the simulator's first episode, from 0 to 2**32 - 1.
         image_size: H = W, pixels.
         action_repeat: Env steps per agent step; ``None`` takes the domain's (2).
         frame_stack: Frames per observation; 1 gives the single frame ``[3, H, W]``.
@@ -63,41 +72,57 @@ def make_env(
     Raises:
         UnknownNameError: for a task nobody knows.
         RenderingError: if no GL backend renders.
+        ValueError: for a number that is none, or out of range.
         CRPTproError: for options or an own environment that cannot be used.
     """
     domain = get_domain(task)
+    seed = as_int(seed, "seed", minimum=0, maximum=2**32 - 1)
     action_repeat = resolve_action_repeat(domain, action_repeat)
-    require_seed(seed)
-    _check_options(
-        quality, colors, image_size=image_size, action_repeat=action_repeat, frame_stack=frame_stack
-    )
-    settings: dict[str, Any] = {
-        "image_size": image_size, "action_repeat": action_repeat, "quality": quality, "colors": colors,
-        "camera": domain.camera if camera is None else camera, "physics_state": physics_state,
-    }  # fmt: skip
-    env: EnvBase
+    image_size = as_int(image_size, "image_size", minimum=1)
+    frame_stack = as_int(frame_stack, "frame_stack", minimum=1)
+    camera = domain.camera if camera is None else camera
+    if camera is not None and not isinstance(camera, str):
+        camera = as_int(camera, "camera")
+    if quality not in QUALITIES:
+        raise CRPTproError(f"quality must be {' or '.join(map(repr, QUALITIES))}, got {quality!r}.")
+    if colors not in COLORS:
+        raise CRPTproError(f"colors must be {', '.join(map(repr, COLORS))}, got {colors!r}.")
     if colors == "reversed_background" and domain.source not in ("suite", "manipulation"):
         raise CRPTproError(
             f"What the background of {domain.name!r} is, is known for dm_control's worlds alone; "
             "colors='reversed_image' reverses the colours of whole images in any world."
         )
+    card = {
+        "task": domain.task, "image_size": image_size, "camera": camera, "backend": "none", "quality": quality,
+        "colors": colors, "action_repeat": action_repeat,
+    }  # fmt: skip
+    if needs_gl(domain):
+        select_backend()
+        card |= backend_card()
+    asked: dict[str, Any] = {
+        "image_size": image_size, "action_repeat": action_repeat, "physics_state": physics_state,
+    }  # fmt: skip
+    world: Any
     if domain.source == "own":
-        env = make_own_env(domain, seed=seed, **settings)
+        world = _own(domain, seed=seed, camera=camera, quality=quality, **asked)
+        card = {"task": domain.task}  # its make decides what the settings shape
     elif domain.source == "gymnasium":
-        env = _make_gymnasium_env(domain, render=render, **settings)
+        world = _gymnasium(domain, camera, quality, render=render, **asked)
     else:
-        env = _make_dm_env(domain, render=render, **settings)
+        world = _dm_control(domain, camera, quality, colors, render=render, **asked)
+    limit = LONGEST_EPISODE_AGENT_STEPS if domain.episode_env_steps is None else None
+    world.watch(card, agent_step_limit=limit, checks_frames=render or domain.source == "own")
+    transforms: list[Transform] = []
     if colors == "reversed_image":
         # Imported late: transforms stand on networks, which no environment needs.
         from crptpro.transforms.color_swap import ColorSwap
 
-        env = with_transform(env, ColorSwap(in_keys=["pixels"]))
-    if domain.episode_env_steps is None:
-        env = with_transform(env, EpisodeLimit(LONGEST_EPISODE_AGENT_STEPS))
+        transforms.append(ColorSwap(in_keys=["pixels"]))
+    if frame_stack > 1:
+        transforms.append(CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
+    env: EnvBase = TransformedEnv(world, Compose(*transforms)) if transforms else world
     env.set_seed(seed)
-    if frame_stack == 1:
-        return env
-    return with_transform(env, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
+    return env
 
 
 def resolve_action_repeat(task: str | Domain, action_repeat: int | None = None) -> int:
@@ -107,13 +132,14 @@ def resolve_action_repeat(task: str | Domain, action_repeat: int | None = None) 
     another number, it warns.
 
     Raises:
-        CRPTproError: asked for less than one.
+        ValueError: asked for less than one.
     """
     if action_repeat is not None:
-        _require_count("action_repeat", action_repeat)
+        action_repeat = as_int(action_repeat, "action_repeat", minimum=1)
     domain = get_domain(task)
-    if domain.source == "own" and not repeats_actions(domain):
-        fixed = fixed_action_repeat(domain)
+    make = domain.make if domain.source == "own" else None
+    if make is not None and not _named_by(make, {"action_repeat": None}):
+        fixed = as_int(_bound(make).get("action_repeat", 1), "action_repeat", minimum=1)
         if action_repeat not in (None, fixed):
             logger.warning(
                 "The make of domain %r takes no action_repeat: a decision is %d env step(s), not %d.",
@@ -145,71 +171,158 @@ def needs_gl(task: str | Domain) -> bool:
     return any(name in made_by for name in ("mujoco", "dm_control", "gymnasium_robotics"))
 
 
-def _check_options(quality: str, colors: str, **counts: int) -> None:
-    for name, value in counts.items():
-        _require_count(name, value)
-    if quality not in QUALITIES:
-        raise CRPTproError(f"quality must be {' or '.join(map(repr, QUALITIES))}, got {quality!r}.")
-    if colors not in COLORS:
-        raise CRPTproError(f"colors must be {', '.join(map(repr, COLORS))}, got {colors!r}.")
+def _dm_control(
+    domain: Domain, camera: Any, quality: Quality, colors: Colors, *, render: bool, **asked: Any
+) -> EnvBase:
+    # Imported late: dm_control keeps the GL backend that it is imported with.
+    from crptpro.envs import dm_control
 
-
-def _require_count(name: str, value: int) -> None:
-    if value < 1:
-        raise CRPTproError(f"{name} must be at least 1, got {value}.")
-
-
-def _make_dm_env(
-    domain: Domain,
-    *,
-    image_size: int,
-    action_repeat: int,
-    camera: int | str,
-    quality: Quality,
-    colors: Colors,
-    physics_state: bool,
-    render: bool,
-) -> PixelEnv:
-    select_backend()
-    shadow_size = FAST_SHADOW_SIZE[domain.source] if quality == "fast" else None
-    with first_frame_watchdog():  # composer renders once when it is built
-        env = load_dm_env(domain)
-    description = {
-        "task": domain.task, "image_size": image_size, "camera": camera, **backend_card(), "quality": quality,
-        "colors": colors,
-    }  # fmt: skip
-    scene_camera = SceneCamera(
-        image_size, camera, shadow_size, reverses_background=colors == "reversed_background"
+    shadow_size = dm_control.FAST_SHADOW_SIZE[domain.source] if quality == "fast" else None
+    scene = dm_control.SceneCamera(
+        asked["image_size"], camera, shadow_size, reverses_background=colors == "reversed_background"
     )
-    scene_camera.prepare(env.physics)
-    simulator = DmControlSimulator(env, scene_camera, action_repeat=action_repeat, description=description)
-    return PixelEnv(simulator, image_size=image_size, physics_state=physics_state, render=render)
+    with first_frame_watchdog():  # composer renders once when it is built
+        env = dm_control.load_dm_env(domain)
+    scene.prepare(env.physics)
+    steps = dm_control.AgentSteps(env, scene if render else None, world=domain.task, **asked)
+    return dm_control.DMControlPixelEnv(steps)
 
 
-def _make_gymnasium_env(
-    domain: Domain,
-    *,
-    image_size: int,
-    action_repeat: int,
-    camera: int | str | None,
-    quality: Quality,
-    colors: Colors,
-    physics_state: bool,
-    render: bool,
-) -> PixelEnv:
-    gl_card: dict[str, Any] = {"backend": "none"}
-    if needs_gl(domain):
-        select_backend()
-        gl_card = backend_card()
-    simulator = GymnasiumSimulator(
-        domain.task[len(GYMNASIUM_PREFIX) :],
-        image_size=image_size,
-        action_repeat=action_repeat,
-        camera=camera,
-        shadow_size=FAST_SHADOW_SIZE["suite"] if quality == "fast" else None,
-        description={
-            "task": domain.task, "image_size": image_size, "camera": camera, **gl_card, "quality": quality,
-            "colors": colors,
-        },
-    )  # fmt: skip
-    return PixelEnv(simulator, image_size=image_size, physics_state=physics_state, render=render)
+def _gymnasium(domain: Domain, camera: Any, quality: Quality, *, render: bool, **asked: Any) -> EnvBase:
+    from crptpro.envs import gymnasium_worlds
+
+    env_id = domain.task[len(GYMNASIUM_PREFIX) :]
+    env = gymnasium_worlds.load_gymnasium_env(
+        env_id, camera=camera, image_size=asked["image_size"], quality=quality
+    )
+    steps = gymnasium_worlds.AgentSteps(env, world=domain.task, render=render, **asked)
+    return gymnasium_worlds.GymnasiumPixelEnv(env=steps)
+
+
+class OwnEnv(CheckedWorld, TransformedEnv):
+    """A user's TorchRL environment, with transforms of its own inside and what makes it like all others outside."""
+
+
+class FrameTransform(Transform):
+    """Makes ``pixels`` frames (:class:`~crptpro.envs.worlds.FrameReader`), and adds ``truncated`` if it is missing.
+
+    TorchRL's ``PermuteTransform`` returns a view of the world's own buffer, ``ToTensorImage`` divides uint8 by 255.
+
+    Args:
+        world: Name for messages.
+    """
+
+    def __init__(self, world: str):
+        super().__init__(in_keys=["pixels"], out_keys=["pixels"])
+        self._read_frame = FrameReader(world)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Make it uint8, channels first."""
+        shape = observation_spec["pixels"].shape
+        size = shape[1]  # the world is square
+        observation_spec["pixels"] = Bounded(0, 255, shape=(3, size, size), dtype=torch.uint8)
+        return observation_spec
+
+    def transform_done_spec(self, done_spec: Composite) -> Composite:
+        """Add ``truncated``, a copy of ``done``."""
+        done_spec = done_spec.clone()
+        if "truncated" not in set(done_spec.keys()):
+            done_spec["truncated"] = done_spec["done"].clone()
+        return done_spec
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        next_tensordict.set("pixels", self._read_frame(next_tensordict.get("pixels")))
+        if "truncated" not in set(next_tensordict.keys()):
+            next_tensordict.set("truncated", torch.zeros_like(next_tensordict.get("done")))
+        return next_tensordict
+
+
+def _own(domain: Domain, *, image_size: int, **settings: Any) -> EnvBase:
+    make = domain.make
+    if make is None:
+        raise CRPTproError(f"Domain {domain.name!r} has no make, the function that builds its environment.")
+    named = _named_by(make, {"image_size": image_size, **settings})
+    if settings["quality"] != "exact" and "quality" not in named:
+        logger.warning(
+            "The make of domain %r takes no quality: it draws as ever, not with quality=%r.",
+            domain.name, settings["quality"],
+        )  # fmt: skip
+    with passed_on(domain.task, "make"):
+        env = make(**named)
+    _require_contract(domain, env, image_size)
+    state = ("qpos", "qvel") if settings["physics_state"] else ()
+    present = set(env.observation_spec.keys(True, True))
+    kept = [key for key in ("pixels", *state, *_read_back(env)) if key in present]
+    transforms: list[Transform] = [FrameTransform(domain.task)]
+    if present - set(kept):
+        transforms.insert(0, SelectTransform(*kept))
+    rewards = ["reward"] if env.reward_spec.dtype == torch.float64 else []
+    actions = ["action"] if env.action_spec.dtype == torch.float64 else []
+    if rewards or actions:
+        transforms.append(DoubleToFloat(in_keys=rewards, in_keys_inv=actions))
+    return OwnEnv(env, Compose(*transforms), auto_unwrap=False)
+
+
+def _read_back(env: EnvBase) -> list[Any]:
+    """Return the observations that the environment itself reads at the next step.
+
+    A transform that counts (``StepCounter``, ``RewardSum``) keeps its count in the tensordict, and so does an
+    environment without a state of its own: what is dropped there is missing one step later.
+    """
+    base = env
+    while isinstance(base, TransformedEnv):
+        base = base.base_env
+    own = set(base.observation_spec.keys(True, True))
+    found = [key for key in env.observation_spec.keys(True, True) if key not in own]
+    return [*found, *env.full_state_spec.keys(True, True)]
+
+
+def _bound(make: Any) -> dict[str, Any]:
+    return make.keywords if isinstance(make, functools.partial) else {}
+
+
+def _named_by(make: Any, settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings that ``make`` names; what a ``partial`` has bound is decided and not asked for again."""
+    # TorchRL's metaclass hides what the constructor of an environment names.
+    parameters = inspect.signature(make.__init__ if inspect.isclass(make) else make).parameters
+    takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+    return {
+        name: settings[name]
+        for name in OFFERED
+        if name in settings and (takes_all or name in parameters) and name not in _bound(make)
+    }
+
+
+def _require_contract(domain: Domain, env: Any, image_size: int) -> None:
+    """Raise for what the rest of the library cannot use."""
+
+    def refuse(what: str) -> CRPTproError:
+        return CRPTproError(f"The environment of domain {domain.name!r} {what} (see crptpro.domains.Domain).")
+
+    if not isinstance(env, EnvBase):
+        raise refuse(f"is a {type(env).__name__}; make must return a TorchRL EnvBase")
+    if env.device is not None and env.device.type != "cpu":
+        raise refuse(f"lives on {env.device}; it must be on the CPU, where frames are stored")
+    if env.batch_size != torch.Size([]):
+        raise refuse(f"has batch size {tuple(env.batch_size)}; it must be unbatched")
+    if "pixels" not in set(env.observation_spec.keys()):
+        raise refuse(f"emits {sorted(map(str, env.observation_spec.keys()))}, but no 'pixels'")
+    spec = env.observation_spec["pixels"]
+    if spec.dtype != torch.uint8 and not spec.dtype.is_floating_point:
+        raise refuse(f"emits pixels of {spec.dtype}; they must be torch.uint8, or floats in [0, 1]")
+    shapes = ((3, image_size, image_size), (image_size, image_size, 3))
+    if tuple(spec.shape) not in shapes:
+        expected = " or ".join(map(str, shapes))
+        raise refuse(f"emits pixels of shape {tuple(spec.shape)}; expected one RGB image, {expected}")
+    action = env.action_spec
+    low: Any = getattr(action.space, "low", None)
+    high: Any = getattr(action.space, "high", None)
+    if not action.dtype.is_floating_point or low is None or len(action.shape) != 1 or 0 in action.shape:
+        raise refuse(f"has the action {action}; it must be a bounded float vector")
+    if not ((low == -1).all() and (high == 1).all()):
+        raise refuse("has action bounds other than [-1, 1]; let make scale the actions")
+    if tuple(env.reward_spec.shape) != (1,):
+        raise refuse(f"has rewards of shape {tuple(env.reward_spec.shape)}; expected (1,)")

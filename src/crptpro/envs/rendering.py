@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
+import signal
 import socket
+import subprocess
 import sys
+import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import IO, Any, NamedTuple
 
-from crptpro.envs.gl_process import BACKENDS, Attempt, attempt_backend, canonical_backend
 from crptpro.errors import RenderingError
 
 logger = logging.getLogger(__name__)
 
+BACKENDS = ("egl", "osmesa", "glfw")
 #: Environment variable that carries the proof, as JSON, to this process's later calls and to its children. A cluster
 #: may hand the environment on to another machine, where the proof holds no longer.
 PROOF_VARIABLE = "CRPTPRO_GL_PROOF"
@@ -31,6 +36,68 @@ HANG_CAUSE = (
     "The usual cause is a GPU driver that hangs when several processes hold EGL contexts at once (NVIDIA "
     "580.x does, google-deepmind/mujoco issue 3444), or one left behind by a killed run."
 )
+REMEDIES = {
+    "egl": "Install EGL (Debian, Ubuntu: apt-get install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri), or "
+    "the GL parts of the GPU's driver.",
+    "osmesa": "Install OSMesa (Debian 12, Ubuntu: apt-get install libosmesa6).",
+    "glfw": "GLFW needs a display; on a machine without one use MUJOCO_GL=egl or MUJOCO_GL=osmesa.",
+}
+
+#: Values of MUJOCO_GL that dm_control knows beside the backends' names.
+_SYNONYMS = {
+    **dict.fromkeys(("on", "enable", "enabled", "true", "1", ""), "glfw"),
+    **dict.fromkeys(("disable", "disabled", "false", "0"), "off"),
+}
+
+#: Renders one small scene with the backend that MUJOCO_GL names and describes it as JSON. It imports MuJoCo alone, to
+#: stay below a second or two, and runs in a process of its own, because a broken GL driver may hang or crash.
+_PROBE = """
+import importlib, json, os, time
+start = time.perf_counter()
+import mujoco
+if not hasattr(mujoco, "Renderer"):  # MuJoCo hides why its backend cannot be imported
+    importlib.import_module("mujoco." + os.environ["MUJOCO_GL"])
+model = mujoco.MjModel.from_xml_string('''<mujoco><visual><quality shadowsize="512"/></visual><worldbody>
+    <light pos="0 0 3"/><geom type="plane" size="2 2 .1" rgba="1 0 0 1"/><geom type="sphere" size=".4" pos="0 0 .4"/>
+    <camera name="c" pos="0 -2 2" xyaxes="1 0 0 0 .7 .7"/></worldbody></mujoco>''')
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+renderer = mujoco.Renderer(model, 84, 84)
+renderer.update_scene(data, camera="c")
+first = renderer.render().copy()
+first_frame_s = time.perf_counter() - start
+again = renderer.render()
+from OpenGL import GL
+names = {"gl_vendor": GL.GL_VENDOR, "gl_renderer": GL.GL_RENDERER, "gl_version": GL.GL_VERSION}
+answer = {key: (GL.glGetString(name) or b"unknown").decode(errors="replace") for key, name in names.items()}
+soft = any(name in answer["gl_renderer"].lower() for name in ("llvmpipe", "softpipe", "swrast", "software"))
+answer["gl_kind"] = "software" if soft else "hardware"
+answer["first_frame_s"] = round(first_frame_s, 3)
+answer["alive"] = bool(first.max() > first.min() and (first == again).all())
+renderer.close()
+print(json.dumps(answer))
+"""
+PROBE_COMMAND = (sys.executable, "-c", _PROBE)
+
+
+def canonical_backend(text: str) -> str:
+    """Return ``"egl"``, ``"osmesa"``, ``"glfw"`` or ``"off"`` for a value of ``MUJOCO_GL``.
+
+    Raises:
+        RenderingError: for any other value.
+
+    Examples:
+        >>> canonical_backend("EGL"), canonical_backend("disabled")
+        ('egl', 'off')
+    """
+    name = text.strip().lower()
+    backend = _SYNONYMS.get(name, name)
+    if backend not in (*BACKENDS, "off"):
+        raise RenderingError(
+            f"MUJOCO_GL={text} is not a GL backend. Set it to egl (GPU or Mesa), osmesa (software) or glfw "
+            "(needs a display), or unset it and the first that renders is taken."
+        )
+    return backend
 
 
 def select_backend(
@@ -58,7 +125,7 @@ def select_backend(
     """
     timeout_s = default_timeout_s() if timeout_s is None else timeout_s
     proof = _proof()
-    requested = _requested_by_user()
+    requested = requested_backend()
     if preference is not None and preference not in BACKENDS:
         raise RenderingError(f"There is no GL backend {preference!r}; choose one of {', '.join(BACKENDS)}.")
     if requested is not None and preference not in (None, requested):
@@ -73,24 +140,30 @@ def select_backend(
         )
     only = wanted or imported
     candidates = (only,) if only else platform_candidates()
-    if proof and proof["processes"] >= processes and proof["backend"] in candidates:
-        os.environ["MUJOCO_GL"] = proof["backend"]
-        return proof["backend"]
-    if proof and proof["backend"] in candidates:  # those before it have failed already
-        candidates = candidates[candidates.index(proof["backend"]) :]
-    failures: list[Attempt] = []
+    if proof and proof["backend"] in candidates:
+        if proof["processes"] >= processes:
+            os.environ["MUJOCO_GL"] = proof["backend"]
+            return proof["backend"]
+        candidates = candidates[candidates.index(proof["backend"]) :]  # those before it have failed already
+    failures: list[str] = []
     for backend in candidates:
         attempt = attempt_backend(backend, timeout_s=timeout_s, processes=processes)
-        if attempt.is_ok:
-            _accept(attempt, processes=processes, chosen_by="user" if requested else "crptpro")
+        if not attempt.failure:
             for failure in failures:
-                logger.warning(
-                    "%s Rendering with %s instead.", explain(failure, timeout_s, processes), backend
-                )
+                logger.warning("%s Rendering with %s instead.", failure, backend)
+            _accept(attempt, processes=processes, chosen_by="user" if requested else "crptpro")
             return backend
-        failures.append(attempt)
-    details = [explain(failure, timeout_s, processes) for failure in failures]
-    raise RenderingError("\n  ".join([_nothing_renders(requested, imported), *details]))
+        failures.append(attempt.failure)
+    if requested:
+        what = f"MUJOCO_GL={os.environ['MUJOCO_GL']} was set by you, is kept, and does not render a frame."
+    elif imported:
+        what = (
+            f"dm_control was imported with the backend {imported!r} before one could be chosen, and it does "
+            "not render a frame. Make the first environment before importing dm_control, or set MUJOCO_GL."
+        )
+    else:
+        what = "No GL backend renders a frame."
+    raise RenderingError("\n  ".join([what, *failures]))
 
 
 def backend_card() -> dict[str, Any]:
@@ -135,6 +208,122 @@ def default_timeout_s() -> float:
         raise RenderingError(f"{TIMEOUT_VARIABLE} must be a number of seconds, got {text!r}.") from None
 
 
+def platform_candidates() -> tuple[str, ...]:
+    """Return the backends worth trying here, best first."""
+    if not sys.platform.startswith("linux"):
+        return ("glfw",)
+    has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    return BACKENDS if has_display else ("egl", "osmesa")
+
+
+def requested_backend() -> str | None:
+    """Return the backend of a MUJOCO_GL that is not our own doing, here or where the environment comes from.
+
+    Raises:
+        RenderingError: if MUJOCO_GL is no backend, or switches rendering off.
+    """
+    text = os.environ.get("MUJOCO_GL")
+    proof = _carried_proof()
+    if text is None or (proof and proof.get("chosen_by") == "crptpro" and text == proof["backend"]):
+        return None
+    backend = canonical_backend(text)
+    if backend == "off":
+        raise RenderingError(
+            f"MUJOCO_GL={text} switches rendering off; unset it, or set it to egl or osmesa."
+        )
+    return backend
+
+
+class Attempt(NamedTuple):
+    """How a backend did: ``failure`` says why not and what to do (empty: it rendered), ``gl`` is what the probe saw."""
+
+    backend: str
+    failure: str
+    gl: dict[str, Any]
+
+
+def attempt_backend(backend: str, *, timeout_s: float, processes: int = 1) -> Attempt:
+    """Render with ``backend`` in ``processes`` simultaneous processes, all within ``timeout_s``."""
+    gl: dict[str, Any] = {}
+    for returncode, stdout, stderr in run_isolated([PROBE_COMMAND] * processes, backend, timeout_s=timeout_s):
+        if returncode is None:
+            where = f" from each of {processes} simultaneous processes" if processes > 1 else ""
+            late = f"{backend}: the first frame did not arrive{where} within {timeout_s:g} s."
+            return Attempt(backend, f"{late} {HANG_CAUSE} {ALTERNATIVES}", {})
+        reason, remedy = "", REMEDIES[backend]
+        if returncode < 0:
+            reason = f"the GL driver crashed the process ({signal.Signals(-returncode).name})."
+        elif returncode > 0:
+            lines = [line.strip() for line in stderr.splitlines() if line.strip()]
+            reason = (
+                f"{lines[-1].rstrip('.')}." if lines else f"the probe ended with exit status {returncode}."
+            )
+            remedy = "Unset PYOPENGL_PLATFORM." if "PYOPENGL_PLATFORM" in reason else remedy
+        else:
+            try:
+                gl = json.loads(stdout.strip().splitlines()[-1])
+            except (json.JSONDecodeError, IndexError):
+                reason = "the probe gave no answer."
+            else:
+                if not gl.get("alive"):
+                    reason = "the frame came back without content; the GL driver does not work."
+        if reason:
+            return Attempt(backend, f"{backend}: {reason} {remedy}", {})
+    return Attempt(backend, "", gl)
+
+
+def run_isolated(
+    commands: list[tuple[str, ...]], backend: str, *, timeout_s: float
+) -> list[tuple[int | None, str, str]]:
+    """Run commands at the same time with ``MUJOCO_GL=backend``; kill what is not done in time.
+
+    Output goes through files, not pipes, and nobody waits for a killed process: one that hangs in the kernel
+    cannot be reaped.
+
+    Returns:
+        For each command its exit status (``None``: killed), standard output and standard error.
+    """
+    environment = {**os.environ, "MUJOCO_GL": backend}
+    if "OpenGL" in sys.modules:  # then dm_control or mujoco has set it here, for the backend of this process
+        environment.pop("PYOPENGL_PLATFORM", None)
+    jobs: list[tuple[subprocess.Popen[bytes], IO[bytes], IO[bytes]]] = []
+    with contextlib.ExitStack() as stack:
+        try:
+            for command in commands:
+                out: IO[bytes] = stack.enter_context(tempfile.TemporaryFile())
+                err: IO[bytes] = stack.enter_context(tempfile.TemporaryFile())
+                process = subprocess.Popen(
+                    command, env=environment, stdin=subprocess.DEVNULL, stdout=out, stderr=err,
+                    start_new_session=True,
+                )  # fmt: skip
+                jobs.append((process, out, err))
+            deadline = time.monotonic() + timeout_s
+            results = []
+            for process, out, err in jobs:
+                try:
+                    returncode: int | None = process.wait(max(0.0, deadline - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    returncode = None
+                results.append((returncode, _text(out), _text(err)))
+            return results
+        finally:
+            _kill([job[0] for job in jobs if job[0].poll() is None])
+
+
+def _kill(processes: list[subprocess.Popen[bytes]]) -> None:
+    for process in processes:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+    for process in processes:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(2.0)
+
+
+def _text(file: IO[bytes]) -> str:
+    file.seek(0)
+    return file.read().decode(errors="replace")
+
+
 def _carried_proof() -> dict[str, Any] | None:
     """Return the proof in the environment, wherever it was made."""
     try:
@@ -156,61 +345,18 @@ def _place() -> dict[str, Any]:
     return {"host": socket.gethostname(), "egl_device": os.environ.get("MUJOCO_EGL_DEVICE_ID")}
 
 
-def _requested_by_user() -> str | None:
-    """Return the backend of a MUJOCO_GL that is not our own doing, here or where the environment comes from."""
-    text = os.environ.get("MUJOCO_GL")
-    proof = _carried_proof()
-    if text is None or (proof and proof.get("chosen_by") == "crptpro" and text == proof["backend"]):
-        return None
-    backend = canonical_backend(text)
-    if backend == "off":
-        raise RenderingError(
-            f"MUJOCO_GL={text} switches rendering off; unset it, or set it to egl or osmesa."
-        )
-    return backend
-
-
 def _imported_backend() -> str | None:
-    module = sys.modules.get("dm_control._render")
-    name = getattr(module, "BACKEND", None)
+    name = getattr(sys.modules.get("dm_control._render"), "BACKEND", None)
     return name if name in BACKENDS else None
-
-
-def platform_candidates() -> tuple[str, ...]:
-    """Return the backends worth trying here, best first."""
-    if not sys.platform.startswith("linux"):
-        return ("glfw",)
-    has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-    return BACKENDS if has_display else ("egl", "osmesa")
 
 
 def _accept(attempt: Attempt, *, processes: int, chosen_by: str) -> None:
     # A user's spelling ("EGL", "on") becomes the one that dm_control and Gymnasium both understand.
     os.environ["MUJOCO_GL"] = attempt.backend
-    if attempt.answer.get("gl_kind") == "software":
+    if attempt.gl.get("gl_kind") == "software":
         os.environ.setdefault("LP_NUM_THREADS", "1")
     proof = {
-        **attempt.answer, **_place(), "backend": attempt.backend, "processes": processes, "chosen_by": chosen_by,
+        **attempt.gl, **_place(), "backend": attempt.backend, "processes": processes, "chosen_by": chosen_by,
     }  # fmt: skip
     os.environ[PROOF_VARIABLE] = json.dumps(proof)
-    logger.info("GL backend %s: %s", attempt.backend, attempt.answer.get("gl_renderer"))
-
-
-def explain(attempt: Attempt, timeout_s: float, processes: int = 1) -> str:
-    """Return in one sentence or two why an attempt failed and what to do."""
-    if attempt.is_timeout:
-        where = f" from each of {processes} simultaneous processes" if processes > 1 else ""
-        what = f"{attempt.backend}: the first frame did not arrive{where} within {timeout_s:g} s."
-        return f"{what} {HANG_CAUSE} {ALTERNATIVES}"
-    return f"{attempt.backend}: {attempt.reason} {attempt.remedy}".strip()
-
-
-def _nothing_renders(requested: str | None, imported: str | None) -> str:
-    if requested:
-        return f"MUJOCO_GL={os.environ['MUJOCO_GL']} was set by you, is kept, and does not render a frame."
-    if imported:
-        return (
-            f"dm_control was imported with the backend {imported!r} before one could be chosen, and it does "
-            "not render a frame. Make the first environment before importing dm_control, or set MUJOCO_GL."
-        )
-    return "No GL backend renders a frame."
+    logger.info("GL backend %s: %s", attempt.backend, attempt.gl.get("gl_renderer"))

@@ -1,8 +1,8 @@
-"""Scores of runs and what to say of many of them: pure functions on arrays.
+"""What to say of many runs in one number: aggregates over tasks, and bootstrap intervals that know of shared encoders.
 
-Aggregates take one array per task, ``[..., R]`` with a task's runs along the last axis, and reduce runs and tasks;
-axes before it pass through, so that one call serves an estimate, a whole curve, or thousands of bootstrap replicates
-(:mod:`crptpro.experiments.bootstrap`). Tasks may differ in their number of runs: every task counts the same.
+Aggregates take one array per task, ``[..., R]`` with a task's runs along the last axis, and reduce runs and tasks. Axes
+before it pass through, so that one call serves an estimate, a curve, or thousands of bootstrap replicates. Every task
+counts the same in all but the interquartile mean, where every run does.
 
 Source: Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, 2021, arXiv 2108.13264,
 and its code google-research/rliable, with which all agree where every task has the same number of runs.
@@ -10,214 +10,225 @@ and its code google-research/rliable, with which all agree where every task has 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from typing import TypeVar
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.stats import mannwhitneyu, trim_mean
 
 Array = NDArray[np.float64]
-Aggregate = Callable[[Sequence[Array]], Array]
-"""Reduces one array ``[..., R_t]`` per task to ``[...]``."""
 
-Task = TypeVar("Task", bound=Hashable)
-
-
-# --- one run --------------------------------------------------------------------------------------------------------
-
-
-def evaluation_means(env_steps: ArrayLike, episode_returns: ArrayLike) -> tuple[NDArray[np.int64], Array]:
-    """Return the mean episode return of every evaluation of a run.
-
-    Args:
-        env_steps: ``[N]``, when the evaluation was made that an episode belongs to.
-        episode_returns: ``[N]``.
-
-    Returns:
-        The evaluations' env steps ``[E]``, ascending, and their means ``[E]``.
-
-    Raises:
-        ValueError: no episode, shapes that differ, or a return that is not finite.
-
-    Examples:
-        >>> evaluation_means([0, 0, 500], [1.0, 3.0, 8.0])
-        (array([  0, 500]), array([2., 8.]))
-    """
-    steps, returns = np.asarray(env_steps), np.asarray(episode_returns, dtype=np.float64)
-    if steps.shape != returns.shape or steps.ndim != 1 or not len(steps):
-        raise ValueError(
-            f"A run's score needs as many env steps as episode returns, one at least; got shapes {steps.shape} "
-            f"and {returns.shape}."
-        )
-    _require_finite("episode_returns", returns)
-    places, inverse, counts = np.unique(steps.astype(np.int64), return_inverse=True, return_counts=True)
-    return places, np.bincount(inverse, weights=returns) / counts
-
-
-def final_score(env_steps: ArrayLike, episode_returns: ArrayLike) -> float:
-    """Score a run by the mean return of its final evaluation's episodes.
-
-    What tables show unless they say otherwise. The paper averages "at least 6 different evaluations (60 episodes)" and
-    does not say how they divide into seeds and evaluations.
-
-    Args:
-        env_steps: ``[N]``, when the evaluation was made that an episode belongs to.
-        episode_returns: ``[N]``.
-
-    Raises:
-        ValueError: as of :func:`evaluation_means`.
-    """
-    return float(evaluation_means(env_steps, episode_returns)[1][-1])
-
-
-def last_evaluations_score(
-    env_steps: ArrayLike, episode_returns: ArrayLike, *, evaluations: int = 10
-) -> float:
-    """Score a run by the mean over its last evaluations: steadier than the final one, and behind it while learning.
-
-    Args:
-        env_steps: ``[N]``, when the evaluation was made that an episode belongs to.
-        episode_returns: ``[N]``.
-        evaluations: how many; each counts the same. All of them if the run has fewer.
-
-    Raises:
-        ValueError: as of :func:`evaluation_means`, or ``evaluations`` below 1.
-    """
-    if evaluations < 1:
-        raise ValueError(f"`evaluations` must be at least 1, got {evaluations}.")
-    return float(evaluation_means(env_steps, episode_returns)[1][-evaluations:].mean())
-
-
-def expert_normalized(scores: Mapping[Task, ArrayLike], experts: Mapping[Task, float]) -> dict[Task, Array]:
-    """Divide every score by the expert's on the same task.
-
-    ``score / expert``; the random policy's score is not subtracted, as in the paper, whose expert is DrQ
-    (:data:`crptpro.experiments.published.EXPERT_SCORES`).
-
-    Args:
-        scores: task to scores ``[R]``.
-        experts: task to the expert's score; further tasks are ignored.
-
-    Raises:
-        ValueError: a task has no expert, or one that is not above 0.
-    """
-    without = [str(task) for task in scores if task not in experts]
-    if without:
-        raise ValueError(
-            f"There is no expert's score on {', '.join(without)}; give one, or leave the task out."
-        )
-    for task in scores:
-        if not experts[task] > 0 or not np.isfinite(experts[task]):
-            raise ValueError(f"An expert's score must be above 0, got {experts[task]} on {task}.")
-    return {task: np.asarray(values, dtype=np.float64) / experts[task] for task, values in scores.items()}
-
-
-# --- many runs ------------------------------------------------------------------------------------------------------
+MIN_RUNS = 5
+"""A task with fewer runs has no interval: percentile intervals of fewer draws are far too narrow."""
+COVERAGE = {5: 0.84, 6: 0.86, 8: 0.89, 10: 0.90}
+"""How often a 95 % percentile interval of the mean of so many draws of a normal law holds the law's mean."""
+CONFIDENCE, REPLICATES, SEED = 0.95, 2_000, 0
+"""Of every interval; the same runs give the same interval, in whatever order they come."""
 
 
 def mean(scores: Sequence[Array]) -> Array:
-    """Return the mean over tasks of the mean over a task's runs.
-
-    Args:
-        scores: one ``[..., R_t]`` per task.
-    """
-    return np.mean(_task_means(scores), axis=-1)
+    """Return the mean over tasks of the mean over a task's runs."""
+    return np.mean([task.mean(axis=-1) for task in scores], axis=0)
 
 
 def median(scores: Sequence[Array]) -> Array:
-    """Return the median over tasks of the mean over a task's runs; with one task, that mean.
-
-    Args:
-        scores: one ``[..., R_t]`` per task.
-    """
-    return np.median(_task_means(scores), axis=-1)
+    """Return the median over tasks of the mean over a task's runs; with one task, that mean."""
+    return np.median([task.mean(axis=-1) for task in scores], axis=0)
 
 
 def iqm(scores: Sequence[Array]) -> Array:
-    r"""Return the interquartile mean: that of the middle half of all runs of all tasks, sorted together.
-
-    ``floor(R / 4)`` of the ``R`` runs are cut at each end, as rliable does. With unequal counts a run weighs
-    ``R / (T R_t)``, so that every task weighs the same, and a run at the cut counts in part.
-
-    Args:
-        scores: one ``[..., R_t]`` per task.
+    """Return the interquartile mean: that of the middle half of all runs of all tasks, sorted together.
 
     Examples:
         >>> float(iqm([np.array([0.0, 1.0]), np.array([3.0, 100.0])]))
         2.0
     """
-    runs = np.concatenate(scores, axis=-1)  # (..., R)
-    total = runs.shape[-1]
-    cut = total // 4
-    weights = np.concatenate([np.full(s.shape[-1], total / (len(scores) * s.shape[-1])) for s in scores])
-    if np.allclose(weights, 1):
-        return np.sort(runs, axis=-1)[..., cut : total - cut].mean(axis=-1)
-    order = np.argsort(runs, axis=-1, kind="stable")
-    weight = weights[order]
-    end = np.cumsum(weight, axis=-1)  # a run fills the stretch from `end - weight` to `end` of [0, R]
-    kept = np.clip(np.minimum(end, total - cut) - np.maximum(end - weight, cut), 0, None)
-    return (kept * np.take_along_axis(runs, order, axis=-1)).sum(axis=-1) / kept.sum(axis=-1)
+    return np.asarray(trim_mean(np.concatenate(scores, axis=-1), 0.25, axis=-1))
 
 
-def optimality_gap(scores: Sequence[Array], *, target: float = 1.0) -> Array:
-    """Return by how much runs fall short of ``target`` on average; more than the target makes up for nothing.
-
-    ``mean over tasks of mean over runs of max(target - score, 0)``; lower is better.
-
-    Args:
-        scores: one ``[..., R_t]`` per task, normalised so that ``target`` means the same on all.
-        target: what is enough; 1 is the expert.
-    """
-    return mean([np.maximum(target - s, 0.0) for s in scores])
-
-
-def performance_profile(scores: Sequence[Array], thresholds: ArrayLike) -> Array:
-    """Return the fraction of runs that score above each threshold, every task counting the same.
-
-    ``F(t) = mean over tasks of mean over runs of [score > t]`` (a run-score distribution).
-
-    Args:
-        scores: one ``[..., R_t]`` per task.
-        thresholds: ``[K]``.
-
-    Returns:
-        Fractions ``[..., K]`` in [0, 1], not increasing in the threshold.
-    """
-    marks = np.asarray(thresholds, dtype=np.float64)
-    # One threshold at a time: replicates x runs x thresholds would be large.
-    return np.stack([mean([s > mark for s in scores]) for mark in marks], axis=-1)
+def optimality_gap(scores: Sequence[Array]) -> Array:
+    """Return by how much normalised runs fall short of 1 on average; more than 1 makes up for nothing."""
+    return mean([np.maximum(1.0 - task, 0.0) for task in scores])
 
 
 def probability_of_improvement(scores: Sequence[Array], others: Sequence[Array]) -> Array:
     """Return how probably a run of one method beats one of another on the same task, averaged over tasks.
 
-    ``P(X > Y) + P(X = Y) / 2`` over all pairs of runs: the Mann-Whitney U statistic over ``R_x R_y``. Half means no
+    ``P(X > Y) + P(X = Y) / 2`` over all pairs of runs: the Mann-Whitney U statistic over their number. Half means no
     difference. It says nothing about by how much.
 
     Args:
         scores: one ``[..., R_t]`` per task, method X.
         others: one ``[..., S_t]`` per task, method Y, in the same order of tasks.
+    """
+    with np.errstate(
+        all="ignore"
+    ):  # its p-value, which nobody reads here, divides by zero where all runs are alike
+        wins = [
+            mannwhitneyu(x, y, axis=-1, method="asymptotic").statistic / (x.shape[-1] * y.shape[-1])
+            for x, y in zip(scores, others, strict=True)
+        ]
+    return np.mean(wins, axis=0)
+
+
+def relative_mean(scores: Sequence[Array], others: Sequence[Array]) -> Array:
+    """Return the mean over tasks of the ratio of two methods' mean scores."""
+    return np.mean([x.mean(axis=-1) / y.mean(axis=-1) for x, y in zip(scores, others, strict=True)], axis=0)
+
+
+class Estimate(NamedTuple):
+    """A number or a curve, its interval, and what it stands on.
+
+    Args:
+        value: ``[K]``, one per column asked for.
+        low: lower ends ``[K]``; ``None`` where a task has fewer than :data:`MIN_RUNS` runs.
+        high: upper ends, likewise.
+        runs: of all tasks together, of both methods where two are compared; one in several rows counts once.
+        encoders: different pre-trained encoders among them.
+    """
+
+    value: Array
+    low: Array | None
+    high: Array | None
+    runs: int
+    encoders: int
+
+    def __format__(self, spec: str) -> str:
+        """Return the first number and its interval, if it has one: ``f"{estimate:.2f}"`` is ``0.43 [0.31, 0.52]``."""
+        text = f"{self.value[0]:{spec}}"
+        if self.low is None or self.high is None:
+            return text
+        return f"{text} [{self.low[0]:{spec}}, {self.high[0]:{spec}}]"
+
+
+def estimate(
+    statistic: Callable[..., Array],
+    *methods: pd.DataFrame,
+    columns: Sequence[str] = ("score",),
+    replicates: int = REPLICATES,
+    seed: int = SEED,
+) -> Estimate:
+    """Aggregate the runs of one method, or of two that are compared, with a two-level stratified bootstrap interval.
+
+    A replicate redraws the encoders, once for all tasks that share them, and then, for each run's place, a downstream
+    run of the encoder drawn; tasks are kept (Davison & Hinkley, Bootstrap Methods and their Application, 1997, section
+    3.8). Runs that share an encoder are no independent draws of the method that made it, so that these intervals are
+    wider than those over runs alone wherever encoders differ. Where all runs stand on one encoder they are over its
+    runs, and speak of that encoder only; where each run has its own encoder they are over runs. Percentile intervals of
+    few draws are too narrow (:data:`COVERAGE`), and with few encoders even these are.
+
+    Args:
+        statistic: an aggregate of this module; of two methods one that takes both.
+        *methods: a row per run, with columns ``task``, ``encoder`` and ``run`` (names; a run without a pre-trained
+            encoder is its own), and the numbers asked for. A run that stands under several tasks is redrawn alike in
+            all of them. Two methods need the same tasks.
+        columns: numbers to aggregate: one score, or a curve's.
+        replicates: of the bootstrap.
+        seed: of the bootstrap.
 
     Raises:
-        ValueError: the numbers of tasks differ.
+        ValueError: no run, a number that is not finite, or tasks that only one method has.
+
+    Examples:
+        >>> runs = pd.DataFrame({"task": "walker_run", "run": list("abcde"), "score": [1.0, 2.0, 3.0, 4.0, 5.0]})
+        >>> runs["encoder"] = runs["run"]
+        >>> print(f"{estimate(mean, runs):.1f}")
+        3.0 [1.8, 4.2]
     """
-    if len(scores) != len(others):
-        raise ValueError(f"Both methods need the same tasks, got {len(scores)} and {len(others)} of them.")
-    wins = []
-    for x, y in zip(scores, others):
-        difference = x[..., :, None] - y[..., None, :]  # (..., R, S)
-        wins.append(((np.sign(difference) + 1) / 2).mean(axis=(-2, -1)))
-    return np.mean(np.stack(wins, axis=-1), axis=-1)
-
-
-def _task_means(scores: Sequence[Array]) -> Array:
-    return np.stack([s.mean(axis=-1) for s in scores], axis=-1)  # (..., T)
-
-
-def _require_finite(name: str, values: Array) -> None:
-    wrong = np.argwhere(~np.isfinite(values))
-    if len(wrong):
-        index = tuple(int(i) for i in wrong[0])
-        raise ValueError(
-            f"{name}{list(index)} is {values[index]}. A run that diverged has no score: leave it out and say so."
+    samples = [_by_task(method, columns) for method in methods]
+    if len({tuple(sample) for sample in samples}) > 1:
+        odd = sorted(set.symmetric_difference(*map(set, samples)))
+        raise ValueError(f"Only one of the methods has runs on {', '.join(map(str, odd))}.")
+    arrays = [[task[list(columns)].to_numpy(float).T for task in sample.values()] for sample in samples]
+    value = np.asarray(statistic(*arrays))
+    every = [task for sample in samples for task in sample.values()]
+    runs, encoders = (len(set().union(*(task[name] for task in every))) for name in ("run", "encoder"))
+    if min(map(len, every)) < MIN_RUNS:
+        return Estimate(value, None, None, runs, encoders)
+    rng = np.random.default_rng(seed)
+    redrawn = []
+    for sample, scores in zip(samples, arrays):
+        indices = resample(
+            [task["encoder"].tolist() for task in sample.values()],
+            [task["run"].tolist() for task in sample.values()],
+            replicates=replicates,
+            rng=rng,
         )
+        redrawn.append([task[:, index] for task, index in zip(scores, indices)])  # [K, B, R_t] each
+    tail = 50 * (1 - CONFIDENCE)
+    low, high = np.percentile(statistic(*redrawn), [tail, 100 - tail], axis=-1)
+    return Estimate(value, low, high, runs, encoders)
+
+
+def resample(
+    encoders: Sequence[Sequence[str]],
+    runs: Sequence[Sequence[str]],
+    *,
+    replicates: int,
+    rng: np.random.Generator,
+) -> list[NDArray[np.int64]]:
+    """Draw encoders with replacement, jointly for the tasks that share them, and then runs of those drawn.
+
+    A task keeps the places that it has: the first encoder's ``n`` runs become ``n`` runs of the first encoder drawn,
+    redrawn with replacement, and so on. A task on which an encoder has no run is resampled from those it has.
+
+    Args:
+        encoders: per task, the encoder of each of its runs.
+        runs: per task, the name of each; tasks with the same runs are redrawn alike.
+        replicates: how many resamples, ``B``.
+        rng: where chance comes from.
+
+    Returns:
+        One ``[B, R_t]`` of indices into its runs per task.
+
+    Examples:
+        >>> rng = np.random.default_rng(0)
+        >>> first, second = resample([["a", "b"], ["a", "b"]], [["r1", "r2"], ["r3", "r4"]], replicates=100, rng=rng)
+        >>> bool((first == second).all())  # one run of each encoder: drawing encoders draws both tasks' runs
+        True
+    """
+    names = [np.unique(labels) for labels in encoders]
+    strata = _strata(names)
+    ranks = {
+        stratum: rng.random((replicates, max(len(n) for n, s in zip(names, strata) if s == stratum)))
+        for stratum in dict.fromkeys(strata)
+    }
+    drawn: dict[tuple, NDArray[np.int64]] = {}
+    found = []
+    for labels, of_task, own, stratum in zip(encoders, runs, names, strata):
+        same = (tuple(labels), tuple(of_task))
+        if same not in drawn:
+            place = np.searchsorted(own, labels)  # [R] which encoder a run stands on
+            counts = np.bincount(place)
+            by_encoder = np.argsort(place, kind="stable")
+            first = np.cumsum(counts) - counts
+            chosen = (ranks[stratum][:, : len(own)] * len(own)).astype(np.int64)[:, place]  # [B, R]
+            nth = (rng.random(chosen.shape) * counts[chosen]).astype(np.int64)
+            drawn[same] = by_encoder[first[chosen] + nth]
+        found.append(drawn[same])
+    return found
+
+
+def _by_task(method: pd.DataFrame, columns: Sequence[str]) -> dict[str, pd.DataFrame]:
+    if method.empty:
+        raise ValueError("There are no runs to estimate from.")
+    wrong = method[~np.isfinite(method[list(columns)].to_numpy(float)).all(axis=1)]
+    if len(wrong):
+        raise ValueError(
+            f"Run {wrong['run'].iloc[0]} on {wrong['task'].iloc[0]} has a score that is not finite. A run that "
+            "diverged has no score: leave it out and say so."
+        )
+    return dict(iter(method.sort_values(["task", "encoder", "run"]).groupby("task")))
+
+
+def _strata(names: Sequence[NDArray]) -> list[int]:
+    """Number the sets of tasks that hang together by shared encoders."""
+    codes, unique = pd.factorize(np.concatenate(names))
+    tasks = np.repeat(np.arange(len(names)), [len(own) for own in names])
+    size = len(names) + len(unique)
+    links = coo_array((np.ones(len(codes)), (tasks, len(names) + codes)), shape=(size, size))
+    return connected_components(links, directed=False)[1][: len(names)].tolist()

@@ -1,17 +1,63 @@
-"""What sits on the encoder during pre-training: projector, predictor and prototypes (CRPTpro, Sec. III)."""
+"""What sits on the encoder during pre-training: the heads of CRPTpro and Proto-RL, of ATC, and of BeCL."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from crptpro.modules.initialisation import WeightInit, init_weights_, orthogonal_linear_, require_weight_init
 from crptpro.modules.precision import linear_in
+from crptpro.values import as_int
+
+WeightInit = Literal["orthogonal", "kaiming"]
 
 NORM_EPS = 1e-12
+
+
+@torch.no_grad()
+def init_weights_(layer: nn.Linear | nn.Conv2d, init: WeightInit = "orthogonal", gain: float = 1.0) -> None:
+    """Initialise a layer in place, with zero bias.
+
+    Args:
+        layer: linear or convolutional.
+        init: ``"orthogonal"`` on the flattened kernel, or ``"kaiming"``: normal with variance 2 / fan-in, for
+            layers that a ReLU follows (rlpyt, the framework of ATC).
+        gain: of the orthogonal matrix.
+
+    Raises:
+        ValueError: unknown ``init``.
+    """
+    if init not in get_args(WeightInit):
+        raise ValueError(f"init must be one of {', '.join(get_args(WeightInit))}, got {init!r}.")
+    if init == "kaiming":
+        nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+    else:
+        nn.init.orthogonal_(layer.weight, gain=gain)
+    if layer.bias is not None:
+        nn.init.zeros_(layer.bias)
+
+
+class OrthogonalNetwork(nn.Module):
+    """A network of linear layers with orthogonal weights (gain 1) and zero biases; LayerNorms start as the identity."""
+
+    def reset_parameters(self) -> None:
+        """Draw all weights anew."""
+        for layer in self.modules():
+            if isinstance(layer, nn.Linear):
+                init_weights_(layer)
+            elif isinstance(layer, nn.LayerNorm):
+                layer.reset_parameters()
+
+
+def plain_sizes(**sizes: Any) -> dict[str, int]:
+    """Return sizes from users as plain positive integers, for a card to hold.
+
+    Raises:
+        ValueError: naming the first that is none.
+    """
+    return {name: as_int(value, name, minimum=1) for name, value in sizes.items()}
 
 
 class Projector(nn.Module):
@@ -27,31 +73,30 @@ class Projector(nn.Module):
         init: ``"orthogonal"``, or ``"kaiming"`` (normal, fan-in, for ReLU), as ATC draws its own.
 
     Raises:
-        ValueError: unknown ``init``.
+        ValueError: unknown ``init``, or a size that is no positive whole number.
     """
 
     def __init__(
         self, feature_dim: int = 39_200, latent_dim: int = 128, init: WeightInit = "orthogonal"
     ) -> None:
         super().__init__()
-        require_weight_init(init)
-        self.linear = nn.Linear(feature_dim, latent_dim)
+        sizes = plain_sizes(feature_dim=feature_dim, latent_dim=latent_dim)
+        self.config: dict[str, Any] = {**sizes, "init": init}
+        self.linear = nn.Linear(sizes["feature_dim"], sizes["latent_dim"])
         self.init: WeightInit = init
-        self.config: dict[str, Any] = {"feature_dim": feature_dim, "latent_dim": latent_dim, "init": init}
         self.compute_dtype: torch.dtype = torch.float32
         self.reset_parameters()
 
-    @torch.no_grad()
     def reset_parameters(self) -> None:
         """Draw the weights and zero the bias."""
         init_weights_(self.linear, self.init)
 
     def forward(self, features: Tensor) -> Tensor:
         """Project ``[*, feature_dim]`` (any floating dtype) to ``[*, latent_dim]``, not normalised."""
-        return linear_in(features, self.linear.weight, self.linear.bias, self.compute_dtype)
+        return linear_in(features, self.linear, self.compute_dtype)
 
 
-class Predictor(nn.Module):
+class Predictor(OrthogonalNetwork):
     r"""Two-layer perceptron in the latent space, online branch only: :math:`v_\psi`.
 
     Orthogonal weights (gain 1), zero biases. Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
@@ -59,20 +104,18 @@ class Predictor(nn.Module):
     Args:
         latent_dim: input and output length D.
         hidden_dim: hidden width. 1024 as in the paper's table; the released code has 512.
+
+    Raises:
+        ValueError: a size that is no positive whole number.
     """
 
     def __init__(self, latent_dim: int = 128, hidden_dim: int = 1024) -> None:
         super().__init__()
+        self.config: dict[str, Any] = plain_sizes(latent_dim=latent_dim, hidden_dim=hidden_dim)
+        latent_dim, hidden_dim = self.config.values()
         self.hidden = nn.Linear(latent_dim, hidden_dim)
         self.output = nn.Linear(hidden_dim, latent_dim)
-        self.config: dict[str, Any] = {"latent_dim": latent_dim, "hidden_dim": hidden_dim}
         self.reset_parameters()
-
-    @torch.no_grad()
-    def reset_parameters(self) -> None:
-        """Draw orthogonal weights and zero the biases."""
-        orthogonal_linear_(self.hidden)
-        orthogonal_linear_(self.output)
 
     def forward(self, latents: Tensor) -> Tensor:
         """Map ``[*, D]`` to ``[*, D]``."""
@@ -90,12 +133,15 @@ class Prototypes(nn.Module):
     Args:
         num_prototypes: M.
         latent_dim: D.
+
+    Raises:
+        ValueError: a size that is no positive whole number.
     """
 
     def __init__(self, num_prototypes: int = 512, latent_dim: int = 128) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.empty(num_prototypes, latent_dim))
-        self.config: dict[str, Any] = {"num_prototypes": num_prototypes, "latent_dim": latent_dim}
+        self.config: dict[str, Any] = plain_sizes(num_prototypes=num_prototypes, latent_dim=latent_dim)
+        self.weight = nn.Parameter(torch.empty(*self.config.values()))
         self.reset_parameters()
 
     @torch.no_grad()
@@ -110,27 +156,91 @@ class Prototypes(nn.Module):
         self.weight.div_(self.weight.norm(dim=-1, keepdim=True).clamp_min(NORM_EPS))
         return self
 
-    def unit_weight(self, *, through_norm: bool = False) -> Tensor:
+    def unit_weight(self) -> Tensor:
         """Return the rows at unit length ``[M, D]``.
 
-        Args:
-            through_norm: differentiate the normalisation. By default the length is a constant, so the
-                gradient reaches the raw weight as it does in the released code, radial part included.
+        The length is a constant to autograd: the gradient reaches the raw weight as it does in the released code,
+        radial part included.
         """
-        norm = self.weight.norm(dim=-1, keepdim=True).clamp_min(NORM_EPS)
-        return self.weight / (norm if through_norm else norm.detach())
+        return self.weight / self.weight.detach().norm(dim=-1, keepdim=True).clamp_min(NORM_EPS)
 
     def forward(self, latents: Tensor) -> Tensor:
         """Cosine scores ``[*, M]`` in [-1, 1] of l2-normalised latents ``[*, D]``."""
         return F.linear(latents, self.unit_weight())
 
 
-def latent_dim_of(head: nn.Module) -> int | None:
-    """Return the length D of the latents a head works in, where it says so, else None.
+class AnchorHead(nn.Module):
+    r"""ATC's contrast model on the anchor's side: :math:`W(a + \mathrm{MLP}(a))`, online branch only.
+
+    Two-layer residual perceptron and a bilinear matrix without bias; the logits are the inner products of the
+    result with the positives' latents. PyTorch's default initialisation, as in the source: astooke/rlpyt
+    ``rlpyt/ul/models/ul/atc_models.py`` (ATC, arXiv 2009.08319).
 
     Args:
-        head: one of the above, or any module with a ``config`` that has ``"latent_dim"``.
+        latent_dim: length D of the latents.
+        hidden_dim: hidden width of the perceptron.
+
+    Raises:
+        ValueError: a size that is no positive whole number.
     """
+
+    def __init__(self, latent_dim: int = 128, hidden_dim: int = 512) -> None:
+        super().__init__()
+        self.config: dict[str, Any] = plain_sizes(latent_dim=latent_dim, hidden_dim=hidden_dim)
+        latent_dim, hidden_dim = self.config.values()
+        self.hidden = nn.Linear(latent_dim, hidden_dim)
+        self.output = nn.Linear(hidden_dim, latent_dim)
+        self.bilinear = nn.Linear(latent_dim, latent_dim, bias=False)
+
+    def reset_parameters(self) -> None:
+        """Draw the weights and biases as PyTorch's linear layers do."""
+        for layer in (self.hidden, self.output, self.bilinear):
+            layer.reset_parameters()
+
+    def forward(self, anchors: Tensor) -> Tensor:
+        """Map latents ``[*, D]`` to ``[*, D]``, not normalised."""
+        return self.bilinear(anchors + self.output(F.relu(self.hidden(anchors))))
+
+
+class SkillHead(OrthogonalNetwork):
+    """BeCL's head: embedding of the features, then projection, in one module.
+
+    features -> hidden ReLU -> hidden ReLU -> D (embedding) -> hidden ReLU -> D (projection). Orthogonal weights
+    (gain 1), zero biases. The product with the features runs in ``compute_dtype``; everything after it, and the
+    result, has the parameters' dtype. Source: Rooshy-yang/BeCL ``agent/becl.py`` (arXiv 2305.04477).
+
+    Args:
+        feature_dim: input length (39,200 for the default encoder).
+        latent_dim: length D of the embedding and of the result; the number of skills in the source.
+        hidden_dim: hidden width of both parts.
+
+    Raises:
+        ValueError: a size that is no positive whole number.
+    """
+
+    def __init__(self, feature_dim: int = 39_200, latent_dim: int = 16, hidden_dim: int = 1024) -> None:
+        super().__init__()
+        self.config: dict[str, Any] = plain_sizes(
+            feature_dim=feature_dim, latent_dim=latent_dim, hidden_dim=hidden_dim
+        )
+        feature_dim, latent_dim, hidden_dim = self.config.values()
+        self.embed_input = nn.Linear(feature_dim, hidden_dim)
+        self.embed_hidden = nn.Linear(hidden_dim, hidden_dim)
+        self.embed_output = nn.Linear(hidden_dim, latent_dim)
+        self.project_hidden = nn.Linear(latent_dim, hidden_dim)
+        self.project_output = nn.Linear(hidden_dim, latent_dim)
+        self.compute_dtype: torch.dtype = torch.float32
+        self.reset_parameters()
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map features ``[*, feature_dim]`` (any floating dtype) to ``[*, D]``, not normalised."""
+        hidden = F.relu(linear_in(features, self.embed_input, self.compute_dtype))
+        embedding = self.embed_output(F.relu(self.embed_hidden(hidden)))
+        return self.project_output(F.relu(self.project_hidden(embedding)))
+
+
+def latent_dim_of(head: nn.Module) -> int | None:
+    """Return the length D of the latents a head works in, where its ``config`` says so, else None."""
     config = getattr(head, "config", None)
     return config.get("latent_dim") if isinstance(config, dict) else None
 

@@ -1,25 +1,19 @@
-"""Objectives: pure functions in ``functional``, one LossModule per method, and the registry of methods."""
+"""Objectives: pure functions in ``functional``, one LossModule per method, and the table of methods."""
 
-from crptpro.objectives import builtin as _builtin  # noqa: F401 - registers what the library brings
 from crptpro.objectives.atc import ATCLoss
-from crptpro.objectives.averaged_sac import AveragedSACLoss
 from crptpro.objectives.base import PretrainingLoss
 from crptpro.objectives.becl import BeCLLoss
-from crptpro.objectives.drq import DrQLoss
-from crptpro.objectives.exploration import ExplorationDefaults
-from crptpro.objectives.proto import ProtoLoss
-from crptpro.objectives.rad_sac import RADSACLoss
-from crptpro.objectives.registry import (
+from crptpro.objectives.methods import (
+    Exploration,
     Method,
-    MethodDefaults,
-    exploration_defaults,
-    exploring_method,
+    exploration_of,
     get_method,
-    method_defaults,
-    method_name_of,
-    methods,
+    method_names,
+    method_of,
     register_method,
 )
+from crptpro.objectives.proto import ProtoLoss
+from crptpro.objectives.sac import AveragedSACLoss, DrQLoss, RADSACLoss
 from crptpro.objectives.simclr import SimCLRLoss
 from crptpro.objectives.skill_ddpg import SkillDDPGLoss
 
@@ -28,19 +22,16 @@ __all__ = [
     "AveragedSACLoss",
     "BeCLLoss",
     "DrQLoss",
-    "ExplorationDefaults",
+    "Exploration",
     "Method",
-    "MethodDefaults",
     "PretrainingLoss",
     "ProtoLoss",
     "RADSACLoss",
     "SimCLRLoss",
     "SkillDDPGLoss",
-    "exploration_defaults",
-    "exploring_method",
+    "exploration_of",
     "get_method",
-    "method_defaults",
-    "method_name_of",
-    "methods",
+    "method_names",
+    "method_of",
     "register_method",
 ]

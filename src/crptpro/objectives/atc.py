@@ -8,13 +8,12 @@ import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams, dispatch
-from torch import Tensor, nn
+from torch import nn
 
 from crptpro.modules import AnchorHead, Projector
 from crptpro.modules.heads import latent_dim_of, require_one_latent_dim
-from crptpro.objectives import metrics
-from crptpro.objectives.base import PretrainingLoss, valid_rows
-from crptpro.objectives.functional import info_nce
+from crptpro.objectives.base import PretrainingLoss
+from crptpro.objectives.functional import info_nce, mean_pairwise_cosine
 
 
 class ATCLoss(PretrainingLoss):
@@ -27,12 +26,8 @@ class ATCLoss(PretrainingLoss):
 
     There is no temperature. A loss that stays at ln B (6.238 for a batch of 512) says that anchors are not told
     apart. Images must already be augmented, each independently. Softmax runs in float32 or wider. A batch of one
-    is legal and uninformative (loss 0); non-finite input propagates.
-
-    Rows that a mask entry of the batch excludes (``loss_mask_key``) are ignored as anchors, but their positives
-    stay as negatives of the other rows, as in the source. The source masks so the rows whose successor belongs to
-    another episode; in TorchRL batches ``("next", "pixels")`` is the true successor, so ends of episodes need no
-    mask.
+    is legal and uninformative (loss 0); non-finite input propagates. In TorchRL batches ``("next", "pixels")`` is the
+    true successor, so ends of episodes need no mask as in the source.
 
     Args:
         encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
@@ -41,10 +36,9 @@ class ATCLoss(PretrainingLoss):
         anchor_head: latents of anchors to ``[B, D]``; default ``AnchorHead(latent_dim, hidden_dim)``.
         latent_dim: D.
         hidden_dim: width of the anchors' perceptron.
-        reduction: over the batch.
 
     Raises:
-        ValueError: heads of different latent lengths, or an unknown reduction.
+        ValueError: heads of different latent lengths.
 
     Returns (``forward``):
         Scalar ``loss_contrast`` (nats) and, detached, ``embedding_cosine`` (mean pairwise cosine of the anchors'
@@ -81,9 +75,8 @@ class ATCLoss(PretrainingLoss):
         anchor_head: nn.Module | None = None,
         latent_dim: int = 128,
         hidden_dim: int = 512,
-        reduction: str | None = None,
     ) -> None:
-        super().__init__(reduction=reduction)
+        super().__init__()
         if projector is None:
             projector = Projector(cast(int, encoder.feature_dim), latent_dim, init="kaiming")
         if anchor_head is None:
@@ -99,30 +92,12 @@ class ATCLoss(PretrainingLoss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the loss and diagnostics of one batch; see the class."""
-        pixels, lead = self._read(tensordict, self.tensor_keys.observation, event_dims=3)
-        next_pixels, _ = self._read(tensordict, self.tensor_keys.next_observation, event_dims=3)
-        valid = valid_rows(self, tensordict)
-        # A masked anchor must not even be encoded: NaN in it would reach the weights' gradient as 0 * NaN.
-        anchors = self._anchors(pixels if valid is None else pixels[valid])
-        positives = self._positives(next_pixels)
+        anchors = self._latents(self._read(tensordict, self.tensor_keys.observation))
+        positives = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))
         queries = self._apply_network("anchor_head", anchors)
         with torch.autocast(device_type=queries.device.type, enabled=False):
-            positives = positives.to(queries.dtype)
-            if valid is None:
-                rows = info_nce(queries, positives, reduction="none")
-            else:
-                every = queries.new_zeros(positives.shape).masked_scatter(valid.unsqueeze(-1), queries)
-                rows = info_nce(every, positives, valid=valid, reduction="none")[valid]
             out = {
-                "loss_contrast": self._reduce_rows(rows, valid, lead),
-                "embedding_cosine": metrics.mean_pairwise_cosine(F.normalize(anchors.detach(), dim=-1)),
+                "loss_contrast": info_nce(queries, positives.to(queries.dtype)),
+                "embedding_cosine": mean_pairwise_cosine(F.normalize(anchors.detach(), dim=-1)),
             }
         return TensorDict(out, batch_size=[])
-
-    def _anchors(self, pixels: Tensor) -> Tensor:
-        return self._apply_network("projector", self._apply_network("encoder", pixels))
-
-    @torch.no_grad()
-    def _positives(self, next_pixels: Tensor) -> Tensor:
-        features = self._apply_network("encoder", next_pixels, target=True)
-        return self._apply_network("projector", features, target=True)

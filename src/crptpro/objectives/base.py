@@ -1,4 +1,4 @@
-"""The wiring that every pre-training loss shares: keys, masks, target networks, re-initialisation."""
+"""What every pre-training loss shares: keys, target networks, re-initialisation, copies."""
 
 from __future__ import annotations
 
@@ -9,9 +9,28 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
-from torchrl.objectives.common import AUTO_LOSS_MASK_KEYS
 
-from crptpro.objectives.out_keys import OutKeys
+from crptpro.values import as_float
+
+
+class OutKeys:
+    """Entries that ``forward`` returns, or those that a caller names; a base before ``LossModule``."""
+
+    default_out_keys: ClassVar[tuple[str, ...]] = ()
+    """Entries that ``forward`` returns."""
+
+    _out_keys: list[NestedKey] | None = None
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Entries that ``forward`` returns."""
+        if self._out_keys is None:
+            self._out_keys = list(self.default_out_keys)
+        return self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, values: list[NestedKey]) -> None:
+        self._out_keys = values
 
 
 class PretrainingLoss(OutKeys, LossModule):
@@ -41,15 +60,11 @@ class PretrainingLoss(OutKeys, LossModule):
     """Names given to ``convert_to_functional``, in the order of re-initialisation."""
 
     method_name: str | None = None
-    """Registered method or preset that built this loss, if it was built by name."""
+    """Registered method that built this loss, if it was built by name."""
 
-    def __init__(self, *, reduction: str | None = None) -> None:
+    def __init__(self) -> None:
         self._in_keys: list[NestedKey] | None = None
         super().__init__()
-        reduction = "mean" if reduction is None else reduction
-        if reduction not in ("none", "mean", "sum"):
-            raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}.")
-        self.reduction = reduction
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -111,6 +126,11 @@ class PretrainingLoss(OutKeys, LossModule):
         # No value estimator here; changed keys only have to show in in_keys.
         self._in_keys = None
 
+    def _register_coefficient(self, name: str, value: float | None) -> None:
+        """Keep a coefficient as a float64 scalar: it does not promote float32 tensors, and 0.1 stays 0.1."""
+        number = None if value is None else as_float(value, name)
+        self.register_coeff_buffer(name, number, dtype=torch.float64)
+
     def _apply_network(self, name: str, inputs: Tensor, *, target: bool = False) -> Tensor:
         """Output of one of ``network_names``, with its own or with its target parameters."""
         network = getattr(self, name)
@@ -118,59 +138,34 @@ class PretrainingLoss(OutKeys, LossModule):
         with params.to_module(network, preserve_module_state=False):
             return network(inputs)
 
-    def _read(
-        self, tensordict: TensorDictBase, key: NestedKey, *, event_dims: int
-    ) -> tuple[Tensor, torch.Size]:
-        """One entry with one batch dimension, its last ``event_dims`` as they are; the original batch shape."""
+    def _latents(self, pixels: Tensor) -> Tensor:
+        """Latents of the online encoder and projector."""
+        return self._apply_network("projector", self._apply_network("encoder", pixels))
+
+    @torch.no_grad()
+    def _target_latents(self, pixels: Tensor) -> Tensor:
+        """Latents of the target encoder and projector."""
+        return self._apply_network(
+            "projector", self._apply_network("encoder", pixels, target=True), target=True
+        )
+
+    def _read(self, tensordict: TensorDictBase, key: NestedKey, *, event_dims: int = 3) -> Tensor:
+        """One entry with one batch dimension, its last ``event_dims`` as they are."""
         value = tensordict.get(key, None)
         if value is None:
             raise KeyError(f"{type(self).__name__} needs the entry {key!r}; set_keys() names another one.")
-        split = value.ndim - event_dims
-        return value.reshape(-1, *value.shape[split:]), value.shape[:split]
-
-    def _read_images(
-        self, tensordict: TensorDictBase, first: NestedKey, second: NestedKey
-    ) -> tuple[Tensor, Tensor, Tensor | None, torch.Size]:
-        """Two entries of images without masked rows; the mask; the original batch shape."""
-        one, lead = self._read(tensordict, first, event_dims=3)
-        two, _ = self._read(tensordict, second, event_dims=3)
-        valid = valid_rows(self, tensordict)
-        if valid is not None:
-            # Dropped, not multiplied by zero: batch-wise normalisations couple all rows.
-            one, two = one[valid], two[valid]
-        return one, two, valid, lead
-
-    def _reduce_rows(self, rows: Tensor, valid: Tensor | None, lead: torch.Size) -> Tensor:
-        """Reduce values of the rows that are left; ``"none"`` restores the batch shape, 0 where masked."""
-        if self.reduction == "none":
-            if valid is not None:
-                rows = rows.new_zeros(valid.shape).masked_scatter(valid, rows)
-            return rows.reshape(lead)
-        return rows.sum() if self.reduction == "sum" else rows.sum() / max(rows.numel(), 1)
+        return value.reshape(-1, *value.shape[value.ndim - event_dims :])
 
 
-def mask_keys(loss: LossModule) -> tuple[NestedKey, ...]:
-    """Entries that say which rows of a batch count, where it has them."""
-    names = loss.loss_mask_key
-    return AUTO_LOSS_MASK_KEYS if names == "auto" else () if names is None else (names,)
+def require_positive(**values: float) -> None:
+    """Refuse coefficients that would only show as NaN thousands of updates later.
 
-
-def valid_rows(loss: LossModule, tensordict: TensorDictBase) -> Tensor | None:
-    """Which rows of a batch count, from the mask entries that ``loss.loss_mask_key`` names.
-
-    Args:
-        loss: any loss.
-        tensordict: its input.
-
-    Returns:
-        Flat bool ``[B]`` over all batch dimensions, or None if the batch has no mask.
+    Raises:
+        ValueError: naming the first that is not a positive number.
     """
-    valid = None
-    for key in mask_keys(loss):
-        mask = tensordict.get(key, None)
-        if mask is not None:
-            valid = mask.reshape(-1) if valid is None else valid & mask.reshape(-1)
-    return valid
+    for name, value in values.items():
+        if not as_float(value, name) > 0:
+            raise ValueError(f"`{name}` must be positive, got {value}.")
 
 
 def _reset(network: nn.Module) -> None:

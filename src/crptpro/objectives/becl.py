@@ -9,13 +9,12 @@ import torch
 import torch.nn.functional as F
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams, dispatch
-from torch import Tensor, nn
+from torch import nn
 
 from crptpro.modules import SkillHead
 from crptpro.modules.heads import latent_dim_of
-from crptpro.objectives import metrics
-from crptpro.objectives.base import PretrainingLoss, valid_rows
-from crptpro.objectives.functional import becl_loss
+from crptpro.objectives.base import PretrainingLoss, require_positive
+from crptpro.objectives.functional import becl_loss, mean_pairwise_cosine
 
 
 class BeCLLoss(PretrainingLoss):
@@ -29,7 +28,7 @@ class BeCLLoss(PretrainingLoss):
     ``projector`` is the whole head, embedding and projection: what the reward is computed from, and what an
     artifact carries. All rows should come from one domain, where skills are comparable. Images must already be
     augmented. Cosines and exponentials run in float32 or wider. A batch of one is legal and uninformative
-    (loss 0); masked rows (``loss_mask_key``) take no part; non-finite input propagates.
+    (loss 0); non-finite input propagates.
 
     Args:
         encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
@@ -37,10 +36,9 @@ class BeCLLoss(PretrainingLoss):
         skill_dim: D, equal to the number of skills in the source.
         hidden_dim: hidden width of the default head.
         temperature: tau, divides the cosines; positive.
-        reduction: over the batch.
 
     Raises:
-        ValueError: a temperature that is not positive, or an unknown reduction.
+        ValueError: a temperature that is not positive.
 
     Returns (``forward``):
         Scalar ``loss_contrast`` (nats) and, detached, ``embedding_cosine`` (mean pairwise cosine of F).
@@ -88,37 +86,28 @@ class BeCLLoss(PretrainingLoss):
         skill_dim: int = 16,
         hidden_dim: int = 1024,
         temperature: float = 0.5,
-        reduction: str | None = None,
     ) -> None:
-        super().__init__(reduction=reduction)
-        if not temperature > 0:
-            raise ValueError(f"temperature must be positive, got {temperature}.")
+        super().__init__()
+        require_positive(temperature=temperature)
         if projector is None:
             projector = SkillHead(cast(int, encoder.feature_dim), skill_dim, hidden_dim)
         self.convert_to_functional(encoder, "encoder")
         self.convert_to_functional(projector, "projector")
         self.skill_dim = latent_dim_of(projector) or skill_dim
-        # float64 scalar: it does not promote float32 tensors.
-        self.register_coeff_buffer("temperature", temperature, dtype=torch.float64)
+        self._register_coefficient("temperature", temperature)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the loss and diagnostics of one batch; see the class."""
-        next_pixels, lead = self._read(tensordict, self.tensor_keys.next_observation, event_dims=3)
-        skills, _ = self._read(tensordict, self.tensor_keys.skill, event_dims=1)
-        valid = valid_rows(self, tensordict)
-        if valid is not None:
-            next_pixels, skills = next_pixels[valid], skills[valid]
-        latents = self._apply_network("projector", self._apply_network("encoder", next_pixels))
+        latents = self._latents(self._read(tensordict, self.tensor_keys.next_observation))
+        skills = self._read(tensordict, self.tensor_keys.skill, event_dims=1).argmax(dim=-1)
         with torch.autocast(device_type=latents.device.type, enabled=False):
-            rows = self._rows(latents, skills.argmax(dim=-1))
+            if latents.shape[0] < 2:
+                contrast = 0 * latents.sum()  # nothing to contrast with
+            else:
+                contrast = becl_loss(latents, skills, temperature=self.temperature)
             out = {
-                "loss_contrast": self._reduce_rows(rows, valid, lead),
-                "embedding_cosine": metrics.mean_pairwise_cosine(F.normalize(latents.detach(), dim=-1)),
+                "loss_contrast": contrast,
+                "embedding_cosine": mean_pairwise_cosine(F.normalize(latents.detach(), dim=-1)),
             }
         return TensorDict(out, batch_size=[])
-
-    def _rows(self, latents: Tensor, skills: Tensor) -> Tensor:
-        if latents.shape[0] < 2:
-            return 0 * latents.sum(dim=-1)  # nothing to contrast with
-        return becl_loss(latents, skills, temperature=self.temperature, reduction="none")

@@ -13,8 +13,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from crptpro.objectives.particles import particle_entropy
-
 Reduction = Literal["none", "mean", "sum"]
 DispersionReduction = Literal["mean_all", "sum", "mean_offdiag"]
 
@@ -163,7 +161,7 @@ def particle_reward(
     scale: float | Tensor = 1.0,
     clip: float = 0.0,
 ) -> Tensor:
-    r"""Particle entropy among the k nearest neighbours (:func:`~crptpro.objectives.particles.particle_entropy`).
+    r"""Particle entropy among the k nearest neighbours, :func:`particle_entropy` of their distances.
 
     Args:
         features: ``[N, D]``.
@@ -181,6 +179,23 @@ def particle_reward(
     """
     distances = knn_distances(features, features if keys is None else keys, k=k)
     return particle_entropy(distances if average else distances[:, -1:], scale=scale, clip=clip)
+
+
+def particle_entropy(distances: Tensor, *, scale: float | Tensor = 1.0, clip: float = 0.0) -> Tensor:
+    r"""Return :math:`\log(1 + \overline{\mathrm{relu}(d/scale - clip)})` (APT, arXiv 2103.04551).
+
+    Form of rll-research/url_benchmark ``utils.py``: division and clipping act on each distance, the average
+    over the k neighbours comes after, the logarithm last.
+
+    Args:
+        distances: ``[N, k]``, of each particle to its neighbours.
+        scale: positive; a running statistic of the distances, kept by the caller.
+        clip: subtracted before the relu.
+
+    Returns:
+        ``[N]``, non-negative.
+    """
+    return torch.log1p(F.relu(distances / scale - clip).mean(dim=-1))
 
 
 def info_nce(
@@ -293,5 +308,101 @@ def reduce_batch(rows: Tensor, reduction: Reduction, valid: Tensor | None = None
     return rows.sum() / (max(rows.numel(), 1) if valid is None else valid.sum().clamp_min(1))
 
 
+@torch.no_grad()
+def assignment_entropy(assignments: Tensor) -> Tensor:
+    """Mean entropy of the rows in nats, in [0, ln M]; ln M means that assignments say nothing.
+
+    Args:
+        assignments: ``[B, M]``, rows sum to 1.
+    """
+    return torch.special.entr(assignments).sum(dim=-1).mean()
+
+
+@torch.no_grad()
+def prototypes_in_use(assignments: Tensor) -> Tensor:
+    """Number of prototypes that are the largest assignment of at least one sample, as a float scalar.
+
+    In a collapsed run all assignments tie and the count is rounding; read it beside the entropy.
+
+    Args:
+        assignments: ``[B, M]``.
+    """
+    used = assignments.new_zeros(assignments.shape[-1])
+    return used.index_fill(0, assignments.argmax(dim=-1), 1.0).sum()
+
+
+@torch.no_grad()
+def mean_pairwise_cosine(unit_rows: Tensor) -> Tensor:
+    """Mean cosine over all ordered pairs of different rows; 1 means that all embeddings coincide.
+
+    Computed from the norm of the sum, O(BD). A single row gives 0.
+
+    Args:
+        unit_rows: ``[B, D]`` l2-normalised.
+    """
+    count = unit_rows.shape[0]
+    return _off_diagonal_sum(unit_rows) / max(count * (count - 1), 1)
+
+
+@torch.no_grad()
+def prototype_ane(prototypes: Tensor) -> Tensor:
+    """Average negative-pair cosine: sum over j != k of c_j . c_k, divided by M^2 (the paper's ANE).
+
+    Args:
+        prototypes: ``[M, D]`` unit rows.
+    """
+    return _off_diagonal_sum(prototypes) / prototypes.shape[0] ** 2
+
+
+@torch.no_grad()
+def prototype_kne(prototypes: Tensor, *, k: int = 3) -> Tensor:
+    """Mean over prototypes of the cosine to the k-th nearest other prototype (the paper's KNE).
+
+    The paper does not state k. With k = 3, 512 spread vectors in 128 dimensions give about +0.2; its negative
+    values only fit a median-like k near M / 2.
+
+    Args:
+        prototypes: ``[M, D]`` unit rows.
+        k: which neighbour, the prototype itself not counted; at most M - 1.
+
+    Raises:
+        ValueError: ``k`` out of range.
+    """
+    count = prototypes.shape[0]
+    if not 1 <= k < count:
+        raise ValueError(f"k must be between 1 and {count - 1} for {count} prototypes, got {k}.")
+    itself = torch.eye(count, dtype=torch.bool, device=prototypes.device)
+    cosines = (prototypes @ prototypes.T).masked_fill(itself, float("-inf"))
+    return cosines.topk(k, dim=-1).values[:, -1].mean()
+
+
+@torch.no_grad()
+def prototype_metrics(prototypes: Tensor, *, offset: float = 1.5) -> dict[str, Tensor]:
+    """ANE, KNE at k = 3 and k = M / 2, and the dispersion (mean over all entries), as scalars.
+
+    Args:
+        prototypes: ``[M, D]``, rows of any length, M at least 4.
+        offset: w of the dispersion.
+
+    Returns:
+        Keys ``prototype_ane``, ``prototype_kne_3``, ``prototype_kne_half``, ``prototype_dispersion``.
+
+    Examples:
+        >>> sorted(prototype_metrics(torch.eye(8)))
+        ['prototype_ane', 'prototype_dispersion', 'prototype_kne_3', 'prototype_kne_half']
+    """
+    unit = F.normalize(prototypes, dim=-1)
+    return {
+        "prototype_ane": prototype_ane(unit),
+        "prototype_kne_3": prototype_kne(unit, k=3),
+        "prototype_kne_half": prototype_kne(unit, k=prototypes.shape[0] // 2),
+        "prototype_dispersion": prototype_dispersion(unit, offset=offset),
+    }
+
+
 def _at_least_float32(values: Tensor) -> Tensor:
     return values if values.dtype == torch.float64 else values.float()
+
+
+def _off_diagonal_sum(rows: Tensor) -> Tensor:
+    return rows.sum(dim=0).square().sum() - rows.square().sum()

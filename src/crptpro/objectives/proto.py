@@ -12,14 +12,17 @@ from torch import Tensor, nn
 
 from crptpro.modules import Predictor, Projector, Prototypes
 from crptpro.modules.heads import require_one_latent_dim
-from crptpro.objectives import metrics
-from crptpro.objectives.base import PretrainingLoss
+from crptpro.objectives.base import PretrainingLoss, require_positive
 from crptpro.objectives.functional import (
-    DispersionReduction,
+    assignment_entropy,
     comparative_loss,
+    mean_pairwise_cosine,
+    prototype_ane,
     prototype_dispersion,
+    prototypes_in_use,
     sinkhorn_knopp,
 )
+from crptpro.values import as_int
 
 
 class ProtoLoss(PretrainingLoss):
@@ -35,8 +38,8 @@ class ProtoLoss(PretrainingLoss):
 
     ``loss_comp`` that stays at ln M (6.238 for 512 prototypes), or ``embedding_cosine`` that stays near 1, is
     a dead run. Images must already be augmented. Normalisation, softmax and Sinkhorn always run in float32 or
-    wider. Non-finite weights or latents propagate to the loss; the training loop raises
-    :class:`~crptpro.errors.NonFiniteError`. A batch of one is legal and uninformative (uniform assignments).
+    wider. Non-finite weights or latents propagate to the loss. A batch of one is legal and uninformative (uniform
+    assignments).
 
     Call :meth:`before_update` before each forward of a training loop: it keeps the prototype rows at unit
     length, as the released code does in place. ``forward`` itself never writes to a parameter.
@@ -50,19 +53,13 @@ class ProtoLoss(PretrainingLoss):
         latent_dim: D.
         hidden_dim: predictor width; 1024 in the paper's table, 512 in the released code.
         intr_loss_coef: alpha, weight of the dispersion.
-        offset: w, denominator offset of the dispersion.
-        intr_reduction: ``"mean_all"`` (as published numbers), ``"sum"`` (as printed), ``"mean_offdiag"``.
-        through_norm: differentiate the prototype normalisation (the released code does not).
+        offset: w, denominator offset of the dispersion; larger than 1.
         temperature: tau of the prediction.
         assignment_temperature: tau of the assignments; None follows ``temperature``.
-        annealing_updates: calls of :meth:`before_update` over which the tau of the assignments moves in a straight
-            line from ``assignment_temperature`` to ``temperature``, to stay there; None for a constant one.
-            Deviation: the paper and the released code have one constant temperature.
         sinkhorn_iterations: scalings of the assignments.
-        reduction: of ``loss_comp`` over the batch; ``loss_intr`` has no batch and stays a scalar.
 
     Raises:
-        ValueError: a coefficient out of its range, heads of different latent lengths, or annealing from nowhere.
+        ValueError: a coefficient out of its range, or heads of different latent lengths.
 
     Returns (``forward``):
         Scalars ``loss_comp`` and ``loss_intr`` (already times alpha; their sum is minimised) and, detached,
@@ -92,7 +89,6 @@ class ProtoLoss(PretrainingLoss):
     prototypes: Prototypes
     prototypes_params: TensorDictParams
     target_prototypes_params: TensorDictParams
-    updates_begun: Tensor
 
     network_names: ClassVar[tuple[str, ...]] = ("encoder", "projector", "predictor", "prototypes")
     default_out_keys: ClassVar[tuple[str, ...]] = (
@@ -119,17 +115,15 @@ class ProtoLoss(PretrainingLoss):
         hidden_dim: int = 1024,
         intr_loss_coef: float = 5e-3,
         offset: float = 1.5,
-        intr_reduction: DispersionReduction = "mean_all",
-        through_norm: bool = False,
         temperature: float = 0.1,
         assignment_temperature: float | None = None,
-        annealing_updates: int | None = None,
         sinkhorn_iterations: int = 3,
-        reduction: str | None = None,
     ) -> None:
-        super().__init__(reduction=reduction)
-        _check_options(offset, intr_reduction, temperature, assignment_temperature, sinkhorn_iterations)
-        _check_annealing(annealing_updates, assignment_temperature)
+        super().__init__()
+        if not offset > 1:
+            raise ValueError(f"`offset` must exceed 1, the largest negative cosine, got {offset}.")
+        sharper = {} if assignment_temperature is None else {"assignment_temperature": assignment_temperature}
+        require_positive(temperature=temperature, **sharper)
         if projector is None:
             projector = Projector(cast(int, encoder.feature_dim), latent_dim)
         if predictor is None:
@@ -141,25 +135,14 @@ class ProtoLoss(PretrainingLoss):
         self.convert_to_functional(projector, "projector", create_target_params=True)
         self.convert_to_functional(predictor, "predictor")
         self.convert_to_functional(prototypes, "prototypes")
-        self.intr_reduction = intr_reduction
-        self.through_norm = through_norm
-        self.sinkhorn_iterations = sinkhorn_iterations
-        self.annealing_updates = annealing_updates
-        # float64 scalars: they do not promote float32 tensors, and 0.1 stays 0.1.
-        self.register_coeff_buffer("intr_loss_coef", intr_loss_coef, dtype=torch.float64)
-        self.register_coeff_buffer("offset", offset, dtype=torch.float64)
-        self.register_coeff_buffer("temperature", temperature, dtype=torch.float64)
-        self.register_coeff_buffer("assignment_temperature", assignment_temperature, dtype=torch.float64)
-        if annealing_updates is not None:  # only then: other losses' checkpoints stay as they were
-            self.register_buffer("updates_begun", torch.zeros((), dtype=torch.int64))
+        self.sinkhorn_iterations = as_int(sinkhorn_iterations, "sinkhorn_iterations", minimum=0)
+        self._register_coefficient("intr_loss_coef", intr_loss_coef)
+        self._register_coefficient("offset", offset)
+        self._register_coefficient("temperature", temperature)
+        self._register_coefficient("assignment_temperature", assignment_temperature)
 
     def before_update(self) -> ProtoLoss:
-        """Scale the prototype rows to unit length in place, outside autograd, and count the update if annealing.
-
-        Returns self.
-        """
-        if self.annealing_updates is not None:
-            self.updates_begun.add_(1)
+        """Scale the prototype rows to unit length in place, outside autograd. Returns self."""
         with self.prototypes_params.to_module(self.prototypes, preserve_module_state=False):
             self.prototypes.normalize_()
         return self
@@ -167,91 +150,36 @@ class ProtoLoss(PretrainingLoss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the loss terms and diagnostics of one batch; see the class."""
-        keys = self.tensor_keys
-        pixels, next_pixels, valid, lead = self._read_images(
-            tensordict, keys.observation, keys.next_observation
-        )
-        latents, predictions = self._online(pixels)
-        targets = self._target(next_pixels)
+        latents = self._latents(self._read(tensordict, self.tensor_keys.observation))
+        predictions = self._apply_network("predictor", latents)
+        targets = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))
         # The prototypes' precision from here on, also in a caller's autocast region or after a half-precision head.
         with torch.autocast(device_type=latents.device.type, enabled=False):
             unit = self._unit_prototypes()
             latents, predictions, targets = (x.to(unit.dtype) for x in (latents, predictions, targets))
-            assignments = self._assign(targets, unit.detach())
+            sharpness = (
+                self.temperature if self.assignment_temperature is None else self.assignment_temperature
+            )
+            assignments = sinkhorn_knopp(
+                F.normalize(targets, dim=-1) @ unit.detach().T,
+                temperature=sharpness,
+                iterations=self.sinkhorn_iterations,
+            )
             scores = F.normalize(predictions, dim=-1) @ unit.T  # (B, D) x (D, M) -> (B, M)
-            rows = comparative_loss(scores, assignments, temperature=self.temperature, reduction="none")
-            comp = self._reduce_rows(rows, valid, lead)
-            intr = prototype_dispersion(unit, offset=self.offset, reduction=self.intr_reduction)
+            comp = comparative_loss(scores, assignments, temperature=self.temperature)
+            intr = prototype_dispersion(unit, offset=self.offset)
             out = {
                 "loss_comp": comp,
                 "loss_intr": (self.intr_loss_coef * intr).to(intr.dtype),
                 "comp": comp.detach(),
                 "intr": intr.detach(),
-                "assignment_entropy": metrics.assignment_entropy(assignments),
-                "prototypes_in_use": metrics.prototypes_in_use(assignments),
-                "embedding_cosine": metrics.mean_pairwise_cosine(F.normalize(latents.detach(), dim=-1)),
-                "prototype_ane": metrics.prototype_ane(unit.detach()),
+                "assignment_entropy": assignment_entropy(assignments),
+                "prototypes_in_use": prototypes_in_use(assignments),
+                "embedding_cosine": mean_pairwise_cosine(F.normalize(latents.detach(), dim=-1)),
+                "prototype_ane": prototype_ane(unit.detach()),
             }
         return TensorDict(out, batch_size=[])
 
-    def _online(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        latents = self._apply_network("projector", self._apply_network("encoder", pixels))
-        return latents, self._apply_network("predictor", latents)
-
-    @torch.no_grad()
-    def _target(self, next_pixels: Tensor) -> Tensor:
-        features = self._apply_network("encoder", next_pixels, target=True)
-        return self._apply_network("projector", features, target=True)
-
     def _unit_prototypes(self) -> Tensor:
         with self.prototypes_params.to_module(self.prototypes, preserve_module_state=False):
-            return self.prototypes.unit_weight(through_norm=self.through_norm)
-
-    @torch.no_grad()
-    def _assign(self, targets: Tensor, unit_prototypes: Tensor) -> Tensor:
-        return sinkhorn_knopp(
-            F.normalize(targets, dim=-1) @ unit_prototypes.T,
-            temperature=self._assignment_temperature_now(),
-            iterations=self.sinkhorn_iterations,
-        )
-
-    def _assignment_temperature_now(self) -> Tensor:
-        """Tau of the assignments in the update that has begun; a tensor's arithmetic, so that it can be recorded."""
-        first, last = self.assignment_temperature, self.temperature
-        if first is None:
-            return last
-        if self.annealing_updates is None:
-            return first
-        # Update number u (from 0) has begun u + 1 times; exactly `last` at the end, as lerp is from weight 0.5 on.
-        progress = ((self.updates_begun - 1) / self.annealing_updates).clamp(0, 1)
-        return torch.lerp(first, last, progress.to(first.dtype))
-
-
-def _check_options(
-    offset: float,
-    intr_reduction: str,
-    temperature: float,
-    assignment_temperature: float | None,
-    sinkhorn_iterations: int,
-) -> None:
-    """Refuse values that would only show as NaN thousands of updates later."""
-    if not offset > 1:
-        raise ValueError(f"offset must exceed 1, the largest negative cosine, got {offset}.")
-    if intr_reduction not in ("mean_all", "sum", "mean_offdiag"):
-        raise ValueError(
-            f"intr_reduction must be 'mean_all', 'sum' or 'mean_offdiag', got {intr_reduction!r}."
-        )
-    for name, value in (("temperature", temperature), ("assignment_temperature", assignment_temperature)):
-        if value is not None and not value > 0:
-            raise ValueError(f"{name} must be positive, got {value}.")
-    if sinkhorn_iterations < 0:
-        raise ValueError(f"sinkhorn_iterations must not be negative, got {sinkhorn_iterations}.")
-
-
-def _check_annealing(annealing_updates: int | None, assignment_temperature: float | None) -> None:
-    if annealing_updates is None:
-        return
-    if annealing_updates < 1:
-        raise ValueError(f"annealing_updates must be at least 1, got {annealing_updates}.")
-    if assignment_temperature is None:
-        raise ValueError("annealing_updates needs an assignment_temperature to start from, such as 0.05.")
+            return self.prototypes.unit_weight()

@@ -9,13 +9,12 @@ import torch
 import torch.nn.functional as F
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams, dispatch
-from torch import Tensor, nn
+from torch import nn
 
 from crptpro.modules import Projector
 from crptpro.modules.heads import latent_dim_of
-from crptpro.objectives import metrics
-from crptpro.objectives.base import PretrainingLoss
-from crptpro.objectives.functional import info_nce
+from crptpro.objectives.base import PretrainingLoss, require_positive
+from crptpro.objectives.functional import info_nce, mean_pairwise_cosine
 
 
 class SimCLRLoss(PretrainingLoss):
@@ -28,8 +27,7 @@ class SimCLRLoss(PretrainingLoss):
 
     It says in :attr:`views` that ``pixels_view`` is a second view of ``pixels``;
     :func:`~crptpro.training.pretrain` makes it by shifting the same images again. Softmax runs in float32 or
-    wider. A batch of one is legal and uninformative (loss 0); masked rows (``loss_mask_key``) take no part;
-    non-finite input propagates.
+    wider. A batch of one is legal and uninformative (loss 0); non-finite input propagates.
 
     Deviation: APT has published no code for DeepMind Control; loss and temperature are those of the authors' code
     for Atari, the head (one linear layer, 128) is the one that every method here has.
@@ -39,10 +37,9 @@ class SimCLRLoss(PretrainingLoss):
         projector: features to latents ``[B, D]``; default ``Projector(encoder.feature_dim, latent_dim)``.
         latent_dim: D.
         temperature: tau, positive.
-        reduction: over the batch; a row's value is the mean of its two views'.
 
     Raises:
-        ValueError: a temperature that is not positive, or an unknown reduction.
+        ValueError: a temperature that is not positive.
 
     Returns (``forward``):
         Scalar ``loss_contrast`` (nats) and, detached, ``embedding_cosine`` (mean pairwise cosine of the first
@@ -89,18 +86,15 @@ class SimCLRLoss(PretrainingLoss):
         projector: nn.Module | None = None,
         latent_dim: int = 128,
         temperature: float = 0.07,
-        reduction: str | None = None,
     ) -> None:
-        super().__init__(reduction=reduction)
-        if not temperature > 0:
-            raise ValueError(f"temperature must be positive, got {temperature}.")
+        super().__init__()
+        require_positive(temperature=temperature)
         if projector is None:
             projector = Projector(cast(int, encoder.feature_dim), latent_dim)
         self.convert_to_functional(encoder, "encoder")
         self.convert_to_functional(projector, "projector")
         self.latent_dim = latent_dim_of(projector) or latent_dim
-        # float64 scalar: it does not promote float32 tensors, and 0.07 stays 0.07.
-        self.register_coeff_buffer("temperature", temperature, dtype=torch.float64)
+        self._register_coefficient("temperature", temperature)
 
     @property
     def views(self) -> dict[NestedKey, NestedKey]:
@@ -110,18 +104,12 @@ class SimCLRLoss(PretrainingLoss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the loss and diagnostics of one batch; see the class."""
-        keys = self.tensor_keys
-        first, second, valid, lead = self._read_images(tensordict, keys.observation, keys.observation_view)
-        latents = self._latents(torch.cat([first, second]))
+        keys = (self.tensor_keys.observation, self.tensor_keys.observation_view)
+        latents = self._latents(torch.cat([self._read(tensordict, key) for key in keys]))
         with torch.autocast(device_type=latents.device.type, enabled=False):
             one, two = F.normalize(latents, dim=-1).chunk(2)
-            views = info_nce(one, two, temperature=self.temperature, negatives="both", reduction="none")
-            rows = views.view(2, -1).mean(dim=0)  # (2B,) -> (B,)
             out = {
-                "loss_contrast": self._reduce_rows(rows, valid, lead),
-                "embedding_cosine": metrics.mean_pairwise_cosine(one.detach()),
+                "loss_contrast": info_nce(one, two, temperature=self.temperature, negatives="both"),
+                "embedding_cosine": mean_pairwise_cosine(one.detach()),
             }
         return TensorDict(out, batch_size=[])
-
-    def _latents(self, pixels: Tensor) -> Tensor:
-        return self._apply_network("projector", self._apply_network("encoder", pixels))

@@ -13,10 +13,9 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from crptpro.modules import DeterministicActor, TwinCritic
-from crptpro.modules.deterministic_actor import with_skill
-from crptpro.objectives.base import valid_rows
-from crptpro.objectives.masked_rows import mean_of_rows, without_masked_values
-from crptpro.objectives.out_keys import OutKeys
+from crptpro.modules.actor_critic import with_skill
+from crptpro.objectives.base import OutKeys
+from crptpro.values import as_float
 
 
 class SkillDDPGLoss(OutKeys, LossModule):
@@ -38,7 +37,6 @@ class SkillDDPGLoss(OutKeys, LossModule):
         noise_clip: largest absolute noise of the actions that are learned from.
         generator: source of all noise, asked for the target's first; torch's global generator if None. Not part
             of the state dictionary.
-        reduction: ``"mean"``, ``"sum"`` or ``"none"`` (per-row losses).
 
     Returns (``forward``):
         ``loss_actor``, ``loss_qvalue`` and, detached scalars, ``q_mean``, ``target_q_mean``, ``td_error`` (mean
@@ -47,7 +45,6 @@ class SkillDDPGLoss(OutKeys, LossModule):
 
     Raises:
         ValueError: ``noise_clip`` negative, or a critic for other features than the actor's.
-        NotImplementedError: (``forward``) an unknown ``reduction``.
 
     Examples:
         >>> actor = DeterministicActor(6, 2, skill_dim=3, hidden_dim=8)
@@ -71,7 +68,6 @@ class SkillDDPGLoss(OutKeys, LossModule):
             action: what was done.
             reward: n-step return, under ``"next"``.
             discount: of the value n steps later, under ``"next"``.
-            priority_weight: importance of a row, if the batch has it.
         """
 
         observation: NestedKey = "features"
@@ -79,7 +75,6 @@ class SkillDDPGLoss(OutKeys, LossModule):
         action: NestedKey = "action"
         reward: NestedKey = "reward"
         discount: NestedKey = "discount"
-        priority_weight: NestedKey = "priority_weight"
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
@@ -99,10 +94,7 @@ class SkillDDPGLoss(OutKeys, LossModule):
         *,
         noise_clip: float = 0.3,
         generator: torch.Generator | None = None,
-        reduction: str | None = None,
     ) -> None:
-        if noise_clip < 0:
-            raise ValueError(f"noise_clip must not be negative, got {noise_clip}; 0.3 is usual.")
         inputs = actor.config["feature_dim"] + actor.skill_dim
         if critic.config["feature_dim"] != inputs:
             raise ValueError(
@@ -111,9 +103,8 @@ class SkillDDPGLoss(OutKeys, LossModule):
             )
         self._in_keys: list[NestedKey] | None = None
         super().__init__()
-        self.noise_clip = noise_clip
+        self.noise_clip = as_float(noise_clip, "noise_clip", minimum=0)
         self.generator = generator
-        self.reduction = "mean" if reduction is None else reduction
         self.convert_to_functional(actor, "actor_network")
         self.convert_to_functional(critic, "qvalue_network", create_target_params=True)
         # Hidden from nn.Module, as LossModule hides its networks: the parameters are registered once.
@@ -144,31 +135,28 @@ class SkillDDPGLoss(OutKeys, LossModule):
 
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not changed."""
-        valid = valid_rows(self, tensordict)
-        tensordict = without_masked_values(self, tensordict)
         target = self._target(tensordict)  # (B,)
         inputs = self._inputs(tensordict, tensordict)
         with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
             values = self.critic(inputs, tensordict.get(self.tensor_keys.action))  # (B, 2)
         errors = values - target.unsqueeze(-1)
         out = {
-            "loss_qvalue": self._reduced(errors.square().sum(-1), tensordict),
-            "q_mean": mean_of_rows(values.detach().mean(-1), valid),
-            "target_q_mean": mean_of_rows(target, valid),
-            "td_error": mean_of_rows(errors.detach().abs().amax(-1), valid),
+            "loss_qvalue": errors.square().sum(-1).mean(),
+            "q_mean": values.detach().mean(),
+            "target_q_mean": target.mean(),
+            "td_error": errors.detach().abs().amax(-1).mean(),
         }
         return TensorDict(out, batch_size=[])
 
     def actor_loss(self, tensordict: TensorDictBase) -> Tensor:
         """The actor's loss, against the critic as it is now."""
-        tensordict = without_masked_values(self, tensordict)
         inputs = self._inputs(tensordict, tensordict)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
             action = self.actor.sample(inputs, noise_clip=self.noise_clip, generator=self.generator)
         # Detached weights: the gradient passes through Q to the action and to nothing else.
         with self.qvalue_network_params.data.to_module(self.qvalue_network, preserve_module_state=False):
             value = self.critic(inputs, action).amin(-1)
-        return self._reduced(-value, tensordict)
+        return -value.mean()
 
     @torch.no_grad()
     def _target(self, tensordict: TensorDictBase) -> Tensor:
@@ -187,10 +175,6 @@ class SkillDDPGLoss(OutKeys, LossModule):
         return with_skill(
             observed.get(self.tensor_keys.observation).detach(), root.get(self.tensor_keys.skill)
         )
-
-    def _reduced(self, rows: Tensor, tensordict: TensorDictBase) -> Tensor:
-        weights = self._maybe_get_priority_weight(tensordict)
-        return self._reduce_loss(rows, tensordict=tensordict, weights=weights)
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         # No value estimator here; changed keys only have to show in in_keys.

@@ -7,6 +7,8 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
+from torch import nn
+
 _LOG = logging.getLogger(__name__)
 
 State = Literal["learning", "plateau", "dead"]
@@ -57,6 +59,19 @@ class CollapseMonitor:
         self._outside_count = 0
         self._comp: float | None = None
         self._cosines: dict[str, float] = {}
+
+    @classmethod
+    def of(cls, loss: nn.Module) -> CollapseMonitor:
+        """Return the monitor of a loss.
+
+        Raw convolutional features are non-negative and share the background, so that healthy ones come close to a
+        cosine of 1; those of a projector do not.
+        """
+        weight = getattr(getattr(loss, "prototypes", None), "weight", None)
+        has_projector = isinstance(getattr(loss, "projector", None), nn.Module)
+        return cls(
+            None if weight is None else len(weight), cosine_threshold=0.99 if has_projector else 0.9999
+        )
 
     def observe(
         self, updates: int, *, comp: float | None = None, cosine: float | Mapping[str, float] | None = None

@@ -1,30 +1,188 @@
-"""Downstream reinforcement learning: on a frozen encoder (CRPTpro, Sec. III-C), or end to end for comparison."""
+"""Downstream reinforcement learning: SAC on a frozen encoder with an exploration bonus, or DrQ end to end."""
 
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
-import tempfile
+import functools
+import logging
+import math
+import shutil
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from crptpro.directory_lock import DirectoryLock
-from crptpro.downstream_config import DownstreamConfig
-from crptpro.envs import make_env
-from crptpro.errors import CheckpointError, PretrainedError
-from crptpro.loggers import RunLogger
-from crptpro.modules import usable_device
-from crptpro.objectives import Method, get_method, methods
+import torch
+from torch import nn
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import step_mdp
+
+from crptpro.data import FrameReplay
+from crptpro.domains import get_domain
+from crptpro.envs import make_env, needs_gl, resolve_action_repeat
+from crptpro.envs.rendering import select_backend
+from crptpro.errors import CheckpointError, NonFiniteError, PretrainedError, UnknownNameError
+from crptpro.logging import RunLogger
+from crptpro.modules import (
+    SquashedGaussianActor,
+    TwinCritic,
+    resolve_precision,
+    set_compute_dtype,
+    usable_device,
+)
+from crptpro.modules.precision import Precision
+from crptpro.objectives import DrQLoss, RADSACLoss, get_method, method_names
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
-from crptpro.seeding import kept_global_rng
-from crptpro.training.action_repeat import action_repeat_of
-from crptpro.training.agent import PixelAgent
-from crptpro.training.checkpoint import CheckpointDir
-from crptpro.training.downstream_checkpoint import require_continuable
-from crptpro.training.downstream_checkpoint import resume as resume_run
-from crptpro.training.downstream_replay import remove_replay
-from crptpro.training.downstream_run import DownstreamRun, EnvFactory
+from crptpro.provenance import cpu_cores
+from crptpro.seeding import derive_seed, seed_everything
+from crptpro.training.agent import EnvThread, PixelAgent, SACLearner, save_agent, uniform_action
+from crptpro.training.evaluate import WORKER_BYTES, Episode, Evaluator, can_be_sent, summarize
+from crptpro.training.run import Generators, Run
+from crptpro.transforms import (
+    DenseShiftFeatures,
+    FrozenEncoder,
+    PrototypeReward,
+    RandomShift,
+    choose_feature_mode,
+)
+from crptpro.transforms.free_memory import free_bytes
+from crptpro.transforms.prototype_reward import warn_if_mostly_zero
+from crptpro.values import Colors, Quality, as_float, as_int
+
+logger = logging.getLogger(__name__)
+
+EnvFactory = Callable[..., EnvBase]
+SHIFT_PAD = 4
+WORTH_WORKERS = 20
+"""Evaluation episodes of a run from which on workers pay: starting one takes as long as an episode."""
+SPARE_FRAMES = 2_000
+
+
+@dataclass(frozen=True)
+class DownstreamConfig:
+    """How a task is learned. ``None`` means the method's own value, which is the paper's.
+
+    Source: CRPTpro, hyper-parameter table; Proto-RL's released agent. One update per agent step once
+    ``random_agent_steps`` transitions are stored.
+    """
+
+    env_steps: int | None = None
+    """budget in simulator steps (default: the method's; 500,000, drq 1,000,000); an episode running then is cut"""
+    batch_size: int = 512
+    """transitions per update"""
+    replay_capacity: int | None = None
+    """transitions kept (default: the method's; 40,000, proto-rl and drq 100,000); the oldest go first"""
+    random_agent_steps: int = 1_000
+    """decisions taken uniformly at random before the first update"""
+    intrinsic_reward_coef: float | None = None
+    """weight of the prototype-kNN bonus (default: the method's; 0.2 for those with prototypes); 0 switches it off"""
+    knn_k: int = 3
+    """the bonus is the distance to the k-th nearest candidate"""
+    queue_size: int = 2_048
+    """candidates kept, a multiple of the number of prototypes"""
+    hidden_dim: int = 1_024
+    """width of the two hidden layers of actor and critic"""
+    discount: float = 0.99
+    """per agent step; only true terminations stop bootstrapping, time limits never do"""
+    learning_rate: float | None = None
+    """of the Adam optimisers of actor, critic and temperature (default: the method's; 1e-4, drq 1e-3)"""
+    initial_temperature: float = 0.1
+    """SAC's alpha at the start"""
+    critic_tau: float = 0.01
+    """EMA rate of the target critic, at every second update"""
+    action_repeat: int | None = None
+    """simulator steps per decision (default: the domain's, 2)"""
+    features: Literal["auto", "dense", "dense-bf16", "reencode"] = "auto"
+    """where the features of shifted observations come from: crops of dense maps that are stored once per observation
+    (exact; in bfloat16 rounded once, with half the memory), or the encoder at every update; auto takes dense maps
+    where the memory suffices"""
+    eval_interval_env_steps: int = 10_000
+    """simulator steps between two evaluations; the first is at 0, the last at the end"""
+    eval_episodes: int = 10
+    """episodes per evaluation"""
+    eval_workers: int | None = None
+    """processes that evaluate while training goes on, 0.5 GB of memory each; 0 evaluates in between (default: one per
+    core where that pays)"""
+    checkpoint_interval_env_steps: int = 5_000
+    """simulator steps between two checkpoints, taken at episode ends"""
+    log_interval_env_steps: int = 1_000
+    """simulator steps between two rows of training metrics"""
+    seed: int = 0
+    """seeds initialisation, environment, exploration, sampling, shifts, bonus and evaluation"""
+    quality: Quality = "exact"
+    """render quality"""
+    colors: Colors = "normal"
+    """colours of the task: reversed_background are the paper's unseen ones, reversed_image works everywhere"""
+    precision: Precision = "auto"
+    """arithmetic of the big matrix products; auto is bf16 where the hardware is faster in it. Deviation: the released
+    code computes in fp32 throughout, which fp32 gives"""
+    compile: bool = False
+    """compile the losses with torch.compile; changes rounding only"""
+    device: str = "cpu"
+    """where networks and features are"""
+
+    def __post_init__(self) -> None:
+        """Take numbers as the plain values they mean.
+
+        Raises:
+            ValueError: naming the setting, its value and what is allowed.
+        """
+        counts = (
+            "env_steps", "batch_size", "replay_capacity", "knn_k", "queue_size", "hidden_dim", "action_repeat",
+            "eval_interval_env_steps", "eval_episodes", "checkpoint_interval_env_steps", "log_interval_env_steps",
+        )  # fmt: skip
+        values: dict[str, Any] = {
+            name: as_int(getattr(self, name), name, minimum=1)
+            for name in counts
+            if getattr(self, name) is not None
+        }
+        values["seed"] = as_int(self.seed, "seed", minimum=0, maximum=2**32 - 1)
+        values["random_agent_steps"] = as_int(self.random_agent_steps, "random_agent_steps", minimum=1)
+        if self.eval_workers is not None:
+            values["eval_workers"] = as_int(self.eval_workers, "eval_workers", minimum=0)
+        largest = {"discount": 1, "critic_tau": 1}
+        for name in (
+            "discount",
+            "critic_tau",
+            "learning_rate",
+            "initial_temperature",
+            "intrinsic_reward_coef",
+        ):
+            if getattr(self, name) is not None:
+                values[name] = as_float(getattr(self, name), name, minimum=0, maximum=largest.get(name))
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        if self.features not in ("auto", "dense", "dense-bf16", "reencode"):
+            raise ValueError(
+                f"`features` must be auto, dense, dense-bf16 or reencode, got {self.features!r}."
+            )
+        if self.replay_capacity is not None and self.replay_capacity < self.random_agent_steps:
+            raise ValueError(
+                f"`replay_capacity` ({self.replay_capacity}) must hold the {self.random_agent_steps} transitions of "
+                "`random_agent_steps`, or no update would ever start."
+            )
+
+    def resolved(self, task: str, pretrained: Pretrained) -> Any:
+        """Return the settings with the method's and the domain's values where they were left open."""
+        known = pretrained.method in method_names(presets=True)
+        own = DOWNSTREAM_DEFAULTS | dict(get_method(pretrained.method).downstream if known else {})
+        values = {name: value for name, value in own.items() if getattr(self, name, self) is None}
+        if "replay_capacity" in values:
+            values["replay_capacity"] = max(values["replay_capacity"], self.random_agent_steps)
+        if self.action_repeat is None:
+            try:
+                values["action_repeat"] = resolve_action_repeat(task, None)
+            except UnknownNameError:  # only a caller's own factory knows the task
+                values["action_repeat"] = 2
+        return dataclasses.replace(self, **values)
+
+
+DOWNSTREAM_DEFAULTS: dict[str, Any] = {
+    "env_steps": 500_000, "replay_capacity": 40_000, "learning_rate": 1e-4, "intrinsic_reward_coef": 0.2,
+}  # fmt: skip
+"""What a method has downstream unless its row in the table says otherwise."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +190,13 @@ class DownstreamResult:
     """What a downstream run leaves.
 
     Attributes:
-        policy: the trained agent, deterministic.
+        agent: the trained agent; callable as a deterministic policy.
         evaluations: one row per evaluated episode: ``env_steps``, ``episode``, ``episode_return``, ...
-        agent_path: artifact of the agent, ``None`` without a run directory.
+        agent_path: artifact of the agent; ``None`` without a run directory.
         env_steps: simulator steps taken.
     """
 
-    policy: PixelAgent
+    agent: PixelAgent
     evaluations: list[dict[str, Any]]
     agent_path: Path | None
     env_steps: int
@@ -46,108 +204,408 @@ class DownstreamResult:
 
 def train_downstream(
     task: str,
-    pretrained: Pretrained | str | Path | None,
+    pretrained: Pretrained | str | Path,
     *,
     run_dir: str | Path | None = None,
     config: DownstreamConfig | None = None,
-    logger: RunLogger | None = None,
+    records: RunLogger | None = None,
     resume: bool = True,
     progress: bool = True,
     env_factory: EnvFactory = make_env,
     **overrides: Any,
 ) -> DownstreamResult:
-    """Train an agent on a task: SAC with the encoder frozen, or what ``config.algorithm`` says.
+    """Learn a task with SAC on a frozen encoder (CRPTpro, Sec. III-C), or with DrQ, which trains its own encoder.
 
     Args:
         task: any name that :func:`crptpro.envs.make_env` knows.
-        pretrained: an artifact or its directory. Without prototypes there is no bonus, which is said once. None for
-            DrQ, whose encoder starts from the seed: ``train_downstream(task, None, config=drq_settings())``.
-        run_dir: records, checkpoints and the agent go here; ``None`` keeps nothing but the result.
+        pretrained: an artifact, its directory, the name of an encoder that ships, or one of the controls
+            ``"random-encoder"`` and ``"drq"``.
+        run_dir: records (``eval.csv``, ``train.csv``, ``episodes.csv``), checkpoints, replay and agent; ``None`` keeps
+            nothing but the result.
         config: every number; the paper's by default.
-        logger: records and mirrors; by default a local record in ``run_dir``.
-        resume: continue from the newest checkpoint in ``run_dir``. Checkpoints are taken between episodes, so a
-            kill costs the episodes since the last one and, on a CPU, changes no number.
-        progress: show bars (never in log files).
+        records: used instead of a record in ``run_dir``.
+        resume: continue from the newest checkpoint in ``run_dir``. Checkpoints are taken between episodes: a kill
+            costs the episodes since the last one and, on a CPU, changes no number.
+        progress: show a bar, or lines in a log file.
         env_factory: makes the environments; called as :func:`~crptpro.envs.make_env` is, in a thread of its own and in
-            the processes that evaluate (see ``render_ahead`` and ``eval_workers``).
+            the processes that evaluate.
         **overrides: single settings of :class:`DownstreamConfig`, e.g. ``env_steps=100_000``.
 
-    Returns:
-        The agent and every evaluated episode.
+    Raises:
+        PretrainedError: the artifact does not fit, e.g. another image size.
+        CheckpointError: ``run_dir`` holds a run of other settings (named), or one whose replay is gone.
+        NonFiniteError: a loss, a weight, an action or a reward is not finite; the last checkpoint is kept.
+        DiskSpaceError: the disk cannot hold the replay.
+    """
+    artifact = _artifact(
+        pretrained, (config or DownstreamConfig()).seed if "seed" not in overrides else overrides["seed"]
+    )
+    settings = dataclasses.replace(config or DownstreamConfig(), **overrides).resolved(task, artifact)
+    device, repeat = usable_device(settings.device), settings.action_repeat
+    with contextlib.ExitStack() as stack:
+        run = stack.enter_context(Run(run_dir, unit="env_steps", streams=("train", "episodes", "eval"), records=records,
+                                      config={"task": task, **dataclasses.asdict(settings)}, resume=resume,
+                                      progress=progress))  # fmt: skip
+        dtype = resolve_precision(run.saved_setting("precision", settings.precision), device)
+        features = run.saved_setting("features", settings.features)
+        run.require_same({**settings_of(task, artifact, settings, dtype), "features": features})
+        seed_everything(derive_seed(settings.seed, "downstream"))
+        generators = Generators(settings.seed, "replay", "shift", "bonus", "policy", "random_actions")
+        make_this_env = env_builder(task, artifact.encoder, settings, env_factory)
+        env = EnvThread(make_this_env, runs_ahead=runs_ahead(task, settings.device))
+        stack.callback(env.close)
+        artifact.require(image_size=env.env.observation_spec["pixels"].shape[-1])
+        encoder = frozen_copy(artifact.encoder, device, dtype)
+        learner, agent = make_agent(artifact, encoder, env.env, settings, generators["policy"])
+        set_compute_dtype(learner.loss, dtype)
+        evaluator = Evaluator(make_this_env, episodes=settings.eval_episodes, seed=settings.seed, progress=progress,
+                              workers=eval_workers(task, make_this_env, settings),
+                              on_result=functools.partial(record_evaluation, run, task, artifact.label))  # fmt: skip
+        evaluator.agent = agent
+        stack.callback(evaluator.close)
+        replay = make_replay(env.env, settings, generators["replay"], run)
+        memory = attach_transforms(replay, artifact, encoder, settings, generators, run,
+                                   reserved_bytes=evaluator.workers * WORKER_BYTES)  # fmt: skip
+        counters = Counters()
+        run.keep(
+            **learner.components(),
+            **memory,
+            generators=generators,
+            evaluator=evaluator,
+            counters=counters,
+            **({} if is_complete(run, settings) else {"replay": replay}),
+        )
+
+        for position in run.until(
+            settings.env_steps, checkpoint_interval=settings.checkpoint_interval_env_steps
+        ):
+            if position >= counters["next_evaluation"]:
+                if (
+                    position != counters["last_evaluation"]
+                ):  # a shorter run has ended, and was evaluated, here
+                    evaluator.start(
+                        agent, env_steps=position, agent_steps=position // repeat, updates=counters["updates"]
+                    )
+                counters["last_evaluation"] = position
+                counters["next_evaluation"] = (
+                    position // settings.eval_interval_env_steps + 1
+                ) * settings.eval_interval_env_steps
+            td = env.reset(derive_seed(settings.seed, "downstream", "episode", counters["episodes"]))
+            episode_return, first, done = 0.0, run.position, False
+            while not done and run.position < settings.env_steps:
+                agent_step = run.position // repeat
+                is_random = agent_step < settings.random_agent_steps
+                td["action"] = (
+                    uniform_action(env.env, generators["random_actions"])
+                    if is_random
+                    else agent.explore(td["pixels"], generators["policy"])
+                )
+                step = env.step(td)  # the next observation is drawn while the update computes
+                if not is_random:
+                    # The sample has features under random shifts, and the bonus is part of its reward.
+                    batch = replay.sample(settings.batch_size).to(device)
+                    intrinsic = batch.get(("next", "intrinsic_reward"), None)
+                    run.log(learner.update(batch, agent_step=agent_step))
+                    if intrinsic is not None:
+                        run.log({"intrinsic_reward": intrinsic.mean()})
+                    counters["updates"] += 1
+                transition = step.result()
+                reward = transition["next", "reward"].item()
+                if not math.isfinite(reward):
+                    raise NonFiniteError(f"{task}: the reward of agent step {agent_step} is {reward}.")
+                replay.extend(transition)
+                episode_return += reward
+                done = bool(transition["next", "done"].item())
+                td = step_mdp(transition)
+                run.advance(repeat)
+                if run.every(settings.log_interval_env_steps) and run.means["train"].counts:
+                    row = run.write("train", updates=counters["updates"])
+                    run.show(q=row["q_mean"])
+            counters["episodes"] += 1
+            length = (run.position - first) // repeat
+            run.write(
+                "episodes",
+                {"episode_return": episode_return, "episode_agent_steps": length},
+                episodes=counters["episodes"],
+            )
+
+        if run.position != counters["last_evaluation"]:
+            evaluator.start(
+                agent, env_steps=run.position, agent_steps=run.position // repeat, updates=counters["updates"]
+            )
+            counters["last_evaluation"] = run.position
+        evaluator.finish()
+        run.finish()
+        path = None
+        if run.run_dir is not None:
+            card = {
+                "task": task,
+                "env_steps": run.position,
+                "config": dataclasses.asdict(settings),
+                **run.settings,
+            }
+            path = save_agent(run.run_dir / "agent", agent, card=card)
+            if run.records is not None:
+                run.records.artifact(path, name=f"agent_{task}", kind="agent")
+        return DownstreamResult(agent, run.rows("eval"), path, run.position)
+
+
+# --- parts ------------------------------------------------------------------------------------------------------------
+
+
+def is_complete(run: Run, config: Any) -> bool:
+    """Whether nothing is left to do, so that the replay, which may be gone, is not needed."""
+    return bool(run.saved.get("is_finished")) and run.saved["position"] >= config.env_steps
+
+
+class Counters(dict[str, int]):
+    """Where a run is beside its position; part of every checkpoint."""
+
+    def __init__(self) -> None:
+        super().__init__(updates=0, episodes=0, next_evaluation=0, last_evaluation=-1)
+
+    def state_dict(self) -> dict[str, int]:
+        """Return the counters."""
+        return dict(self)
+
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """Restore :meth:`state_dict`."""
+        self.update(state)
+
+
+def _artifact(pretrained: Pretrained | str | Path, seed: int) -> Pretrained:
+    if isinstance(pretrained, Pretrained):
+        return pretrained
+    if str(pretrained) in ("drq", "random-encoder"):
+        return random_pretrained(seed=seed, method=str(pretrained))
+    return load_pretrained(pretrained)
+
+
+def settings_of(task: str, pretrained: Pretrained, config: Any, dtype: torch.dtype) -> dict[str, Any]:
+    """Return everything that decides the numbers of a run; its budget may grow, and machines differ."""
+    free = ("env_steps", "precision", "features", "eval_workers", "compile", "device")
+    return {
+        "task": task,
+        "pretrained": pretrained.identity(),
+        "precision": "bf16" if dtype == torch.bfloat16 else "fp32",
+        **{name: value for name, value in dataclasses.asdict(config).items() if name not in free},
+    }
+
+
+def env_builder(task: str, encoder: Any, config: Any, env_factory: EnvFactory) -> Callable[[], EnvBase]:
+    """Return a function without arguments that builds the environment for an encoder's images."""
+    settings: dict[str, Any] = {
+        "quality": config.quality,
+        "action_repeat": config.action_repeat,
+        "image_size": getattr(encoder, "image_size", 84),
+        "frame_stack": getattr(encoder, "in_channels", 9) // 3,
+    }
+    if config.colors != "normal":  # a factory of one's own need not know of colours
+        settings["colors"] = config.colors
+    # The domain itself, whose name may be registered in this process only.
+    name = get_domain(task) if env_factory is make_env else task
+    return functools.partial(env_factory, name, seed=config.seed, **settings)
+
+
+def runs_ahead(task: str, device: str) -> bool:
+    """Whether the next observation is drawn in another thread: where this process has cores for it; not with GLFW."""
+    if (
+        device != "cpu" or cpu_cores() == 1 or torch.get_num_threads() == 1
+    ):  # one thread: others want the cores
+        return False
+    with contextlib.suppress(UnknownNameError):  # only a caller's own factory knows the task
+        return not (needs_gl(task) and select_backend() == "glfw")
+    return True
+
+
+def frozen_copy(network: nn.Module, device: torch.device, dtype: torch.dtype) -> Any:
+    """Return a frozen copy on the device, computing in ``dtype``; another run may hold the artifact too."""
+    return set_compute_dtype(copy.deepcopy(network).requires_grad_(False).eval().to(device), dtype)
+
+
+def make_agent(
+    pretrained: Pretrained,
+    encoder: Any,
+    env: EnvBase,
+    config: Any,
+    generator: torch.Generator,
+) -> tuple[SACLearner, PixelAgent]:
+    """Return SAC on the encoder's features, or DrQ, whose critic trains the encoder, and the agent that acts."""
+    action_dim, device = env.action_spec.shape[-1], torch.device(config.device)
+    is_drq = pretrained.method == "drq"
+    widths: dict[str, Any] = {"hidden_dim": config.hidden_dim, "has_tanh": is_drq}
+    actor = transferred_actor(pretrained, env, config) or SquashedGaussianActor(
+        encoder.feature_dim, action_dim, **widths
+    )
+    critic = TwinCritic(encoder.feature_dim, action_dim, **widths)
+    options: dict[str, Any] = {
+        "gamma": config.discount, "alpha_init": config.initial_temperature, "generator": generator,
+    }  # fmt: skip
+    loss: RADSACLoss
+    if is_drq:
+        loss = DrQLoss(encoder.requires_grad_(True), actor.to(device), critic.to(device), **options)
+    else:
+        loss = RADSACLoss(actor.to(device), critic.to(device), **options)
+    learner = SACLearner(
+        loss, learning_rate=config.learning_rate, critic_tau=config.critic_tau, compile=config.compile
+    )
+    return learner, PixelAgent(encoder, loss.actor)
+
+
+def transferred_actor(pretrained: Pretrained, env: EnvBase, config: Any) -> SquashedGaussianActor | None:
+    """Return a trainable copy of the actor that explored the task's own domain while the encoder was pre-trained."""
+    actor = pretrained.actor
+    if (
+        not isinstance(actor, SquashedGaussianActor)
+        or actor.config["action_dim"] != env.action_spec.shape[-1]
+    ):
+        return None
+    return copy.deepcopy(actor).requires_grad_(True).train()
+
+
+def make_replay(env: EnvBase, config: Any, generator: torch.Generator, run: Run) -> FrameReplay:
+    """Return the replay of a run: frames stored once, on disk below the run's directory, where it has one.
+
+    A checkpoint holds counters and no frames: whatever the last two refer to outlives the next one.
 
     Raises:
-        CRPTproError: if the device cannot be used.
-        PretrainedError: if the artifact does not fit, e.g. another image size, or actor weights only; if there is none
-            for a frozen encoder, or one for DrQ.
-        CheckpointError: if ``run_dir`` holds a run with other settings, or one that cannot go on: its replay is gone,
-            or the dense maps that it began with do not fit the memory. A finished run needs neither.
-        NonFiniteError: if a loss became NaN or infinite; the last checkpoint is kept.
+        CheckpointError: the run is to be continued, and its frames are gone.
+        DiskSpaceError: the disk cannot hold the frames.
     """
-    config = dataclasses.replace(config or DownstreamConfig(), **overrides)
-    usable_device(config.device)
-    config = dataclasses.replace(config, action_repeat=action_repeat_of(task, config.action_repeat))
-    artifact = _artifact(pretrained, config)
-    config = dataclasses.replace(config, replay_capacity=_replay_capacity(artifact, config))
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(kept_global_rng())
-        directory = Path(run_dir or stack.enter_context(tempfile.TemporaryDirectory(prefix="crptpro-")))
-        stack.enter_context(DirectoryLock(directory, error=CheckpointError, is_reentrant=True))
-        records = logger or stack.enter_context(
-            RunLogger(directory, config={"task": task, **dataclasses.asdict(config)})
+    channels, height, width = env.observation_spec["pixels"].shape
+    path = None if run.run_dir is None or is_complete(run, config) else run.run_dir / "replay"
+    if path is not None and not run.saved:
+        shutil.rmtree(path, ignore_errors=True)  # of an attempt without a checkpoint
+    if path is not None and run.saved and not path.exists():
+        raise CheckpointError(
+            f"{run.run_dir} has done {run.saved['position']:,} env steps; to continue it needs its frames, and {path} "
+            "is gone. Put it back, or start in another run directory."
         )
-        checkpoints = CheckpointDir(directory / "checkpoints")
-        if not resume and checkpoints.latest_counter() is not None:
-            raise CheckpointError(
-                f"{directory} already holds a run. Choose another directory, or continue it (resume=True)."
-            )
-        state = None if run_dir is None else checkpoints.load_latest()
-        if state is None:
-            remove_replay(directory)
-        else:
-            require_continuable(
-                state,
-                task=task,
-                pretrained=None if config.algorithm == "drq" else artifact.identity(),
-                config=config,
-                run_dir=directory,
-            )
-        run = DownstreamRun(
-            task,
-            artifact,
-            directory,
-            config,
-            records,
-            progress=progress,
-            env_factory=env_factory,
-            state=state,
-        )
-        stack.callback(run.close)
-        resume_run(run, state, progress=progress)
-        run.train(checkpoints if run_dir is not None else None)
-        agent_path = run.save_agent() if run_dir is not None else None
-        return DownstreamResult(run.agent(), records.rows("eval"), agent_path, run.env_steps)
+    return FrameReplay(
+        config.replay_capacity,
+        frame_shape=(3, height, width),
+        action_dim=env.action_spec.shape[-1],
+        frame_stack=channels // 3,
+        path=path,
+        slack=2 * (config.checkpoint_interval_env_steps // config.action_repeat) + SPARE_FRAMES,
+        generator=generator,
+    )
 
 
-def _artifact(pretrained: Pretrained | str | Path | None, config: DownstreamConfig) -> Pretrained:
-    if config.algorithm == "drq":
-        if pretrained is not None:
+def attach_transforms(
+    replay: FrameReplay,
+    pretrained: Pretrained,
+    encoder: Any,
+    config: Any,
+    generators: Mapping[str, torch.Generator],
+    run: Run,
+    *,
+    reserved_bytes: int,
+) -> dict[str, Any]:
+    """Attach to the replay what turns a sample into the learner's batch; returns what a checkpoint must hold of it.
+
+    DrQ reads two shifts of every image. SAC on a frozen encoder reads features under a random shift: crops of dense
+    maps, or the shifted image encoded anew. The bonus is added to the sampled reward.
+    """
+    device = torch.device(config.device)
+    pixels = ["pixels", ("next", "pixels")]
+    if pretrained.method == "drq":
+        views = ["pixels_view", ("next", "pixels_view")]
+        replay.append_transform(
+            RandomShift(
+                pad=SHIFT_PAD,
+                in_keys=[*pixels, *pixels],
+                out_keys=[*views, *pixels],
+                generator=generators["shift"],
+            )
+        )
+        return {}
+    has_bonus = (
+        pretrained.prototypes is not None
+        and pretrained.projector is not None
+        and config.intrinsic_reward_coef > 0
+    )
+    if config.intrinsic_reward_coef > 0 and not has_bonus:
+        logger.info("no exploration bonus: the encoder of %s has no prototypes", pretrained.label)
+    networks: Any = (pretrained.projector, pretrained.prototypes) if has_bonus else ()
+    projector, prototypes = [frozen_copy(n, device, encoder.compute_dtype) for n in networks] or [None, None]
+    # An update projects its whole batch, an agent step every shift of one observation.
+    keeps_projections = has_bonus and config.batch_size >= 2 * (2 * SHIFT_PAD + 1) ** 2
+    dtype = (
+        torch.bfloat16
+        if config.features == "dense-bf16"
+        else getattr(encoder, "compute_dtype", torch.float32)
+    )
+    slots = min(replay.window, 2 * -(-config.env_steps // config.action_repeat))
+    asked = run.settings["features"]
+    mode, reason = choose_feature_mode(
+        "dense" if asked == "dense-bf16" else asked, encoder, slots, dtype,
+        available_bytes=max(0, free_bytes(device) - reserved_bytes), pad=SHIFT_PAD, device=device,
+        latent_dim=prototypes.weight.shape[1] if keeps_projections else None,
+    )  # fmt: skip
+    logger.info("features: %s", reason)
+    # The two ways round differently in bfloat16: a run that is continued keeps its own.
+    run.settings["features"] = "dense-bf16" if asked == "dense-bf16" else mode
+    features = ["features", ("next", "features")]
+    if mode == "reencode":
+        keeps_projections = False
+        replay.append_transform(RandomShift(pad=SHIFT_PAD, in_keys=pixels, generator=generators["shift"]))
+        replay.append_transform(FrozenEncoder(encoder, in_keys=pixels, out_keys=features))
+    else:
+        replay.returns_pixels = False
+        replay.append_transform(
+            DenseShiftFeatures(
+                encoder, replay, pad=SHIFT_PAD, projector=projector if keeps_projections else None, dtype=dtype,
+                generator=generators["shift"], observations=slots,
+            )
+        )  # fmt: skip
+    if not has_bonus:
+        return {}
+    warn_if_mostly_zero(len(prototypes.weight), config.batch_size, config.knn_k)
+    bonus = PrototypeReward(
+        None if keeps_projections else projector,
+        prototypes,
+        in_keys=("next", "embedding") if keeps_projections else ("next", "features"),
+        coef=config.intrinsic_reward_coef,
+        knn_k=config.knn_k,
+        queue_size=config.queue_size,
+        queue=pretrained.queue,
+        generator=generators["bonus"],
+    )
+    replay.append_transform(bonus)
+    return {"bonus": bonus}
+
+
+def eval_workers(task: str, make_this_env: Callable[[], EnvBase], config: Any) -> int:
+    """Return how many processes evaluate: as asked, or one per core where that works and pays."""
+    asked = config.eval_workers
+    if asked is not None:
+        if asked and not can_be_sent(make_this_env):
             raise PretrainedError(
-                "DrQ trains its encoder from scratch and takes no pretrained one; leave it out (None), or choose "
-                "algorithm='rad-sac' to learn on this encoder."
+                f"eval_workers is {asked}, but the environment of {task} cannot be built in another process: its "
+                "factory must be a function of an importable module. Move it there, or set eval_workers=0."
             )
-        return random_pretrained(seed=config.seed)
-    if pretrained is None:
-        raise PretrainedError(
-            f"{config.algorithm} learns on a frozen encoder: give it a pretrained artifact, or random_pretrained() as "
-            "the control. Only drq needs none."
-        )
-    return pretrained if isinstance(pretrained, Pretrained) else load_pretrained(pretrained)
+        return asked
+    evaluations = -(-config.env_steps // config.eval_interval_env_steps) + 1
+    pays = cpu_cores() > 1 and evaluations * config.eval_episodes >= WORTH_WORKERS
+    workers = min(cpu_cores(), torch.get_num_threads())  # one thread: others want the cores
+    return workers if workers > 1 and pays and can_be_sent(make_this_env) else 0
 
 
-def _replay_capacity(pretrained: Pretrained, config: DownstreamConfig) -> int:
-    """Transitions to keep: as asked, or what the artifact's method keeps, and at least the random phase."""
-    if config.replay_capacity is not None:
-        return config.replay_capacity
-    known = pretrained.method in methods(presets=True)
-    usual = get_method(pretrained.method).replay_capacity if known else Method.replay_capacity
-    return max(usual, config.random_agent_steps)
+def record_evaluation(
+    run: Run, task: str, method: str, episodes: Sequence[Episode], counters: Mapping[str, int]
+) -> None:
+    """Write a row per episode, and announce the mean."""
+    for e in episodes:
+        row: dict[str, Any] = {
+            "episode_return": e.episode_return,
+            "episode_agent_steps": e.agent_steps,
+            "seed": e.seed,
+            "method": method,
+        }
+        run.write("eval", row, extra=None, episode=e.episode, **counters)
+    scores = summarize(episodes)
+    logger.info(
+        "%s: %s env steps, %s updates, return %.1f ± %.1f over %d episodes",
+        task, f"{counters['env_steps']:,}", f"{counters['updates']:,}", scores["mean"], scores["std"], len(episodes),
+    )  # fmt: skip

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data.tensor_specs import Composite
-from torchrl.envs.transforms import Transform
 
-from crptpro.transforms.keys import as_key_list
-from crptpro.transforms.root_keys import KeyPair, OnRootKeys
+from crptpro.transforms.base import PixelTransform
 
 CHANNELS = 3
 
@@ -38,15 +34,15 @@ def swap_colors(pixels: Tensor) -> Tensor:
     return pixels.unflatten(-3, (-1, CHANNELS)).flip(-3).flatten(-4, -3)
 
 
-class ColorSwap(OnRootKeys, Transform):
+class ColorSwap(PixelTransform):
     """Reverses the channel order of whole images: the simplest reading of the paper's unseen colours.
 
     Everything changes its colour with it, the robot too; ``make_env(..., colors="reversed_background")`` changes the
     background alone. Works on RGB frames and on stacks of them, in environments and on replay batches.
 
     Args:
-        in_keys: Images ``[*, 3 k, H, W]``; ``pixels`` and ``("next", "pixels")`` if None.
-        out_keys: Where they go; in place if None.
+        in_keys: images ``[*, 3 k, H, W]``; ``pixels`` and ``("next", "pixels")`` if None.
+        out_keys: where they go; in place if None.
 
     Raises:
         ValueError: ``out_keys`` that do not pair with ``in_keys``.
@@ -57,35 +53,7 @@ class ColorSwap(OnRootKeys, Transform):
         in_keys: NestedKey | Sequence[NestedKey] | None = None,
         out_keys: NestedKey | Sequence[NestedKey] | None = None,
     ) -> None:
-        read = ["pixels", ("next", "pixels")] if in_keys is None else as_key_list(in_keys)
-        written = read if out_keys is None else as_key_list(out_keys)
-        if len(read) != len(written):
-            raise ValueError(f"in_keys {read} and out_keys {written} must pair up.")
-        super().__init__(in_keys=read, out_keys=written)
-        self._pairs: list[KeyPair] = list(zip(read, written))
-        self._may_lack = in_keys is None
+        super().__init__(in_keys, out_keys)
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Swap the keys of a batch; of the default ones, those that it has.
-
-        Raises:
-            KeyError: a named key is missing.
-        """
-        held = tensordict.keys(True)
-        pairs = [pair for pair in self._pairs if pair[0] in held]
-        if not self._may_lack and len(pairs) < len(self._pairs):
-            lacking = [read for read, _ in self._pairs if read not in held]
-            raise KeyError(f"ColorSwap found no {lacking[0]!r} among {list(tensordict.keys(True, True))}.")
-        return self._apply_to(tensordict, pairs)
-
-    def _apply_to(self, tensordict: TensorDictBase, pairs: list[KeyPair]) -> TensorDictBase:
-        for read, written in pairs:
-            tensordict.set(written, swap_colors(tensordict.get(read)))
-        return tensordict
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Register what is written, images of the same form."""
-        observation_spec = observation_spec.clone()
-        for read, written in self._root_pairs():
-            observation_spec[written] = observation_spec[read].clone()
-        return observation_spec
+    def _apply_transform(self, obs: Tensor) -> Tensor:
+        return swap_colors(obs)

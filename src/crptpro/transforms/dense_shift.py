@@ -10,17 +10,53 @@ https://arxiv.org/abs/1312.6229). For the default encoder (84x84, strides 2, 1, 
 
 from __future__ import annotations
 
+import logging
 import math
+import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import torch
 import torch.nn.functional as F
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.data.tensor_specs import TensorSpec
+from torchrl.envs.transforms import Transform
 
-from crptpro.host_memory import as_numpy_bits, empty_batch
 from crptpro.modules import PixelEncoder
-from crptpro.modules.chunks import split_among_threads
-from crptpro.transforms.random_shift import check_offsets
+from crptpro.modules.precision import device_of
+from crptpro.transforms.base import as_key_list
+from crptpro.transforms.free_memory import free_bytes
+from crptpro.transforms.random_shift import as_numpy_bits, check_offsets, draw_offsets
+from crptpro.values import as_int
+
+if TYPE_CHECKING:
+    from typing import Self
+
+FeatureMode = Literal["auto", "dense", "reencode"]
+
+MEMORY_SHARE = 0.8
+"""What dense maps may take of the memory that is free; the rest is for networks, batches and the page cache."""
+
+WORTH_SAYING = 500
+"""Observations to encode at once, which takes a while."""
+
+logger = logging.getLogger(__name__)
+
+
+class ReplayOfObservations(Protocol):
+    """What is asked of a replay: a :class:`~crptpro.data.FrameReplay` has it."""
+
+    @property
+    def window(self) -> int:
+        """Observations that it can hold at once; those that it holds have numbers that differ modulo this."""
+        ...
+
+    def observations(self, numbers: Tensor) -> Tensor:
+        """Return observations by number, uint8 ``[B, C, H, W]``."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -58,14 +94,14 @@ def dense_shift_geometry(encoder: nn.Module, pad: int = 4) -> DenseShiftGeometry
     """
     if not isinstance(encoder, PixelEncoder):
         raise ValueError(
-            f"dense-shift features need an un-padded convolutional PixelEncoder, "
-            f"got {type(encoder).__name__}; use mode 'reencode'."
+            f"dense-shift features need an un-padded convolutional PixelEncoder, got {type(encoder).__name__}; "
+            "encode shifted images instead."
         )
     stride = math.prod(encoder.strides)
     if stride > 2 * pad + 1:
         raise ValueError(
             f"the encoder's total stride {stride} exceeds the {2 * pad + 1} shifts per axis of pad {pad}; "
-            f"use mode 'reencode'."
+            "encode shifted images instead."
         )
     channels, height, width = encoder.feature_map_shape
     extra = 2 * pad // stride
@@ -85,13 +121,13 @@ def dense_shift_maps(
 
     Args:
         encoder: see :func:`dense_shift_geometry`.
-        pixels: ``[B, in_channels, image_size, image_size]``, uint8 or floating, values 0..255.
+        pixels: ``[B, in_channels, image_size, image_size]``, as the encoder takes them.
         pad: largest shift in pixels.
         dtype: of the result; the encoder's compute dtype by default.
 
     Returns:
-        ``[B, phases**2, C, m, m]`` contiguous, phases ordered (row, column); without gradient. For the
-        default encoder ``[B, 4, 32, 39, 39]``.
+        ``[B, phases**2, C, m, m]`` contiguous, phases ordered (row, column); not standardised; without gradient.
+        ``[B, 4, 32, 39, 39]`` for the default encoder.
 
     Raises:
         ValueError: an encoder that is not of this form, or pixels of another shape.
@@ -116,49 +152,31 @@ def dense_shift_maps(
     return maps.to(dtype=maps.dtype if dtype is None else dtype, memory_format=torch.contiguous_format)
 
 
-def crop_features(maps: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
-    """Read the features of one shift per image from its dense maps.
-
-    Equal to ``encoder(random_shift(pixels, offsets, pad=pad))``: bit for bit in float32 where the
-    convolution adds up each output in an order that does not depend on the image size (oneDNN on x86 does),
-    otherwise to the rounding of the convolution (about 1e-6 of the largest feature).
-
-    Args:
-        maps: ``[B, phases**2, C, m, m]`` of :func:`dense_shift_maps`.
-        offsets: int64 ``[B, 2]``, (row, column) in ``{0, ..., 2 * pad}``.
-        pad: as given to :func:`dense_shift_maps`.
-
-    Returns:
-        ``[B, feature_dim]`` in the (C, H, W) order of :class:`~crptpro.modules.PixelEncoder`.
-
-    Raises:
-        ValueError: an offset outside the range (read on the CPU only).
-    """
-    return crop_rows(maps, torch.arange(maps.shape[0], device=maps.device), offsets, pad=pad)
-
-
 @torch.no_grad()
-def crop_rows(
+def crop_features(
     maps: Tensor,
-    rows: Tensor,
     offsets: Tensor,
     *,
     pad: int = 4,
+    rows: Tensor | None = None,
     out: Tensor | None = None,
     dtype: torch.dtype | None = None,
 ) -> Tensor:
-    """Crop row ``rows[i]`` of a store of maps at ``offsets[i]``.
+    """Read the features of one shift per image from its dense maps.
+
+    Equal to ``encoder(random_shift(pixels, offsets, pad=pad))``, not standardised: bit for bit in float32 where the
+    convolution adds up each output in an order that does not depend on the image size (oneDNN on x86 does),
+    otherwise to the rounding of the convolution (about 1e-6 of the largest feature).
 
     On a CPU each crop is one slice copy; elsewhere it is one indexing kernel on an overlapping view of the
-    store, without host synchronisation.
+    maps, without host synchronisation.
 
     Args:
-        maps: contiguous ``[N, phases**2, C, m, m]``.
-        rows: int64 ``[B]``.
+        maps: contiguous ``[N, phases**2, C, m, m]`` of :func:`dense_shift_maps`.
         offsets: int64 ``[B, 2]``, (row, column) in ``{0, ..., 2 * pad}``.
         pad: as given to :func:`dense_shift_maps`.
-        out: contiguous ``[B, feature_dim]`` of ``dtype`` to write into. Reusing one halves the time on a CPU, where
-            the rest goes into mapping fresh memory.
+        rows: int64 ``[B]``, of the maps; all in turn if None.
+        out: contiguous ``[B, feature_dim]`` of ``dtype`` to write into; reusing one takes a third off on a CPU.
         dtype: of the crops: that of the maps when None, or float32 of bfloat16 maps.
 
     Returns:
@@ -168,7 +186,8 @@ def crop_rows(
         ValueError: shapes or formats that do not fit, or an offset outside the range (read on the CPU only).
     """
     dtype = maps.dtype if dtype is None else dtype
-    require_readable(maps.dtype, dtype)
+    _require_readable(maps.dtype, dtype)
+    rows = torch.arange(maps.shape[0], device=maps.device) if rows is None else rows
     batch, channels = rows.shape[0], maps.shape[2]
     if offsets.shape != (batch, 2):
         raise ValueError(f"expected offsets of shape [{batch}, 2], got {tuple(offsets.shape)}.")
@@ -184,22 +203,17 @@ def crop_rows(
         return crops.to(dtype) if out is None else out.copy_(crops)
     # Channels first although channels last would copy in longer runs: the features must come in (C, H, W)
     # order, and turning a batch around costs three times the whole copy.
-    crops = empty_batch(shape, dtype) if out is None else out
+    crops = torch.empty(shape, dtype=dtype) if out is None else out
     source = as_numpy_bits(maps)
     widens = dtype != maps.dtype
     target = crops.view(torch.int32).numpy() if widens else as_numpy_bits(crops)
     target = target.reshape(batch, channels, height, width)
-    where = list(zip(rows.tolist(), offsets.tolist()))
-
-    def crop_part(part: slice) -> None:
-        for crop, (row, (dy, dx)) in zip(target[part], where[part]):
-            top, left = dy // phases, dx // phases
-            phase = dy % phases * phases + dx % phases
-            crop[:] = source[row, phase, :, top : top + height, left : left + width]
-            if widens:
-                crop <<= 16  # the bits of a bfloat16 are the upper half of the same number's in float32
-
-    split_among_threads(crop_part, batch)
+    for crop, row, (dy, dx) in zip(target, rows.tolist(), offsets.tolist()):
+        top, left = dy // phases, dx // phases
+        phase = dy % phases * phases + dx % phases
+        crop[:] = source[row, phase, :, top : top + height, left : left + width]
+        if widens:
+            crop <<= 16  # the bits of a bfloat16 are the upper half of the same number's in float32
     return crops
 
 
@@ -219,11 +233,311 @@ def _crop_by_index(
     return every_crop[rows, phase, origin[:, 0], origin[:, 1]].flatten(1)
 
 
-def require_readable(maps: torch.dtype, features: torch.dtype) -> None:
-    """Refuse to read maps of one format as features of another, except bfloat16 as float32.
-
-    Raises:
-        ValueError: naming both.
-    """
+def _require_readable(maps: torch.dtype, features: torch.dtype) -> None:
     if features != maps and (maps, features) != (torch.bfloat16, torch.float32):
         raise ValueError(f"maps in {maps} are read as {maps}, or bfloat16 as float32; got {features}.")
+
+
+class DenseShiftFeatures(Transform):
+    """Write a frozen encoder's features of randomly shifted observations into a replay batch.
+
+    Attached to a :class:`~crptpro.data.FrameReplay` it does what ``RandomShift`` and ``FrozenEncoder`` would, with the
+    same shifts from the same generator and the same bits, but encodes each observation once: the first time that it is
+    sampled. Its dense maps are kept under the number of the observation, until the replay has overwritten it. They are
+    derived: no state dictionary, copy or pickle holds them, and after a resumption they are encoded again where they
+    are needed. Where the replay's numbers go back (``load_state_dict`` on the one in use), call :meth:`forget`.
+
+    The features of a call are valid until the next call in the same thread, which writes into the same memory: that
+    takes a third off. Threads may sample side by side.
+
+    For replay batches; on an environment use :class:`~crptpro.transforms.FrozenEncoder`.
+
+    Args:
+        encoder: frozen, see :func:`dense_shift_geometry`; its weights must not change from now on.
+        replay: where observations are fetched by number.
+        pad: largest shift in pixels.
+        projector: with one, its output for all ``(2 * pad + 1)**2`` shifts of an observation is kept too (float32), and
+            ``embedding_key`` is written.
+        dtype: of the kept maps; the encoder's compute dtype when None. bfloat16 halves the memory and rounds each
+            feature to eight significant bits (exact if the encoder computes in bfloat16).
+        generator: source of the offsets; torch's global generator when None. Not part of the state dict.
+        observations: maps to keep; what the replay can hold when None. Fewer will do for a run that stores fewer.
+        in_keys: int64 ``[*]`` or ``[*, 1]``, numbers of observations.
+        out_keys: features ``[*, feature_dim]`` in the encoder's compute dtype, one key per observation.
+        embedding_key: with a projector, projections ``[*, D]`` of the observation of the last in key.
+
+    Attributes:
+        nbytes: memory when full; taken as observations arrive (on GPUs at the first call).
+
+    Raises:
+        ValueError: an encoder that has no dense maps, key lists of unequal length, or features in a format that maps
+            are not read in.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> class Frames:
+        ...     window = 4
+        ...     def observations(self, numbers):
+        ...         return torch.zeros(len(numbers), 3, 16, 16, dtype=torch.uint8)
+        >>> encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=16)
+        >>> features = DenseShiftFeatures(encoder, Frames(), in_keys=["number"], out_keys=["features"])
+        >>> features(TensorDict({"number": torch.tensor([5, 6])}, [2]))["features"].shape
+        torch.Size([2, 100])
+    """
+
+    encoder: PixelEncoder
+    projector: nn.Module | None
+
+    def __init__(
+        self,
+        encoder: PixelEncoder,
+        replay: ReplayOfObservations,
+        *,
+        pad: int = 4,
+        projector: nn.Module | None = None,
+        dtype: torch.dtype | None = None,
+        generator: torch.Generator | None = None,
+        observations: int | None = None,
+        in_keys: NestedKey | Sequence[NestedKey] = ("number", ("next", "number")),
+        out_keys: NestedKey | Sequence[NestedKey] = ("features", ("next", "features")),
+        embedding_key: NestedKey = ("next", "embedding"),
+    ) -> None:
+        read, written = as_key_list(in_keys), as_key_list(out_keys)
+        if len(read) != len(written):
+            raise ValueError(f"in_keys {read} and out_keys {written} must pair up.")
+        super().__init__(in_keys=read, out_keys=written)
+        self.pad = as_int(pad, "pad", minimum=0)
+        self.geometry = dense_shift_geometry(encoder, self.pad)
+        self.dtype = encoder.compute_dtype if dtype is None else dtype
+        _require_readable(self.dtype, encoder.compute_dtype)
+        # Hidden from nn.Module: the networks are somebody else's, and no part of a replay's state.
+        self.__dict__["encoder"] = encoder
+        self.__dict__["projector"] = projector
+        self.replay = replay
+        slots = replay.window if observations is None else observations
+        self.observations = as_int(slots, "observations", minimum=1)
+        self.generator = generator
+        self.embedding_key = embedding_key
+        self._latent_dim = None if projector is None else self._latents_of(encoder, projector)
+        self.nbytes = dense_maps_bytes(
+            encoder, self.observations, self.dtype, pad=self.pad, latent_dim=self._latent_dim
+        )
+        logger.info(
+            "Dense maps: %.2f GiB on %s when full (%d observations, %s).",
+            self.nbytes / 2**30, device_of(encoder), self.observations, str(self.dtype).removeprefix("torch."),
+        )  # fmt: skip
+        self.forget()
+
+    def forget(self) -> None:
+        """Drop all maps, and give their memory back."""
+        self._lock = threading.Lock()
+        self._outputs = threading.local()
+        self._held = torch.full((self.observations,), -1, dtype=torch.int64)
+        self._maps: Tensor | None = None
+        self._embeddings: Tensor | None = None
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Add features, and projections with a projector, to a sampled batch.
+
+        Raises:
+            KeyError: an in key is missing.
+            ValueError: ``observations`` is smaller than what the replay holds.
+        """
+        # The lock is held until the crops are read: another thread might need the same place for a newer observation.
+        with self._lock:
+            return self._write_features(tensordict)
+
+    def _write_features(self, tensordict: TensorDictBase) -> TensorDictBase:
+        numbers = [self._numbers(tensordict, key) for key in self.in_keys]
+        self._encode_missing(torch.cat([flat for flat, _ in numbers]))
+        assert self._maps is not None
+        for (flat, lead), out_key in zip(numbers, self.out_keys):
+            offsets = draw_offsets(flat.shape[0], self.pad, self.generator)
+            rows = flat % self.observations
+            features = crop_features(
+                self._maps, offsets, pad=self.pad, rows=rows, out=self._output(out_key, len(flat)),
+                dtype=self.encoder.compute_dtype,
+            )  # fmt: skip
+            features = self.encoder.standardised(features)
+            tensordict.set(out_key, features.reshape(*lead, -1))
+        if self._embeddings is not None:
+            shifts = offsets[:, 0] * (2 * self.pad + 1) + offsets[:, 1]
+            device = self._embeddings.device
+            embeddings = self._embeddings[rows.to(device), shifts.to(device)]
+            tensordict.set(self.embedding_key, embeddings.reshape(*lead, -1))
+        return tensordict
+
+    def _numbers(self, tensordict: TensorDictBase, key: NestedKey) -> tuple[Tensor, torch.Size]:
+        value = tensordict.get(key, None)
+        if value is None:
+            present = list(tensordict.keys(True, True))
+            raise KeyError(f"DenseShiftFeatures found no {key!r} among {present}; set in_keys.")
+        # Replay buffers store a scalar per row as [*] or as [*, 1].
+        value = value.squeeze(-1) if value.ndim == tensordict.batch_dims + 1 else value
+        return value.reshape(-1).cpu(), value.shape
+
+    def _encode_missing(self, numbers: Tensor) -> None:
+        if self._maps is None:
+            self._allocate()
+        missing = numbers[self._held[numbers % self.observations] != numbers].unique()
+        if len(missing) >= WORTH_SAYING:
+            logger.info("Dense maps: encoding %d observations", len(missing))
+        for number in missing.tolist():
+            # One by one: a convolution may round differently in a batch, and then a resumed run would, too.
+            pixels = self.replay.observations(torch.tensor([number])).to(device_of(self.encoder))
+            maps = dense_shift_maps(self.encoder, pixels, pad=self.pad, dtype=self.dtype)
+            slot = number % self.observations
+            assert self._maps is not None
+            self._maps[slot] = maps[0]
+            if self._embeddings is not None:
+                self._embeddings[slot] = self._embed_all_shifts(maps)
+            self._held[slot] = number
+        if len(missing) and not torch.equal(self._held[numbers % self.observations], numbers):
+            raise ValueError(
+                f"`observations` is {self.observations}, fewer than the replay holds: two observations of one batch "
+                "need the same place. Leave it out, or keep as many as the replay."
+            )
+
+    def _embed_all_shifts(self, maps: Tensor) -> Tensor:
+        side = torch.arange(2 * self.pad + 1)
+        offsets = torch.cartesian_prod(side, side)
+        rows = torch.zeros(len(offsets), dtype=torch.int64)
+        features = crop_features(maps, offsets, pad=self.pad, rows=rows, dtype=self.encoder.compute_dtype)
+        assert self.projector is not None
+        return self.projector(self.encoder.standardised(features)).float()
+
+    def _allocate(self) -> None:
+        device = device_of(self.encoder)
+        shape = (self.observations, *self.geometry.maps_shape)
+        self._maps = torch.empty(shape, dtype=self.dtype, device=device)
+        if self._latent_dim is not None:
+            shifts = (2 * self.pad + 1) ** 2
+            self._embeddings = torch.empty(self.observations, shifts, self._latent_dim, device=device)
+
+    def _output(self, key: NestedKey, count: int) -> Tensor:
+        """Memory of this thread's features under a key, the same in every call of as many rows."""
+        kept: dict[NestedKey, Tensor] = self._outputs.__dict__
+        out = kept.get(str(key))
+        if out is None or len(out) != count:
+            assert self._maps is not None
+            shape = (count, self.geometry.feature_dim)
+            out = torch.empty(shape, dtype=self.encoder.compute_dtype, device=self._maps.device)
+            kept[str(key)] = out
+        return out
+
+    @staticmethod
+    @torch.no_grad()
+    def _latents_of(encoder: PixelEncoder, projector: nn.Module) -> int:
+        return int(projector(torch.zeros(1, encoder.feature_dim, device=device_of(encoder))).shape[-1])
+
+    def clone(self) -> Self:
+        """Return a transform without parent and maps; replay, networks and generator are shared."""
+        copy = super().clone()
+        copy.forget()
+        return copy
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what is derived."""
+        derived = ("_lock", "_outputs", "_held", "_maps", "_embeddings")
+        return {key: value for key, value in super().__getstate__().items() if key not in derived}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore without maps."""
+        super().__setstate__(state)
+        self.forget()
+
+    def _load_from_state_dict(self, *args: Any) -> None:
+        self.forget()  # whoever loads a state may number observations anew
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        raise NotImplementedError(_REPLAY_ONLY)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        raise NotImplementedError(_REPLAY_ONLY)
+
+    def transform_output_spec(self, output_spec: TensorSpec) -> TensorSpec:
+        """Refuse to be part of an environment.
+
+        Raises:
+            NotImplementedError: always.
+        """
+        raise NotImplementedError(_REPLAY_ONLY)
+
+
+_REPLAY_ONLY = "DenseShiftFeatures reads a replay batch; on an environment use FrozenEncoder."
+
+
+def choose_feature_mode(
+    mode: FeatureMode,
+    encoder: nn.Module,
+    observations: int,
+    dtype: torch.dtype = torch.float32,
+    available_bytes: int | None = None,
+    *,
+    pad: int = 4,
+    latent_dim: int | None = None,
+    device: torch.device | str = "cpu",
+) -> tuple[Literal["dense", "reencode"], str]:
+    """Decide between dense maps and encoding shifted images anew; both give the same features.
+
+    Args:
+        mode: ``"auto"`` takes dense maps where the encoder has the form and the memory suffices; the other
+            two are obeyed.
+        encoder: the frozen encoder.
+        observations: to hold maps of.
+        dtype: of the stored maps.
+        available_bytes: free memory, of which the maps may take four fifths; measured when None (on a CPU
+            within the limits of the container or batch job).
+        pad: largest shift in pixels.
+        latent_dim: length of the projections if they are to be kept too.
+        device: whose memory is measured.
+
+    Returns:
+        The mode, and the reason in one line, to be shown to the user.
+
+    Raises:
+        ValueError: ``"dense"`` for an encoder that is not of the form, or an unknown mode.
+    """
+    if mode == "reencode":
+        return "reencode", "re-encoding at every update, as asked"
+    if mode not in ("auto", "dense"):
+        raise ValueError(f"mode must be 'auto', 'dense' or 'reencode', got {mode!r}.")
+    try:
+        needed = dense_maps_bytes(encoder, observations, dtype, pad=pad, latent_dim=latent_dim)
+    except ValueError as error:
+        if mode == "dense":
+            raise
+        return "reencode", f"re-encoding at every update: {error}"
+    available = free_bytes(torch.device(device)) if available_bytes is None else available_bytes
+    size = f"{needed / 2**30:.1f} GiB for {observations} observations, {available / 2**30:.1f} GiB free"
+    if mode == "dense":
+        if needed > available:
+            logger.warning("The dense-shift cache was asked for and may not fit: %s.", size)
+        return "dense", f"dense-shift cache, as asked ({size})"
+    if needed > MEMORY_SHARE * available:
+        in_bf16 = dense_maps_bytes(encoder, observations, torch.bfloat16, pad=pad, latent_dim=latent_dim)
+        fits = in_bf16 <= MEMORY_SHARE * available
+        remedy = f"; in bf16, by dense_precision, it would fit with {in_bf16 / 2**30:.1f} GiB" if fits else ""
+        return (
+            "reencode",
+            f"re-encoding at every update: too little memory for the dense-shift cache ({size}{remedy})",
+        )
+    return "dense", f"dense-shift cache ({size})"
+
+
+def dense_maps_bytes(
+    encoder: nn.Module,
+    observations: int,
+    dtype: torch.dtype,
+    *,
+    pad: int = 4,
+    latent_dim: int | None = None,
+) -> int:
+    """Return the memory of dense maps in bytes; see :func:`choose_feature_mode`.
+
+    Raises:
+        ValueError: an encoder that is not of the form.
+    """
+    values = dense_shift_geometry(encoder, pad).values
+    return observations * (values * dtype.itemsize + (latent_dim or 0) * 4 * (2 * pad + 1) ** 2)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
@@ -14,7 +13,8 @@ from torch import Tensor, nn
 
 from crptpro.modules.heads import latent_dim_of
 from crptpro.objectives.functional import knn_distance
-from crptpro.transforms.intrinsic_reward import IntrinsicReward
+from crptpro.transforms.base import IntrinsicReward
+from crptpro.values import as_int
 
 logger = logging.getLogger(__name__)
 
@@ -27,99 +27,79 @@ class PrototypeReward(IntrinsicReward):
     With :math:`z_i` the l2-normalised projections of a batch of next observations and :math:`c_j` the
     l2-normalised prototypes, each call
 
-    1. draws one candidate per prototype,
-       :math:`i_j \sim \mathrm{Categorical}_i(\mathrm{softmax}_i(c_j \cdot z_i / T))`;
+    1. draws one candidate per prototype, :math:`i_j \sim \mathrm{Categorical}_i(\mathrm{softmax}_i(c_j \cdot z_i))`;
     2. puts the M vectors :math:`z_{i_j}` into the first-in-first-out queue Q;
     3. then takes :math:`\hat r_i = \lVert z_i - \mathrm{NN}_k(z_i; Q) \rVert_2`, in [0, 2].
 
     As in the released agent (liuxin0824/CRPTpro ``proto.py``), copies of a sample that were just drawn
     count as neighbours, so a sample drawn k times or more gets exactly 0 (about 8 % of a batch of 512 with
-    512 prototypes and k = 3), and rows of the queue not yet filled are zero vectors at distance 1.
+    512 prototypes and k = 3), and rows of the queue not yet filled are zero vectors at distance 1. A row that is not
+    finite is never drawn.
 
     Works on replay batches (``forward``, keys under ``"next"``) and on environments. The candidates come
     from the batch at hand: on a single environment that is one sample, which fills the queue with itself
-    and earns 0 unless ``knn_exclude_self``; use replay batches or many environments. Never put it on
-    evaluation environments. Sampling leaves stored rewards as they are; see :meth:`forward` for the one way
-    of reading a buffer that does not. Nothing depends on training mode.
+    and earns 0; use replay batches or many environments. Never put it on evaluation environments. Nothing depends on
+    training mode.
 
     Deviation: the released pre-training fills Q on the way and hands it over; here Q starts from zeros unless
     ``queue`` is given.
 
     Args:
         projector: maps features to the latent space, frozen; None if ``in_keys`` already names projections.
-        prototypes: M prototypes, a :class:`~crptpro.modules.Prototypes` or a tensor ``[M, D]``, any row
-            length.
-        intrinsic_reward_coef: :math:`\beta`.
+        prototypes: :class:`~crptpro.modules.Prototypes`, rows of any length.
+        coef: :math:`\beta`; None writes :math:`\hat r` only.
         knn_k: k, counted with copies of the sample itself.
         queue_size: length of Q, a multiple of M.
-        candidate_temperature: T. 1 is close to uniform, because cosines lie in [-1, 1].
-        knn_exclude_self: ignore entries that this very call copied from the sample.
-        reward_norm: ``"rms"`` divides :math:`\hat r` by the root of the running mean of its square (all
-            calls so far, this one included). Deviation: neither the paper nor the released code normalises;
-            None does not.
         in_keys: one key, features ``[*, feature_dim]`` (or projections ``[*, D]``) of the next observation.
         out_keys: one key for :math:`\hat r`, of the reward's shape.
-        reward_key: :math:`r_\mathrm{ext}`, ``[*, 1]``; None writes :math:`\hat r` only.
-        out_reward_key: where :math:`r_\mathrm{ext} + \beta \hat r` goes; ``reward_key`` when None.
-        queue: ``[queue_size, D]`` to start from, such as a checkpoint's; zeros when None.
-        queue_pointer: row of ``queue`` that is overwritten first.
+        reward_key: :math:`r_\mathrm{ext}`, ``[*, 1]``, which the sum replaces.
+        queue: ``[queue_size, D]`` to start from, such as a checkpoint's, the row that is overwritten first in front;
+            zeros when None.
         generator: source of the draws; the global generator of the device when None. Not part of the state
             dict.
 
-    Keys name entries of an environment's step; in replay batches they are read and written under
-    ``"next"``. A leading ``"next"`` in a key is therefore ignored.
+    In an environment's step the entries are those without the leading ``"next"``.
 
     Raises:
-        ValueError: a queue size that is no multiple of M, a queue of another shape, more than one key,
-            non-positive ``knn_k`` or ``candidate_temperature``, an unknown ``reward_norm``, or a projector
-            whose outputs are not as long as the prototypes.
+        ValueError: a queue size that is no multiple of M, a queue of another shape, more than one key, a ``knn_k``
+            that does not lie in 1 to ``queue_size``, or a projector whose outputs are not as long as the prototypes.
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> bonus = PrototypeReward(None, torch.eye(4), queue_size=8)  # features that are projections already
+        >>> from crptpro.modules import Prototypes
+        >>> bonus = PrototypeReward(None, Prototypes(4, 4), queue_size=8)  # features that are projections already
         >>> after = {"features": torch.randn(5, 4), "reward": torch.zeros(5, 1)}
         >>> batch = bonus(TensorDict({"next": after}, [5]))
         >>> torch.equal(batch["next", "reward"], 0.2 * batch["next", "intrinsic_reward"])
         True
     """
 
-    own_state: ClassVar[tuple[str, ...]] = ("queue", "queue_pointer", "reward_square_sum", "reward_count")
+    projector: nn.Module | None
+    prototypes: nn.Module
     queue: Tensor
     queue_pointer: Tensor
-    reward_square_sum: Tensor
-    reward_count: Tensor
 
     def __init__(
         self,
         projector: nn.Module | None,
-        prototypes: nn.Module | Tensor,
+        prototypes: nn.Module,
         *,
-        intrinsic_reward_coef: float = 0.2,
+        coef: float | None = 0.2,
         knn_k: int = 3,
         queue_size: int = 2048,
-        candidate_temperature: float = 1.0,
-        knn_exclude_self: bool = False,
-        reward_norm: Literal["rms"] | None = None,
-        in_keys: NestedKey | Sequence[NestedKey] = "features",
-        out_keys: NestedKey | Sequence[NestedKey] = "intrinsic_reward",
-        reward_key: NestedKey | None = "reward",
-        out_reward_key: NestedKey | None = None,
+        in_keys: NestedKey | Sequence[NestedKey] = ("next", "features"),
+        out_keys: NestedKey | Sequence[NestedKey] = ("next", "intrinsic_reward"),
+        reward_key: NestedKey = ("next", "reward"),
         queue: Tensor | None = None,
-        queue_pointer: int = 0,
         generator: torch.Generator | None = None,
     ) -> None:
-        if reward_norm not in (None, "rms"):
-            raise ValueError(f"reward_norm must be None or 'rms', got {reward_norm!r}.")
-        if candidate_temperature <= 0:
-            raise ValueError(f"candidate_temperature must be positive, got {candidate_temperature}.")
-        weight = prototypes if isinstance(prototypes, Tensor) else prototypes.get_parameter("weight")
+        weight = prototypes.get_parameter("weight")
         num_prototypes, latent_dim = weight.shape
-        if queue_size < 1 or queue_size % num_prototypes:
+        queue_size = as_int(queue_size, "queue_size", minimum=1)
+        if queue_size % num_prototypes:
             raise ValueError(
                 f"queue_size must be a multiple of num_prototypes, got {queue_size} and {num_prototypes}."
             )
-        if not 1 <= knn_k <= queue_size:
-            raise ValueError(f"knn_k must lie in 1..queue_size, got {knn_k} with queue_size {queue_size}.")
         if queue is not None and queue.shape != (queue_size, latent_dim):
             raise ValueError(
                 f"expected a queue of shape {(queue_size, latent_dim)}, got {tuple(queue.shape)}."
@@ -128,30 +108,20 @@ class PrototypeReward(IntrinsicReward):
         if told is not None:
             _check_latents(told, latent_dim)
         super().__init__(
-            intrinsic_reward_coef=intrinsic_reward_coef,
+            {"projector": projector, "prototypes": prototypes},
+            coef=coef,
             in_keys=in_keys,
             out_keys=out_keys,
             reward_key=reward_key,
-            out_reward_key=out_reward_key,
         )
-        self.projector = projector
-        if isinstance(prototypes, Tensor):
-            self.register_buffer("prototypes", prototypes.detach().clone())
-        else:
-            self.prototypes = prototypes
-        self.knn_k = knn_k
-        self.candidate_temperature = candidate_temperature
-        self.knn_exclude_self = knn_exclude_self
-        self.reward_norm = reward_norm
+        self.knn_k = as_int(knn_k, "knn_k", minimum=1, maximum=queue_size)
         self.generator = generator
-        start = torch.zeros(queue_size, latent_dim, device=weight.device) if queue is None else queue
+        start = torch.zeros(queue_size, latent_dim) if queue is None else queue
         self.register_buffer("queue", start.detach().to(weight.device, torch.float32, copy=True))
-        self.register_buffer("queue_pointer", torch.tensor(queue_pointer % queue_size, device=weight.device))
-        self.register_buffer("reward_square_sum", torch.zeros((), dtype=torch.float64, device=weight.device))
-        self.register_buffer("reward_count", torch.zeros((), dtype=torch.int64, device=weight.device))
+        self.register_buffer("queue_pointer", torch.tensor(0, device=weight.device))
 
     def reset_queue(self) -> None:
-        """Empty the queue: all rows zero, pointer at the first. The running statistics of ``"rms"`` stay."""
+        """Empty the queue: all rows zero, pointer at the first."""
         self.queue.zero_()
         self.queue_pointer.zero_()
 
@@ -171,36 +141,15 @@ class PrototypeReward(IntrinsicReward):
         latents = features if self.projector is None else self.projector(features)
         _check_latents(latents.shape[-1], self.queue.shape[-1])
         latents = F.normalize(latents.float(), dim=-1)
-        prototypes = self.prototypes
-        weight = prototypes if isinstance(prototypes, Tensor) else prototypes.get_parameter("weight")
-        scores = F.normalize(weight.float(), dim=-1) @ latents.T
-        candidates = draw_candidates(scores / self.candidate_temperature, self.generator)
+        weight = self.prototypes.get_parameter("weight")
+        candidates = draw_candidates(F.normalize(weight.float(), dim=-1) @ latents.T, self.generator)
         count = candidates.shape[0]
         rows = (self.queue_pointer + torch.arange(count, device=latents.device)) % self.queue.shape[0]
         self.queue.index_copy_(0, rows, latents[candidates])
         self.queue_pointer.add_(count).remainder_(self.queue.shape[0])
-        if self.knn_exclude_self:
-            reward = self._distance_to_others(latents, rows, candidates)
-        else:
-            reward = knn_distance(latents, self.queue, k=self.knn_k)
-        if self.reward_norm == "rms":
-            self.reward_square_sum.add_(reward.double().square().sum())
-            self.reward_count.add_(reward.numel())
-            mean_square = self.reward_square_sum / self.reward_count
-            reward = reward / mean_square.sqrt().clamp_min(1e-8).to(reward.dtype)
-        return reward
+        return knn_distance(latents, self.queue, k=self.knn_k)
 
-    def _distance_to_others(self, latents: Tensor, rows: Tensor, candidates: Tensor) -> Tensor:
-        distances = torch.cdist(latents, self.queue)
-        # Copies of a sample made by this call are infinitely far from it.
-        distances[candidates, rows] = torch.inf
-        nearest = distances.topk(self.knn_k, dim=-1, largest=False)
-        # The matrix product in cdist cannot resolve small distances: take this one again from the difference.
-        kth = (latents - self.queue[nearest.indices[:, -1]]).norm(dim=-1)
-        # Too few other entries (tiny batches in a tiny queue): no estimate, no bonus.
-        return torch.where(nearest.values[:, -1].isinf(), torch.zeros_like(kth), kth)
-
-    def _bonus(self, features: Tensor, root: TensorDictBase) -> Tensor:
+    def _intrinsic_reward(self, features: Tensor, root: TensorDictBase) -> Tensor:
         return self.intrinsic_reward(features)
 
 
@@ -238,15 +187,18 @@ def draw_candidates(logits: Tensor, generator: torch.Generator | None = None) ->
     By inversion of the cumulative distribution: one uniform number per prototype, no host synchronisation.
 
     Args:
-        logits: ``[M, B]``.
+        logits: ``[M, B]``; samples with NaN are never drawn.
         generator: source of the draws, on any device; the global generator of the logits' device when None.
 
     Returns:
         int64 ``[M]`` in ``{0, ..., B - 1}``.
     """
-    cumulative = logits.softmax(dim=-1).cumsum(dim=-1)
+    cumulative = logits.masked_fill(logits.isnan(), -torch.inf).softmax(dim=-1).cumsum(dim=-1)
     source = logits.device if generator is None else generator.device
     uniform = torch.rand(logits.shape[0], 1, generator=generator, device=source).to(logits.device)
-    drawn = torch.searchsorted(cumulative, uniform * cumulative[:, -1:], right=True)
-    # Rounding may carry a draw just below 1 past the last sample.
+    # Rounding must not carry a draw just below 1 past the last sample that can be drawn.
+    target = torch.minimum(
+        uniform * cumulative[:, -1:], torch.nextafter(cumulative[:, -1:], -uniform.new_ones(()))
+    )
+    drawn = torch.searchsorted(cumulative, target, right=True)
     return drawn.squeeze(-1).clamp_max(logits.shape[1] - 1)

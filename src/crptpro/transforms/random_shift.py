@@ -7,17 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data.tensor_specs import Composite
-from torchrl.envs.transforms import Transform
 
-from crptpro.host_memory import as_numpy_bits, empty_batch
-from crptpro.transforms.keys import as_key_list
-from crptpro.transforms.root_keys import KeyPair, OnRootKeys
-
-DEFAULT_KEYS: list[NestedKey] = ["pixels", ("next", "pixels")]
+from crptpro.transforms.base import PixelTransform
+from crptpro.values import as_int
 
 
 def draw_offsets(
@@ -110,7 +104,7 @@ def shifted_stacks(frames: Tensor, rows: Tensor, offsets: Tensor, *, pad: int = 
         return random_shift(frames[rows].reshape(shape), offsets, pad=pad)
     check_offsets(offsets, pad)
     source = as_numpy_bits(frames)
-    shifted = empty_batch(shape, frames.dtype)
+    shifted = torch.empty(shape, dtype=frames.dtype)
     for view, numbers, offset in zip(as_numpy_bits(shifted), rows.tolist(), (offsets - pad).tolist()):
         first, last = numbers[0], numbers[-1]
         # Where an episode begins, its first frame is repeated, and the frames are picked one by one.
@@ -133,6 +127,12 @@ def check_offsets(offsets: Tensor, pad: int) -> None:
         raise ValueError(f"offsets must lie in 0..{2 * pad} (pad {pad}), got {low}..{high}.")
 
 
+def as_numpy_bits(tensor: Tensor) -> np.ndarray[Any, Any]:
+    """Return a numpy array over the same memory, good for copying but not for arithmetic."""
+    # numpy has no bfloat16; copying never looks at the values, so any type of the same width serves.
+    return (tensor.view(torch.int16) if tensor.dtype == torch.bfloat16 else tensor).numpy()
+
+
 def _shift_by_gather(pixels: Tensor, offsets: Tensor, pad: int) -> Tensor:
     batch, channels, height, width = pixels.shape
     device = pixels.device
@@ -145,7 +145,7 @@ def _shift_by_gather(pixels: Tensor, offsets: Tensor, pad: int) -> Tensor:
 
 
 def _shift_by_slices(pixels: Tensor, offsets: Tensor, pad: int) -> Tensor:
-    shifted = empty_batch(pixels.shape, pixels.dtype)
+    shifted = torch.empty(pixels.shape, dtype=pixels.dtype)
     source, target = as_numpy_bits(pixels.detach()), as_numpy_bits(shifted)
     for image, view, offset in zip(source, target, (offsets - pad).tolist()):
         _copy_shifted(view, image, *offset)
@@ -171,7 +171,7 @@ def _copy_shifted(view: np.ndarray[Any, Any], image: np.ndarray[Any, Any], row: 
         view[:, bottom:] = view[:, bottom - 1 : bottom]
 
 
-class RandomShift(OnRootKeys, Transform):
+class RandomShift(PixelTransform):
     """Shift images at random, for replay buffers (``forward``) and environments.
 
     Every key and every sample draws its own offset; all channels (stacked frames) of a sample share it. The
@@ -207,52 +207,11 @@ class RandomShift(OnRootKeys, Transform):
         out_keys: NestedKey | Sequence[NestedKey] | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
-        keys = DEFAULT_KEYS if in_keys is None else as_key_list(in_keys)
-        super().__init__(in_keys=keys, out_keys=keys if out_keys is None else as_key_list(out_keys))
-        if pad < 0:
-            raise ValueError(f"pad must not be negative, got {pad}.")
-        if len(self.in_keys) != len(self.out_keys):
-            raise ValueError(f"in_keys and out_keys differ in length: {self.in_keys} and {self.out_keys}.")
-        self._pairs = list(zip(self.in_keys, self.out_keys))
-        self.pad = pad
+        super().__init__(in_keys, out_keys)
+        self.pad = as_int(pad, "pad", minimum=0)
         self.generator = generator
-        self._optional = DEFAULT_KEYS[1:] if in_keys is None else []
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Shift every key of a sampled batch.
-
-        As TorchRL's transforms do, this sets new tensors in the very tensordict it is given. A buffer's
-        ``sample()`` and ``buffer[indices]`` hand over a fresh one, so what is stored stays as it is. Only
-        ``buffer[:]`` on a full tensor storage hands over the storage itself, which then holds the shifted
-        images.
-
-        Raises:
-            KeyError: a named key is missing.
-        """
-        return self._apply_to(tensordict, self._pairs)
-
-    def _apply_to(self, tensordict: TensorDictBase, pairs: list[KeyPair]) -> TensorDictBase:
-        for in_key, out_key in pairs:
-            pixels = tensordict.get(in_key, None)
-            if pixels is not None:
-                tensordict.set(out_key, self._apply_transform(pixels))
-            elif in_key not in self._optional and not self.missing_tolerance:
-                raise KeyError(f"RandomShift found no {in_key!r} among {list(tensordict.keys(True, True))}.")
-        return tensordict
 
     def _apply_transform(self, obs: Tensor) -> Tensor:
         images = obs.reshape(-1, *obs.shape[-3:])
         offsets = draw_offsets(images.shape[0], self.pad, self.generator, images.device)
         return random_shift(images, offsets, pad=self.pad).reshape(obs.shape)
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Give every out key the spec of its in key: a shift changes neither shape, dtype nor range.
-
-        Raises:
-            KeyError: the environment has no such observation.
-        """
-        for in_key, out_key in self._root_pairs():
-            if in_key not in observation_spec.keys(True, True):
-                raise KeyError(f"RandomShift found no {in_key!r} in the observations {observation_spec}.")
-            observation_spec[out_key] = observation_spec[in_key].clone()
-        return observation_spec

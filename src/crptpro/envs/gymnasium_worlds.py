@@ -1,0 +1,198 @@
+"""Gymnasium worlds that render RGB as TorchRL environments: ``GymWrapper`` over one step per decision."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+import torch.nn.functional as F
+from gymnasium import spaces
+from torch import Tensor
+from torchrl.envs.libs.gym import GymWrapper
+
+from crptpro.domains import GYMNASIUM_PREFIX
+from crptpro.envs.dm_control import FAST_SHADOW_SIZE, route_mujoco_warnings
+from crptpro.envs.rendering import first_frame_watchdog
+from crptpro.envs.worlds import ActionRange, CheckedWorld, FrameReader, passed_on
+from crptpro.errors import CRPTproError, RenderingError, WorldError
+
+
+class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """A Gymnasium world of which one step is one decision: repeated, summed, scaled, and drawn once.
+
+    Gymnasium's own wrappers for this need OpenCV (``ResizeObservation``), render every repeated step
+    (``AddRenderObservation``), and none repeats an action.
+
+    Args:
+        env: Made with ``render_mode="rgb_array"``.
+        world: Name for messages.
+        image_size: H = W, pixels; images of another size are resized.
+        action_repeat: Gymnasium steps per step, on top of any frame skip of the environment.
+        physics_state: Also observe ``qpos`` and ``qvel``, where it has them.
+        render: ``False`` leaves every image black.
+
+    Raises:
+        CRPTproError: for actions that are not a bounded vector of floats.
+    """
+
+    def __init__(
+        self, env: Any, *, world: str, image_size: int, action_repeat: int, physics_state: bool, render: bool
+    ):
+        super().__init__(env)
+        self.episode_seed: int | None = None
+        self._world, self._image_size, self._action_repeat = world, image_size, action_repeat
+        self._renders, self._read_frame, self._has_drawn = render, FrameReader(world), False
+        action = env.action_space
+        if not isinstance(action, spaces.Box):
+            raise CRPTproError(
+                f"{world} has {type(action).__name__} actions. Only continuous actions are supported (a "
+                "Box); wrap it, and make it known with register_domain."
+            )
+        self._to_actuators = ActionRange(action.low, action.high, action.dtype, world)
+        if self._to_actuators.unbounded:
+            raise CRPTproError(
+                f"{world} has actions without bounds ({action}), which cannot be mapped from [-1, 1]; wrap it with "
+                "gymnasium.wrappers.RescaleAction or ClipAction, and make it known with register_domain."
+            )
+        self.action_space = spaces.Box(-1.0, 1.0, (int(np.prod(action.shape)),), np.float32)
+        self._data: Any = getattr(env.unwrapped, "data", None)
+        shown = spaces.Box(0, 255, (3, image_size, image_size), np.uint8)
+        observed: dict[str, spaces.Space[Any]] = {"pixels": shown}
+        self._emits_state = physics_state and hasattr(self._data, "qpos") and hasattr(self._data, "qvel")
+        for name in ("qpos", "qvel") if self._emits_state else ():
+            observed[name] = spaces.Box(-np.inf, np.inf, getattr(self._data, name).shape, np.float64)
+        self.observation_space = spaces.Dict(observed)
+
+    def reset(self, **_: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start an episode, of ``episode_seed`` if one was set since the last."""
+        self.env.reset(seed=self.episode_seed)
+        self.episode_seed = None
+        return self._observe(), {}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Repeat an action in [-1, 1]; the reward is the sum."""
+        command = self._to_actuators(action)
+        total = 0.0
+        for _ in range(self._action_repeat):
+            try:
+                _, reward, terminated, truncated, _ = self.env.step(command)
+            except ValueError as reason:
+                if "expected 5" not in str(reason):
+                    raise
+                raise WorldError(
+                    f"The world {self._world!r} does not answer step() with Gymnasium's five values (observation, "
+                    f"reward, terminated, truncated, info): {reason}. Worlds of the old API end with `done, info`."
+                ) from reason
+            total += float(reward)
+            if terminated or truncated:
+                break
+        # A time limit that coincides with a real end is a real end.
+        return self._observe(), total, bool(terminated), bool(truncated and not terminated), {}
+
+    def _observe(self) -> dict[str, Any]:
+        size = self._image_size
+        frame = self._draw() if self._renders else torch.zeros(3, size, size, dtype=torch.uint8)
+        observed = {"pixels": frame}
+        if self._emits_state:
+            observed |= {"qpos": torch.tensor(self._data.qpos), "qvel": torch.tensor(self._data.qvel)}
+        return observed
+
+    def _draw(self) -> Tensor:
+        if self._has_drawn:
+            with passed_on(self._world, "render"):
+                image = self.env.render()
+        else:
+            with first_frame_watchdog(), passed_on(self._world, "render"):
+                try:
+                    image = self.env.render()
+                except (ImportError, gymnasium.error.Error) as reason:
+                    raise RenderingError(f"{self._world} does not render: {reason}") from reason
+            self._has_drawn = True
+        return resize(self._read_frame(image), self._image_size)
+
+
+class GymnasiumPixelEnv(CheckedWorld, GymWrapper):
+    """TorchRL's ``GymWrapper`` whose seed waits for the next reset, the only moment at which Gymnasium takes one.
+
+    Images are what ``render_mode="rgb_array"`` returns, resized without aliasing (bilinear with the filter
+    widened to the scale; TorchRL's ``Resize`` needs torchvision); Gymnasium's MuJoCo environments render at twice
+    ``image_size``, others at their own size.
+    """
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self._env.episode_seed = seed
+
+
+def load_gymnasium_env(env_id: str, *, camera: int | str | None, image_size: int, quality: str) -> Any:
+    """Make a Gymnasium environment that renders RGB.
+
+    Args:
+        env_id: Id in Gymnasium's registry.
+        camera: Camera index or name of a MuJoCo environment; ``None`` keeps the environment's own.
+        image_size: MuJoCo environments of Gymnasium's own render at twice this size.
+        quality: ``"fast"`` renders MuJoCo's shadows from smaller maps.
+
+    Raises:
+        CRPTproError: if it cannot be made so, or has no such camera.
+        WorldFailedError: if its own code fails.
+    """
+    name = f"{GYMNASIUM_PREFIX}{env_id}"
+    options: dict[str, Any] = {}
+    if camera is not None:
+        options["camera_name" if isinstance(camera, str) else "camera_id"] = camera
+    if str(gymnasium.spec(env_id).entry_point).startswith("gymnasium.envs.mujoco"):
+        # Their 480 x 480 by default costs twice the time on software GL and ends as the same few pixels.
+        options.update(width=2 * image_size, height=2 * image_size)
+        route_mujoco_warnings()
+    with passed_on(name, "make"):
+        try:
+            env: Any = gymnasium.make(env_id, render_mode="rgb_array", disable_env_checker=True, **options)
+        except TypeError as reason:
+            if not any(f"unexpected keyword argument '{option}'" in str(reason) for option in options):
+                raise  # the world's own
+            hint = " It takes no camera; leave camera unset." if camera is not None else ""
+            raise CRPTproError(f"{name} cannot be made with rgb_array rendering: {reason}.{hint}") from reason
+        except (ImportError, gymnasium.error.Error) as reason:
+            raise CRPTproError(f"{name} cannot be made: {reason}") from reason
+    model: Any = getattr(env.unwrapped, "model", None)
+    if isinstance(camera, int) and not -1 <= camera < getattr(model, "ncam", camera + 1):
+        env.close()  # MuJoCo would end the process
+        raise CRPTproError(f"{name} has no camera {camera}; its model has {model.ncam}, numbered from 0.")
+    _fix_free_camera(env)
+    if quality == "fast" and hasattr(model, "vis"):
+        model.vis.quality.shadowsize = min(FAST_SHADOW_SIZE["suite"], model.vis.quality.shadowsize)
+    return env
+
+
+def resize(frame: Tensor, size: int) -> Tensor:
+    """Resize a uint8 frame ``[3, H, W]`` to ``[3, size, size]``, bilinear and antialiased.
+
+    A non-square frame is squeezed, not cropped: everything that is rendered stays visible.
+    """
+    if frame.shape[1:] == (size, size):
+        return frame
+    small = F.interpolate(
+        frame[None].float(), (size, size), mode="bilinear", antialias=True, align_corners=False
+    )
+    return small[0].round_().clamp_(0, 255).to(torch.uint8)
+
+
+def _fix_free_camera(env: Any) -> None:
+    """Point Gymnasium's free camera at where the model's default pose lies.
+
+    By itself it looks at the middle of whatever state is drawn first, for good: the same episode would be drawn
+    differently as the second one of a process than as the first of a resumed one.
+    """
+    renderer = getattr(env.unwrapped, "mujoco_renderer", None)
+    config = getattr(renderer, "default_cam_config", None) or {}
+    if renderer is None or "lookat" in config:
+        return
+    import mujoco
+
+    model = env.unwrapped.model
+    pose = mujoco.MjData(model)
+    mujoco.mj_forward(model, pose)
+    renderer.default_cam_config = {**config, "lookat": np.median(pose.geom_xpos, axis=0)}

@@ -1,0 +1,253 @@
+"""What every world must keep, whoever wrote it: frames that are images, finite numbers, errors with its name."""
+
+from __future__ import annotations
+
+import atexit
+import logging
+import traceback
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import Any, cast
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from crptpro.errors import CRPTproError, NonFiniteError, WorldError, WorldFailedError
+
+logger = logging.getLogger(__name__)
+
+#: Bounds of an action from which on they are taken for "none": MuJoCo's mjMAXVAL. A ``Box`` of float32's range
+#: (3.4e38) means the same.
+NO_BOUND = 1e10
+#: Agent steps from which on an episode that was left before its end is looked at as a whole one.
+LONG_EPISODE = 25
+
+_open: weakref.WeakValueDictionary[int, EnvBase] = weakref.WeakValueDictionary()
+
+
+class CheckedWorld:
+    """Mixed into the class that steps a world: checks what it answers, and names it in what goes wrong.
+
+    - An exception of the world's own code is passed on as :class:`~crptpro.errors.WorldFailedError`, with its name and
+      the call.
+    - An action, a reward or a physical state that is not finite raises :class:`~crptpro.errors.NonFiniteError` with
+      the episode and the agent step, before anything can store it.
+    - An episode whose frames are all alike is reported by one warning per environment.
+    - After ``agent_step_limit`` agent steps an episode is truncated. (TorchRL's ``StepCounter`` would add
+      ``step_count`` to every observation and read it back, so no replay could leave it out.)
+    - The environment is closed at the interpreter's exit, if nobody did it before: a render context that is freed
+      later prints errors.
+    """
+
+    world: str = ""
+    agent_step_limit: int | None = None
+    checks_frames = True
+    _episode = -1
+    _agent_step = 0
+    _first_frame: Tensor | None = None
+    _is_still = False
+    _has_warned = False
+    _was_closed = False
+
+    def watch(
+        self, card: dict[str, Any], *, agent_step_limit: int | None = None, checks_frames: bool = True
+    ) -> None:
+        """Begin to watch: ``card["task"]`` is the name in messages."""
+        self._card, self.world = card, card["task"]
+        self.agent_step_limit, self.checks_frames = agent_step_limit, checks_frames
+        _open[id(self)] = cast(EnvBase, self)
+
+    def card(self) -> dict[str, Any]:
+        """Return what shaped the pixels: task, camera, GL backend, quality, colours, action repeat."""
+        return dict(self._card)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        if self._agent_step >= LONG_EPISODE:
+            self._report_still_frames()
+        self._episode, self._agent_step = self._episode + 1, 0
+        with passed_on(self.world, "reset"):
+            found: TensorDictBase = super()._reset(tensordict, **kwargs)  # type: ignore[misc]
+        self._require_finite(found, "answered with", "qpos", "qvel")
+        self._first_frame, self._is_still = found.get("pixels"), self.checks_frames
+        return found
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._agent_step += 1
+        self._require_finite(tensordict, "was given the", "action")
+        with passed_on(self.world, "step"):
+            found: TensorDictBase = super()._step(tensordict)  # type: ignore[misc]
+        self._require_finite(found, "answered with", "reward", "qpos", "qvel")
+        if self._agent_step == self.agent_step_limit:
+            for flag in ("truncated", "done"):
+                found.set(flag, torch.ones_like(found.get(flag)))
+        if self._is_still:
+            self._is_still = torch.equal(found.get("pixels"), self._first_frame)  # type: ignore[arg-type]
+            if self._is_still and found.get("done").any():
+                self._report_still_frames()
+        return found
+
+    def _require_finite(self, td: TensorDictBase, verb: str, *keys: str) -> None:
+        for key in keys:
+            value = td.get(key, None)
+            if value is not None and not value.isfinite().all():
+                raise NonFiniteError(
+                    f"The world {self.world!r} {verb} {key} {value.tolist()} in agent step {self._agent_step} of "
+                    f"episode {self._episode} (this environment's first is 0). Nothing of this step is stored; mend "
+                    "what computes it, or keep the actions where the world is stable."
+                )
+
+    def _report_still_frames(self) -> None:
+        if not self._is_still or self._has_warned or self._first_frame is None or self._agent_step < 2:
+            return
+        self._has_warned, self._is_still = True, False
+        shade = self._first_frame.unique()
+        what = f" ({'black' if not shade.any() else 'of one shade'})" if shade.numel() == 1 else ""
+        logger.warning(
+            "All frames of a whole episode of the world %r are alike%s: %d agent steps, nothing moved. Look at what it "
+            "renders before you train on it.",
+            self.world, what, self._agent_step,
+        )  # fmt: skip
+
+    def read_obs(self, observations: dict[str, Any]) -> dict[str, Any]:
+        """Take frames as they are; TorchRL's would compare each of their bytes with the spec's bounds."""
+        return dict(observations)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Free the world and its render context; calling it twice is harmless."""
+        _open.pop(id(self), None)
+        if not self._was_closed:
+            self._was_closed = True
+            super().close(raise_if_closed=False)  # type: ignore[misc]
+
+
+@atexit.register
+def _close_what_is_open() -> None:
+    for env in list(_open.values()):
+        with suppress(Exception):
+            env.close()
+
+
+@contextmanager
+def passed_on(world: str, call: str) -> Iterator[None]:
+    """Pass an exception of a world's own code on with the world's name and the call.
+
+    Raises:
+        WorldFailedError: from the world's exception; errors of this library stay what they are.
+    """
+    try:
+        yield
+    except (CRPTproError, WorldFailedError):
+        raise
+    except Exception as reason:
+        origin: BaseException = reason
+        while origin.__cause__ is not None:  # Gymnasium raises what a constructor raised once more
+            origin = origin.__cause__
+        where = traceback.extract_tb(origin.__traceback__)[-1]
+        raise WorldFailedError(
+            f"{reason} ({type(reason).__name__} in {call}() of the world {world!r}, {where.filename}, line "
+            f"{where.lineno})"
+        ) from reason
+
+
+class FrameReader:
+    """Turns what a world shows into a frame of one's own: a copy, uint8 ``[3, H, W]``.
+
+    uint8 is taken as it is, floats in [0, 1] are multiplied by 255, which is said once. A world may hand out a view of
+    a buffer that it uses again: the frame is always a copy.
+
+    Args:
+        world: Name for messages.
+    """
+
+    def __init__(self, world: str):
+        self.world = world
+        self._has_scaled = False
+
+    def __call__(self, image: Any) -> Tensor:
+        """Return the frame of an image ``[H, W, 3]`` or ``[3, H, W]`` (array or tensor).
+
+        Raises:
+            WorldError: for what is no RGB image, for other dtypes, and for floats outside [0, 1] or NaN.
+        """
+        if not isinstance(image, (np.ndarray, Tensor)):
+            raise self._refusal(f"is {type(image).__name__}", "an RGB array [H, W, 3]")
+        if image.ndim != 3 or 3 not in (image.shape[0], image.shape[2]):
+            raise self._refusal(f"has shape {tuple(image.shape)}", "an RGB array [H, W, 3]")
+        dtype = str(image.dtype).removeprefix("torch.")
+        if dtype not in ("uint8", "float16", "float32", "float64"):
+            raise self._refusal(f"has dtype {dtype}", "uint8, or floats in [0, 1]")
+        pixels = torch.as_tensor(image if isinstance(image, Tensor) or _is_plain(image) else image.copy())
+        if pixels.shape[2] == 3:
+            pixels = pixels.permute(2, 0, 1)
+        if dtype == "uint8":
+            return pixels.clone(memory_format=torch.contiguous_format)
+        low, high = float(pixels.min()), float(pixels.max())
+        if not (low >= 0.0 and high <= 1.0):  # NaN is neither
+            raise self._refusal(f"holds {dtype} from {low:g} to {high:g}", "uint8, or floats in [0, 1]")
+        if not self._has_scaled:
+            self._has_scaled = True
+            logger.warning(
+                "The world %r shows %s in [0, 1]; its frames are multiplied by 255.", self.world, dtype
+            )
+        return (pixels * 255).round().to(torch.uint8).contiguous()
+
+    def _refusal(self, what: str, expected: str) -> WorldError:
+        return WorldError(f"The image that the world {self.world!r} renders {what}; it must be {expected}.")
+
+
+def _is_plain(image: np.ndarray) -> bool:
+    """Whether torch can look at the array without a copy."""
+    return image.flags.writeable and all(stride >= 0 for stride in image.strides)
+
+
+class ActionRange:
+    """The affine map from [-1, 1] to a world's own bounds; without bounds an action is passed on as it is.
+
+    Args:
+        low: Lower bounds, of the shape that the world takes.
+        high: Upper bounds.
+        dtype: What the world takes.
+        world: Name for messages.
+
+    Raises:
+        CRPTproError: for integer or empty actions, for bounds in the wrong order, or on one side only.
+
+    Examples:
+        >>> ActionRange(np.array([0.0, -1.0]), np.array([4.0, 1.0]))(np.array([0.5, -1.0]))
+        array([ 3., -1.])
+    """
+
+    def __init__(self, low: np.ndarray, high: np.ndarray, dtype: Any = np.float64, world: str = ""):
+        if not np.issubdtype(dtype, np.floating):
+            raise CRPTproError(
+                f"The world {world!r} has actions of {np.dtype(dtype)}; only continuous actions (floats) are "
+                "supported. Wrap it in one that takes floats and rounds as it should."
+            )
+        low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+        if not low.size:
+            raise CRPTproError(
+                f"The world {world!r} has an empty action, shape {low.shape}: nothing to learn."
+            )
+        no_low, no_high = ~(np.abs(low) < NO_BOUND), ~(np.abs(high) < NO_BOUND)
+        if (no_low != no_high).any():
+            raise CRPTproError(
+                f"The world {world!r} bounds an action on one side only (low {low.tolist()}, high {high.tolist()}), so "
+                "[-1, 1] cannot be mapped to it."
+            )
+        self.unbounded = bool(no_low.any())
+        self._low, high = np.where(no_low, -1.0, low), np.where(no_high, 1.0, high)
+        if not (self._low < high).all():
+            raise CRPTproError(
+                f"The world {world!r} has action bounds that hold nothing: low {low.tolist()}, high {high.tolist()}."
+            )
+        self._half = (high - self._low) / 2.0
+        self._dtype = dtype
+
+    def __call__(self, action: np.ndarray) -> np.ndarray:
+        """Map ``action``, float ``[A]`` in [-1, 1]."""
+        centred = action.astype(np.float64).reshape(self._low.shape) + 1.0
+        return (self._low + self._half * centred).astype(self._dtype, copy=False)

@@ -1,0 +1,422 @@
+"""The record of a run, complete on disk after every row, and its copies on Weights & Biases and TensorBoard."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import logging
+import math
+import netrc
+import os
+import re
+import time
+import uuid
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import urlparse
+
+from crptpro.artifact import write_json, write_whole
+from crptpro.directory_lock import DirectoryLock
+from crptpro.errors import CheckpointError, writing_error
+from crptpro.provenance import provenance
+from crptpro.values import as_int, as_path, as_plain
+
+JSONL_NAME = "metrics.jsonl"
+RESERVED = ("stream", "unix_time_s")
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class WandbOptions:
+    """How a run appears on Weights & Biases; what is ``None`` follows W&B's own variables."""
+
+    project: str | None = None
+    """project (``WANDB_PROJECT``, else crptpro)"""
+    group: str | None = None
+    """runs of one comparison (``WANDB_RUN_GROUP``, else none)"""
+    name: str | None = None
+    """display name (``WANDB_NAME``, else the run directory's name)"""
+    tags: tuple[str, ...] = ()
+    """tags"""
+    mode: Literal["auto", "online", "offline"] = "auto"
+    """auto: ``WANDB_MODE`` if set, online if logged in, else offline (``wandb sync`` uploads it later)"""
+
+
+class RunLogger:
+    """Writes ``metrics.jsonl`` and one CSV per stream, and copies them to W&B and TensorBoard if asked.
+
+    Rows are complete on disk when :meth:`log` returns. ``metrics.jsonl`` is the truth: ``<stream>.csv`` is written anew
+    from it where the two disagree. A mirror that fails is switched off with one warning; the run continues. Usable as a
+    context manager. The directory is held for this process until :meth:`close`.
+
+    Args:
+        run_dir: directory of the run, created if missing; rows found there are continued.
+        config: settings of the run, a mapping or a dataclass; kept in ``config.json`` with versions and hardware, from
+            the first row on.
+        wandb: mirror to Weights & Biases; ``None`` for not.
+        tensorboard: mirror to TensorBoard (needs the ``tensorboard`` extra).
+
+    Raises:
+        CheckpointError: if another process is running in ``run_dir``.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder, RunLogger(folder) as logger:
+        ...     logger.log({"loss_comp": 6.5}, stream="pretrain", updates=100)
+        ...     logger.log({"loss_comp": 6.2, "updates_per_s": 3.0}, stream="pretrain", updates=200)
+        ...     [row["updates"] for row in logger.rows("pretrain")]
+        [100, 200]
+    """
+
+    def __init__(
+        self,
+        run_dir: str | Path,
+        *,
+        config: Any = None,
+        wandb: WandbOptions | None = None,
+        tensorboard: bool = False,
+    ) -> None:
+        self.run_dir = as_path(run_dir, "run_dir")
+        self.path = self.run_dir / JSONL_NAME
+        # Written with the first row: a request that is refused must not replace the settings of the run it found.
+        self._config = as_plain(config or {}, "config")
+        self._lock = DirectoryLock(self.run_dir, error=CheckpointError, is_reentrant=True)
+        self._columns: dict[str, list[str]] = {}
+        self._counts: dict[str, int] = {}
+        self._replace(self._read())
+        self._mirrors: list[_Mirror] = []
+        if wandb is not None:
+            self._open("Weights & Biases", lambda: _Wandb(wandb, self.run_dir, self._config))
+        if tensorboard:
+            self._open("TensorBoard", lambda: _TensorBoard(self.run_dir))
+
+    def __enter__(self) -> RunLogger:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def log(self, metrics: Mapping[str, Any], *, stream: str, **counters: int) -> None:
+        """Write one row.
+
+        Args:
+            metrics: names to numbers, scalar tensors or short texts; ``None`` leaves a cell empty.
+            stream: which CSV, e.g. ``"pretrain"``, ``"train"``, ``"eval"``.
+            counters: where the run is, e.g. ``updates=100`` or ``env_steps=1000, episodes=2``; at least one. The x-axis
+                of the mirrors is ``env_steps`` if given, else the first.
+
+        Raises:
+            ValueError: no counter, a name used twice, reserved or not printable, or a value that is no scalar.
+            DiskSpaceError: if the disk is full; no half row stays behind.
+        """
+        if not re.fullmatch(r"[a-z][a-z0-9_]*", stream):
+            raise ValueError(f"A stream is named by lower-case letters, digits and _, got {stream!r}.")
+        if not counters:
+            raise ValueError(f"A row of {stream!r} needs a counter, such as updates=100.")
+        for key in (*counters, *metrics):
+            if key in RESERVED or (key in counters and key in metrics):
+                raise ValueError(f"{key!r} cannot name a metric of {stream!r}: it is reserved, or a counter.")
+            if not isinstance(key, str) or not key.isprintable() or re.search('[,"]', key):
+                raise ValueError(
+                    f"{key!r} cannot name a metric of {stream!r}: it would not fit a CSV header."
+                )
+        where = {name: as_int(value, name) for name, value in counters.items()}
+        values = {key: _scalar(key, value) for key, value in metrics.items() if value is not None}
+        if self._config:
+            write_json(self.run_dir / "config.json", {"config": self._config, **provenance()})
+            self._config = {}
+        index = sum(self._counts.values())
+        row = {"stream": stream, **where, "unix_time_s": round(time.time(), 3), **values}
+        known = list(self._columns.get(stream, ()))
+        _append(self.path, json.dumps({key: _cell(value) for key, value in row.items()}) + "\n")
+        self._count(row)
+        if self._columns[stream] == known and self._csv(stream).exists():
+            _append(self._csv(stream), _csv_text([[row.get(name) for name in known]]))
+        else:
+            self._write_csvs(self._read(), only=stream)
+        self._mirror(lambda mirror: mirror.log(stream, where, values, index))
+
+    def event(self, text: str) -> None:
+        """Announce something on the console, one line."""
+        _LOG.info("%s", text)
+
+    def video(self, name: str, path: str | Path, **counters: int) -> None:
+        """Copy a video file to W&B, as ``name``."""
+        self._mirror(lambda mirror: mirror.video(name, Path(path), counters))
+
+    def artifact(self, path: str | Path, *, name: str, kind: str) -> None:
+        """Copy an artifact (a file or a directory) to W&B."""
+        self._mirror(lambda mirror: mirror.artifact(Path(path), name, kind))
+
+    def rows(self, stream: str) -> list[dict[str, Any]]:
+        """Return the rows of a stream so far, oldest first, without the stream's name."""
+        found = [row for row in self._read() if row["stream"] == stream]
+        return [{key: value for key, value in row.items() if key != "stream"} for row in found]
+
+    def state_dict(self, streams: Iterable[str] | None = None) -> dict[str, Any]:
+        """Return how far the record goes, after forcing it to disk; belongs into every checkpoint.
+
+        Args:
+            streams: streams of the stage that makes the checkpoint, so that resuming it leaves those of other stages in
+                the same directory alone; ``None`` for all.
+        """
+        if self.path.exists():
+            with open(self.path, "rb") as file:
+                os.fsync(file.fileno())
+        names = None if streams is None else list(streams)
+        return {"rows": {name: self._counts.get(name, 0) for name in names or self._counts}, "streams": names}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Take back the rows written after the checkpoint, so that the resumed run writes each row once."""
+        missing = {name: count - self._counts.get(name, 0) for name, count in state["rows"].items()}
+        for name, count in missing.items():
+            if count > 0:
+                _LOG.warning(
+                    "%s: %d rows of %r are missing that the checkpoint counted.", self.path, count, name
+                )
+        others = math.inf if state["streams"] is not None else 0
+        seen: dict[str, int] = {}
+        kept = []
+        for row in self._read():
+            seen[row["stream"]] = seen.get(row["stream"], 0) + 1
+            if seen[row["stream"]] <= state["rows"].get(row["stream"], others):
+                kept.append(row)
+        self._replace(kept)
+
+    def truncate_to(self, stream: str, counter: str, value: int) -> None:
+        """Take back the rows of ``stream`` whose ``counter`` exceeds ``value`` (-1: all of them)."""
+        self._replace([r for r in self._read() if r["stream"] != stream or r.get(counter, 0) <= value])
+
+    def writes_into(self, directory: str | Path) -> bool:
+        """Whether the record lies in ``directory`` or below it: only then is all of it that directory's own."""
+        return self.run_dir.resolve().is_relative_to(Path(directory).resolve())
+
+    def close(self) -> None:
+        """Finish the mirrors and free the directory; every row is on disk already."""
+        self._mirror(lambda mirror: mirror.close())
+        self._mirrors = []
+        self._lock.release()
+
+    def _csv(self, stream: str) -> Path:
+        return self.run_dir / f"{stream}.csv"
+
+    def _count(self, row: Mapping[str, Any]) -> None:
+        columns = self._columns.setdefault(row["stream"], [])
+        columns.extend(key for key in row if key != "stream" and key not in columns)
+        self._counts[row["stream"]] = self._counts.get(row["stream"], 0) + 1
+
+    def _read(self) -> list[dict[str, Any]]:
+        """All rows; a torn or foreign line is dropped from the file with a warning."""
+        lines = self.path.read_bytes().splitlines(keepends=True) if self.path.exists() else []
+        rows = []
+        for line in lines:
+            try:
+                row = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(row, dict) and isinstance(row.get("stream"), str) and line.endswith(b"\n"):
+                rows.append(row)
+        if len(rows) < len(lines):
+            _LOG.warning("%s: dropped %d damaged line(s).", self.path, len(lines) - len(rows))
+            self._write_rows(rows)
+        return rows
+
+    def _replace(self, rows: list[dict[str, Any]]) -> None:
+        """Make these the rows of the record."""
+        if len(rows) < sum(self._counts.values()):
+            self._write_rows(rows)
+        before, self._columns, self._counts = set(self._columns), {}, {}
+        for row in rows:
+            self._count(row)
+        for stream in before - set(self._columns):
+            self._csv(stream).unlink(missing_ok=True)
+        self._write_csvs(rows)
+
+    def _write_rows(self, rows: Iterable[Mapping[str, Any]]) -> None:
+        write_whole(self.path, "".join(json.dumps(row) + "\n" for row in rows))
+
+    def _write_csvs(self, rows: list[dict[str, Any]], *, only: str | None = None) -> None:
+        for stream in self._columns if only is None else (only,):
+            columns = self._columns[stream]
+            cells = [[row.get(name) for name in columns] for row in rows if row["stream"] == stream]
+            content = _csv_text([columns, *cells])
+            path = self._csv(stream)
+            if not path.exists() or path.read_bytes() != content.encode():
+                write_whole(path, content)
+
+    def _open(self, name: str, make: Callable[[], _Mirror]) -> None:
+        try:
+            self._mirrors.append(make())
+        except Exception as reason:
+            _LOG.warning("%s is off for this run (%s); the local record is complete.", name, reason)
+
+    def _mirror(self, call: Callable[[_Mirror], None]) -> None:
+        for mirror in list(self._mirrors):
+            try:
+                call(mirror)
+            except Exception as reason:
+                self._mirrors.remove(mirror)
+                _LOG.warning(
+                    "%s failed and is off from here (%s); the local record in %s is complete.",
+                    mirror.name, reason, self.run_dir,
+                )  # fmt: skip
+
+
+class _Mirror:
+    """Receives copies of what the record holds; what a mirror cannot show it leaves out."""
+
+    name: str
+
+    def log(self, stream: str, counters: Mapping[str, int], values: Mapping[str, Any], index: int) -> None:
+        raise NotImplementedError
+
+    def video(self, name: str, path: Path, counters: Mapping[str, int]) -> None: ...
+    def artifact(self, path: Path, name: str, kind: str) -> None: ...
+    def close(self) -> None: ...
+
+
+class _Wandb(_Mirror):
+    """One W&B run per directory. A row's index is its step: W&B drops those that a resumed run repeats."""
+
+    name = "Weights & Biases"
+
+    def __init__(self, options: WandbOptions, run_dir: Path, config: Mapping[str, Any]) -> None:
+        from torchrl.record.loggers import get_logger
+
+        told = os.environ.get
+        arguments = {
+            "project": options.project or told("WANDB_PROJECT") or "crptpro",
+            "group": options.group or told("WANDB_RUN_GROUP"),
+            "tags": list(options.tags) or None,
+            "config": dict(config),
+            "id": _wandb_id(run_dir),
+            "reinit": "create_new",
+            "settings": {"silent": True, "console": "off", "init_timeout": 60.0},
+            "log_env_packages": False,
+        }
+        name = options.name or told("WANDB_NAME") or run_dir.name
+        mode = options.mode if options.mode != "auto" else _wandb_mode()
+
+        def start(mode: str) -> Any:
+            return get_logger("wandb", str(run_dir), name, wandb_kwargs={**arguments, "mode": mode})
+
+        try:
+            self._logger = start(mode)
+        except Exception as reason:
+            if mode != "online":
+                raise
+            _LOG.warning(
+                "W&B cannot be reached (%s); logging offline, `wandb sync` uploads it later.", reason
+            )
+            self._logger = start("offline")
+        self._run = self._logger.experiment
+        self._streams: set[str] = set()
+
+    def log(self, stream: str, counters: Mapping[str, int], values: Mapping[str, Any], index: int) -> None:
+        if stream not in self._streams:
+            self._run.define_metric(_axis(counters))
+            self._run.define_metric(f"{stream}/*", step_metric=_axis(counters))
+            self._streams.add(stream)
+        row = {**counters, **{f"{stream}/{key}": value for key, value in values.items()}}
+        self._logger.log_metrics(row, step=index, override_global_step=True)
+
+    def video(self, name: str, path: Path, counters: Mapping[str, int]) -> None:
+        import wandb
+
+        self._run.log({**counters, name: wandb.Video(str(path))}, commit=False)
+
+    def artifact(self, path: Path, name: str, kind: str) -> None:
+        import wandb
+
+        # W&B takes letters, digits, dash, underscore and dot; a Gymnasium task has a colon.
+        artifact = wandb.Artifact(re.sub(r"[^\w.-]", "_", name), type=kind)
+        (artifact.add_dir if path.is_dir() else artifact.add_file)(str(path))
+        self._run.log_artifact(artifact)
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+class _TensorBoard(_Mirror):
+    """Event files in ``<run_dir>/tensorboard``; they hold the numbers alone."""
+
+    name = "TensorBoard"
+
+    def __init__(self, run_dir: Path) -> None:
+        from torchrl.record.loggers import get_logger
+
+        self._logger: Any = get_logger("tensorboard", str(run_dir), "tensorboard")
+
+    def log(self, stream: str, counters: Mapping[str, int], values: Mapping[str, Any], index: int) -> None:
+        numbers = {f"{stream}/{key}": value for key, value in values.items() if not isinstance(value, str)}
+        self._logger.log_metrics(numbers, step=counters[_axis(counters)])
+
+    def close(self) -> None:
+        self._logger.experiment.close()
+
+
+def _axis(counters: Mapping[str, int]) -> str:
+    return "env_steps" if "env_steps" in counters else next(iter(counters))
+
+
+def _wandb_mode() -> str:
+    """What W&B's own settings say, without touching the network."""
+    if mode := os.environ.get("WANDB_MODE"):
+        return mode
+    if os.environ.get("WANDB_API_KEY"):
+        return "online"
+    host = urlparse(os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai")).hostname or ""
+    try:
+        known = netrc.netrc(str(Path(os.environ.get("NETRC", "~/.netrc")).expanduser())).hosts
+    except (OSError, netrc.NetrcParseError):
+        return "offline"
+    return "online" if host in known else "offline"
+
+
+def _wandb_id(run_dir: Path) -> str:
+    """The id of this directory's W&B run, drawn once and kept."""
+    path = run_dir / "wandb_run.json"
+    try:
+        return str(json.loads(path.read_text())["id"])
+    except (OSError, ValueError, KeyError, TypeError):
+        identity = uuid.uuid4().hex[:8]
+        write_json(path, {"id": identity})
+        return identity
+
+
+def _scalar(key: str, value: Any) -> int | float | str:
+    if isinstance(value, str):  # on one line, and such that a UTF-8 file takes it
+        return " ".join(value.splitlines()).encode("utf-8", "backslashreplace").decode()
+    try:
+        number = value.item() if hasattr(value, "item") else value
+        return int(number) if isinstance(number, int) else float(number)
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(f"The metric {key!r} is no scalar: {value!r}.") from None
+
+
+def _cell(value: Any) -> Any:
+    """NaN and infinity become words: they are not JSON, and the CSV shows the same."""
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _csv_text(rows: Iterable[Iterable[Any]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(
+        [["" if c is None else _cell(c) for c in row] for row in rows]
+    )
+    return text.getvalue()
+
+
+def _append(path: Path, line: str) -> None:
+    size = path.stat().st_size if path.exists() else 0
+    try:
+        with open(path, "a", encoding="utf-8") as file:
+            file.write(line)
+    except OSError as reason:
+        if path.exists():
+            os.truncate(path, size)
+        raise writing_error(path, reason) from reason

@@ -1,0 +1,433 @@
+"""The methods by name: the loss of each, how it is trained, how it explores, what its downstream agents do otherwise.
+
+A method of one's own takes two files: its loss, and a row here (or a call of :func:`register_method`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from torch import nn
+from torchrl.objectives import LossModule
+
+from crptpro.errors import CRPTproError, UnknownNameError
+from crptpro.modules import PixelEncoder
+from crptpro.objectives.atc import ATCLoss
+from crptpro.objectives.becl import BeCLLoss
+from crptpro.objectives.proto import ProtoLoss
+from crptpro.objectives.simclr import SimCLRLoss
+from crptpro.values import as_float, as_int
+
+
+def _plain(row: Any, minima: Mapping[str, int]) -> None:
+    for name, minimum in minima.items():
+        value = getattr(row, name)
+        if value is not None:
+            object.__setattr__(row, name, as_int(value, name, minimum=minimum))
+
+
+@dataclass(frozen=True)
+class Exploration:
+    """How a method explores while it pre-trains; the values here are Proto-RL's.
+
+    Every interval counts a domain's own agent steps, so that no domain is starved whatever their number.
+
+    Raises:
+        ValueError: a count or interval below 1, or fewer than two skills.
+    """
+
+    reward: str | Callable[..., Any] = "prototype"
+    """Intrinsic reward that alone drives the exploration: ``"prototype"``, ``"particle"``, ``"skill-contrast"``, or a
+    function of the loss and a ``torch.Generator`` that returns a transform writing ``("next", "intrinsic_reward")``."""
+
+    agent: str = "rad-sac"
+    """Exploring agent: ``"rad-sac"``, ``"averaged-sac"`` (DrQ's K = M = 2 on detached features), ``"skill-ddpg"``."""
+
+    env_steps: int = 200_000
+    """Simulator steps: in total over the domains of a group, or of the one domain. The random phases come out of them,
+    so there are a few per cent fewer encoder updates than the steps would allow."""
+
+    is_single_domain: bool = False
+    """The (S) variants: pre-trained on one domain only."""
+
+    encoder_update_interval: int = 2
+    """Agent steps between two encoder updates."""
+
+    encoder_updates_each: int = 1
+    """Encoder updates every time, each on a fresh batch."""
+
+    agent_update_interval: int = 1
+    """Agent steps between two updates of the agent."""
+
+    encodes_before_update: bool = False
+    """Whether reward and agent see the features from before the encoder update of the same step, not after it."""
+
+    transfers_actor: bool = False
+    """Whether the downstream agent starts from the exploring actor."""
+
+    n_step: int = 1
+    """Agent steps from an observation to the "next" one in the agent's and the encoder's batches."""
+
+    skill_dim: int | None = None
+    """Number of skills; None for an agent without skills."""
+
+    skill_agent_steps: int = 50
+    """Agent steps that a skill is kept."""
+
+    replay_capacity: int = 100_000
+    """Transitions kept per domain."""
+
+    random_agent_steps: int = 1_000
+    """Agent steps of uniformly random actions per domain, before its updates start."""
+
+    def __post_init__(self) -> None:
+        counts = (
+            "env_steps", "encoder_update_interval", "encoder_updates_each", "agent_update_interval", "n_step",
+            "skill_agent_steps", "replay_capacity",
+        )  # fmt: skip
+        _plain(self, {**dict.fromkeys(counts, 1), "random_agent_steps": 0, "skill_dim": 2})
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of the table; the values here are CRPTpro's.
+
+    Raises:
+        ValueError: a number out of its range.
+    """
+
+    name: str
+    """Unique name."""
+
+    loss_class: type[LossModule] | None
+    """The loss that pre-trains its encoder; None where nothing is pre-trained."""
+
+    loss_options: Mapping[str, Any] = field(default_factory=dict)
+    """Keyword arguments of ``loss_class``."""
+
+    encoder_options: Mapping[str, Any] = field(default_factory=dict)
+    """Keyword arguments of :class:`~crptpro.modules.PixelEncoder`."""
+
+    updates: int = 50_000
+    """Encoder updates in total, over all domains."""
+
+    domain_updates: Mapping[str, int] = field(default_factory=dict)
+    """Encoder updates on one domain by its name, for a method that starts from another one's encoder."""
+
+    batch_size: int = 512
+    """Transitions per update."""
+
+    learning_rate: float = 1e-4
+    """Of Adam (its highest value, if scheduled)."""
+
+    encoder_tau: float | None = 0.05
+    """Rate of the target networks, every update; None for a method without targets."""
+
+    schedule: Literal["constant", "warmup_cosine"] = "constant"
+    """Learning rate over the updates."""
+
+    warmup_updates: int = 0
+    """Length of the linear warm-up of the learning rate from 0; 0 for none."""
+
+    grad_clip: float | None = None
+    """Largest gradient norm; None for no clipping."""
+
+    exploration: Exploration | None = None
+    """How it explores while it pre-trains; None for a method that learns from random datasets, or from nothing."""
+
+    downstream: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of downstream training that differ from CRPTpro's, such as ``{"replay_capacity": 100_000}``."""
+
+    starts_from: str | None = None
+    """Method whose encoder it takes: as it is where ``updates`` is 0, otherwise to train it on."""
+
+    is_preset: bool = False
+    """A variant of another method: not listed among the methods, not what a loss built by hand is trained like."""
+
+    is_builtin: bool = False
+    """Comes with the library, whose revision says what it is."""
+
+    def __post_init__(self) -> None:
+        _plain(self, {"updates": 0, "batch_size": 1, "warmup_updates": 0})
+        for name, bounds in {"learning_rate": {}, "encoder_tau": {"maximum": 1}, "grad_clip": {}}.items():
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, as_float(getattr(self, name), name, minimum=0, **bounds))
+        if self.schedule not in ("constant", "warmup_cosine"):
+            raise ValueError(f"`schedule` must be 'constant' or 'warmup_cosine', got {self.schedule!r}.")
+
+    def describe(self) -> dict[str, Any]:
+        """Return all that was registered as plain values: what a record needs to tell two methods of one name apart.
+
+        The code of the loss is not part of it, only its class's name.
+        """
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        loss_class = values.pop("loss_class")
+        plain = {key: dict(value) if isinstance(value, Mapping) else value for key, value in values.items()}
+        return {
+            **{key: value for key, value in plain.items() if key not in ("name", "is_builtin", "is_preset")},
+            "loss_class": None
+            if loss_class is None
+            else f"{loss_class.__module__}.{loss_class.__qualname__}",
+            "exploration": None if self.exploration is None else dataclasses.asdict(self.exploration),
+        }
+
+    def build_encoder(self, in_channels: int = 9, image_size: int = 84, **options: Any) -> PixelEncoder:
+        """Build a fresh encoder of the kind that the method trains.
+
+        Args:
+            in_channels: colour channels times stacked frames.
+            image_size: height and width in pixels.
+            **options: of :class:`~crptpro.modules.PixelEncoder`, over the method's own.
+        """
+        return PixelEncoder(in_channels, image_size=image_size, **{**self.encoder_options, **options})
+
+    def build(self, encoder: nn.Module, **options: Any) -> LossModule:
+        """Build the loss on ``encoder``; ``options`` override the method's own.
+
+        The result remembers this method's name, by which :func:`method_of` finds it.
+
+        Raises:
+            CRPTproError: a method that pre-trains nothing.
+            ValueError: an option that the loss does not have.
+        """
+        if self.loss_class is None:
+            raise CRPTproError(f"The method {self.name!r} pre-trains nothing; it is for downstream training.")
+        parameters = inspect.signature(self.loss_class.__init__).parameters.values()
+        known = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY or p.name in options]
+        unknown = sorted(set(options) - set(known))
+        if unknown and not any(p.kind is p.VAR_KEYWORD for p in parameters):
+            raise ValueError(
+                f"The method {self.name!r} has no option {', '.join(unknown)}; it has {', '.join(known)}."
+            )
+        loss = self.loss_class(encoder, **{**self.loss_options, **options})
+        loss.method_name = self.name
+        return loss
+
+
+_CRPTPRO = Method("crptpro", ProtoLoss)
+_NO_BONUS = {"intrinsic_reward_coef": 0.0}
+
+# ATC's own loss, head and schedule on the trunk (orthogonal weights), batch and budget that all methods share.
+_ATC = Method(
+    "atc",
+    ATCLoss,
+    learning_rate=1e-3,
+    encoder_tau=0.01,
+    schedule="warmup_cosine",
+    warmup_updates=1_000,
+    grad_clip=10.0,
+    downstream=_NO_BONUS,
+)
+
+# Active methods: four simulator steps per encoder update, 200,000 in total over a group (C) or 500,000 in one
+# domain (S). The paper's efficiency table has equal times for one to three domains, so (C) counts in total.
+_APT_C = Method(
+    "apt-c",
+    SimCLRLoss,
+    encoder_tau=None,
+    exploration=Exploration(reward="particle", agent="averaged-sac"),
+    downstream=_NO_BONUS,
+)
+# Deviation: the released code of Proto-RL has a predictor of width 512; the paper's table, which has it beside
+# CRPTpro, says 1024.
+_PROTO_RL_C = Method(
+    "proto-rl-c",
+    ProtoLoss,
+    loss_options={"intr_loss_coef": 0.0},
+    exploration=Exploration(),
+    downstream={"replay_capacity": 100_000},
+)
+_SINGLE_DOMAIN: dict[str, Any] = {"env_steps": 500_000, "is_single_domain": True}
+
+# The first method of a class that is no preset is what a loss of that class built by hand is trained like.
+TABLE = (
+    _CRPTPRO,
+    replace(
+        _CRPTPRO,
+        name="crptpro-no-bonus",
+        updates=0,
+        starts_from="crptpro",
+        downstream=_NO_BONUS,
+        is_preset=True,
+    ),
+    # Deviation: targets at half the student's temperature, which leave the plateau at ln M sooner, and three times the
+    # learning rate, which gets further once it is left (docs/study.md).
+    replace(
+        _CRPTPRO,
+        name="crptpro-fast",
+        learning_rate=3e-4,
+        loss_options={"assignment_temperature": 0.05},
+        is_preset=True,
+    ),
+    replace(
+        _CRPTPRO,
+        name="crptpro-finetune",
+        updates=2_000,
+        domain_updates={
+            "pendulum": 2_000,
+            "manip": 2_000,
+            "cartpole": 3_000,
+            "cheetah": 1_000,
+            "walker": 500,
+        },
+        starts_from="crptpro",
+        is_preset=True,
+    ),
+    # The authors' published code where it differs from the paper: predictor width, and 3 x 16,666 updates.
+    replace(_CRPTPRO, name="released-code", updates=49_998, loss_options={"hidden_dim": 512}, is_preset=True),
+    _ATC,
+    replace(
+        _ATC,
+        name="atc-native",
+        batch_size=256,
+        encoder_options={"strides": (2, 2, 2, 1), "init": "kaiming"},
+        is_preset=True,
+    ),
+    _APT_C,
+    replace(
+        _APT_C,
+        name="apt-s",
+        updates=125_000,
+        exploration=Exploration(reward="particle", agent="averaged-sac", **_SINGLE_DOMAIN),
+    ),
+    _PROTO_RL_C,
+    replace(
+        _PROTO_RL_C,
+        name="proto-rl-s",
+        updates=125_000,
+        exploration=Exploration(transfers_actor=True, **_SINGLE_DOMAIN),
+    ),
+    # An update of BeCL's agent every second agent step brings three encoder updates: 150,000 for 50,000 of the agent.
+    Method(
+        "becl",
+        BeCLLoss,
+        updates=150_000,
+        encoder_tau=None,
+        encoder_options={"pixel_offset": 0.5},
+        exploration=Exploration(
+            reward="skill-contrast",
+            agent="skill-ddpg",
+            encoder_updates_each=3,
+            encodes_before_update=True,
+            agent_update_interval=2,
+            n_step=3,
+            skill_dim=16,
+            random_agent_steps=2_000,
+        ),
+        downstream=_NO_BONUS,
+    ),
+    # Trains its encoder end to end, with the critic.
+    Method(
+        "drq",
+        None,
+        updates=0,
+        downstream={
+            "algorithm": "drq",
+            "env_steps": 1_000_000,
+            "replay_capacity": 100_000,
+            "learning_rate": 1e-3,
+            **_NO_BONUS,
+        },
+    ),
+    # Controls: the encoder as it is drawn, and with features of mean 0 and deviation 1.
+    Method("random-encoder", None, updates=0, downstream=_NO_BONUS),
+    Method(
+        "random-encoder-standardised",
+        None,
+        updates=0,
+        encoder_options={"standardised": True},
+        downstream=_NO_BONUS,
+    ),
+)
+
+_METHODS: dict[str, Method] = {row.name: replace(row, is_builtin=True) for row in TABLE}
+
+
+def register_method(name: str, loss_class: type[LossModule], **fields: Any) -> Method:
+    """Make a method available by name, on the command line too.
+
+    Args:
+        name: unique name; registering a name again with another class is refused.
+        loss_class: built as ``loss_class(encoder, **loss_options)``.
+        **fields: further fields of :class:`Method`, such as ``updates=10_000`` or ``exploration=Exploration()``.
+
+    Returns:
+        The registered method.
+
+    Raises:
+        ValueError: the name is taken by another class, or a number is out of its range.
+        TypeError: a field that :class:`Method` does not have.
+    """
+    taken = _METHODS.get(name)
+    if taken is not None and taken.loss_class is not loss_class:
+        owner = "no loss" if taken.loss_class is None else taken.loss_class.__name__
+        raise ValueError(f"The method {name!r} is already registered for {owner}; choose another.")
+    _METHODS[name] = Method(name, loss_class, **fields)
+    return _METHODS[name]
+
+
+def get_method(name: str, *, besides: Iterable[str] = ()) -> Method:
+    """Look a method or preset up by name.
+
+    Args:
+        name: as it was registered.
+        besides: further names that the caller takes, which the error may propose.
+
+    Raises:
+        UnknownNameError: with the nearest known names.
+
+    Examples:
+        >>> get_method("crptpro").updates
+        50000
+    """
+    if name not in _METHODS:
+        known = sorted({*_METHODS, *besides})
+        nearest = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
+        raise UnknownNameError(f"There is no method {name!r}. Did you mean {', '.join(nearest or known)}?")
+    return _METHODS[name]
+
+
+def method_names(*, presets: bool = False) -> list[str]:
+    """Names of the methods that pre-train an encoder, sorted; with ``presets``, of every row of the table."""
+    return sorted(
+        name for name, row in _METHODS.items() if presets or not (row.is_preset or row.loss_class is None)
+    )
+
+
+def method_of(loss: LossModule | type[LossModule]) -> Method:
+    """Return how a loss is trained.
+
+    The method that built it by name; else the first method of its class or its nearest base class; else CRPTpro's
+    numbers. Of a loss built by hand that has targets, or has none, ``encoder_tau`` says so.
+
+    Args:
+        loss: a loss, or its class.
+    """
+    loss_class = loss if isinstance(loss, type) else type(loss)
+    named = _METHODS.get(getattr(loss, "method_name", None) or "")
+    if named is not None and named.loss_class is not None and issubclass(loss_class, named.loss_class):
+        return named
+    found = next((row for base in loss_class.__mro__ for row in _methods_of(base)), None)
+    if found is not None and found.loss_class is loss_class:
+        return found
+    method = replace(found or _CRPTPRO, name=loss_class.__name__, loss_class=loss_class, is_builtin=False)
+    if isinstance(loss, type):
+        return method
+    has_targets = any(name.startswith("target_") for name, _ in loss.named_children())
+    if has_targets and method.encoder_tau is None:
+        return replace(method, encoder_tau=_CRPTPRO.encoder_tau)
+    return method if has_targets else replace(method, encoder_tau=None)
+
+
+def exploration_of(loss: LossModule | type[LossModule]) -> Exploration:
+    """Return how active pre-training of a loss explores; Proto-RL's way where its method does not say."""
+    return method_of(loss).exploration or Exploration()
+
+
+def _methods_of(loss_class: type) -> list[Method]:
+    return [row for row in _METHODS.values() if row.loss_class is loss_class and not row.is_preset]

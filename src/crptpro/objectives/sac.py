@@ -1,0 +1,387 @@
+"""Soft actor-critic: RAD-SAC on frozen features, its average over two views, and DrQ with the encoder inside."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, dispatch
+from tensordict.utils import unravel_key
+from torch import Tensor
+from torchrl.modules import ProbabilisticActor
+from torchrl.objectives import SACLoss, ValueEstimators
+
+from crptpro.modules import PixelCritic, PixelEncoder, SquashedGaussianActor, TwinCritic
+from crptpro.modules.actor_critic import SquashedGaussian, standard_normal_like
+from crptpro.objectives.base import OutKeys, require_positive
+from crptpro.values import as_float
+
+
+class RADSACLoss(OutKeys, SACLoss):
+    r"""RAD-SAC of CRPTpro (liuxin0824/CRPTpro and denisyarats/proto, ``proto.py``) on TorchRL's ``SACLoss``.
+
+    With :math:`h, h'` the features of an observation and the next, :math:`a' \sim \pi(h')`:
+
+    * :math:`y = r + \gamma (1-\mathrm{terminated}) (\min(Q_1', Q_2')(h', a') - \alpha \log\pi(a'|h'))`
+    * ``loss_qvalue`` = MSE(Q1, y) + MSE(Q2, y), gradient to the critic only;
+    * ``loss_actor`` = mean(alpha log pi(a|h) - min(Q1, Q2)(h, a)), gradient to the actor only;
+    * ``loss_alpha`` = mean(exp(log_alpha) * sg(-log pi - target_entropy)), gradient to ``log_alpha`` only.
+
+    Of n-step transitions, whose ``steps_to_next_obs`` TorchRL's ``MultiStepTransform`` writes, gamma is raised to n.
+
+    Features never receive a gradient. What differs from ``SACLoss``: squared error; the temperature loss of
+    the released code (not its logarithm); the log-std squash and pre-tanh log-probability of
+    :class:`~crptpro.modules.SquashedGaussianActor`; one trunk under both Q heads, so the critic is one
+    network with two outputs instead of a stack of two; no ``td_error`` is written into the input; and separate steps
+    :meth:`critic_loss` and :meth:`actor_and_temperature_loss`, because the actor, the temperature and the target are
+    updated every second time, against the critic just stepped::
+
+        loss.critic_loss(td)["loss_qvalue"].backward(); critic_optimizer.step()
+        if update % 2 == 0:
+            out = loss.actor_and_temperature_loss(td)   # backward each, step both
+            target_updater.step()                       # SoftUpdate(loss, tau=0.01)
+
+    Deviation: the released code always bootstraps; here ``terminated`` cuts it, which no task of the paper has.
+
+    Args:
+        actor: on features.
+        critic: on features and actions; the target is a copy of all of it.
+        gamma: discount per agent step, in [0, 1].
+        alpha_init: initial temperature, positive: its logarithm is what is learned.
+        target_entropy: in nats; None for minus the action dimension.
+        observation: key of the features; also read under ``"next"``. ``set_keys`` changes it and the others.
+        generator: source of all action noise; torch's global one if None. Not part of the state dictionary.
+
+    Returns (``forward``):
+        ``loss_actor``, ``loss_qvalue``, ``loss_alpha`` and, detached scalars, ``alpha``, ``entropy`` (-log
+        pi, nats), ``q_mean``, ``target_q_mean``, ``td_error`` (mean over rows of the larger of the two heads'
+        absolute errors). Non-finite input propagates; the loop checks. Batches of any shape, one row included.
+
+    Raises:
+        ValueError: ``gamma`` outside [0, 1], or an ``alpha_init`` that is not positive.
+
+    Examples:
+        >>> actor = SquashedGaussianActor(6, 2, hidden_dim=8)
+        >>> loss = RADSACLoss(actor, TwinCritic(6, 2, hidden_dim=8))
+        >>> from torchrl.objectives import SoftUpdate
+        >>> updater = SoftUpdate(loss, tau=0.01)
+        >>> h, reward, done = torch.randn(4, 6), torch.ones(4, 1), torch.zeros(4, 1, dtype=torch.bool)
+        >>> after = {"features": h, "reward": reward, "done": done, "terminated": done}
+        >>> td = TensorDict({"features": h, "action": torch.zeros(4, 2), "next": after}, [4])
+        >>> loss(td)["loss_qvalue"].shape
+        torch.Size([])
+    """
+
+    @dataclass
+    class _AcceptedKeys(SACLoss._AcceptedKeys):
+        """``SACLoss``'s keys and one more.
+
+        Attributes:
+            observation: the features, at the root and under ``"next"``.
+        """
+
+        observation: NestedKey = "features"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    view_names: ClassVar[tuple[str, ...]] = ("observation",)
+    """Configurable keys of the views of an observation."""
+
+    default_out_keys = (
+        "loss_actor",
+        "loss_qvalue",
+        "loss_alpha",
+        "alpha",
+        "entropy",
+        "q_mean",
+        "target_q_mean",
+        "td_error",
+    )
+
+    def __init__(
+        self,
+        actor: SquashedGaussianActor,
+        critic: TwinCritic | PixelCritic,
+        *,
+        gamma: float = 0.99,
+        alpha_init: float = 0.1,
+        target_entropy: float | None = None,
+        observation: NestedKey = "features",
+        generator: torch.Generator | None = None,
+    ) -> None:
+        gamma = as_float(gamma, "gamma", minimum=0, maximum=1)
+        require_positive(alpha_init=alpha_init)
+        policy = ProbabilisticActor(
+            TensorDictModule(actor, in_keys=[observation], out_keys=["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            out_keys=["action"],
+            distribution_class=SquashedGaussian,
+            return_log_prob=True,
+        )
+        super().__init__(
+            policy,
+            TensorDictModule(critic, in_keys=[observation, "action"], out_keys=["state_action_value"]),
+            # Not 1 or 2: any count makes SACLoss stack the parameters into new ones, and for a single module
+            # draw them anew, losing the orthogonal initialisation and the identity with ``critic``.
+            num_qvalue_nets=0,
+            loss_function="l2",
+            alpha_init=float(alpha_init),
+            target_entropy=-float(actor.action_dim) if target_entropy is None else float(target_entropy),
+            scalar_output_mode="exclude",
+        )
+        self.num_qvalue_nets = 2
+        # Hidden from nn.Module, as LossModule hides its networks: the parameters are registered once.
+        self.__dict__["actor"] = actor
+        self.__dict__["critic"] = critic
+        self.generator = generator
+        self.set_keys(observation=observation)
+        self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute all three losses against the same critic; see the class."""
+        critic = self.critic_loss(tensordict)
+        return critic.update(self.actor_and_temperature_loss(tensordict)).select(*self.default_out_keys)
+
+    def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not changed."""
+        loss, metadata = self.qvalue_v2_loss(tensordict)
+        out = {
+            "loss_qvalue": loss,
+            "q_mean": metadata["q"].mean(),
+            "target_q_mean": metadata["target_q"].mean(),
+            "td_error": metadata["td_error"].mean(),
+        }
+        return TensorDict(out, batch_size=[])
+
+    def actor_and_temperature_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """``loss_actor`` and ``loss_alpha`` of one action draw, with ``alpha`` and ``entropy``."""
+        loss_actor, metadata = self.actor_loss(tensordict)
+        log_prob = metadata["log_prob"]
+        out = {
+            "loss_actor": loss_actor,
+            "loss_alpha": self._alpha_loss(log_prob).mean(),
+            "alpha": self._alpha,
+            "entropy": -log_prob.mean(),
+        }
+        return TensorDict(out, batch_size=[])
+
+    def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Critic loss and detached per-row metadata (``td_error``, ``q``, ``target_q``)."""
+        target = self._compute_target_v2(tensordict)  # (B,)
+        action = tensordict.get(self.tensor_keys.action)
+        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
+            values = torch.stack([self._q_values(view, action) for view in self._views(tensordict)], -2)
+        errors = values - target[..., None, None]  # (B, views, 2)
+        # Sum over the views and the two heads of the mean over the batch.
+        loss = errors.square().sum((-2, -1)).mean()
+        largest = errors.detach().abs().amax(-1).mean(-1)
+        return loss, {"td_error": largest, "q": values.detach().mean(-2), "target_q": target}
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Actor loss and the detached log-probability of its actions."""
+        features = self._policy_features(self._views(tensordict)[0])
+        noise = self._noise(features)
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            action, log_prob = self.actor.sample(features, noise=noise)
+        # Detached weights: the gradient passes through Q to the action and to nothing else.
+        with self._cached_detached_qvalue_params.to_module(self.qvalue_network, preserve_module_state=False):
+            value = self._q_values_on_features(features, action).amin(-1)
+        return (self._alpha * log_prob - value).mean(), {"log_prob": log_prob.detach()}
+
+    def _alpha_loss(self, log_prob: Tensor) -> Tensor:
+        # SACLoss uses log_alpha in place of alpha.
+        return self.log_alpha.exp() * (-log_prob - self.target_entropy).detach()
+
+    @torch.no_grad()
+    def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
+        soft_values = []
+        for view in self._views(tensordict.get("next")):
+            features = self._policy_features(view)
+            noise = self._noise(features)
+            with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+                action, log_prob = self.actor.sample(features, noise=noise)
+            with self.target_qvalue_network_params.to_module(
+                self.qvalue_network, preserve_module_state=False
+            ):
+                soft_values.append(self._q_values(view, action).amin(-1) - self._alpha * log_prob)
+        soft_value = torch.stack(soft_values).mean(0).unsqueeze(-1)
+        names = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
+        keys = [unravel_key(("next", name)) for name in names]
+        steps_ahead = self.value_estimator.tensor_keys.steps_to_next_obs
+        estimate = tensordict.select(*keys, steps_ahead, strict=False)
+        estimate.set(("next", self.value_estimator.tensor_keys.value), soft_value)
+        return self.value_estimator.value_estimate(estimate).squeeze(-1)
+
+    def _noise(self, features: Tensor) -> Tensor:
+        # Drawn before the parameters are swapped in, where a compiler cannot pause for a generator.
+        like = features.new_empty(*features.shape[:-1], self.actor.action_dim, dtype=self.log_alpha.dtype)
+        return standard_normal_like(like, self.generator)
+
+    # What subclasses change: how many views there are of an observation, and what lies before the features.
+
+    def _views(self, tensordict: TensorDictBase) -> list[Tensor]:
+        """The views of the observation; the first is the one that the actor learns from."""
+        return [tensordict.get(getattr(self.tensor_keys, name)).detach() for name in self.view_names]
+
+    def _policy_features(self, view: Tensor) -> Tensor:
+        """What the actor sees of a view, without gradient."""
+        return view
+
+    def _q_values(self, view: Tensor, action: Tensor) -> Tensor:
+        return self.critic(view, action)
+
+    def _q_values_on_features(self, features: Tensor, action: Tensor) -> Tensor:
+        return self.critic(features, action)
+
+    def _make_vmap(self) -> None:
+        # SACLoss vectorises over a stack of critics; here there is one, and the vmap closure cannot be pickled.
+        pass
+
+    def _set_in_keys(self) -> None:
+        keys = self.tensor_keys
+        views = [getattr(keys, name) for name in self.view_names]
+        following = (*views, keys.reward, keys.done, keys.terminated)
+        self._in_keys = [*views, keys.action, *(unravel_key(("next", key)) for key in following)]
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        super()._forward_value_estimator_keys(**kwargs)
+        self._set_in_keys()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore from a pickle or a deep copy, tying the networks to the copied parameters again."""
+        super().__setstate__(state)
+        # SACLoss caches detached views of the critic's parameters; copied, they are views of nothing that trains.
+        self._erase_cache()
+        self.actor_network_params.to_module(self.actor_network, preserve_module_state=False)
+        self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False)
+
+    @torch.no_grad()
+    def reset_parameters_recursive(self) -> None:
+        """Re-initialise actor and critic, copy the critic into its target, restore the first temperature."""
+        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+            self.actor.reset_parameters()
+        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
+            self.critic.reset_parameters()
+        self.target_qvalue_network_params.data.update_(self.qvalue_network_params.data)
+        self.log_alpha.copy_(self.alpha_init.log())
+
+
+class AveragedSACLoss(RADSACLoss):
+    r""":class:`RADSACLoss` with two views of each observation (DrQ, arXiv 2004.13649, K = M = 2).
+
+    With :math:`h_m, h_m'` the features of view m of an observation and the next, each with its own
+    :math:`a_m' \sim \pi(h_m')`:
+
+    * :math:`y = \frac12 \sum_m [r + \gamma (1-\mathrm{terminated}) (\min(Q_1', Q_2')(h_m', a_m') - \alpha
+      \log\pi(a_m'|h_m'))]`
+    * ``loss_qvalue`` = :math:`\sum_m` (MSE(Q1, y) + MSE(Q2, y)), a sum and not a mean over the views, as in
+      denisyarats/drq ``drq.py``;
+    * ``loss_actor`` and ``loss_alpha`` on the first view.
+
+    The exploration agent of APT learns with it on detached features (forhaoliu/mini_apt averages likewise).
+
+    Args:
+        actor: on features.
+        critic: on features and actions; the target is a copy of all of it.
+        observation: key of the first view's features; also read under ``"next"``.
+        observation_view: key of the second view's, likewise.
+        **options: of :class:`RADSACLoss`. A ``generator`` is asked for the next actions of the first view, of
+            the second, then for the actor's.
+
+    Returns (``forward``):
+        As :class:`RADSACLoss`; ``q_mean`` and ``td_error`` are means over the views too.
+    """
+
+    @dataclass
+    class _AcceptedKeys(RADSACLoss._AcceptedKeys):
+        """``RADSACLoss``'s keys and one more.
+
+        Attributes:
+            observation_view: features of the second view, at the root and under ``"next"``.
+        """
+
+        observation_view: NestedKey = "features_view"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    view_names: ClassVar[tuple[str, ...]] = ("observation", "observation_view")
+
+    def __init__(
+        self,
+        actor: SquashedGaussianActor,
+        critic: TwinCritic | PixelCritic,
+        *,
+        observation: NestedKey = "features",
+        observation_view: NestedKey = "features_view",
+        **options: Any,
+    ) -> None:
+        super().__init__(actor, critic, observation=observation, **options)
+        self.set_keys(observation_view=observation_view)
+
+
+class DrQLoss(AveragedSACLoss):
+    r"""DrQ (arXiv 2004.13649; denisyarats/drq ``drq.py``): :class:`AveragedSACLoss` with the encoder inside.
+
+    Actor and critic share the convolutions, tied, and each has a head of its own. The convolutions learn from
+    ``loss_qvalue`` alone: the actor, its critic and the policy of the targets see detached features. The target
+    critic has its own copy of convolutions and head. Give actor and critic ``has_tanh=True``: DrQ's heads end
+    with a tanh.
+
+    Deviation: as in :class:`RADSACLoss`, ``terminated`` cuts the bootstrap.
+
+    Args:
+        encoder: trained in place.
+        actor: on the encoder's features.
+        critic: on the encoder's features and actions.
+        observation: key of the first view, images ``[B, C, H, W]``; also read under ``"next"``.
+        observation_view: key of the second view, likewise.
+        **options: of :class:`RADSACLoss`.
+
+    Raises:
+        ValueError: a critic that does not fit the encoder; otherwise as :class:`RADSACLoss`.
+    """
+
+    @dataclass
+    class _AcceptedKeys(AveragedSACLoss._AcceptedKeys):
+        """The keys of :class:`AveragedSACLoss` with other defaults.
+
+        Attributes:
+            observation: images of the first view, at the root and under ``"next"``.
+            observation_view: images of the second view, likewise.
+        """
+
+        observation: NestedKey = "pixels"
+        observation_view: NestedKey = "pixels_view"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    critic: PixelCritic
+
+    def __init__(
+        self,
+        encoder: PixelEncoder,
+        actor: SquashedGaussianActor,
+        critic: TwinCritic,
+        *,
+        observation: NestedKey = "pixels",
+        observation_view: NestedKey = "pixels_view",
+        **options: Any,
+    ) -> None:
+        keys = {"observation": observation, "observation_view": observation_view}
+        super().__init__(actor, PixelCritic(encoder, critic), **keys, **options)
+
+    @property
+    def encoder(self) -> PixelEncoder:
+        """The convolutions that actor and critic share."""
+        return self.critic.encoder
+
+    @torch.no_grad()
+    def _policy_features(self, view: Tensor) -> Tensor:
+        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
+            return self.critic.encoder(view)
+
+    def _q_values_on_features(self, features: Tensor, action: Tensor) -> Tensor:
+        return self.critic.head(features, action)

@@ -1,0 +1,99 @@
+"""What made a number: versions, hardware and source revision, for cards and records."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import subprocess
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import psutil
+import torch
+
+PACKAGES = (
+    "crptpro", "torch", "torchrl", "tensordict", "dm-control", "mujoco", "gymnasium", "numpy", "wandb",
+)  # fmt: skip
+
+#: How the name of a GPU begins that torch sees and cannot use.
+UNUSABLE = "unusable"
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Return the installed version of every package that can change a number, and Python's."""
+    found = {"python": platform.python_version()}
+    for package in PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+@cache
+def hardware() -> dict[str, Any]:
+    """Return what decides how long work takes here.
+
+    Returns:
+        ``cpu``, the model; ``cpu_instructions``, see :func:`cpu_instructions`; ``cpu_cores``, that this process may
+        use; ``ram_bytes``; ``gpus``, the names torch sees (or why it cannot use one).
+    """
+    cpu = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
+        cpu = names[0].split(":", 1)[1].strip() if names else cpu
+    return {
+        "cpu": cpu,
+        "cpu_instructions": cpu_instructions(),
+        "cpu_cores": cpu_cores(),
+        "ram_bytes": psutil.virtual_memory().total,
+        "gpus": [_gpu_name(index) for index in range(torch.cuda.device_count())],
+    }
+
+
+def cpu_instructions() -> str:
+    """Return the vector instructions that torch computes with, e.g. ``"AVX512, AVX512-BF16"``.
+
+    Virtual machines hide the model: two of one name may differ threefold in speed, and one of them multiply no
+    bfloat16.
+    """
+    probes = {"_is_avx512_bf16_supported": "AVX512-BF16", "_is_amx_tile_supported": "AMX"}
+    there = [name for probe, name in probes.items() if getattr(torch.cpu, probe, lambda: False)()]
+    return ", ".join([torch.backends.cpu.get_cpu_capability(), *there])
+
+
+def cpu_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _gpu_name(index: int) -> str:
+    try:
+        return torch.cuda.get_device_name(index)
+    except Exception as reason:  # a driver that is broken, or older than torch wants
+        return f"{UNUSABLE}: {(str(reason).splitlines() or [type(reason).__name__])[0]}"
+
+
+@cache
+def git_revision() -> str:
+    """Return the revision of the source checkout, ``+dirty`` if modified, or ``"unknown"``."""
+    here = Path(__file__).resolve()
+    git = ["git", "-C", str(here.parent)]
+    # Installed below somebody's repository (a .venv that it ignores), this file is not part of it.
+    is_tracked = [*git, "ls-files", "--error-unmatch", here.name]
+    describe = [*git, "describe", "--always", "--dirty=+dirty", "--abbrev=12"]
+    try:
+        for command in (is_tracked, describe):
+            answer = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+        return answer.stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+
+
+def provenance() -> dict[str, Any]:
+    """Return the part of a card that every artifact shares: versions, hardware, git revision."""
+    return {"versions": versions(), "hardware": hardware(), "git_revision": git_revision()}

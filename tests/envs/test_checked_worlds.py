@@ -1,0 +1,321 @@
+"""What every world must keep, whichever library it is of: images, finite numbers, actions, errors with its name."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from fake_worlds import FakeDmEnv, OwnWorld, own, painter
+from torchrl.envs import EnvBase
+
+from crptpro.data import collect_random
+from crptpro.envs import make_env
+from crptpro.envs.dm_control import AgentSteps
+from crptpro.errors import CRPTproError, NonFiniteError, WorldError, WorldFailedError
+
+SIZE = 8
+
+
+def grey(shade: Any, dtype: Any = np.uint8) -> np.ndarray:
+    return np.full((SIZE, SIZE, 3), shade, dtype)
+
+
+@contextmanager
+def shows(image: Any, *, library: str, **options: Any) -> Iterator[EnvBase]:
+    """An environment of a world of either library that shows ``image(clock)``."""
+    if library == "gymnasium":
+        with painter(image=image) as task:
+            yield make_env(task, seed=0, image_size=SIZE, action_repeat=1, **options)
+    else:
+
+        def make() -> EnvBase:
+            return OwnWorld(lambda clock: torch.from_numpy(image(clock)))
+
+        yield make_env(own(make), seed=0, image_size=SIZE, **options)
+
+
+both = pytest.mark.parametrize("library", ["gymnasium", "own"])
+
+
+@both
+@pytest.mark.parametrize("frame_stack", [1, 3])
+def test_frames_outlive_the_buffer_that_a_world_uses_again(library: str, frame_stack: int) -> None:
+    buffer = grey(0)
+
+    def reuse(clock: int) -> np.ndarray:
+        buffer[:] = clock
+        return buffer
+
+    with shows(reuse, library=library, frame_stack=frame_stack) as env:
+        shown = env.rollout(3)["next", "pixels"]
+    assert shown[:, -1, 0, 0].tolist() == [1, 2, 3]
+
+
+@both
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_floats_between_0_and_1_are_scaled_once_and_said(
+    library: str, dtype: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    with (
+        caplog.at_level(logging.WARNING),
+        shows(lambda clock: grey(clock / 5, dtype), library=library) as env,
+    ):
+        shown = env.rollout(3)["next", "pixels"]
+    assert shown.dtype == torch.uint8
+    assert shown[:, -1, 0, 0].tolist() == [51, 102, 153]
+    assert caplog.text.count("multiplied by 255") == 1
+
+
+@both
+@pytest.mark.parametrize(
+    ("image", "complaint"),
+    [
+        (grey(300, np.uint16), "uint16"),
+        (grey(3, np.int64), "int64"),
+        (grey(True, bool), "bool"),
+        (grey(np.nan, np.float32), "nan"),
+        (grey(200.0, np.float32), "200"),
+        (grey(-0.5, np.float64), "-0.5"),
+    ],
+)
+def test_images_that_are_neither_uint8_nor_floats_between_0_and_1_are_refused_by_name(
+    library: str, image: np.ndarray, complaint: str
+) -> None:
+    with pytest.raises(CRPTproError, match=complaint):  # noqa: SIM117
+        with shows(lambda _: image, library=library) as env:
+            env.reset()
+
+
+@pytest.mark.parametrize(
+    ("image", "complaint"),
+    [("no picture", "is str"), (None, "NoneType"), (np.zeros((8, 8), np.uint8), r"\(8, 8\)"),
+     (np.zeros((8, 8, 4), np.uint8), r"\(8, 8, 4\)")],
+)  # fmt: skip
+def test_what_is_no_rgb_image_is_refused_at_whatever_step_it_comes(image: Any, complaint: str) -> None:
+    with painter(image=lambda clock: grey(clock) if clock < 2 else image) as task:
+        env = make_env(task, seed=0, image_size=SIZE, action_repeat=1)
+        with pytest.raises(WorldError, match=rf"{task}.*{complaint}"):
+            env.rollout(3)
+
+
+@both
+@pytest.mark.parametrize(("shade", "word"), [(0, "black"), (7, "of one shade")])
+def test_an_episode_whose_frames_are_all_alike_is_reported_once(
+    library: str, shade: int, word: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING), shows(lambda _: grey(shade), library=library) as env:
+        for _ in range(3):
+            env.rollout(10)
+    assert caplog.text.count("All frames of a whole episode") == 1
+    assert word in caplog.text
+
+
+@both
+def test_an_episode_in_which_something_moves_late_or_that_was_left_early_is_not_reported(
+    library: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING), shows(lambda clock: grey(clock // 4), library=library) as env:
+        env.rollout(10)
+        env.rollout(2)
+        env.rollout(2)
+    assert not caplog.text
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@both
+def test_a_reward_that_is_not_finite_names_world_episode_and_step_before_it_is_returned(
+    library: str, value: float
+) -> None:
+    def reward(clock: int) -> float:
+        return value if clock == 3 else 1.0
+
+    with painter(reward=reward) as task:
+        domain = task if library == "gymnasium" else own(lambda: OwnWorld(reward=reward))
+        env = make_env(domain, seed=0, image_size=SIZE, action_repeat=1)
+        env.rollout(2)
+        name = task if library == "gymnasium" else "mine_go"
+        with pytest.raises(NonFiniteError, match=rf"'{name}' .*reward .*agent step 3 of episode 1"):
+            env.rollout(5)
+
+
+def test_a_physical_state_that_is_not_finite_is_refused() -> None:
+    class Broken(OwnWorld):
+        def _observe(self, is_over: bool) -> Any:
+            return super()._observe(is_over) | {"qpos": torch.tensor([np.nan], dtype=torch.float64)}
+
+    with pytest.raises(NonFiniteError, match=r"'mine_go' .*qpos"):
+        make_env(own(Broken), seed=0, image_size=SIZE, physics_state=True).reset()
+
+
+@both
+def test_an_action_that_is_not_finite_names_world_episode_and_step_and_reaches_no_simulator(
+    library: str,
+) -> None:
+    with shows(grey, library=library) as env:
+        td = env.reset().set("action", torch.tensor([0.0, np.nan]))
+        with pytest.raises(NonFiniteError, match=r"action .*nan.* agent step 1 of episode 0"):
+            env.step(td)
+
+
+def test_a_reward_that_is_not_finite_reaches_no_episode_that_is_collected(tmp_path: Path) -> None:
+    pictures = [torch.full((3, SIZE, SIZE), shade, dtype=torch.uint8) for shade in range(5)]
+    domain = own(lambda: OwnWorld(pictures.__getitem__, reward=lambda clock: np.nan if clock == 2 else 0.0))
+    with pytest.raises(CRPTproError, match="agent step 2"):
+        collect_random(domain, tmp_path, transitions=9, workers=1, image_size=SIZE, progress=False)
+
+
+def explode(clock: int) -> Any:
+    if clock >= 2:
+        raise ValueError("the motor is on fire")
+    return 0.0
+
+
+def explode_drawing(clock: int) -> Any:
+    return grey(clock + int(explode(clock)))
+
+
+def test_an_exception_of_a_worlds_own_is_passed_on_with_its_name_and_the_call() -> None:
+    with painter(image=explode_drawing) as task, pytest.raises(WorldFailedError) as caught:
+        make_env(task, seed=0, image_size=SIZE, action_repeat=1).rollout(3)
+    assert isinstance(caught.value.__cause__, ValueError)
+    for part in ("the motor is on fire", "ValueError in render()", task, __file__):
+        assert part in str(caught.value)
+    with (
+        painter(reward=explode) as task,
+        pytest.raises(WorldFailedError, match=r"ValueError in step\(\) of the world"),
+    ):
+        make_env(task, seed=0, image_size=SIZE).rollout(3)
+    with pytest.raises(WorldFailedError, match=r"on fire .*ValueError in step\(\) of the world 'mine_go'"):
+        make_env(own(lambda: OwnWorld(reward=explode)), seed=0, image_size=SIZE).rollout(3)
+
+
+def test_an_exception_of_a_worlds_own_is_never_taken_for_a_setting() -> None:
+    class Picky(gymnasium.Env):  # type: ignore[type-arg]
+        metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+        def __init__(self, render_mode: str = "", camera_id: int = 0):
+            raise TypeError("unsupported operand type(s) for +: 'int' and 'str'")
+
+    gymnasium.register("CrptproPicky-v0", Picky, disable_env_checker=True)
+    try:
+        with pytest.raises(WorldFailedError, match=r"unsupported operand.*make\(\).*CrptproPicky") as caught:
+            make_env("gymnasium:CrptproPicky-v0", seed=0, camera=0)
+    finally:
+        del gymnasium.registry["CrptproPicky-v0"]
+    assert __file__ in str(caught.value)
+    assert "takes no camera" not in str(caught.value)
+
+    def make(quality: str) -> EnvBase:
+        raise ValueError("no such quality")
+
+    with pytest.raises(
+        WorldFailedError, match=r"no such quality \(ValueError in make\(\) of the world 'mine_go'"
+    ):
+        make_env(own(make), seed=0)
+
+
+@pytest.mark.parametrize("limit", [5, None])
+def test_a_step_of_the_old_api_is_answered_with_what_is_expected(limit: int | None) -> None:
+    with painter(limit, answer=lambda clock: (np.zeros(1), 0.0, False, {})) as task:
+        env = make_env(task, seed=0, image_size=SIZE)
+        with pytest.raises(WorldError, match=rf"{task}.*five values.*got 4"):
+            env.rollout(2)
+
+
+HUGE = float(np.finfo(np.float32).max)
+
+
+@pytest.mark.parametrize(
+    ("space", "complaint"),
+    [
+        (gymnasium.spaces.Discrete(3), "Discrete actions"),
+        (gymnasium.spaces.Box(0, 10, (2,), np.int64), "actions of int64"),
+        (gymnasium.spaces.Box(-1.0, 1.0, (0,)), "empty action"),
+        (gymnasium.spaces.Box(-HUGE, HUGE, (2,)), "without bounds"),
+        (gymnasium.spaces.Box(-np.inf, np.inf, (2,)), "without bounds"),
+        (gymnasium.spaces.Box(0.0, HUGE, (2,)), "one side only"),
+        (gymnasium.spaces.Box(1.0, 1.0, (2,)), "hold nothing"),
+    ],
+)
+def test_action_spaces_that_cannot_be_mapped_from_minus_1_to_1_are_refused_by_name(
+    space: Any, complaint: str
+) -> None:
+    with painter(action_space=space) as task, pytest.raises(CRPTproError, match=rf"{task}.*{complaint}"):
+        make_env(task, seed=0)
+
+
+@pytest.mark.parametrize("bound", [np.inf, HUGE, 1e10])
+def test_an_actuator_of_dm_control_without_bounds_takes_the_action_as_it_is(bound: float) -> None:
+    env = FakeDmEnv(bounds=([-bound, 0.0], [bound, 4.0]))
+    steps = AgentSteps(env, None, world="fake", image_size=SIZE, action_repeat=1, physics_state=False)
+    steps.reset()
+    for action in ([-1, -1], [0.5, 1]):
+        steps.step(np.array(action, np.float32))
+    np.testing.assert_allclose(env.actions, [[-1.0, 0.0], [0.5, 4.0]], atol=1e-12)
+    env = FakeDmEnv(bounds=([-1.0, 0.0], [bound, 4.0]))
+    with pytest.raises(CRPTproError, match="one side only"):
+        AgentSteps(env, None, world="fake", image_size=SIZE, action_repeat=1, physics_state=False)
+
+
+def test_numbers_are_taken_as_what_they_mean_and_refused_before_anything_is_loaded() -> None:
+    with painter() as task:
+        plain = make_env(task, seed=3, image_size=8, action_repeat=2, frame_stack=2)
+        meant: dict[str, Any] = {
+            "seed": np.int64(3), "image_size": 8.0, "action_repeat": torch.tensor(2), "frame_stack": np.int8(2)
+        }  # fmt: skip
+        other = make_env(task, **meant)
+        assert torch.equal(plain.reset()["pixels"], other.reset()["pixels"])
+        assert plain.card() == other.card()
+        assert {type(other.card()[name]) for name in ("image_size", "action_repeat")} == {int}
+    for wrong in (
+        {"seed": -1},
+        {"seed": 2**32},
+        {"image_size": 0},
+        {"action_repeat": 1.5},
+        {"frame_stack": "3"},
+    ):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            make_env("cheetah_run", **({"seed": 0} | wrong))  # type: ignore[arg-type]
+    for option in ({"quality": "best"}, {"colors": "pink"}):
+        with pytest.raises(CRPTproError, match=next(iter(option))):
+            make_env("cheetah_run", seed=0, **option)  # type: ignore[arg-type]
+
+
+@pytest.mark.gl
+def test_what_nobody_closed_is_closed_at_exit_without_a_line() -> None:
+    code = """
+from crptpro.envs import make_env
+kept = [make_env(task, seed=0, frame_stack=1) for task in ("gymnasium:HalfCheetah-v5", "cartpole")]
+print([tuple(env.reset()["pixels"].shape) for env in kept])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
+    )
+    assert "(3, 84, 84), (3, 84, 84)" in done.stdout
+    assert done.stderr == ""
+
+
+def test_a_world_is_closed_once_however_often_it_is_asked() -> None:
+    closed: list[str] = []
+
+    class Closing(OwnWorld):
+        def close(self, *, raise_if_closed: bool = True) -> None:
+            closed.append("own")
+            super().close(raise_if_closed=raise_if_closed)
+
+    with painter() as task:
+        for domain in (task, own(lambda: Closing())):
+            env = make_env(domain, seed=0, image_size=SIZE)
+            env.close()
+            env.close()
+            assert env.is_closed
+    assert closed == ["own"]

@@ -1,0 +1,303 @@
+"""dm_control's worlds behind ``make_env``: every frame and reward is what plain dm_control gives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from fake_worlds import FakeDmEnv
+from tensordict import TensorDictBase
+from torchrl.envs import CatFrames, DMControlWrapper, EnvBase, check_env_specs
+
+from crptpro.domains import PAPER_DOMAINS, SUITE_TASKS, Domain, get_domain
+from crptpro.envs import make_env
+from crptpro.envs.dm_control import AgentSteps, load_dm_env, reverse_background
+from crptpro.envs.rendering import select_backend
+from crptpro.errors import CRPTproError, UnknownNameError
+
+TASKS = [task for tasks in SUITE_TASKS.values() for task in tasks]
+ACTION_SIZES = {
+    "cheetah": 6, "walker": 6, "quadruped": 12, "cartpole": 1, "pendulum": 1, "manipulation": 9, "hopper": 4,
+    "finger": 2,
+}  # fmt: skip
+
+
+def play(env: EnvBase, agent_steps: int) -> TensorDictBase:
+    """A fixed sequence of actions from the next reset on."""
+    generator = torch.Generator().manual_seed(0)
+    td, seen = env.reset(), []
+    for _ in range(agent_steps):
+        td["action"] = torch.rand(env.action_spec.shape, generator=generator) * 2 - 1
+        stepped, td = env.step_and_maybe_reset(td)
+        seen.append(stepped)
+    return torch.stack(seen)
+
+
+class Played:
+    """An environment of a domain, the third episode of which was played from its seed, with its camera counted."""
+
+    seed = 11
+
+    def __init__(self, name: str, monkeypatch: pytest.MonkeyPatch):
+        select_backend()
+        from dm_control.mujoco import engine
+
+        self.name, self.renders = name, 0
+        self.env = make_env(name, seed=0, physics_state=True)
+        self.first = play(self.env, 1)
+        self.env.set_seed(self.seed)
+        render = engine.Camera.render
+
+        def counted(*args: Any, **kwargs: Any) -> Any:
+            self.renders += 1
+            return render(*args, **kwargs)
+
+        monkeypatch.setattr(engine.Camera, "render", counted)
+        self.rollout = play(self.env, 3)
+
+
+@pytest.fixture(scope="module", params=PAPER_DOMAINS)
+def played(request: pytest.FixtureRequest) -> Iterator[Played]:
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        played = Played(request.param, monkeypatch)
+    yield played
+    played.env.close()
+
+
+def plain_dm_control(domain: Domain, seed: int) -> tuple[Any, Any, Any]:
+    """Load a domain without this library; returns the world, the scaled world, and what its images are."""
+    from dm_control import manipulation, suite
+    from dm_control.suite.wrappers import action_scale
+
+    if domain.source == "manipulation":
+        world = manipulation.load("reach_duplo_vision", seed=seed)
+        return world, action_scale.Wrapper(world, -1.0, 1.0), lambda step: step.observation["front_close"][0]
+    world = suite.load(domain.name, domain.task.removeprefix(f"{domain.name}_"), task_kwargs={"random": seed})
+    camera = 2 if domain.name == "quadruped" else 0
+    scaled = action_scale.Wrapper(world, -1.0, 1.0)
+    return world, scaled, lambda _: world.physics.render(84, 84, camera_id=camera)
+
+
+@pytest.mark.gl
+def test_every_paper_domain_gives_the_frames_and_rewards_of_plain_dm_control(played: Played) -> None:
+    world, scaled, image_of = plain_dm_control(PAPER_DOMAINS[played.name], played.seed)
+    step = scaled.reset()
+    frames, rewards = [torch.from_numpy(image_of(step).transpose(2, 0, 1).copy())], []
+    for action in played.rollout["action"].numpy():
+        steps = [scaled.step(action) for _ in range(2)]
+        frames.append(torch.from_numpy(image_of(steps[-1]).transpose(2, 0, 1).copy()))
+        rewards.append([np.float32(steps[0].reward + steps[1].reward)])
+    state = world.physics.data.qpos.copy()
+    world.close()
+    shown = [frames[0]] * 3 + frames[1:]
+    for step_index, td in enumerate(played.rollout):
+        assert torch.equal(td["pixels"], torch.cat(shown[step_index : step_index + 3]))
+        assert torch.equal(td["next", "pixels"], torch.cat(shown[step_index + 1 : step_index + 4]))
+    np.testing.assert_array_equal(played.rollout["next", "reward"].numpy(), rewards)
+    np.testing.assert_array_equal(played.rollout["next", "qpos"][-1].numpy(), state)
+    assert not torch.equal(frames[0], frames[-1])
+
+
+@pytest.mark.gl
+def test_every_paper_domain_is_drawn_once_per_agent_step_by_torchrls_parts(played: Played) -> None:
+    assert played.renders == 1 + 3
+    assert isinstance(played.env.base_env, DMControlWrapper)
+    assert isinstance(played.env.transform[-1], CatFrames)
+    assert played.rollout["pixels"].shape == (3, 9, 84, 84)
+    assert played.rollout["pixels"].dtype == torch.uint8
+    assert played.rollout["action"].shape == (3, ACTION_SIZES[played.name])
+    assert played.rollout["next", "reward"].dtype == played.rollout["action"].dtype == torch.float32
+    assert played.rollout["next", "reward"].shape == (3, 1)
+    assert played.rollout["next", "qvel"].dtype == torch.float64
+    assert played.env.action_spec.space.low.eq(-1).all()
+    assert played.env.card()["backend"] in ("egl", "osmesa", "glfw")
+    if played.name in ("cheetah", "manipulation"):
+        check_env_specs(played.env)
+
+
+@pytest.mark.gl
+def test_an_episode_depends_on_its_seed_and_a_state_is_drawn_as_it_was_seen(played: Played) -> None:
+    played.env.set_seed(0)
+    again = play(played.env, 1)
+    for key in ("pixels", ("next", "pixels"), ("next", "reward"), ("next", "qpos"), ("next", "qvel")):
+        assert torch.equal(again[key], played.first[key]), key
+    assert not torch.equal(again["pixels"][0], played.rollout["pixels"][0])
+    before, after = again["pixels"][0, -3:], again["next", "pixels"][0, -3:]
+    world: Any = played.env.base_env
+    for key, seen in (("next", after), ("root", before)):
+        td = again[0]["next"] if key == "next" else again[0]
+        difference = world.draw_state(td["qpos"].numpy(), td["qvel"].numpy()).float() - seen.float()
+        assert difference.abs().mean() < 0.5
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("task", ["walker_run", "quadruped_escape"])
+def test_fast_quality_reaches_the_render_context_and_changes_few_pixels(task: str) -> None:
+    """quadruped_escape makes its context in the reset, to send its terrain to the GPU."""
+    images = {}
+    for quality in ("exact", "fast"):
+        env = make_env(task, seed=0, frame_stack=1, quality=quality)
+        images[quality] = env.reset()["pixels"].int()
+        size = env.physics.contexts.mujoco.ptr.shadowSize
+        assert size == 512 if quality == "fast" else size > 512
+        assert env.card()["quality"] == quality
+        env.close()
+    changed = (images["exact"] != images["fast"]).any(0).float().mean()
+    assert 0 < changed < (0.15 if task == "quadruped_escape" else 0.01)
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("name", ["cheetah", pytest.param("manipulation", marks=pytest.mark.slow)])
+def test_a_real_background_changes_its_colours_and_the_episode_stays_the_same(name: str) -> None:
+    """Manipulation compiles a new model at every reset."""
+    images, states = {}, {}
+    for colors in ("normal", "reversed_background", "reversed_image"):
+        env = make_env(name, seed=1, frame_stack=1, quality="fast", physics_state=True, colors=colors)
+        env.reset()
+        env.set_seed(1)
+        seen = play(env, 1)
+        images[colors], states[colors] = seen["next", "pixels"][-1].int(), seen["next", "qpos"]
+        assert env.card()["colors"] == colors
+        env.close()
+    assert states["normal"].equal(states["reversed_background"])
+    assert images["reversed_image"].equal(images["normal"].flip(0))
+    # Most of a picture is background: there it is the same as the reversed picture. The robot is not.
+    same = (images["reversed_background"] == images["reversed_image"]).all(0).float().mean()
+    assert 0.7 < same < 1.0
+    assert images["reversed_background"][1].equal(images["normal"][1]), "the middle channel keeps its place"
+
+
+@pytest.mark.gl
+def test_other_sizes_stacks_repeats_and_cameras() -> None:
+    env = make_env("cartpole_balance", seed=0, image_size=500, frame_stack=2, action_repeat=4, camera=1)
+    assert env.rollout(2)["next", "pixels"].shape == (2, 6, 500, 500)
+    assert env.physics.time() == pytest.approx(2 * 4 * 0.01)
+    card = env.card()
+    assert (card["image_size"], card["action_repeat"], card["camera"]) == (500, 4, 1)
+    env.close()
+    env = make_env("cheetah_run", seed=0, camera="sideways")
+    with pytest.raises(CRPTproError, match=r"sideways.*side, back"):
+        env.reset()
+    env.close()
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize(("task", "agent_steps"), [("pendulum", 500), ("reach_duplo", 125)])
+def test_a_full_episode_is_truncated_and_not_terminated(task: str, agent_steps: int) -> None:
+    env = make_env(task, seed=0, image_size=8, render=False)
+    ends = env.rollout(agent_steps + 10)["next"]
+    env.close()
+    assert len(ends) == agent_steps
+    assert ends["truncated"].sum() == ends["truncated"][-1] == 1
+    assert not ends["terminated"].any()
+
+
+@pytest.mark.gl
+def test_a_suite_task_may_be_registered_under_another_domain_name() -> None:
+    select_backend()
+    env = load_dm_env(Domain("seen_from_behind", "acrobot_swingup", camera=0, source="suite"))
+    assert env.physics.model.nq == 2
+    with pytest.raises(UnknownNameError, match="acrobot_dance"):
+        load_dm_env(Domain("own", "acrobot_dance", source="suite"))
+    with pytest.raises(UnknownNameError, match="walker_walk"):
+        get_domain("walker_wolk")
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_every_suite_task_is_built_by_its_name_and_its_pixels_change(task: str) -> None:
+    # Long agent steps, so that every world moves visibly in one.
+    env = make_env(task, seed=0, image_size=48, frame_stack=1, action_repeat=20, quality="fast")
+    first = env.reset()
+    last = env.step(first.clone().set("action", torch.ones(env.action_spec.shape)))["next"]
+    env.close()
+    assert first["pixels"].unique().numel() > 10
+    assert not torch.equal(first["pixels"], last["pixels"])
+
+
+def steps_of(env: FakeDmEnv, action_repeat: int = 2) -> AgentSteps:
+    steps = AgentSteps(
+        env, None, world="fake", image_size=8, action_repeat=action_repeat, physics_state=False
+    )
+    steps.reset()
+    return steps
+
+
+def test_rewards_of_repeated_env_steps_are_summed_up_to_the_episodes_end() -> None:
+    env = FakeDmEnv(length=5)
+    steps = steps_of(env, action_repeat=3)
+    first, last = (steps.step(np.zeros(2, np.float32)) for _ in range(2))
+    assert (first.reward, first.last()) == (1.0 + 2.0 + 3.0, False)
+    assert (last.reward, last.last(), env.env_steps) == (4.0 + 5.0, True, 5)
+
+
+def test_actions_are_mapped_to_the_actuators_ranges() -> None:
+    env = FakeDmEnv()
+    steps = steps_of(env, action_repeat=1)
+    for action in ([-1, -1], [1, 1], [0, 0.5]):
+        steps.step(np.array(action, np.float32))
+    np.testing.assert_allclose(env.actions, [[-1.0, -0.8], [1.1, 0.8], [0.05, 0.4]], atol=1e-12)
+
+
+def test_seeding_reaches_the_generator_of_either_kind_of_environment() -> None:
+    suite_like, composer_like = FakeDmEnv(), FakeDmEnv()
+    composer_like.random_state = np.random.RandomState(0)  # type: ignore[attr-defined]
+    steps_of(suite_like).seed(3)
+    steps_of(composer_like).seed(3)
+    expected = np.random.RandomState(3).rand()
+    assert suite_like.task.random.rand() == composer_like.random_state.rand() == expected  # type: ignore[attr-defined]
+
+
+MODEL = """
+<mujoco>
+  <asset>
+    <texture name="sky" type="skybox" builtin="flat" rgb1=".1 .2 .4" width="4" height="24"/>
+    <texture name="grid" type="2d" builtin="flat" rgb1=".8 .4 .2" width="4" height="4"/>
+    <texture name="skin" type="2d" builtin="flat" rgb1=".2 .6 1" width="4" height="4"/>
+    <texture name="shared" type="2d" builtin="flat" rgb1=".2 .4 .6" width="4" height="4"/>
+    <material name="grid" texture="grid" rgba=".9 .6 .3 .5"/>
+    <material name="skin" texture="skin" rgba=".1 .2 .3 1"/>
+    <material name="shared" texture="shared" rgba=".1 .2 .3 1"/>
+  </asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 1" material="grid"/>
+    <geom name="wall" type="plane" size="1 1 1" rgba=".3 .2 .1 1"/>
+    <geom name="striped" type="plane" size="1 1 1" material="shared"/>
+    <geom name="rail" type="box" size="1 1 1" rgba=".3 .2 .1 1"/>
+    <body>
+      <joint type="hinge"/>
+      <geom name="robot" type="sphere" size="1" material="skin" rgba=".7 .5 .3 1"/>
+      <geom name="foot" type="sphere" size="1" material="shared"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def texels(model: mujoco.MjModel, name: str) -> np.ndarray:
+    texture = model.texture(name)
+    size = int(texture.height[0] * texture.width[0] * 3)
+    return model.tex_data[texture.adr[0] : texture.adr[0] + size].reshape(-1, 3).copy()
+
+
+def test_skybox_and_floor_are_reversed_and_nothing_else() -> None:
+    model, untouched = (mujoco.MjModel.from_xml_string(MODEL) for _ in range(2))
+    reverse_background(model)
+    for name in ("sky", "grid"):
+        assert (texels(model, name) == texels(untouched, name)[:, ::-1]).all()
+        assert (texels(model, name) != texels(untouched, name)).any()
+    for name in ("skin", "shared"):
+        assert (texels(model, name) == texels(untouched, name)).all()
+        assert (model.material(name).rgba == untouched.material(name).rgba).all()
+    np.testing.assert_allclose(model.material("grid").rgba, [0.3, 0.6, 0.9, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(model.geom("wall").rgba, [0.1, 0.2, 0.3, 1], rtol=1e-6)
+    for name in ("rail", "robot", "foot"):
+        assert (model.geom(name).rgba == untouched.geom(name).rgba).all()
+    bare = "<mujoco><worldbody><geom type='box' size='1 1 1'/></worldbody></mujoco>"
+    with pytest.raises(CRPTproError, match=r"no background.*reversed_image"):
+        reverse_background(mujoco.MjModel.from_xml_string(bare))

@@ -1,0 +1,230 @@
+"""A user's own TorchRL environment behind ``make_env``: what it may be, what it is given, what it keeps."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from fake_worlds import OwnWorld, own
+from torchrl.data import Bounded, Composite
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    InitTracker,
+    RewardSum,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+    check_env_specs,
+)
+from torchrl.envs.transforms import ExcludeTransform, UnsqueezeTransform
+
+from crptpro.domains import Domain
+from crptpro.envs import episode_length, factory, make_env, resolve_action_repeat
+from crptpro.errors import CRPTproError
+
+
+def make_chw(seed: int, image_size: int) -> EnvBase:
+    return OwnWorld()
+
+
+def make_hwc(**_: Any) -> EnvBase:
+    def pixels(clock: int) -> torch.Tensor:
+        image = torch.full((8, 8, 3), clock, dtype=torch.uint8)
+        image[0, :, 1] = 200  # the top row is greener: catches swapped axes
+        return image
+
+    return OwnWorld(pixels)
+
+
+@pytest.mark.parametrize("frame_stack", [1, 3])
+@pytest.mark.parametrize("make", [make_chw, make_hwc])
+def test_own_pixels_are_stacked_channels_first(make: Any, frame_stack: int) -> None:
+    env = make_env(own(make), seed=0, image_size=8, frame_stack=frame_stack)
+    check_env_specs(env)
+    env.set_seed(0)
+    rollout = env.rollout(3)
+    shown = rollout["next", "pixels"][1]
+    assert shown.shape == (3 * frame_stack, 8, 8)
+    assert shown[::3, 1, 0].tolist() == [0, 1, 2][-frame_stack:]
+    assert (shown[1::3, 0] == 200).all() == (make is make_hwc)
+    assert set(env.observation_spec.keys()) == {"pixels"}
+
+
+def test_a_seed_waits_for_the_next_reset() -> None:
+    env = make_env(own(make_chw), seed=2, image_size=8, frame_stack=1)
+    assert env.reset()["pixels"].unique().tolist() == [20]
+    env.set_seed(5)
+    assert env.reset()["pixels"].unique().tolist() == [50]
+
+
+def test_the_physical_state_is_kept_on_request() -> None:
+    env = make_env(own(make_chw), seed=0, image_size=8, physics_state=True)
+    assert set(env.observation_spec.keys()) == {"pixels", "qpos"}
+    assert env.rollout(3)["next", "qpos"].flatten().tolist() == [1.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("transform", "kept"),
+    [
+        (StepCounter, {"step_count"}),
+        (RewardSum, {"episode_reward"}),
+        (InitTracker, {"is_init"}),
+        (lambda: Compose(StepCounter(), RewardSum()), {"step_count", "episode_reward"}),
+    ],
+)
+@pytest.mark.parametrize("frame_stack", [1, 3])
+def test_entries_that_a_worlds_own_transforms_read_back_are_kept(
+    transform: Any, kept: set[str], frame_stack: int
+) -> None:
+    def make() -> EnvBase:
+        return TransformedEnv(OwnWorld(), transform())
+
+    env = make_env(own(make), seed=0, image_size=8, frame_stack=frame_stack)
+    check_env_specs(env)
+    assert set(env.observation_spec.keys()) == {"pixels", *kept}
+    rollout = env.rollout(3)["next"]
+    if "step_count" in kept:
+        assert rollout["step_count"].flatten().tolist() == [1, 2, 3]
+    if "episode_reward" in kept:
+        assert rollout["episode_reward"].flatten().tolist() == [1.0, 3.0, 6.0]
+
+
+def test_entries_that_a_world_without_a_state_reads_back_are_kept() -> None:
+    class Stateless(OwnWorld):
+        def __init__(self) -> None:
+            super().__init__()
+            self.state_spec = Composite(observation=self.observation_spec["observation"].clone())
+
+        def _step(self, tensordict: Any) -> Any:
+            carried = tensordict["observation"] + 1
+            return super()._step(tensordict).set("observation", carried)
+
+    rollout = make_env(own(lambda: Stateless()), seed=0, image_size=8).rollout(3)
+    assert rollout["next", "observation"][:, 0].tolist() == [1.0, 2.0, 3.0]
+
+
+def test_make_is_given_what_it_names_and_what_a_partial_has_bound_is_decided() -> None:
+    given: dict[str, Any] = {}
+
+    def make(image_size: int, quality: str, action_repeat: int, camera: str) -> EnvBase:
+        given.update(image_size=image_size, quality=quality, action_repeat=action_repeat, camera=camera)
+        return OwnWorld()
+
+    domain = own(functools.partial(make, action_repeat=4, camera="side"))
+    make_env(domain, seed=0, image_size=8, quality="fast")
+    assert given == {"image_size": 8, "quality": "fast", "action_repeat": 4, "camera": "side"}
+    assert resolve_action_repeat(domain) == 4
+    make_env(own(make), seed=0, image_size=8, action_repeat=3, camera="top")
+    assert given == {"image_size": 8, "quality": "exact", "action_repeat": 3, "camera": "top"}
+
+
+def test_an_environments_class_is_a_make() -> None:
+    assert make_env(own(OwnWorld), seed=0, image_size=8).rollout(2)["next", "reward"].sum() == 3.0
+
+
+def test_an_option_that_make_does_not_take_is_said_to_do_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        make_env(own(make_chw), seed=0, image_size=8, action_repeat=1)
+        assert caplog.text == ""
+        make_env(own(make_chw), seed=0, image_size=8, action_repeat=4, quality="fast")
+    assert "a decision is 1 env step(s), not 4" in caplog.text
+    assert "takes no quality" in caplog.text
+
+
+def test_float64_actions_and_rewards_become_float32() -> None:
+    env = make_env(own(lambda: OwnWorld(dtype=torch.float64)), seed=0, image_size=8)
+    check_env_specs(env)
+    rollout = env.rollout(2)
+    assert rollout["action"].dtype == rollout["next", "reward"].dtype == torch.float32
+
+
+@pytest.mark.parametrize("frame_stack", [1, 3])
+def test_an_environment_without_truncation_is_never_truncated(frame_stack: int) -> None:
+    domain = own(lambda: OwnWorld(length=3, truncates=False))
+    env = make_env(domain, seed=0, image_size=8, frame_stack=frame_stack)
+    check_env_specs(env)
+    rollout = env.rollout(10)["next"]
+    assert rollout["terminated"].flatten().tolist() == [False, False, True]
+    assert not rollout["truncated"].any()
+
+
+@pytest.mark.parametrize("truncates", [True, False])
+def test_a_world_without_an_end_is_truncated_and_starts_again(
+    truncates: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(factory, "LONGEST_EPISODE_AGENT_STEPS", 7)
+    env = make_env(own(lambda: OwnWorld(length=10**9, truncates=truncates)), seed=0, image_size=8)
+    check_env_specs(env)
+    for _ in range(2):
+        last = env.rollout(20)["next"]
+        assert last["truncated"].flatten().tolist() == [False] * 6 + [True]
+        assert torch.equal(last["done"], last["truncated"])
+        assert not last["terminated"].any()
+    limited = own(lambda: OwnWorld(length=12), episode_env_steps=12)
+    assert make_env(limited, seed=0, image_size=8).rollout(50).shape == (12,)
+
+
+def test_agent_steps_are_counted_by_what_a_world_repeats() -> None:
+    repeating = own(lambda action_repeat: OwnWorld(), action_repeat=np.int64(4), episode_env_steps=2e1)
+    endless = own(make_chw)
+    assert resolve_action_repeat(endless) == resolve_action_repeat(endless, 4) == 1
+    assert (resolve_action_repeat(repeating), resolve_action_repeat(repeating, 2)) == (4, 2)
+    assert resolve_action_repeat("cheetah") == 2
+    assert repr(episode_length(repeating)) == "5"
+    assert episode_length("cheetah") == episode_length("dog_run") == 500
+    assert episode_length("reach_duplo") == episode_length("manip_lift_brick") == 125
+    assert episode_length("walker_walk", action_repeat=3) == 334
+    assert episode_length("lqr_2_1") is episode_length(endless) is None
+    assert episode_length("gymnasium:HalfCheetah-v5") == 500
+
+
+def unscaled() -> EnvBase:
+    env = OwnWorld()
+    env.action_spec = Bounded(-2.0, 2.0, shape=(2,), dtype=torch.float32)
+    return env
+
+
+def without_action() -> EnvBase:
+    env = OwnWorld()
+    env.action_spec = Bounded(-1.0, 1.0, shape=(0,), dtype=torch.float32)
+    return env
+
+
+@pytest.mark.parametrize(
+    ("make", "complaint"),
+    [
+        (unscaled, r"bounds other than \[-1, 1\]"),
+        (without_action, "bounded float vector"),
+        (lambda: TransformedEnv(OwnWorld(), ExcludeTransform("pixels")), "no 'pixels'"),
+        (
+            lambda: TransformedEnv(OwnWorld(), UnsqueezeTransform(-4, in_keys=["pixels"])),
+            r"shape \(1, 3, 8, 8\)",
+        ),
+        (lambda: SerialEnv(1, OwnWorld), "batch size"),
+        (lambda: OwnWorld().to("meta"), "lives on meta; it must be on the CPU"),
+        (lambda: np.zeros(3), "ndarray; make must return a TorchRL EnvBase"),
+        (None, "no make"),
+    ],
+)
+def test_a_broken_contract_is_named(make: Any, complaint: str) -> None:
+    with pytest.raises(CRPTproError, match=complaint):
+        make_env(own(make), seed=0, image_size=8)
+
+
+@pytest.mark.parametrize("task", ["gymnasium:HalfCheetah-v5", Domain("own", "own", make=make_chw)])
+def test_only_dm_control_worlds_have_a_known_background(task: str | Domain) -> None:
+    with pytest.raises(CRPTproError, match=r"dm_control.*reversed_image"):
+        make_env(task, seed=0, colors="reversed_background")
+
+
+def test_the_colours_of_whole_images_are_reversed_in_any_world() -> None:
+    def pixels(clock: int) -> torch.Tensor:
+        return torch.tensor([10, 20, 30], dtype=torch.uint8)[:, None, None].expand(3, 8, 8)
+
+    env = make_env(own(lambda: OwnWorld(pixels)), seed=0, image_size=8, colors="reversed_image")
+    assert env.reset()["pixels"][:, 0, 0].tolist() == [30, 20, 10] * 3

@@ -1,0 +1,416 @@
+"""Which jobs run when, where they run, and what becomes of those that fail."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from filelock import FileLock
+
+import crptpro
+from crptpro.artifact import read_json, write_json
+from crptpro.errors import CRPTproError, SubmissionError
+from crptpro.experiments import launch
+from crptpro.experiments.jobs import Job, describe, make_plan
+from crptpro.experiments.launch import (
+    Failure,
+    LocalLauncher,
+    RayLauncher,
+    SlurmLauncher,
+    Work,
+    divide,
+    run_jobs,
+    slurm_parameters,
+)
+
+SLOW_WORLD = Path(__file__).with_name("slow_world.py")
+ROOT = Path(crptpro.__file__).parents[1]
+
+
+def job(name: str, *needs: Job, kind: str = "run") -> Job:
+    return Job(kind, name, ("evaluate", name, *(f"{{{n.key}}}/x" for n in needs)), {}, needs)
+
+
+class FakeLauncher:
+    """Notes what is started; every job ends at the second look, unless it is told otherwise."""
+
+    is_one_machine = True
+
+    def __init__(self, *, lost: dict[str, int] | None = None, refuses: int = 0) -> None:
+        self.started: list[Work] = []
+        self.at_once: list[set[str]] = []
+        self.lost = dict(lost or {})
+        self.refuses, self.running = refuses, set[str]()
+
+    def start(self, work: Work, *, is_exclusive: bool) -> Any:
+        if self.started and self.refuses:
+            self.refuses -= 1
+            raise SubmissionError("The queue is full.")
+        self.started.append(work)
+        self.running.add(work.key)
+        self.at_once.append(set(self.running))
+        return FakeHandle(self, work)
+
+    def close(self) -> None: ...
+
+
+class FakeHandle:
+    def __init__(self, launcher: FakeLauncher, work: Work) -> None:
+        self.launcher, self.work, self.looks = launcher, work, 0
+
+    def poll(self) -> str | None:
+        self.looks += 1
+        if self.looks < 2:
+            return None
+        name = self.work.key.split("-")[1]
+        self.launcher.running.discard(self.work.key)
+        if self.launcher.lost.get(name, 0):
+            self.launcher.lost[name] -= 1
+            return "it was lost"
+        write_json(self.work.directory / "done.json", {})
+        return ""
+
+    def stop(self) -> None: ...
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch, "POLL_S", 0.001)
+    monkeypatch.setattr(launch, "REFUSED_S", 0.01)
+
+
+def launched(
+    root: Path, *wanted: Job, launcher: FakeLauncher | None = None, **how: Any
+) -> tuple[list[str], list[Failure]]:
+    launcher = launcher or FakeLauncher()
+    failures = run_jobs(make_plan(wanted, root), root, launcher, **how)
+    return [work.key.split("-")[1] for work in launcher.started], failures
+
+
+def test_a_job_starts_when_all_that_it_needs_is_finished(tmp_path: Path) -> None:
+    a, b = job("a"), job("b")
+    launcher = FakeLauncher()
+    order, failures = launched(tmp_path, job("c", a, b), job("d", a), job("e"), launcher=launcher, jobs=2)
+    assert failures == []
+    assert sorted(order) == ["a", "b", "c", "d", "e"]
+    assert order.index("c") > max(order.index("a"), order.index("b"))
+    assert max(map(len, launcher.at_once)) == 2
+    again, _ = launched(tmp_path, job("c", a, b), job("d", a), job("e"))
+    assert again == []
+
+
+def test_what_measures_time_is_alone_and_has_all_cores(tmp_path: Path) -> None:
+    launcher = FakeLauncher()
+    wanted = [job("t", kind="timing"), job("a"), job("b"), job("u", kind="timing")]
+    launched(tmp_path, *wanted, launcher=launcher, jobs=2, cores=3)
+    alone = {
+        work.key: (len(at_once), work.threads) for work, at_once in zip(launcher.started, launcher.at_once)
+    }
+    assert [alone[each.key] for each in wanted] == [(1, 6), (1, 3), (2, 3), (1, 6)]
+
+
+def test_a_lost_job_is_tried_again_and_what_needs_a_failed_one_is_not_started(tmp_path: Path) -> None:
+    bad, lucky = job("bad"), job("lucky")
+    launcher = FakeLauncher(lost={"bad": 9, "lucky": 1})
+    wanted = (job("child", bad), job("grandchild", job("child", bad)), lucky, job("other"))
+    order, failures = launched(tmp_path, *wanted, launcher=launcher, attempts=2)
+    assert sorted(order) == ["bad", "bad", "lucky", "lucky", "other"]
+    assert [(f.key.split("-")[1], f.attempts, f.log is None) for f in failures] == [
+        ("bad", 2, False), ("child", 0, True), ("grandchild", 0, True),
+    ]  # fmt: skip
+    assert failures[0].reason == "it was lost"
+
+
+def test_a_queue_that_is_full_for_a_while_loses_nothing_but_one_that_takes_no_job_ends_the_command(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    order, failures = launched(tmp_path / "a", job("a"), job("b"), launcher=FakeLauncher(refuses=2), jobs=2)
+    assert (order, failures) == (["a", "b"], [])
+
+    class Closed(FakeLauncher):
+        def start(self, work: Work, *, is_exclusive: bool) -> Any:
+            raise SubmissionError("No such partition.")
+
+    with pytest.raises(SubmissionError, match="No such partition"):
+        launched(tmp_path / "b", job("a"), launcher=Closed())
+
+
+def test_a_job_has_its_whole_command(tmp_path: Path) -> None:
+    data = Job("dataset", "d", ("collect", "walker", "--out", "{out}"), {})
+    trained = Job("encoder", "e", ("pretrain", f"{{{data.key}}}/walker", "--out", "{out}"), {}, (data,))
+    describe(tmp_path, make_plan([trained], tmp_path))
+    root = str(tmp_path)
+    assert Work(root, data.key, workers=3, plugins=("p.py",)).arguments() == [
+        "collect", "walker", "--out", f"{root}/jobs/{data.key}", "--plugin", "p.py", "--workers", "3",
+    ]  # fmt: skip
+    assert Work(root, trained.key, device="cuda").arguments() == [
+        "pretrain", f"{root}/jobs/{data.key}/walker", "--out", f"{root}/jobs/{trained.key}", "--device", "cuda",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("ending", "reason"), [
+    (SystemExit(1), "the encoder is missing"), (RuntimeError("shapes differ"), "RuntimeError: shapes differ"),
+    (None, ""),
+])  # fmt: skip
+def test_an_attempt_says_in_its_log_why_it_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: BaseException | None, reason: str
+) -> None:
+    def main() -> None:
+        print("error: the encoder is missing", file=sys.stderr)
+        if ending is not None:
+            raise ending
+
+    monkeypatch.setattr("crptpro.cli.main", main)
+    wanted = job("a")
+    plan = make_plan([wanted], tmp_path)
+    failures = run_jobs(plan, tmp_path, launch.InlineLauncher(), attempts=2)
+    directory = tmp_path / "jobs" / wanted.key
+    assert [failure.reason for failure in failures] == ([reason] if reason else [])
+    log = (directory / "log.txt").read_text()
+    assert log.splitlines()[-1] == (f"error: {reason}" if reason else "finished")
+    if reason:
+        assert log.count("--- ") == 2
+        assert read_json(directory / "clock.json")["attempts"] == 2
+    else:
+        done = read_json(directory / "done.json")
+        assert {*done} == {"seconds", "attempts", "device", "threads", "versions", "hardware", "git_revision"}
+        assert done["attempts"] == 1
+
+
+def test_time_of_earlier_attempts_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("crptpro.cli.main", lambda: None)
+    wanted = job("a")
+    describe(tmp_path, make_plan([wanted], tmp_path))
+    write_json(tmp_path / "jobs" / wanted.key / "clock.json", {"seconds": 100.0, "attempts": 2})
+    assert Work(str(tmp_path), wanted.key).run() == ""
+    done = read_json(tmp_path / "jobs" / wanted.key / "done.json")
+    assert done["seconds"] > 100
+    assert done["attempts"] == 3
+
+
+def test_two_commands_on_one_root_do_not_run_a_job_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import threading
+
+    monkeypatch.setattr("crptpro.cli.main", lambda: pytest.fail("it ran twice"))
+    wanted = job("a")
+    describe(tmp_path, make_plan([wanted], tmp_path))
+    directory = tmp_path / "jobs" / wanted.key
+    other = FileLock(directory / ".job.lock", thread_local=False)
+    other.acquire()
+
+    def finish() -> None:
+        write_json(directory / "done.json", {})
+        other.release()
+
+    threading.Timer(0.5, finish).start()
+    assert Work(str(tmp_path), wanted.key).run() == ""
+
+
+# --- resources ------------------------------------------------------------------------------------------------------
+
+
+def test_a_machine_is_divided_among_jobs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch, "cpu_cores", lambda: 8)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+
+    def divided(
+        launcher: str = "local", device: str = "cpu", **given: Any
+    ) -> tuple[int, int, tuple[str, ...]]:
+        found = divide(launcher, device=device, **{"jobs": None, "cores": None, **given})
+        return found.jobs, found.cores, found.gpus
+
+    assert divided() == (8, 1, ())
+    assert divided(jobs=3) == (3, 2, ())
+    assert divided(cores=4) == (2, 4, ())
+    assert divided("inline") == (1, 8, ())
+    assert divided(device="cuda", jobs_per_gpu=2) == (4, 2, ("0", "1"))
+    assert divided(device="cuda:1") == (1, 8, ())
+    assert divided("slurm") == (16, 1, ())
+    assert divided("ray", "cuda", jobs=5) == (5, 4, ())
+    with pytest.raises(CRPTproError, match="more than the 2 that the GPUs take"):
+        divided(device="cuda", jobs=3)
+
+
+def test_gpus_are_shared_evenly_and_jobs_have_their_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environments = []
+
+    class Process:
+        def __init__(self, command: list[str], *, env: dict[str, str], **_: Any) -> None:
+            environments.append((env["CUDA_VISIBLE_DEVICES"], env["OMP_NUM_THREADS"]))
+
+        def poll(self) -> None: ...
+
+    monkeypatch.setattr(subprocess, "Popen", Process)
+    launcher = LocalLauncher(("0", "1"))
+    for name in "abcd":
+        describe(tmp_path, make_plan([job(name)], tmp_path))
+        launcher.start(Work(str(tmp_path), job(name).key, threads=3), is_exclusive=False)
+    assert sorted(environments) == [("0", "3"), ("0", "3"), ("1", "3"), ("1", "3")]
+
+
+def test_what_slurm_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = {"partition": None, "hours": 1.0, "memory_gb": 2.0, "sbatch": (), "has_gpu": False}
+    assert slurm_parameters(**usual) == {"time": 60, "mem": "2048M"}  # type: ignore[arg-type]
+    gpu = slurm_parameters(**{**usual, "has_gpu": True, "sbatch": ("--qos=high",)})  # type: ignore[arg-type]
+    assert (gpu["gpus_per_node"], gpu["additional_parameters"]) == (1, {"qos": "high"})
+    with pytest.raises(CRPTproError, match="overruled: say it by --hours"):
+        slurm_parameters(**{**usual, "sbatch": ("time=3",)})  # type: ignore[arg-type]
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    with pytest.raises(CRPTproError, match="needs sbatch and srun"):
+        SlurmLauncher({})
+    monkeypatch.setattr("shutil.which", lambda name: name)
+    found = SlurmLauncher({"time": 5}).job_parameters(Work(str(tmp_path), "k", threads=4), is_exclusive=True)
+    assert (found["cpus_per_task"], found["time"], found["exclusive"]) == (4, 5, True)
+    assert {"export OMP_NUM_THREADS=4", "export SRUN_CPUS_PER_TASK=4"} <= set(found["setup"])
+
+
+# --- real processes -------------------------------------------------------------------------------------------------
+
+
+HEEDS_SIGINT = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+
+
+@pytest.fixture
+def slow_plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
+    """Run the slow experiment of a plugin by a launcher, in processes that find this source."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    command = (
+        sys.executable,
+        "-m",
+        "crptpro",
+        "--plugin",
+        SLOW_WORLD,
+        "reproduce",
+        "slow",
+        "--scale",
+        "tiny",
+    )
+
+    def start(*options: object) -> subprocess.Popen:
+        words = [*map(str, (*command, "--out", tmp_path / "root", *options))]
+        # A shell's background job ignores Ctrl-C, and so would what it starts.
+        words = [sys.executable, "-c", HEEDS_SIGINT, *words]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        return subprocess.Popen(words, start_new_session=True, **pipes)  # type: ignore[call-overload]
+
+    return start
+
+
+def _journal(root: Path) -> Path | None:
+    return next(root.glob("jobs/dataset-*/*/journal.jsonl"), None)
+
+
+def _wait_for(condition: Callable[[], Any], process: subprocess.Popen) -> None:
+    deadline = time.monotonic() + 300
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGKILL])
+def test_a_command_that_is_stopped_or_killed_continues(
+    tmp_path: Path, slow_plan: Callable[..., Any], by: signal.Signals
+) -> None:
+    root = tmp_path / "root"
+    first = slow_plan("--jobs", 1, "--cores-per-job", 1)
+    _wait_for(lambda: _journal(root) and _journal(root).read_text().count("\n") >= 3, first)  # type: ignore[union-attr]
+    processes = psutil.Process(first.pid).children(recursive=True)
+    assert processes
+    os.killpg(first.pid, by)  # as a terminal does
+    _, err = first.communicate(timeout=120)
+    assert first.returncode == (130 if by == signal.SIGINT else -9), err
+    _, alive = psutil.wait_procs(processes, timeout=60)
+    assert not alive
+    kept = _journal(root)
+    assert kept is not None
+    lines = kept.read_text().splitlines()
+    assert len(lines) < 20
+    assert not list(root.glob("jobs/*/done.json"))
+
+    again = slow_plan("--jobs", 1, "--cores-per-job", 1)
+    out, err = again.communicate(timeout=300)
+    assert again.returncode == 0, err
+    assert "All of it is there" in out
+    assert kept.read_text().splitlines()[: len(lines)] == lines
+    [done] = root.glob("jobs/*/done.json")
+    assert read_json(done)["attempts"] == 2
+
+
+@pytest.mark.slow
+def test_a_slurm_job_runs_as_submitit_runs_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slow_plan: Callable[..., Any]
+) -> None:
+    monkeypatch.setattr(launch, "POLL_S", 0.2)
+    wanted = Job(
+        "untrained", "u", ("pretrain", "--method", "random-encoder", "--out", "{out}", "--seed", "0"), {}
+    )
+    broken = Job("run", "b", ("evaluate", "{out}/nothing"), {})
+    launcher = SlurmLauncher({"timeout_min": 60}, cluster="local")
+    failures = run_jobs(make_plan([wanted, broken], tmp_path), tmp_path, launcher, jobs=2, attempts=1)
+    assert (tmp_path / "jobs" / wanted.key / "encoder" / "weights.safetensors").exists()
+    assert read_json(tmp_path / "jobs" / wanted.key / "done.json")["threads"] == 1
+    assert [failure.key for failure in failures] == [broken.key]
+    assert failures[0].reason == (tmp_path / "jobs" / broken.key / "log.txt").read_text().splitlines()[-1][7:]
+    assert not list((tmp_path / "submitted").iterdir())
+
+
+@pytest.mark.slow
+def test_ray_runs_jobs_and_one_whose_worker_died_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slow_plan: Callable[..., Any]
+) -> None:
+    monkeypatch.setattr(launch, "POLL_S", 0.2)
+    monkeypatch.setenv("RAY_ADDRESS", "local")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    wanted = Job(
+        "untrained", "u", ("pretrain", "--method", "random-encoder", "--out", "{out}", "--seed", "0"), {}
+    )
+    plan = make_plan([wanted], tmp_path)
+    describe(tmp_path, plan)
+    log = tmp_path / "jobs" / wanted.key / "log.txt"
+    launcher = RayLauncher()
+    killed: list[int] = []
+    start = launcher.start
+
+    def start_and_kill(work: Work, *, is_exclusive: bool) -> Any:
+        handle = start(work, is_exclusive=is_exclusive)
+        deadline = time.monotonic() + 120
+        while not killed and time.monotonic() < deadline:
+            if log.exists() and "process " in log.read_text():
+                killed.append(int(log.read_text().split("process ")[1].split(",")[0]))
+                os.kill(killed[0], signal.SIGKILL)
+            time.sleep(0.01)
+        return handle
+
+    monkeypatch.setattr(launcher, "start", start_and_kill)
+    try:
+        assert run_jobs(plan, tmp_path, launcher, attempts=2) == []
+    finally:
+        launcher.close()
+    assert killed
+    assert (tmp_path / "jobs" / wanted.key / "encoder" / "weights.safetensors").exists()
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1"])
+def test_a_ray_cluster_that_is_not_there_is_said_in_a_line(address: str) -> None:
+    pytest.importorskip("ray")
+    with pytest.raises(CRPTproError, match=rf"{address} cannot be used: .*refused.*--ray-address"):
+        RayLauncher(address)

@@ -1,0 +1,267 @@
+"""What each experiment asks for: which cells, which jobs, which settings."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import crptpro.objectives.methods as registry
+from crptpro.domains import GROUPS, get_domain
+from crptpro.errors import CRPTproError, UnknownNameError
+from crptpro.experiments.jobs import Job, is_finished, make_plan
+from crptpro.experiments.matrix import (
+    EXPERIMENTS,
+    METHODS,
+    PAPER,
+    SCALES,
+    SMALL,
+    TINY,
+    Cell,
+    Request,
+    factors_of,
+)
+from crptpro.objectives import ProtoLoss, register_method
+
+RESULTS = Path(__file__).parents[2] / "results"
+PART = {"groups": ("A",), "tasks": ("walker_run",)}
+
+
+def cells(experiment: str, scale: Any = SMALL, **part: Any) -> list[Cell]:
+    return EXPERIMENTS[experiment].cells(Request(scale, **part))
+
+
+def option(job: Job, name: str) -> str | None:
+    """The word after an option of a job's command."""
+    return job.command[job.command.index(name) + 1] if name in job.command else None
+
+
+def of(found: list[Cell], label: str, **place: Any) -> list[Job]:
+    return [c.job for c in found if c.label == label and place.items() <= dict(c.place).items()]
+
+
+@pytest.mark.parametrize(("experiment", "count", "kinds"), [
+    ("seen", 12 * 12 * 3, {"run"}),
+    ("unseen", 10 * 7 * 3, {"run"}),
+    ("colors", 3 * 7 * 3, {"run"}),
+    ("finetune", 5 * 6 * 3, {"run"}),
+    # Two groups of three tasks; three methods with prototypes of a group, two of them twice; (S) twice on two tasks.
+    ("ablation", (6 * 5 + 2 * 2) * 3, {"run"}),
+    # Five weights of two methods, three sizes of datasets.
+    ("sensitivity", 3 * (5 * 2 + 3) * 3, {"run"}),
+    ("efficiency", 8 * 3, {"timing"}),
+    ("prototypes", 2 + 1 + 2 + 2, {"prototypes"}),
+    ("coverage", 1, {"coverage"}),
+    ("stability", 2 + 1 + 1, {"encoder", "explored"}),
+    ("visualize", 2, {"embeddings"}),
+    ("probe", 9 * 5 * 2, {"probe"}),
+])  # fmt: skip
+def test_every_experiment_of_the_paper_has_its_cells(experiment: str, count: int, kinds: set[str]) -> None:
+    found = cells(experiment, PAPER)
+    assert len(found) == count
+    assert {cell.job.kind for cell in found} == kinds
+    places = Counter((cell.label, tuple(sorted(cell.place.items()))) for cell in found)
+    assert max(places.values()) == 1  # no number stands in two jobs
+
+
+@pytest.mark.parametrize("root", ["seen_small", "study_small"])
+def test_the_committed_records_are_those_of_the_same_commands(root: str) -> None:
+    request = {"groups": ("A",)} if root == "seen_small" else {}
+    names = [path.stem.removesuffix("-small") for path in (RESULTS / root / "experiments").glob("*.json")]
+    assert names
+    for name in names:
+        tasks = {"tasks": ("walker_run",)} if name == "seen" else {}
+        asked = [
+            c for c in cells(name, SMALL, threads=2, **request, **tasks) if c.label != "crptpro-no-bonus"
+        ]
+        missing = {c.label for c in asked if not is_finished(RESULTS / root, c.job)}
+        # Trials of the study that have not been run yet.
+        assert missing <= {f"crptpro, learning_rate_and_temperature 3e-4 and {t}" for t in ("0.05", "0.1")}
+
+
+def test_every_system_of_seen_has_the_encoder_and_the_settings_of_its_own() -> None:
+    found = cells("seen", SMALL, **PART)
+    assert list(dict.fromkeys(cell.label for cell in found)) == list(METHODS)
+    assert {tuple(sorted(cell.place)) for cell in found} == {("encoder_seed", "group", "seed", "task")}
+    jobs = {label: of(found, label, seed=0)[0] for label in METHODS}
+    needs = {label: [needed.kind for needed in job.needs] for label, job in jobs.items()}
+    explored = {label: ["explored"] for label in ("proto-rl-c", "proto-rl-s", "apt-c", "apt-s", "becl")}
+    assert needs == {
+        "crptpro": ["encoder"], "crptpro-fast": ["encoder"], "crptpro-no-bonus": ["encoder"], "atc": ["encoder"],
+        "crptpro-finetune": ["finetuned"], "drq": [], "random-encoder": ["untrained"], **explored,
+    }  # fmt: skip
+    domains = {
+        label: tuple(job.needs[0].facts.get("domains", ())) for label, job in jobs.items() if job.needs
+    }
+    alone = dict.fromkeys(("proto-rl-s", "apt-s", "crptpro-finetune"), ("walker",))
+    assert domains == {**dict.fromkeys(domains, GROUPS["A"]), **alone, "random-encoder": ()}
+    # CRPTpro's encoder, without the exploration bonus downstream.
+    no_bonus = jobs["crptpro-no-bonus"]
+    assert no_bonus.needs == jobs["crptpro"].needs
+    assert [label for label, job in jobs.items() if option(job, "--intrinsic-reward-coef")] == [
+        "crptpro-no-bonus"
+    ]
+    assert option(no_bonus, "--intrinsic-reward-coef") == "0"
+    assert {job.command[0] for job in jobs.values()} == {"downstream"}
+    assert option(jobs["crptpro"], "--env-steps") == "20000"
+
+
+def test_all_systems_have_as_many_runs_and_no_two_runs_are_the_same() -> None:
+    found = cells("seen", SMALL, encoder_seeds=(0, 1), seeds=(3, 4), **PART)
+    counts = Counter(cell.label for cell in found)
+    assert set(counts.values()) == {4}
+    assert len({cell.job.key for cell in found}) == len(found)
+    # DrQ has no encoder to share; a run is the same whatever else is asked for.
+    [one] = of(cells("seen", SMALL, encoder_seeds=(1,), seeds=(4,), **PART), "drq")
+    assert one in of(found, "drq")
+    # Runs of one seed on two tasks have nothing in common.
+    a, b = (
+        of(cells("seen", SMALL, groups=("A",), tasks=(t,)), "drq")[0] for t in ("walker_run", "cheetah_run")
+    )
+    assert option(a, "--seed") != option(b, "--seed")
+
+
+def test_experiments_share_what_they_have_in_common() -> None:
+    seen = {cell.job for cell in cells("seen", SMALL, **PART)}
+    asked = {
+        name: {c.job for c in cells(name, SMALL, **PART)} for name in ("finetune", "ablation", "sensitivity")
+    }
+    assert asked["finetune"] <= seen
+    assert asked["ablation"] & seen
+    # The usual weight and the usual size of the datasets are CRPTpro.
+    found = cells("sensitivity", SMALL, **PART)
+    usual = [*of(found, "crptpro, alpha 0.005"), *of(found, "crptpro, b 20,000")]
+    assert set(usual) == set(of(cells("seen", SMALL, **PART), "crptpro"))
+    assert {c.place["value"] for c in found if c.place["varied"] == "b"} == {"5000", "20000"}
+
+
+def test_the_ablation_has_the_papers_weights_and_budgets() -> None:
+    found = cells("ablation", PAPER)
+    weights = {
+        (c.label, get_domain(c.place["task"]).name): (
+            c.job.needs[0].facts["loss"],
+            c.job.needs[0].facts.get("explore"),
+        )
+        for c in found
+        if c.label.startswith("proto-rl-s")
+    }
+    short = {"env_steps": 200_000}
+    assert weights == {
+        ("proto-rl-s", "cheetah"): ({}, short), ("proto-rl-s", "hopper"): ({}, short),
+        ("proto-rl-s with dispersion", "cheetah"): ({"intr_loss_coef": 1e-3}, short),
+        ("proto-rl-s with dispersion", "hopper"): ({"intr_loss_coef": 5e-4}, short),
+    }  # fmt: skip
+    without = of(found, "crptpro without dispersion")[0].needs[0]
+    assert option(without, "--loss") == "intr_loss_coef=0.0"
+    assert of(found, "proto-rl-c with dispersion")[0].needs[0].facts["loss"] == {"intr_loss_coef": 5e-3}
+
+
+def test_other_colours_are_drawn_downstream_and_for_probes_once_for_all_encoders() -> None:
+    for colors in ("reversed_background", "reversed_image"):
+        found = cells("colors", SMALL, colors=colors)
+        assert {option(cell.job, "--colors") for cell in found} == {colors}
+        assert {cell.place["colors"] for cell in found} == {colors}
+    probes = [c.job for c in cells("probe", SMALL, groups=("A",), tasks=("finger",))]
+    drawn = [needed for job in probes for needed in job.needs if needed.kind == "redrawn"]
+    assert len(drawn) == len(probes) / 2
+    assert len(set(drawn)) == 1
+    assert "--redrawn" in probes[1].command
+
+
+def test_timings_count_every_encoder_of_a_single_domain_method_and_need_only_data() -> None:
+    found = cells("efficiency", SMALL, groups=("A",), threads=2)
+    single, several = (of(found, method, domains=3)[0] for method in ("proto-rl-s", "crptpro"))
+    assert single.command.count("--training") == 3
+    assert several.command.count("--training") == 1
+    assert {needed.kind for needed in several.needs} == {"dataset"}
+    assert single.needs == ()
+    assert all(cell.job.is_exclusive for cell in found)
+    # Device and threads are a part of what is measured, and of nothing else.
+    assert several not in [c.job for c in cells("efficiency", SMALL, groups=("A",), threads=1)]
+    assert cells("seen", SMALL, threads=1) == cells("seen", SMALL, threads=2)
+
+
+def test_the_study_varies_one_factor_at_a_time_and_judges_along_the_training() -> None:
+    found = cells("study", SMALL)
+    factors = {cell.place["factor"] for cell in found}
+    assert factors == {
+        "assignment_temperature", "learning_rate_and_temperature", "control", *(name for name, *_ in factors_of(SMALL))
+    }  # fmt: skip
+    for name, _, usual, values in factors_of(SMALL):
+        trained = {
+            c.place["value"]: c.job for c in found if c.place["factor"] == name and c.job.kind == "encoder"
+        }
+        assert list(trained) == [f"{value:g}" for value in values]
+        words = {
+            value: set(job.command) - set(trained[f"{usual:g}"].command) for value, job in trained.items()
+        }
+        assert words.pop(f"{usual:g}") == set()
+        assert all(0 < len(changed) <= 2 for changed in words.values())  # an option and its value
+    [long] = of(found, "crptpro, assignment_temperature 0.05", encoder_seed=1, group="C")[:1]
+    assert (option(long, "--updates"), option(long, "--loss")) == ("10000", "assignment_temperature=0.05")
+    where = {"group": "C", "encoder_seed": 1, "domain": "finger"}
+    judged = [c for c in found if c.label == "crptpro, assignment_temperature 0.05"]
+    at = [c.place["updates"] for c in judged if where.items() <= c.place.items()]
+    assert at == [500, 1_000, 2_000, 3_000, 5_000, 10_000]
+    snapshot = next(c.job for c in found if c.place.get("updates") == 500)
+    assert any(word.endswith("/encoder_at_500") for word in snapshot.command)
+    assert cells("study", SMALL, methods=("atc",)) == []
+
+
+def test_a_tiny_reproduction_needs_few_jobs_of_every_kind() -> None:
+    jobs = make_plan([c.job for name in EXPERIMENTS for c in cells(name, TINY)], Path("nowhere")).jobs
+    assert len({job.key for job in jobs}) == len(jobs) < 800
+    assert {job.kind for job in jobs} >= {
+        "dataset",
+        "encoder",
+        "explored",
+        "finetuned",
+        "untrained",
+        "run",
+        "timing",
+    }
+    place = {job.key: index for index, job in enumerate(jobs)}
+    assert all(place[needed.key] < place[job.key] for job in jobs for needed in job.needs)
+
+
+def test_a_method_of_the_users_takes_the_scale_of_its_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
+    usual = of(cells("seen", TINY, methods=("crptpro",), **PART), "crptpro")[0].needs[0]
+    register_method("mine", ProtoLoss, loss_options={"tau": 0.2}, is_preset=True)
+    [mine] = [c.job.needs[0] for c in cells("seen", TINY, methods=("mine",), **PART)]
+    assert mine.facts["loss"] == usual.facts["loss"]
+    assert (mine.facts["updates"], mine.facts["batch_size"]) == (6, 4)
+    # An edited plugin makes another encoder.
+    register_method("mine", ProtoLoss, loss_options={"tau": 0.3}, is_preset=True)
+    assert cells("seen", TINY, methods=("mine",), **PART)[0].job.needs[0].key != mine.key
+
+
+@pytest.mark.parametrize(("part", "error", "message"), [
+    ({"methods": ("atcc",)}, UnknownNameError, "atcc"),
+    ({"groups": ("E",)}, UnknownNameError, "no group 'E'"),
+    ({"tasks": ("walker_ran",)}, UnknownNameError, "walker_ran"),
+    ({"seeds": (1, 1)}, CRPTproError, "`seeds` must be different numbers"),
+    ({"encoder_seeds": ()}, CRPTproError, "`encoder_seeds` must be"),
+    ({"seeds": (1_000,)}, CRPTproError, "from 0 to 999"),
+])  # fmt: skip
+def test_a_request_refuses_what_nobody_knows(
+    part: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        Request(SMALL, **part)
+
+
+def test_seeds_are_the_plain_numbers_that_they_mean() -> None:
+    plain = cells("seen", SMALL, encoder_seeds=(1,), seeds=(2,), **PART)
+    given = cells("seen", SMALL, encoder_seeds=(np.int64(1),), seeds=(2.0,), **PART)
+    assert [(c.job.key, c.place) for c in given] == [(c.job.key, c.place) for c in plain]
+    assert type(given[0].place["seed"]) is int
+
+
+def test_a_domains_name_stands_for_its_task_in_every_scale() -> None:
+    for scale in SCALES.values():
+        assert Request(scale, tasks=("walker", "walker_run")).tasks == ("walker_run",)
+    assert cells("seen", SMALL, groups=("A",), tasks=("walker",)) == cells("seen", SMALL, **PART)

@@ -1,0 +1,623 @@
+"""The page on committed records, whose numbers it must give, and on made-up ones, where rules can be seen."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from matplotlib.image import imread
+from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import CatFrames, EnvBase, TransformedEnv
+from toy_world import ToyEnv
+
+from crptpro.artifact import write_json
+from crptpro.errors import DatasetError, DiskSpaceError, RecordError
+from crptpro.experiments.report import Page, build_report, compared, hours_at_work, left_plateau
+from crptpro.modules import PixelEncoder
+from crptpro.pretrained import Pretrained
+from crptpro.training import DownstreamConfig, train_downstream
+
+RESULTS = Path(__file__).parents[2] / "results"
+HARDWARE = {"cpu": "A CPU", "cpu_cores": 2, "ram_bytes": 24 * 2**30, "gpus": []}
+START_S = 1_795_000_000.0
+
+
+class Report:
+    """What a reader of ``report.md`` finds: its text, and tables by the beginning of their caption."""
+
+    def __init__(self, page: Path) -> None:
+        self.html, self.folder = page.read_text(), page.parent
+        self.text = (page.parent / "report.md").read_text()
+        self.tables: dict[str, pd.DataFrame] = {}
+        blocks = re.findall(
+            r"^(?:\*\*|<details><summary>)(.+?)(?:\*\*|</summary>)\n\n((?:\|.*\n)+)", self.text, re.M
+        )
+        for caption, table in blocks:
+            head, _, *rows = [
+                re.split(r" (?<!\\)\| ", f" {line[1:-1]} ") for line in table.strip().split("\n")
+            ]
+            cells = [[cell.strip() for cell in row] for row in rows]
+            self.tables[caption] = pd.DataFrame(cells, columns=[name.strip() for name in head])
+
+    def table(self, caption: str) -> pd.DataFrame:
+        (found,) = [table for name, table in self.tables.items() if name.startswith(caption)]
+        return found
+
+    def cell(self, caption: str, column: str, *row: str) -> str:
+        table = self.table(caption)
+        for name, value in zip(table, row):
+            table = table[table[name] == value]
+        (found,) = table[column]
+        return found
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Report:
+    return Report(build_report(RESULTS / "seen_small", out=tmp_path_factory.mktemp("seen")))
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Report:
+    return Report(build_report(RESULTS / "study_small", out=tmp_path_factory.mktemp("study")))
+
+
+# --- the committed records ------------------------------------------------------------------------------------------
+
+
+def test_every_experiment_is_counted_and_every_job(seen: Report) -> None:
+    counts = seen.table("Experiments: numbers that were asked for").set_index("experiment")
+    assert counts["finished"].to_dict() == {
+        "seen": "22", "efficiency": "24", "prototypes": "7", "coverage": "1", "stability": "4", "visualize": "1",
+        "probe": "90",
+    }  # fmt: skip
+    assert set(counts["missing"]) == {"nothing"}
+    assert "22 of 22 run" in seen.text
+    assert "24.9 h of work in all" in seen.text
+    assert len(seen.table("probe: 90 jobs")) == 90
+
+
+def test_budgets_stand_beside_the_papers(seen: Report) -> None:
+    budgets = seen.table("Budgets beside the paper's").set_index("budget")["small"].to_dict()
+    assert budgets == {
+        "random transitions per domain": "20,000", "encoder updates on datasets": "3,000", "pre-training batch": "128",
+        "prototypes": "128", "env steps of exploration (C)": "40,000", "decisions per encoder update (C)": "6",
+        "downstream env steps": "20,000", "DrQ's env steps": "20,000", "downstream batch": "128",
+        "downstream learning rate": "0.001", "downstream replay": "12,000", "render quality": "exact",
+        "downstream seeds per encoder": "2",
+    }  # fmt: skip
+    assert "What this cannot show" in seen.text
+
+
+def test_returns_stand_beside_the_papers_without_intervals_of_two_runs(seen: Report) -> None:
+    returns = (
+        seen.table("Episode return at the final evaluation").set_index("method")["A walker_run"].to_dict()
+    )
+    assert returns == {
+        "crptpro": "56 ± 2 (n = 2) · paper 513 ± 33", "crptpro-fast": "64 ± 8 (n = 2)",
+        "crptpro-finetune": "39 ± 17 (n = 2)", "proto-rl-c": "53 ± 1 (n = 2) · paper 431 ± 83",
+        "proto-rl-s": "69 ± 6 (n = 2)", "atc": "48 ± 1 (n = 2) · paper 271 ± 16",
+        "apt-c": "43 ± 22 (n = 2) · paper 312 ± 37", "apt-s": "44 ± 9 (n = 2)",
+        "becl": "38 ± 2 (n = 2) · paper 130 ± 79", "drq": "48 ± 0 (n = 2) · paper 485 ± 181",
+        "random-encoder": "23 ± 1 (n = 2)",
+    }  # fmt: skip
+    over = seen.table("Over the 1 task").set_index("method")
+    assert over.loc["crptpro"].tolist()[:8] == [
+        "1", "2", "1", "56 · paper 513", "0.116 · paper 1.058", "0.116", "0.116", "0.884",
+    ]  # fmt: skip
+    assert over["mean / DrQ here"].to_dict()["proto-rl-s"] == "1.447"
+    improvement = seen.table("Probability that a run of crptpro").set_index("other method")[
+        "P(crptpro &gt; other)"
+    ]
+    assert improvement[["crptpro-fast", "apt-c", "random-encoder"]].tolist() == ["0.00", "0.50", "1.00"]
+    assert not re.search(r"\\\[-?\d+(\.\d+)?, ", seen.text)  # an interval
+    assert "here some have as few as 2." in seen.text
+    assert "Brackets are" not in seen.text
+
+
+def test_what_scores_took_is_told_with_the_machine(seen: Report) -> None:
+    took = seen.table("What scores took").set_index("method")
+    assert took.loc["crptpro"].tolist() == [
+        "1", "3,000", "120,000", "38 min", "20 min", "2 of 20,000 env steps", "27 min", "1",
+    ]  # fmt: skip
+    assert took["encoder updates"][["crptpro-finetune", "becl", "drq", "random-encoder"]].tolist() == [
+        "3,030", "2,997", "9,000 · with the task", "0",
+    ]  # fmt: skip
+    assert took.loc["becl", ["pre-training", "one run", "made on"]].tolist() == ["2.6 h", "16 min", "1, 4"]
+    assert "4: Intel(R) Xeon(R) Processor, 2 cores, 24 GiB, no GPU, 1 thread" in seen.text
+    assert "Times compare only within one machine" in seen.text
+
+
+def test_hours_of_the_papers_budget_include_collecting(seen: Report) -> None:
+    hours = seen.table("Pre-training by number of domains on cpu, 2 threads").set_index(["method", "domains"])
+    crptpro, explorer = hours.loc[("crptpro", "3")], hours.loc[("proto-rl-c", "3")]
+    assert crptpro[["s per encoder update", "hours at this scale"]].tolist() == ["0.133 (n = 1)", "0.111"]
+    assert crptpro[["hours of collecting", "hours, paper's budget"]].tolist() == ["0.435", "5.73 · paper 4.8"]
+    assert (crptpro["the same and collecting"], explorer["the same and collecting"]) == ("7.91", "12.7")
+    assert hours.loc[("apt-s", "3"), "hours, paper's budget"] == "158 · paper 61.8"
+    assert hours.loc[("becl", "2"), "encoder updates, paper's budget"] == "144,000 · paper 50,000"
+    assert hours.loc[("crptpro-fast", "1"), "made on"] == "2"
+
+
+def test_measurements_of_encoders_and_data_are_those_of_their_records(seen: Report) -> None:
+    spread = seen.table("Spread of the prototypes at the end").set_index("variant")
+    assert spread.loc["crptpro with L_intr"].tolist() == [
+        "A", "1", "3,000", "125.156 · paper -26.545", "3.513", "2.848 · paper 7.996", "1.726 · paper -31.080",
+    ]  # fmt: skip
+    assert spread.loc["crptpro-fast with L_intr", "KNE, k = 3"] == "3028.036"
+    assert spread.loc["proto-rl-s without L_intr", "ANE"] == "6.620 · paper 48.774"
+    assert seen.cell("Coverage at the end", "coverage", "walker", "proto-rl-c explorer") == "0.2630"
+    assert seen.cell("Coverage at the end", "mean of all windows", "walker", "random policy") == "0.2467"
+    finals = seen.table("Group A: diagnostics at the end").set_index("encoder")
+    assert finals["left the plateau at"].to_dict() == {
+        "crptpro": "1,700", "crptpro without dispersion": "1,700", "crptpro-fast": "600", "proto-rl-c": "1,250",
+    }  # fmt: skip
+    assert finals.loc["crptpro", r"comparative loss \[nats\]"] == "4.744 · wobble 0.0053"
+
+
+@pytest.mark.parametrize(("table", "encoder", "column", "number"), [
+    ("R2 of positions, features", "crptpro", "walker", "0.598 · seen"),
+    ("R2 of velocities, features", "random-encoder", "walker", "0.172 · unseen"),
+    ("R2 of velocities, features", "proto-rl-s", "cheetah", "0.719 · unseen"),
+    ("R2 of velocities, features", "atc", "finger, reversed background", "0.604 · unseen"),
+    ("R2 of velocities, embedding z", "apt-s", "pendulum", "0.918 · unseen"),
+    ("Effective rank (at most the number of observations), features", "becl", "walker", "1631.4 · seen"),
+    ("Mean pairwise cosine, embedding z", "apt-c", "cheetah", "0.0403 · seen"),
+])  # fmt: skip
+def test_probes_have_every_domain_and_colours(
+    seen: Report, table: str, encoder: str, column: str, number: str
+) -> None:
+    assert seen.cell(table, column, encoder) == number
+
+
+def test_the_study_tells_what_each_value_changed(study: Report) -> None:
+    glance = study.table("All values at a glance").set_index(["factor", "value", "group"])
+    place = ("learning rate and temperature", "3e-4 and 0.05", "A")
+    assert glance.loc[place, ["encoders", "velocities, features"]].tolist() == ["2", "0.460 · +0.034"]
+    assert glance.loc[("untrained", "untrained", "C"), "velocities, features"] == "0.236"
+    change = study.table("Change of the R2 of velocities, features").set_index(["factor", "value"])
+    assert change.loc[place[:2], ["pairs", "10,000"]].tolist() == ["4", "+0.028 · +0.017 to +0.034"]
+    assert change.loc[("num prototypes", "256"), ["1,000", "3,000", "10,000"]].tolist() == [
+        "+0.010",
+        "+0.015",
+        "\N{EN DASH}",
+    ]
+    each = study.table("R2 of velocities, features of each encoder").set_index(
+        ["factor", "value", "group", "seed"]
+    )
+    usual = ("assignment temperature", "0.1", "C", "1")
+    assert each.loc[usual, ["left the plateau at", "500", "10,000"]].tolist() == ["900", "0.262", "0.369"]
+    control = each.loc[("untrained", "untrained", "A", "0")]
+    assert set(control[["500", "10,000"]]) == {"0.326"}  # beside every number of updates
+    assert study.cell(
+        "Episode return at the final", "C finger_spin", "crptpro, assignment_temperature 0.05"
+    ) == ("270 ± 15 (n = 2)")
+    assert "854 of 856 numbers are there" in study.text
+    assert len(study.table("The 2 that are missing")) == 2
+
+
+def test_both_files_show_every_table_and_figures_that_are_there(seen: Report, study: Report) -> None:
+    for report in (seen, study):
+        assert report.html.count("<table>") == len(report.tables)
+        shown = re.findall(r"!\[.*\]\((.+?)\)", report.text)
+        assert re.findall(r'<img src="(.+?)"', report.html) == shown
+        assert {path.name for path in (report.folder / "figures").iterdir()} == {
+            Path(file).name for file in shown
+        }
+        for file in shown:
+            assert len(np.unique(imread(report.folder / file)[..., 0])) > 20, file
+    assert len(re.findall("!\\[", seen.text)) == 9
+
+
+# --- made-up records ------------------------------------------------------------------------------------------------
+
+
+def write_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pd.DataFrame(list(rows)).to_csv(path, index=False)
+
+
+def evaluations(
+    score: float, *, method: str = "crptpro", pause_s: float = 0.0, places: int = 11
+) -> list[dict]:
+    """An hour in which the return rises from 0 to a score, with a pause before the last evaluation."""
+    shares = np.linspace(0, 1, places)
+    return [
+        {
+            "episode": episode, "env_steps": int(500_000 * share), "agent_steps": int(250_000 * share),
+            "updates": int(249_000 * share), "unix_time_s": START_S + 3600 * share + pause_s * (share == 1),
+            "episode_return": score * share + 2 * episode - 1, "episode_agent_steps": 500, "seed": 7, "method": method,
+        }
+        for share in shares for episode in (0, 1)
+    ]  # fmt: skip
+
+
+class Reproduction:
+    """Jobs and requests of a root, written as ``crptpro reproduce`` writes them."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    def job(
+        self,
+        key: str,
+        kind: str,
+        needs: Iterable[str] = (),
+        *,
+        done: bool = True,
+        facts: Any = None,
+        **tables: Any,
+    ) -> str:
+        folder = self.root / "jobs" / key
+        description = {"kind": kind, "command": [kind], "needs": list(needs), "facts": facts or {}}
+        write_json(folder / "job.json", description)
+        if done:
+            made = {
+                "seconds": 90.0,
+                "attempts": 1,
+                "device": "cpu",
+                "threads": 1,
+                "git_revision": "0123456789ab",
+            }
+            write_json(folder / "done.json", {**made, "versions": {"torch": "2.13.0"}, "hardware": HARDWARE})
+        for name, rows in tables.items():
+            write_rows(folder / f"{name}.csv", rows)
+        return key
+
+    def ask(
+        self, experiment: str, cells: Iterable[tuple[str, str, Mapping[str, Any]]], scale: str = "paper"
+    ) -> None:
+        told = [{"label": label, "job": job, "place": dict(place)} for label, job, place in cells]
+        content = {"experiment": experiment, "scale": scale, "request": {}, "cells": told}
+        write_json(self.root / "experiments" / f"{len(list(self.root.glob('experiments/*')))}.json", content)
+
+    def runs(
+        self, label: str, task: str, scores: Iterable[float], **place: Any
+    ) -> list[tuple[str, str, dict]]:
+        """Runs of a method, each on an encoder of its own."""
+        cells = []
+        for seed, score in enumerate(scores):
+            encoder = self.job(
+                f"encoder-{label}-{seed}", "encoder", facts={"method": label, "updates": 50_000}
+            )
+            key = f"run-{label}-{task}-{seed}-{'-'.join(map(str, place.values()))}"
+            job = self.job(key, "run", [encoder], facts={"method": label}, eval=evaluations(score))
+            cells.append((label, job, {"group": "A", "task": task, "encoder_seed": seed, "seed": 0, **place}))
+        return cells
+
+    def report(self) -> Report:
+        return Report(build_report(self.root))
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Reproduction:
+    return Reproduction(tmp_path)
+
+
+def test_from_five_runs_on_every_task_aggregates_have_intervals(made: Reproduction) -> None:
+    cells = made.runs("crptpro", "cheetah_run", [500, 550, 600, 650, 700])
+    cells += made.runs("crptpro", "walker_run", [400, 450, 500, 550, 600])
+    cells += made.runs("atc", "cheetah_run", [250, 260, 270, 280, 290])
+    cells += made.runs("atc", "walker_run", [200, 210, 220, 230, 240])
+    made.ask("seen", cells)
+    report = made.report()
+    assert (
+        report.cell("Episode return at the final", "crptpro", "A cheetah_run")
+        == "600 ± 79 (n = 5) · paper 611 ± 44"
+    )
+    assert report.cell("Episode return over the last 10", "atc", "A walker_run").startswith("121 ± 9 (n = 5)")
+    over = report.table("Over the 2 tasks").set_index("method").loc["crptpro"]
+    assert over[["runs", "encoders"]].tolist() == ["10", "5"]
+    assert re.fullmatch(r"550 \\\[\d{3}, \d{3}\\\] · paper 562", over["mean score"])
+    assert re.fullmatch(r"0.887 \\\[0\.\d{3}, 0\.\d{3}\\\] · paper 0.907", over["mean / DrQ"])
+    chance = report.cell("Probability that a run of crptpro", "P(crptpro &gt; other)", "atc")
+    assert chance == r"1.00 \[1.00, 1.00\]"
+    assert "Brackets are 95% intervals" in report.text
+    assert "5: 84%" in report.text
+    assert (report.folder / "figures" / "seen-paper-improvement.png").exists()
+
+
+def test_a_partial_reproduction_says_what_is_missing(made: Reproduction) -> None:
+    cells = made.runs("crptpro", "walker_run", [500.0])
+    begun = made.job("run-begun", "run", done=False)
+    (made.root / "jobs" / begun / "log.txt").touch()
+    cells += [("crptpro", begun, {"group": "A", "task": "walker_run", "encoder_seed": 0, "seed": 1})]
+    cells += [("atc", "run-none", {"group": "A", "task": "walker_run", "encoder_seed": 0, "seed": 0})]
+    made.ask("seen", cells)
+    made.ask(
+        "unseen", [("atc", "run-other", {"group": "A", "task": "finger_spin", "encoder_seed": 0, "seed": 0})]
+    )
+    report = made.report()
+    assert (
+        "1 of 3 numbers are there; missing: crptpro 1, atc 1. Nothing stands in for what is missing."
+        in report.text
+    )
+    states = report.table("The 2 that are missing").set_index("job")["state"].to_dict()
+    assert states == {"run-begun": "begun, not finished", "run-none": "not begun"}
+    assert "Nothing is finished yet: 1 number asked for." in report.text
+    assert (
+        report.cell("Episode return at the final", "crptpro", "A walker_run")
+        == "500 (n = 1) · paper 513 ± 33"
+    )
+
+
+def test_before_anything_is_finished_there_is_a_page_that_says_so(made: Reproduction) -> None:
+    made.ask("seen", [("atc", "run-none", {"group": "A", "task": "walker_run"})], scale="small")
+    assert "Nothing is finished yet: 1 number asked for." in made.report().text
+    made.job("run-none", "run", done=False)
+    assert "0 of 1 run" in made.report().text
+
+
+def test_methods_are_compared_on_the_tasks_that_all_have(made: Reproduction) -> None:
+    cells = made.runs("crptpro", "walker_run", [500.0, 510.0]) + made.runs("crptpro", "cheetah_run", [600.0])
+    made.ask("seen", [*cells, *made.runs("atc", "walker_run", [200.0])])
+    report = made.report()
+    assert "Left out of everything that compares methods: A cheetah_run (no run of atc)." in report.text
+    assert report.cell("Over the 1 task", "mean score", "crptpro").startswith("505")
+
+
+def test_what_cannot_be_read_is_left_out_by_name(made: Reproduction) -> None:
+    cells = made.runs("crptpro", "walker_run", [500.0, 510.0, 520.0])
+    paths = [made.root / "jobs" / job / "eval.csv" for _, job, _ in cells]
+    paths[0].unlink()
+    paths[1].write_text(paths[1].read_text().replace(",519.0,", ",nan,").replace(",511.0,", ",,"))
+    made.ask("seen", cells)
+    report = made.report()
+    assert f"{paths[0].parent.name} has no eval.csv" in report.text
+    assert "a `episode_return` in it is no finite number".replace("`", r"\`") in report.text
+    assert report.cell("Episode return at the final", "crptpro", "A walker_run").startswith("520 (n = 1)")
+
+
+def test_colours_and_what_is_varied_have_rows_of_their_own(made: Reproduction) -> None:
+    reversed_colors = made.runs("crptpro", "cheetah_run", [400.0], group="C", colors="reversed_background")
+    made.ask("colors", reversed_colors)
+    cells = []
+    for value, score in (("0.05", 300.0), ("0", 200.0)):
+        place = {"varied": "alpha", "value": value}
+        cells += [
+            (f"crptpro, alpha {value}", *rest)
+            for _, *rest in made.runs("crptpro", "walker_run", [score], **place)
+        ]
+    made.ask("sensitivity", cells)
+    report = made.report()
+    captions = [caption for caption in report.tables if caption.startswith("Episode return at the final")]
+    assert "alpha varied" in captions[1]
+    row = report.tables[captions[0]].iloc[0]
+    assert row["task"] == "C cheetah_run, reversed_background"
+    assert row["crptpro"] == "400 (n = 1) · paper 485 ± 26"
+    assert (report.folder / "figures" / "sensitivity-paper-alpha.png").exists()
+
+
+def test_pauses_of_a_run_do_not_count_as_its_time(made: Reproduction) -> None:
+    job = made.job("run-paused", "run", eval=evaluations(100.0, pause_s=86_400.0))
+    path = made.root / "jobs" / job
+    hours = hours_at_work(path, pd.read_csv(path / "eval.csv"))
+    assert hours.iloc[-1] == pytest.approx(1.0)
+    assert hours.iloc[0] == 0.0
+
+
+HOSTILE = "</td><script>alert(1)</script> | [x](javascript:y) $\\frac$ \n# `big` & ünïcode"
+
+
+def test_names_of_users_break_neither_page(made: Reproduction) -> None:
+    job = made.job("run-one", "run", facts={"method": HOSTILE}, eval=evaluations(10.0, method=HOSTILE))
+    place = {"group": HOSTILE, "task": HOSTILE, "encoder_seed": 0, "seed": 0}
+    made.ask(HOSTILE, [(HOSTILE, job, place), ("other", "run-none", place)], scale="<b>huge</b>")
+    report = made.report()
+    seen = Tags()
+    seen.feed(report.html)
+    assert not {"script", "b"} & set(seen.tags)
+    assert HOSTILE.replace("\n", "") in re.sub(r"\n", "", seen.text)
+    assert "<script" not in report.text
+    assert "[x](javascript" not in report.text
+    assert report.cell("Experiments: numbers", "finished").startswith("1")
+    assert len(list((report.folder / "figures").iterdir())) >= 2
+
+
+class Tags(HTMLParser):
+    """Elements and text of a page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: Any) -> None:
+        self.tags.append(tag)
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_data_is_shown_and_its_picture_stays_when_the_frames_are_gone(
+    made: Reproduction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = made.job("dataset-toy", "dataset", facts={"domain": "toy", "transitions": 20})
+    write_json(made.root / "jobs" / job / "toy" / "card.json", {"domain": "toy"})
+    made.ask("seen", made.runs("crptpro", "walker_run", [500.0]))
+    data = ReplayBuffer(storage=LazyTensorStorage(10), batch_size=4)
+    data.extend(TensorDict({"pixels": torch.randint(0, 255, (10, 9, 16, 16), dtype=torch.uint8)}, [10]))
+    monkeypatch.setattr("crptpro.data.FrameDataset.open", lambda path: data)
+    assert "![4 observations of each domain" in made.report().text
+
+    def gone(path: Path) -> None:
+        raise DatasetError(f"{path} has no frames")
+
+    monkeypatch.setattr("crptpro.data.FrameDataset.open", gone)
+    without = made.report().text
+    assert "Drawn when the datasets were here." in without
+    assert "Datasets without their frames: toy." in without
+
+
+def test_the_same_records_give_the_same_files(made: Reproduction) -> None:
+    made.ask("seen", made.runs("crptpro", "walker_run", [500.0, 510.0, 520.0, 530.0, 540.0]))
+    first = {path.name: path.read_bytes() for path in (made.report().folder / "figures").iterdir()}
+    again = {path.name: path.read_bytes() for path in (made.report().folder / "figures").iterdir()}
+    assert first == again
+    assert len(first) == 3
+
+
+@pytest.mark.parametrize(("losses", "left"), [
+    ((1.02, 1.0, 0.985, 0.9), 300),
+    ((0.9, 1.0, 0.995, 0.98), 400),  # what it was before the plateau does not count
+    ((1.0, 0.98, 0.995), np.inf),  # back on it
+    ((1.0, 1.0), np.inf),
+    ((0.8, 0.7), 100),
+    ((), np.nan),
+])  # fmt: skip
+def test_a_plateau_is_left_where_the_loss_stays_below_it(losses: tuple[float, ...], left: float) -> None:
+    updates = [100.0 * (n + 1) for n in range(len(losses))]
+    record = pd.DataFrame(
+        {"updates": updates, "comp": [4.0 * share for share in losses], "ln_num_prototypes": 4.0}
+    )
+    assert left_plateau(record) == pytest.approx(left, nan_ok=True)
+
+
+def probed(value: str, seed: int, updates: int, group: str = "A", **r2: float) -> list[dict]:
+    about = {
+        "factor": "tau",
+        "value": value,
+        "usual": "0.1",
+        "group": group,
+        "seed": seed,
+        "updates": updates,
+    }
+    about |= {"measure": "r2_velocity", "embedding": "features"}
+    return [{**about, "where": domain, "r2": number} for domain, number in r2.items()]
+
+
+def test_encoders_are_compared_with_the_usual_ones_of_their_group_seed_and_updates() -> None:
+    rows = [
+        *probed("0.1", 0, 300, walker=0.2, finger=0.4), *probed("0.05", 0, 300, walker=0.3, finger=0.6),
+        *probed("0.1", 0, 100, walker=0.1, finger=0.2), *probed("0.05", 0, 100, walker=0.3, finger=0.5),
+        *probed("0.05", 1, 300, walker=0.9, finger=0.9),  # nothing to compare with
+        *probed("0.05", 2, 300, walker=0.9),  # not probed on every domain yet
+        *probed("0.1", 0, 300, "C", hopper=0.4), *probed("0.05", 0, 300, "C", hopper=0.6),
+    ]  # fmt: skip
+    found = compared(pd.DataFrame(rows))
+    assert 2 not in set(found["seed"])
+    changes = found.dropna(subset="change").set_index(["group", "updates"])["change"]
+    assert changes.to_dict() == pytest.approx({("A", 300): 0.15, ("A", 100): 0.25, ("C", 300): 0.2})
+    ends = found[found["is_end"]]
+    assert set(ends["updates"]) == {300}
+
+
+# --- the command, other directories, a browser ----------------------------------------------------------------------
+
+
+def test_on_an_ascii_terminal_the_page_is_written_first_and_its_name_shown_as_it_can_be(
+    tmp_path: Path,
+) -> None:
+    made = Reproduction(tmp_path / "r\N{LATIN SMALL LETTER E WITH ACUTE}sultats")
+    made.ask("seen", made.runs("crptpro", "walker_run", [500.0]))
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "CUDA_VISIBLE_DEVICES": ""}
+    command = [sys.executable, "-c", "from crptpro.cli import main; main()", "report", str(made.root)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == ascii(str(made.root / "report" / "index.html"))[1:-1]
+    assert "500 (n = 1)" in (made.root / "report" / "report.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"), [("nowhere", "There is no directory"), ("", "holds nothing to report on")]
+)
+def test_a_directory_without_anything_is_refused_and_left_alone(
+    tmp_path: Path, name: str, reason: str
+) -> None:
+    with pytest.raises(RecordError, match=reason):
+        build_report(tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_runs_that_nobody_planned_are_told_apart_by_what_differs(tmp_path: Path) -> None:
+    for seed, rate in enumerate([1e-3, 1e-3, 1e-4]):
+        folder = tmp_path / "mine" / str(seed)
+        settings = {"seed": seed, "env_steps": 500_000, "learning_rate": rate, "device": f"cuda:{seed}"}
+        write_json(folder / "config.json", {"config": {"task": "walker_run", **settings}, "versions": {}})
+        write_rows(folder / "eval.csv", evaluations(100.0 + seed))
+    write_rows(tmp_path / "broken" / "eval.csv", evaluations(1.0))
+    report = Report(build_report(tmp_path, out=tmp_path / "page"))
+    row = report.table("Episode return at the final").iloc[0]
+    assert row["task"] == "walker_run"
+    assert row["crptpro, learning_rate 0.001"] == "100 ± 1 (n = 2)"
+    assert row["crptpro, learning_rate 0.0001"] == "102 (n = 1)"
+
+
+def test_what_training_writes_is_read(tmp_path: Path) -> None:
+    config = DownstreamConfig(
+        env_steps=40, batch_size=4, replay_capacity=20, random_agent_steps=18, eval_interval_env_steps=20,
+        eval_episodes=2, checkpoint_interval_env_steps=20, log_interval_env_steps=20, intrinsic_reward_coef=0.0,
+        precision="fp32", eval_workers=0,
+    )  # fmt: skip
+    encoder = Pretrained(PixelEncoder(channels=(4,), strides=(2,), image_size=16), card={"method": "atc"})
+    finals = []
+    for seed in (0, 1):
+        result = train_downstream(
+            "toy",
+            encoder,
+            run_dir=tmp_path / str(seed),
+            config=config,
+            seed=seed,
+            progress=False,
+            env_factory=toy_env,
+        )
+        finals.append(
+            np.mean([row["episode_return"] for row in result.evaluations if row["env_steps"] == 40])
+        )
+    report = Report(build_report(tmp_path))
+    assert f"{np.mean(finals):.1f}"[:3] in report.cell("Episode return at the final", "atc", "toy")
+    assert report.table("Over the 1 task").iloc[0][["runs", "encoders"]].tolist() == ["2", "1"]
+
+
+def toy_env(task: str, *, seed: int, image_size: int, frame_stack: int, **settings: object) -> EnvBase:
+    env = ToyEnv(lambda _: 10, seed=seed, image_size=image_size)
+    return TransformedEnv(env, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
+
+
+def test_a_disk_that_is_full_is_named_and_the_older_page_kept(tmp_path: Path) -> None:
+    page = Page(tmp_path)
+    page.section("One", "one")
+    page.text("before")
+    page.write("A title", "")
+    (tmp_path / f".index.html.{os.getpid()}.partial").symlink_to("/dev/full")
+    page.text("after")
+    with pytest.raises(DiskSpaceError, match=r"disk is full: .*index\.html cannot be written"):
+        page.write("A title", "")
+    assert "after" not in (tmp_path / "index.html").read_text()
+
+
+BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")
+
+
+@pytest.mark.parametrize("width", [1200, 400])
+def test_a_browser_shows_the_page_and_it_never_scrolls_sideways(
+    seen: Report, tmp_path: Path, width: int
+) -> None:
+    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    if browser is None:
+        pytest.skip(f"no browser was found ({', '.join(BROWSERS)})")
+    page = seen.folder / f"measured-{width}.html"
+    script = "<script>document.title = 'said ' + (document.documentElement.scrollWidth <= innerWidth) + ' ' + " \
+        "[...document.images].filter(i => i.naturalWidth > 100).length</script></body>"  # fmt: skip
+    page.write_text(seen.html.replace("</body>", script))
+    command = [
+        browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--no-first-run",
+        "--host-resolver-rules=MAP * ~NOTFOUND", "--virtual-time-budget=5000", f"--user-data-dir={tmp_path}",
+        f"--window-size={width},1400", "--dump-dom", page.as_uri(),
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
+    found = re.search(r"<title>said (\w+) (\d+)</title>", done.stdout)
+    assert found is not None
+    assert found[1] == "true"
+    assert int(found[2]) == seen.html.count("<img")

@@ -1,0 +1,228 @@
+"""Every recipe and every method from nothing to an evaluation on the real simulator: half, then the same call again."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import importlib.util
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from crptpro.data import collect_group
+from crptpro.domains import GROUPS
+from crptpro.errors import CRPTproError
+from crptpro.modules import PixelEncoder
+from crptpro.objectives import ProtoLoss, method_names
+from crptpro.pretrained import load_pretrained, save_pretrained
+from crptpro.training import DownstreamConfig, ExploreConfig, PretrainConfig, load_agent
+
+RECIPES = Path(__file__).parents[2] / "recipes"
+TASK = "gymnasium:Reacher-v5"
+"""Real MuJoCo pixels with episodes of 25 decisions."""
+EPISODE = 50
+MEASURED = {"unix_time_s", "updates_per_s", "env_steps_per_s", "resident_bytes", "gpu_bytes"}
+
+
+@functools.cache
+def load(recipe: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"{recipe}_recipe", RECIPES / f"{recipe}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # where dataclasses look their annotations up
+    spec.loader.exec_module(module)
+    return module
+
+
+class StoppedError(Exception):
+    """Ends a recipe after its pre-training."""
+
+
+def stop(*_: object, **__: object) -> None:
+    raise StoppedError
+
+
+def pretraining(half: int) -> PretrainConfig:
+    return PretrainConfig(updates=2 * half, batch_size=4, log_interval=1, precision="fp32")
+
+
+def exploring(domains: int) -> ExploreConfig:
+    return ExploreConfig(
+        env_steps=60 * domains, batch_size=4, random_agent_steps=8, hidden_dim=16, log_interval=4,
+        queue_size=1024, checkpoint_interval_env_steps=40, precision="fp32",
+    )  # fmt: skip
+
+
+def learning(half: int) -> DownstreamConfig:
+    return DownstreamConfig(
+        env_steps=half * EPISODE, batch_size=4, replay_capacity=60, random_agent_steps=12, hidden_dim=16,
+        queue_size=1024, eval_interval_env_steps=EPISODE, eval_episodes=1, eval_workers=0,
+        checkpoint_interval_env_steps=EPISODE, log_interval_env_steps=20, precision="fp32",
+    )  # fmt: skip
+
+
+Run = Callable[[Path, int, int], None]
+"""A recipe with a directory, and so many halves of its budgets: of pre-training, and of learning."""
+
+
+def paper(method: str) -> Run:
+    def run(out: Path, half: int, learned: int) -> None:
+        recipe = load("paper")
+        config = recipe.Config(group="D", method=method, tasks=(TASK,), out=out, transitions=12, workers=1)
+        budgets = {"pretrain": pretraining(half), "downstream": learning(learned)}
+        recipe.main(replace(config, quality="fast", **budgets))
+
+    return run
+
+
+def explore(method: str) -> Run:
+    def run(out: Path, half: int, learned: int) -> None:
+        recipe, domains = load("explore"), (TASK,) if method.endswith("-s") else (TASK, "cartpole")
+        recipe.main(recipe.Config(method=method, domains=domains, tasks=(TASK,), out=out, quality="fast",
+                                  explore=exploring(len(domains)), downstream=learning(learned)))  # fmt: skip
+
+    return run
+
+
+def finetune(out: Path, half: int, learned: int) -> None:
+    recipe, source = load("finetune"), out.parent / "source"
+    if not source.exists():
+        torch.manual_seed(0)
+        save_pretrained(ProtoLoss(PixelEncoder(), num_prototypes=16, latent_dim=8, hidden_dim=16), source)
+    recipe.main(recipe.Config(pretrained=str(source), domain=TASK, out=out, transitions=12, workers=1, quality="fast",
+                              pretrain=pretraining(half), downstream=learning(learned)))  # fmt: skip
+
+
+def drq(out: Path, half: int, learned: int) -> None:
+    recipe = load("drq")
+    recipe.main(recipe.Config(tasks=(TASK,), out=out, downstream=learning(learned)))
+
+
+def quickstart(out: Path, half: int, learned: int) -> None:
+    recipe = load("quickstart")
+    recipe.main(recipe.Config(out=out, task=TASK, domains=GROUPS["D"], transitions=12, workers=1, action_repeat=2,
+                              pretrain=pretraining(half), downstream=learning(learned)))  # fmt: skip
+    figures = list((out / "report" / "figures").glob("*.png"))
+    page = (out / "report" / "report.md").read_text()
+    assert figures
+    assert all(figure.name in page for figure in figures)
+    assert "random-encoder" in page
+
+
+def own_domain(out: Path, half: int, learned: int) -> None:
+    recipe = load("own_domain")
+    recipe.main(recipe.Config(world=TASK, out=out, transitions=12, workers=1, pretrain=pretraining(half),
+                              downstream=learning(learned)))  # fmt: skip
+
+
+DATA = ["crptpro", "crptpro-fast", "released-code", "atc", "atc-native"]
+ACTIVE = ["proto-rl-c", "proto-rl-s", "apt-c", "apt-s", "becl"]
+CONTROLS = ["random-encoder", "random-encoder-standardised"]
+WAYS: dict[str, Run] = {
+    **{method: paper(method) for method in [*DATA, *CONTROLS]},
+    **{method: explore(method) for method in ACTIVE},
+    "crptpro-finetune": finetune,
+    "drq": drq,
+}
+RESUMED: dict[str, Run] = {
+    "paper": WAYS["crptpro"], "finetune": finetune, "drq": drq, "quickstart": quickstart, "own_domain": own_domain,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The random data that the recipes of group D would collect themselves."""
+    out = tmp_path_factory.mktemp("data") / "data"
+    collect_group(GROUPS["D"], out, transitions=12, seed=0, workers=1, quality="fast", progress=False)
+    return out
+
+
+def record(path: Path) -> list[dict[str, str]]:
+    with open(path, newline="") as file:
+        return [{k: v for k, v in row.items() if k not in MEASURED} for row in csv.DictReader(file)]
+
+
+def left(out: Path) -> dict[str, object]:
+    """Return every record and every weight below a directory."""
+    found: dict[str, object] = {}
+    for path in sorted(out.rglob("*")):
+        if path.suffix == ".csv" and "report" not in path.parts:
+            found[str(path.relative_to(out))] = record(path)
+        elif path.suffix == ".safetensors" and "checkpoints" not in path.parts:
+            found[str(path.relative_to(out))] = {k: v.tolist() for k, v in load_file(path).items()}
+    return found
+
+
+def test_no_method_is_left_out() -> None:
+    # Downstream alone: the bonus's weight on another method's encoder.
+    assert {*WAYS, "crptpro-no-bonus", "next-latent"} >= set(method_names(presets=True))
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+@pytest.mark.parametrize("method", WAYS)
+def test_every_method_ends_in_evaluations(method: str, tmp_path: Path, collected: Path) -> None:
+    out = tmp_path / "out"
+    if method in DATA or method in CONTROLS:
+        shutil.copytree(collected, out / "data")
+    WAYS[method](out, 1, 1)
+    (evaluation,) = out.rglob("eval.csv")
+    assert [row["env_steps"] for row in record(evaluation)] == ["0", str(EPISODE)]
+    assert {row["method"] for row in record(evaluation)} == {method}
+    _, card = load_agent(evaluation.parent / "agent")
+    assert card["task"] == TASK
+    for path in out.rglob("encoder"):
+        pretrained = load_pretrained(path)
+        assert pretrained.label == method
+        assert card["pretrained"] == pretrained.identity()
+    has_bonus = method.startswith(("crptpro", "proto-rl", "released"))
+    assert all(("intrinsic_reward" in row) == has_bonus for row in record(evaluation.parent / "train.csv"))
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+@pytest.mark.parametrize("recipe", RESUMED)
+def test_twice_the_budget_is_the_budget_and_the_same_call_again(
+    recipe: str, tmp_path: Path, collected: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, parts = RESUMED[recipe], tmp_path / "parts"
+    for out in (tmp_path / "whole", parts):
+        if recipe in ("paper", "quickstart"):
+            shutil.copytree(collected, out / "data")
+    run(tmp_path / "whole", 2, 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(load(recipe), "train_downstream", stop)
+        with pytest.raises(StoppedError):
+            run(parts, 1, 1)
+    run(parts, 2, 1)
+    run(parts, 2, 2)
+    expected, found = left(tmp_path / "whole"), left(parts)
+    assert expected.keys() == found.keys()
+    assert [name for name in expected if expected[name] != found[name]] == []
+
+
+@pytest.mark.parametrize(
+    ("recipe", "changes", "message"),
+    [
+        ("paper", {"tasks": ("walkr_run",)}, "Nearest: walker"),
+        ("finetune", {"pretrained": "absent", "domain": "walker"}, "absent does not exist"),
+        ("finetune", {"pretrained": "absent", "domain": "walkr"}, "Nearest: walker"),
+        ("quickstart", {"task": "walkr"}, "Nearest: walker"),
+        ("drq", {"tasks": ("walkr",)}, "Nearest: walker"),
+    ],
+)
+def test_a_wrong_name_ends_a_recipe_before_it_collects(
+    recipe: str, changes: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    module = load(recipe)
+    with pytest.raises((CRPTproError, ValueError), match=message):
+        module.main(module.Config(out=tmp_path / "out", **changes))
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,434 @@
+"""The record of a run, what a kill or a full disk leaves of it, and its mirrors."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import json
+import logging
+import math
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from crptpro.errors import DiskSpaceError
+from crptpro.logging import RunLogger, WandbOptions
+
+
+def table(run_dir: Path, stream: str) -> list[dict[str, str]]:
+    with open(run_dir / f"{stream}.csv", newline="") as file:
+        return [{k: v for k, v in row.items() if k != "unix_time_s"} for row in csv.DictReader(file)]
+
+
+def lines(run_dir: Path) -> list[dict[str, Any]]:
+    rows = [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in row.items() if k != "unix_time_s"} for row in rows]
+
+
+# --- the record -------------------------------------------------------------------------------------------------------
+
+
+def test_each_stream_has_its_csv_and_the_jsonl_has_all(tmp_path: Path) -> None:
+    with RunLogger(tmp_path) as logger:
+        logger.log({"loss": torch.tensor(1.5)}, stream="train", env_steps=np.int64(1000), episodes=2)
+        logger.log({"episode_return": 7}, stream="eval", env_steps=1e3)
+    assert table(tmp_path, "train") == [{"env_steps": "1000", "episodes": "2", "loss": "1.5"}]
+    assert table(tmp_path, "eval") == [{"env_steps": "1000", "episode_return": "7"}]
+    assert [row["stream"] for row in lines(tmp_path)] == ["train", "eval"]
+
+
+def test_a_column_that_appears_later_does_not_shift_the_others(tmp_path: Path) -> None:
+    with RunLogger(tmp_path) as logger:
+        logger.log({"a": 1, "b": 2}, stream="train", updates=1)
+        logger.log({"b": 3, "late": 4}, stream="train", updates=2)
+        logger.log({"a": 5}, stream="train", updates=3)
+    assert table(tmp_path, "train") == [
+        {"updates": "1", "a": "1", "b": "2", "late": ""},
+        {"updates": "2", "a": "", "b": "3", "late": "4"},
+        {"updates": "3", "a": "5", "b": "", "late": ""},
+    ]
+
+
+def test_floats_keep_every_digit_and_nan_is_a_word(tmp_path: Path) -> None:
+    with RunLogger(tmp_path) as logger:
+        logger.log({"third": 1 / 3, "bad": math.nan, "huge": -math.inf, "none": None}, stream="x", updates=1)
+    row = table(tmp_path, "x")[0]
+    assert float(row["third"]) == 1 / 3
+    assert (row["bad"], row["huge"]) == ("nan", "-inf")
+    assert "none" not in row
+    assert lines(tmp_path)[0]["bad"] == "nan"
+
+
+@pytest.mark.parametrize(("metrics", "stream", "counters", "message"), [
+    ({"a": 1}, "train", {}, "needs a counter"),
+    ({"a": 1}, "train", {"updates": 1.5}, "whole number"),
+    ({"stream": 1}, "train", {"updates": 1}, "cannot name a metric"),
+    ({"updates": 1}, "train", {"updates": 1}, "cannot name a metric"),
+    ({"a": torch.zeros(2)}, "train", {"updates": 1}, "no scalar"),
+    ({"a": 1}, "../x", {"updates": 1}, "stream is named"),
+])  # fmt: skip
+def test_what_cannot_be_a_row_is_refused(
+    tmp_path: Path, metrics: dict[str, Any], stream: str, counters: dict[str, Any], message: str
+) -> None:
+    with RunLogger(tmp_path) as logger, pytest.raises(ValueError, match=message):
+        logger.log(metrics, stream=stream, **counters)
+
+
+TEXTS = ("a\rb", "a\nb", "a\r\nb", "a\u2028b", "a\x1cb", "a,b", 'a"b', "a\udc80b", "caf\xe9", "")
+
+
+@pytest.mark.parametrize("text", TEXTS, ids=ascii)
+def test_no_text_in_a_name_or_a_value_breaks_the_record_or_its_reopening(tmp_path: Path, text: str) -> None:
+    with RunLogger(tmp_path) as logger:
+        logger.log({"loss": 1, "note": text}, stream="train", updates=1)
+        try:
+            logger.log({text: 2}, stream="train", updates=2)
+        except ValueError:
+            logger.log({"loss": 2}, stream="train", updates=2)
+    with RunLogger(tmp_path) as logger:
+        logger.log({"loss": 3, "late": 1}, stream="train", updates=3)
+    rows = table(tmp_path, "train")
+    assert [row["updates"] for row in rows] == ["1", "2", "3"]
+    assert rows[2]["late"] == "1"
+    assert len((tmp_path / "train.csv").read_text(encoding="utf-8").splitlines()) == 4
+    if text in ("a,b", 'a"b', "caf\xe9"):
+        assert rows[0]["note"] == text
+
+
+def test_a_run_directory_is_a_path_as_a_shell_means_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    with RunLogger("~/runs/a") as logger:
+        logger.log({"loss": 1}, stream="train", updates=1)
+    assert (tmp_path / "runs" / "a" / "train.csv").exists()
+    with pytest.raises(ValueError, match="`run_dir` is empty"):
+        RunLogger("")
+
+
+def test_records_have_the_rights_that_the_umask_leaves(tmp_path: Path) -> None:
+    before = os.umask(0o007)
+    try:
+        with RunLogger(tmp_path / "run", config={"a": 1}) as logger:
+            logger.log({"loss": 1}, stream="train", updates=1)
+    finally:
+        os.umask(before)
+    assert {path.stat().st_mode & 0o777 for path in (tmp_path / "run").iterdir()} == {0o660}
+
+
+def test_a_resumed_run_writes_each_row_once(tmp_path: Path) -> None:
+    def write(logger: RunLogger, start: int, stop: int) -> None:
+        for updates in range(start, stop):
+            logger.log({"loss": updates / 7}, stream="train", updates=updates)
+            if updates % 3 == 0:
+                logger.log({"score": updates}, stream="eval", updates=updates)
+
+    with RunLogger(tmp_path / "whole") as whole:
+        write(whole, 0, 12)
+    with RunLogger(tmp_path / "parts") as first:
+        write(first, 0, 5)
+        state = first.state_dict()
+        write(first, 5, 8)
+        first.log({"new_column": 1, "loss": 0}, stream="train", updates=8)
+        first.log({"x": 1}, stream="late", updates=8)
+    with RunLogger(tmp_path / "parts") as second:
+        second.load_state_dict(state)
+        assert not (tmp_path / "parts" / "late.csv").exists()
+        write(second, 5, 12)
+    for stream in ("train", "eval"):
+        assert table(tmp_path / "parts", stream) == table(tmp_path / "whole", stream)
+    assert lines(tmp_path / "parts") == lines(tmp_path / "whole")
+
+
+def test_the_state_of_one_stream_leaves_the_others_alone(tmp_path: Path) -> None:
+    with RunLogger(tmp_path) as logger:
+        logger.log({"a": 1}, stream="pretrain", updates=1)
+        state = logger.state_dict(["pretrain"])
+        logger.log({"a": 2}, stream="pretrain", updates=2)
+        logger.log({"a": 3}, stream="eval", env_steps=5)
+        logger.load_state_dict(state)
+        assert [row["updates"] for row in logger.rows("pretrain")] == [1]
+        assert [row["env_steps"] for row in logger.rows("eval")] == [5]
+
+
+def test_rows_beyond_a_counter_can_be_taken_back(tmp_path: Path) -> None:
+    with RunLogger(tmp_path) as logger:
+        for steps in (10, 20, 30):
+            logger.log({"a": steps}, stream="train", env_steps=steps)
+        logger.truncate_to("train", "env_steps", 20)
+        assert [row["env_steps"] for row in logger.rows("train")] == [10, 20]
+        logger.truncate_to("train", "env_steps", -1)
+        assert logger.rows("train") == []
+
+
+def test_a_record_shorter_than_its_checkpoint_is_announced(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with RunLogger(tmp_path) as logger:
+        logger.log({"a": 1}, stream="train", updates=1)
+        logger.load_state_dict({"rows": {"train": 5}, "streams": None})
+    assert "4 rows of 'train' are missing" in caplog.text
+
+
+def test_a_torn_last_line_is_dropped_and_the_csv_repaired(tmp_path: Path) -> None:
+    with RunLogger(tmp_path) as logger:
+        logger.log({"a": 1}, stream="train", updates=1)
+        logger.log({"a": 2}, stream="train", updates=2)
+    text = (tmp_path / "metrics.jsonl").read_text()
+    (tmp_path / "metrics.jsonl").write_text(text[:-5])
+    with RunLogger(tmp_path) as logger:
+        logger.log({"a": 3}, stream="train", updates=3)
+    assert [row["updates"] for row in table(tmp_path, "train")] == ["1", "3"]
+    assert [row["updates"] for row in lines(tmp_path)] == [1, 3]
+
+
+def test_a_process_killed_while_logging_leaves_whole_rows(tmp_path: Path) -> None:
+    script = (
+        "import sys\nfrom crptpro.logging import RunLogger\nlogger = RunLogger(sys.argv[1])\n"
+        "for i in range(10**6):\n    logger.log({'a': i, 'b': 'x' * 200}, stream='train', updates=i)\n"
+        "    if i == 20: print('ready', flush=True)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.send_signal(signal.SIGKILL)
+    with RunLogger(tmp_path) as logger:
+        count = len(logger.rows("train"))
+        logger.log({"a": count, "b": "y"}, stream="train", updates=count)
+    assert count > 20
+    assert [int(row["updates"]) for row in table(tmp_path, "train")] == list(range(count + 1))
+
+
+def test_a_full_disk_is_one_clear_error_without_half_a_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real_open = open
+
+    class HalfFile:
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            self.file = real_open(*arguments, **options)
+
+        def __enter__(self) -> HalfFile:
+            return self
+
+        def __exit__(self, *exception: object) -> None:
+            self.file.close()
+
+        def write(self, text: str) -> None:
+            self.file.write(text[: len(text) // 2])
+            self.file.flush()
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with RunLogger(tmp_path) as logger:
+        logger.log({"a": 1}, stream="train", updates=1)
+        before = (tmp_path / "metrics.jsonl").read_bytes()
+        monkeypatch.setitem(RunLogger.log.__globals__, "open", HalfFile)
+        with pytest.raises(DiskSpaceError, match="disk is full"):
+            logger.log({"a": 2}, stream="train", updates=2)
+    assert (tmp_path / "metrics.jsonl").read_bytes() == before
+
+
+def test_the_config_is_kept_with_versions_from_the_first_row_that_the_disk_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @dataclass
+    class Config:
+        task: str = "walker_run"
+        out: Path = Path("runs")
+
+    def full(file: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with RunLogger(tmp_path, config=Config()) as logger:
+        # Not before: a request that is refused must not replace the settings of the run it found.
+        assert not (tmp_path / "config.json").exists()
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "fsync", full)
+            with pytest.raises(DiskSpaceError, match=r"disk is full: .*/config\.json"):
+                logger.log({"loss": 1.0}, stream="train", updates=1)
+        logger.log({"loss": 1.0}, stream="train", updates=1)
+    written = json.loads((tmp_path / "config.json").read_text())
+    assert written["config"] == {"task": "walker_run", "out": "runs"}
+    assert "torch" in written["versions"]
+
+
+def test_an_event_is_one_log_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, logger="crptpro"), RunLogger(tmp_path) as logger:
+        logger.event("episode 3: return 12.5, 100 % of 250 env steps")
+    assert [r.message for r in caplog.records] == ["episode 3: return 12.5, 100 % of 250 env steps"]
+
+
+# --- mirrors ----------------------------------------------------------------------------------------------------------
+
+WANDB_VARIABLES = ("API_KEY", "MODE", "BASE_URL", "PROJECT", "NAME", "RUN_GROUP")
+
+
+class FakeRun:
+    """Stands in for a W&B run."""
+
+    def __init__(self, **options: Any) -> None:
+        self.options, self.finished, self.axes = options, False, dict[str, str | None]()
+        self.rows: list[tuple[Any, dict[str, Any]]] = []
+
+    def define_metric(self, name: str, step_metric: str | None = None) -> None:
+        self.axes[name] = step_metric
+
+    def log(self, row: dict[str, Any], **options: Any) -> None:
+        self.rows.append((row, options))
+
+    def finish(self) -> None:
+        self.finished = True
+
+
+@pytest.fixture
+def no_account(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in WANDB_VARIABLES:
+        monkeypatch.delenv(f"WANDB_{name}", raising=False)
+    monkeypatch.setenv("NETRC", "/nowhere/netrc")
+
+
+@pytest.fixture
+def fake_wandb(monkeypatch: pytest.MonkeyPatch, no_account: None) -> Iterator[list[FakeRun]]:
+    import wandb
+
+    runs: list[FakeRun] = []
+
+    def init(**options: Any) -> FakeRun:
+        runs.append(FakeRun(**options))
+        return runs[-1]
+
+    monkeypatch.setattr(wandb, "init", init)
+    yield runs
+    assert not [name for name in os.environ if name.startswith("WANDB_")]  # nothing is changed for the next
+
+
+def test_wandb_gets_metrics_against_their_counter_under_one_identity(
+    tmp_path: Path, fake_wandb: list[FakeRun]
+) -> None:
+    for start in (0, 1):
+        with RunLogger(tmp_path, wandb=WandbOptions(tags=("t",)), config={"lr": 1}) as logger:
+            logger.log({"loss": 1.0, "note": "x"}, stream="pretrain", updates=start + 1)
+            state = logger.state_dict()
+            logger.log({"score": 2.0}, stream="eval", episodes=1, env_steps=10)
+            logger.load_state_dict(state)
+            logger.log({"score": 2.0}, stream="eval", episodes=1, env_steps=10)
+    first, second = fake_wandb
+    assert first.options["id"] == second.options["id"]
+    assert (first.options["mode"], first.options["tags"], first.options["config"]) == (
+        "offline",
+        ["t"],
+        {"lr": 1},
+    )
+    assert first.axes == {
+        "updates": None, "pretrain/*": "updates", "env_steps": None, "eval/*": "env_steps",
+    }  # fmt: skip
+    assert first.rows[0] == ({"updates": 1, "pretrain/loss": 1.0, "pretrain/note": "x"}, {"step": 0})
+    assert first.rows[1] == first.rows[2]  # repeated rows come under the same step
+    assert second.rows[0][1] == {"step": 2}
+    assert first.finished
+
+
+@pytest.mark.parametrize(("options", "environment", "expected"), [
+    ({}, {}, ("crptpro", "run", None)),
+    ({}, {"PROJECT": "mine", "NAME": "n", "RUN_GROUP": "g"}, ("mine", "n", "g")),
+    ({"project": "asked", "name": "a", "group": "h"}, {"PROJECT": "mine", "NAME": "n", "RUN_GROUP": "g"},
+     ("asked", "a", "h")),
+])  # fmt: skip
+def test_defaults_apply_only_where_the_user_has_said_nothing_to_wandb(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_wandb: list[FakeRun], options: dict[str, Any],
+    environment: dict[str, str], expected: tuple[str | None, ...],
+) -> None:  # fmt: skip
+    with monkeypatch.context() as patched:
+        for name, value in environment.items():
+            patched.setenv(f"WANDB_{name}", value)
+        RunLogger(tmp_path / "run", wandb=WandbOptions(**options)).close()
+    assert tuple(fake_wandb[0].options[name] for name in ("project", "name", "group")) == expected
+
+
+@pytest.mark.parametrize("broken", ["init", "log", "finish"])
+def test_a_failing_mirror_is_switched_off_with_one_warning_and_the_record_is_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_wandb: list[FakeRun], caplog: pytest.LogCaptureFixture,
+    broken: str,
+) -> None:  # fmt: skip
+    import wandb
+
+    def fail(*arguments: Any, **options: Any) -> None:
+        raise wandb.errors.CommError("no route to host")
+
+    monkeypatch.setattr(*((wandb, "init") if broken == "init" else (FakeRun, broken)), fail)
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with RunLogger(tmp_path, wandb=WandbOptions(), tensorboard=True) as logger:
+        for updates in (1, 2, 3):
+            logger.log({"loss": 1.0}, stream="train", updates=updates)
+        if broken != "finish":
+            logger.video("eval/video", tmp_path / "missing.mp4", env_steps=1)
+    assert len(table(tmp_path, "train")) == 3
+    assert [
+        sum(name in r.message for r in caplog.records) for name in ("no route", "TensorBoard is off")
+    ] == [1, 1]
+    assert len(caplog.records) == 2
+
+
+def test_an_unreachable_server_means_offline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_wandb: list[FakeRun]
+) -> None:
+    import wandb
+
+    working = wandb.init
+
+    def init(**options: Any) -> Any:
+        if options["mode"] == "online":
+            raise wandb.errors.CommError("timed out")
+        return working(**options)
+
+    monkeypatch.setattr(wandb, "init", init)
+    RunLogger(tmp_path, wandb=WandbOptions(mode="online")).close()
+    assert [run.options["mode"] for run in fake_wandb] == ["offline"]
+
+
+@pytest.mark.parametrize(("environment", "netrc", "asked", "expected"), [
+    ({}, "", "auto", "offline"),
+    ({"WANDB_API_KEY": "k"}, "", "auto", "online"),
+    ({"WANDB_API_KEY": "k", "WANDB_MODE": "disabled"}, "", "auto", "disabled"),
+    ({}, "machine api.wandb.ai login user password x\n", "auto", "online"),
+    ({"WANDB_API_KEY": "k"}, "", "offline", "offline"),
+])  # fmt: skip
+def test_wandb_is_online_only_if_logged_in_or_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_wandb: list[FakeRun], environment: dict[str, str],
+    netrc: str, asked: Any, expected: str,
+) -> None:  # fmt: skip
+    (tmp_path / "netrc").write_text(netrc)
+    with monkeypatch.context() as patched:
+        for name, value in {**environment, "NETRC": str(tmp_path / "netrc")}.items():
+            patched.setenv(name, value)
+        RunLogger(tmp_path / "run", wandb=WandbOptions(mode=asked)).close()
+    assert fake_wandb[0].options["mode"] == expected
+
+
+def test_an_offline_wandb_run_and_event_files_are_really_written_and_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_account: None
+) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    (tmp_path / "note.txt").write_text("an artifact")
+    for updates in (1, 2):
+        with RunLogger(tmp_path, wandb=WandbOptions(), tensorboard=True) as logger:
+            logger.log({"loss": 1.0 / updates, "note": "text"}, stream="train", env_steps=10 * updates)
+            logger.artifact(tmp_path / "note.txt", name="gymnasium:note", kind="text")
+    identity = json.loads((tmp_path / "wandb_run.json").read_text())["id"]
+    files = sorted(tmp_path.glob(f"wandb/offline-run-*-{identity}/run-{identity}.wandb"))
+    assert len(files) >= 1
+    assert all(file.stat().st_size > 0 for file in files)
+    assert len(table(tmp_path, "train")) == 2
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [(e.step, e.value) for e in events.Scalars("train/loss")] == [(10, 1.0), (20, 0.5)]

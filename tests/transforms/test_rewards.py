@@ -1,0 +1,435 @@
+"""The intrinsic rewards: their published values, what they keep, and the same on environments as on batches."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from fake_pixel_env import EPISODE, SKILLS, FakePixelEnv, small_encoder, small_heads
+from tensordict import TensorDict
+from torch import nn
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import Compose, SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from crptpro.modules import Projector, Prototypes
+from crptpro.transforms import ContrastiveReward, FrozenEncoder, ParticleReward, PrototypeReward
+from crptpro.transforms.prototype_reward import draw_candidates, warn_if_mostly_zero
+
+B, D, M, N = 24, 6, 8, 5
+
+
+def seeded(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def latents(seed=0, count=B, dim=D):
+    return torch.randn(count, dim, generator=seeded(seed))
+
+
+def batch(count=B, seed=0):
+    skill = F.one_hot(torch.randint(0, 4, (count,), generator=seeded(seed + 9)), 4).float()
+    following = {"features": latents(seed, count), "reward": torch.rand(count, 1, generator=seeded(seed + 1))}
+    return TensorDict({"skill": skill, "next": following}, [count])
+
+
+def prototypes_of(rows=M, dim=D, seed=2):
+    module = Prototypes(rows, dim)
+    with torch.no_grad():
+        module.weight.copy_(latents(seed, rows, dim))
+    return module
+
+
+def on_latents(**options):
+    """A prototype reward that takes the features as projections."""
+    chosen = {"queue_size": 32, "generator": seeded(1), "prototypes": prototypes_of(), **options}
+    return PrototypeReward(None, chosen.pop("prototypes"), **chosen)
+
+
+# Prototypes ----------------------------------------------------------------------------------------------
+
+
+def kth_distance(z, queue, k):
+    return torch.tensor(
+        [sorted(float((row - entry).norm()) for entry in queue.double())[k - 1] for row in z.double()]
+    ).float()
+
+
+def test_the_prototype_reward_equals_the_formula_typed_again():
+    """kth smallest of ||z_i - Q_l||, l2-normalised z, after the candidates went in (CRPTpro proto.py)."""
+    projector, prototypes = Projector(10, D), Prototypes(M, D)
+    transform = PrototypeReward(projector, prototypes, queue_size=32, generator=seeded(4))
+    draws, queue, pointer = seeded(4), torch.zeros(32, D), 0
+    for seed in range(6):
+        td = batch(seed=seed)
+        td["next", "features"] = latents(seed, B, 10)
+        with torch.no_grad():
+            z = F.normalize(projector(td["next", "features"]), dim=-1)
+            probabilities = torch.softmax(F.normalize(prototypes.weight, dim=-1) @ z.T, dim=1)
+        uniform = torch.rand(M, 1, generator=draws)
+        for j in range(M):
+            queue[(pointer + j) % 32] = z[
+                int((probabilities[j].cumsum(0) <= uniform[j]).sum().clamp_max(B - 1))
+            ]
+        pointer = (pointer + M) % 32
+        external = td["next", "reward"].clone()
+        transform(td)
+        torch.testing.assert_close(transform.queue, queue)
+        expected = kth_distance(z, queue, 3).unsqueeze(-1)
+        torch.testing.assert_close(td["next", "intrinsic_reward"], expected, rtol=1e-4, atol=1e-5)
+        assert torch.equal(td["next", "reward"], external + 0.2 * td["next", "intrinsic_reward"])
+        assert int(transform.queue_pointer) == pointer
+
+
+def test_the_golden_values_of_the_prototype_reward():
+    start = torch.tensor([[7.0, 7.0], [0.0, 1.0], [0.8, 0.6], [-1.0, 0.0]])
+    transform = on_latents(prototypes=prototypes_of(1, 2), queue_size=4, queue=start)
+    z = torch.tensor([[1.0, 0.0], [0.6, 0.8]])
+    transform.generator = next(
+        g
+        for g in map(seeded, range(50))
+        if draw_candidates(F.normalize(transform.prototypes.weight.detach(), dim=-1) @ z.T, copy.deepcopy(g))
+        == 0
+    )
+    values = transform.intrinsic_reward(z)
+    torch.testing.assert_close(values, torch.tensor([1.414214, 0.894427]), rtol=0, atol=1e-6)
+    assert torch.equal(transform.queue, torch.tensor([[1.0, 0.0], [0.0, 1.0], [0.8, 0.6], [-1.0, 0.0]]))
+
+
+def test_candidates_follow_the_softmax_over_the_batch():
+    logits = torch.tensor([[0.0, 1.0, -1.0, 0.5], [2.0, 0.0, 0.0, 0.0]]).repeat_interleave(20_000, 0)
+    drawn = draw_candidates(logits, seeded()).view(2, -1)
+    for row, logit in zip(drawn, logits[::20_000]):
+        frequency = torch.bincount(row, minlength=4) / 20_000
+        torch.testing.assert_close(frequency, logit.softmax(0), rtol=0, atol=0.015)
+
+
+def test_neither_the_length_of_prototypes_nor_of_latents_matters():
+    scaled = prototypes_of()
+    with torch.no_grad():
+        scaled.weight.mul_(7)
+    found = on_latents(prototypes=scaled).intrinsic_reward(latents(3) * 0.1)
+    torch.testing.assert_close(found, on_latents().intrinsic_reward(latents(3)))
+
+
+def test_a_sample_drawn_k_times_gets_exactly_zero_and_that_happens_to_eight_percent():
+    transform = PrototypeReward(None, Prototypes(512, 128), generator=seeded(6))
+    features = torch.randn(512, 128, generator=seeded(7))
+    reward = transform.intrinsic_reward(features)
+    times_drawn = (F.normalize(features, dim=-1).unsqueeze(1) == transform.queue[:512]).all(-1).sum(1)
+    assert torch.equal(reward == 0, times_drawn >= 3)
+    assert 0.05 < float((reward == 0).float().mean()) < 0.115
+    assert float(on_latents(queue_size=64).intrinsic_reward(latents(5)).max()) <= 1.0 + 1e-6  # unfilled rows
+
+
+def test_batches_too_small_for_the_prototypes_are_announced(caplog: pytest.LogCaptureFixture) -> None:
+    warn_if_mostly_zero(512, 512, 3)
+    assert not caplog.text
+    warn_if_mostly_zero(512, 128, 3)
+    assert "512 prototypes draw their candidates from batches of 128" in caplog.text
+    assert "batches of more than 192" in caplog.text
+    reward = PrototypeReward(None, prototypes_of(512, 16), generator=seeded())
+    values = [reward.intrinsic_reward(latents(seed, 128, 16)) for seed in range(5)]
+    assert float((values[-1] == 0).float().mean()) > 0.6
+
+
+def test_the_queue_is_first_in_first_out_and_can_be_handed_over_and_emptied():
+    handed = F.normalize(latents(8, 32), dim=-1)
+    transform = on_latents(queue=handed)
+    assert transform.queue.data_ptr() != handed.data_ptr()
+    transform(batch())
+    assert torch.equal(transform.queue[M:], handed[M:])
+    assert not torch.equal(transform.queue[:M], handed[:M])
+    transform.reset_queue()
+    assert not transform.queue.any()
+    assert int(transform.queue_pointer) == 0
+
+
+def test_a_row_that_is_not_finite_never_enters_the_queue():
+    transform = on_latents()
+    for seed in range(8):
+        features = latents(seed)
+        features[[0, 5, B - 1]] = float("nan")
+        reward = transform.intrinsic_reward(features)
+        assert transform.queue.isfinite().all()
+        assert reward.isnan().nonzero().flatten().tolist() == [0, 5, B - 1]
+
+
+# Particles -----------------------------------------------------------------------------------------------
+
+
+class Published:
+    """PBE and RMS of url_benchmark ``utils.py``, typed again in float64."""
+
+    def __init__(self, k=12):
+        self.k, self.mean, self.count = k, 0.0, 1e-4
+
+    def __call__(self, z):
+        z = z.double()
+        distances = (z[:, None, :] - z[None, :, :]).norm(dim=-1).sort(dim=1).values[:, : self.k]
+        new, delta = distances.numel(), distances.mean() - self.mean
+        self.mean = self.mean + delta * new / (self.count + new)
+        self.count += new
+        return torch.log((distances / self.mean - 1e-4).clamp_min(0).mean(dim=1) + 1.0).float()
+
+
+@pytest.mark.parametrize("k", [12, 3])
+def test_particle_rewards_over_several_calls_equal_the_published_code(k):
+    projector = Projector(10, D)
+    transform, published = ParticleReward(projector, k=k), Published(k)
+    for seed in range(4):
+        features = torch.randn(B, 10, generator=seeded(seed)) * (1 + seed)
+        expected = published(projector(features).detach())
+        torch.testing.assert_close(transform.intrinsic_reward(features), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_the_scale_of_the_latent_space_does_not_matter():
+    first, second = ParticleReward(None), ParticleReward(None)
+    for seed in range(3):
+        one, two = first.intrinsic_reward(latents(seed)), second.intrinsic_reward(latents(seed) * 1e3)
+        torch.testing.assert_close(one, two, rtol=1e-4, atol=1e-5)
+
+
+def test_particles_alone_few_or_coinciding_earn_what_is_left_to_compare():
+    transform = ParticleReward(None)
+    assert transform.intrinsic_reward(torch.ones(B, D)).tolist() == [0.0] * B
+    before = copy.deepcopy(transform.state_dict())
+    assert transform.intrinsic_reward(latents(1, count=1)).tolist() == [0.0]
+    assert all(torch.equal(value, before[name]) for name, value in transform.state_dict().items())
+    few = ParticleReward(None, k=12).intrinsic_reward(latents(count=4))
+    assert torch.equal(few, ParticleReward(None, k=4).intrinsic_reward(latents(count=4)))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_row_that_is_not_finite_never_enters_a_running_statistic(bad):
+    transform, clean = ParticleReward(None, k=3), ParticleReward(None, k=3)
+    for each in (transform, clean):
+        each.intrinsic_reward(latents())
+    spoilt = latents(1)
+    spoilt[4] = bad
+    reward = transform.intrinsic_reward(spoilt)
+    assert reward[torch.arange(B) != 4].isfinite().all()
+    assert not reward[4].isfinite()  # seen where it arises
+    assert all(value.isfinite() for value in transform.state_dict().values())
+    after, usual = transform.intrinsic_reward(latents(2)), clean.intrinsic_reward(latents(2))
+    torch.testing.assert_close(after, usual, rtol=0.1, atol=0)
+
+
+# Skills --------------------------------------------------------------------------------------------------
+
+
+def published_contrast(embeddings, skills, temperature=0.5):
+    """exp(-loss) of BeCL ``agent/becl.py``, element by element."""
+    rewards, unit = [], F.normalize(embeddings.double(), dim=-1)
+    for i in range(len(unit)):
+        others = [j for j in range(len(unit)) if j != i]
+        similarity = torch.stack([unit[i] @ unit[j] / temperature for j in others])
+        weights = (similarity - similarity.max()).exp()
+        same = [n for n, j in enumerate(others) if skills[j] == skills[i]]
+        rewards.append(weights[same[0] if same else 0] / (weights.sum() + 1e-6) + 1e-6)
+    return torch.stack(rewards).float()
+
+
+@pytest.mark.parametrize("temperature", [0.5, 0.1])
+def test_the_contrastive_reward_equals_the_published_code(temperature):
+    head, td = nn.Linear(D, 3), batch()
+    misled = td.clone()
+    misled["next", "skill"] = misled["skill"].roll(1, 0)  # what came after is not looked at
+    expected = published_contrast(head(td["next", "features"]).detach(), td["skill"].argmax(-1), temperature)
+    for each in (td, misled, td.reshape(4, 6)):
+        found = ContrastiveReward(head, temperature=temperature)(each.clone())["next", "intrinsic_reward"]
+        torch.testing.assert_close(found.flatten(), expected)
+    golden = ContrastiveReward(None).intrinsic_reward(
+        torch.tensor([[1.0, 0.0], [0.6, 0.8], [0.0, 1.0], [-1.0, 0.0]]), torch.eye(2)[[0, 0, 1, 1]]
+    )
+    expected = torch.tensor([0.745181, 0.387216, 0.143823, 0.696123])
+    torch.testing.assert_close(golden, expected, rtol=0, atol=1e-6)
+
+
+def test_an_environment_is_rewarded_for_the_skill_that_acted_and_its_workers_receive_it():
+    """At an odd agent step the skill changes: the step is rewarded by the one before the change."""
+    torch.manual_seed(0)
+    encoder, embed = small_encoder(), nn.Linear(small_encoder().feature_dim, D)
+    env = TransformedEnv(
+        SerialEnv(4, FakePixelEnv), Compose(FrozenEncoder(encoder), ContrastiveReward(embed))
+    )
+    env.set_seed(0)
+    td = env.reset()
+    td["skill"] = torch.eye(SKILLS)[[0, 1, 1, 0]]  # the policy's to choose
+    td = env.rand_step(td)
+    assert not torch.equal(td["next", "skill"], td["skill"])
+    expected = published_contrast(embed(td["next", "features"]).detach(), torch.tensor([0, 1, 1, 0]))
+    torch.testing.assert_close(td["next", "intrinsic_reward"].squeeze(-1), expected)
+
+    def worker():
+        return TransformedEnv(FakePixelEnv(), Compose(FrozenEncoder(encoder), ContrastiveReward(embed)))
+
+    assert SerialEnv(2, worker).full_state_spec["skill"].shape == (2, SKILLS)
+
+
+# All of them ---------------------------------------------------------------------------------------------
+
+
+def prototype(encoder, **options):
+    projector, prototypes = small_heads(encoder)
+    return PrototypeReward(projector, prototypes, queue_size=32, generator=seeded(), **options)
+
+
+def particle(encoder, **options):
+    return ParticleReward(small_heads(encoder)[0], k=3, **options)
+
+
+def contrastive(encoder, **options):
+    return ContrastiveReward(small_heads(encoder)[0], **options)
+
+
+def alone(kind, **options):
+    """The reward on features that are projections already."""
+    if kind is prototype:
+        return on_latents(**options)
+    return (ParticleReward if kind is particle else ContrastiveReward)(None, **options)
+
+
+each = pytest.mark.parametrize("kind", [prototype, particle, contrastive])
+
+
+@each
+def test_the_reward_is_added_with_its_coefficient_or_left_alone(kind):
+    td = batch()
+    external = td["next", "reward"].clone()
+    alone(kind, coef=0.5, out_keys="bonus")(td)
+    assert torch.equal(td["next", "reward"], external + 0.5 * td["next", "bonus"])
+    td = alone(kind, coef=None)(batch())
+    assert torch.equal(td["next", "reward"], external)
+    assert td["next", "intrinsic_reward"].shape == (B, 1)
+    half = batch()
+    half["next", "features"] = half["next", "features"].bfloat16().requires_grad_()
+    alone(kind)(half)
+    assert half["next", "intrinsic_reward"].dtype == torch.float32
+    assert not half["next", "intrinsic_reward"].requires_grad
+
+
+@each
+def test_keys_can_be_renamed_and_nested_and_what_is_missing_is_named(kind):
+    td, renamed = batch(), batch()
+    renamed.rename_key_(("next", "features"), ("next", "agent", "z"))
+    renamed.rename_key_(("next", "reward"), ("next", "agent", "score"))
+    keys = {
+        "in_keys": ("next", "agent", "z"),
+        "out_keys": ("agent", "bonus"),
+        "reward_key": ("agent", "score"),
+    }
+    alone(kind, coef=0.2)(td)
+    alone(kind, coef=0.2, **keys)(renamed)
+    assert torch.equal(renamed["next", "agent", "score"], td["next", "reward"])
+    assert torch.equal(renamed["next", "agent", "bonus"], td["next", "intrinsic_reward"])
+    with pytest.raises(KeyError, match="'features'"):
+        alone(kind)(batch().exclude(("next", "features")))
+    with pytest.raises(KeyError, match="'reward'"):
+        alone(kind, coef=1.0)(batch().exclude(("next", "reward")))
+    with pytest.raises(ValueError, match="reads and writes one key each"):
+        alone(kind, in_keys=["a", "b"])
+
+
+@each
+def test_a_buffer_adds_the_reward_to_samples_and_its_storage_stays(kind):
+    buffer = ReplayBuffer(storage=LazyTensorStorage(B), batch_size=16)
+    td = batch().set("row", torch.arange(B))
+    buffer.extend(td.clone())
+    buffer.append_transform(alone(kind, coef=0.2))
+    for _ in range(3):
+        sample = buffer.sample()
+        external = td["next", "reward"][sample["row"]]
+        assert torch.equal(sample["next", "reward"], external + 0.2 * sample["next", "intrinsic_reward"])
+        assert sample["next", "intrinsic_reward"].any()
+    stored = buffer._storage[:]
+    assert torch.equal(stored["next", "reward"], td["next", "reward"])
+    assert ("next", "intrinsic_reward") not in stored.keys(True)
+
+
+@each
+def test_state_dicts_clones_and_pickles_have_a_state_of_their_own_and_no_networks(kind):
+    encoder = small_encoder()
+    transform = kind(encoder)
+    td = batch()
+    td["next", "features"] = torch.rand(B, encoder.feature_dim)
+    transform(td.clone())
+    names = {prototype: {"queue", "queue_pointer"}, particle: {"distance_mean", "distance_count"}}
+    assert set(transform.state_dict()) == names.get(kind, set())
+    before = copy.deepcopy(transform.state_dict())
+    fresh = kind(encoder)
+    for own, given in zip(fresh._networks, transform._networks):
+        fresh.__dict__[own] = getattr(transform, given)
+    fresh.load_state_dict(before)
+    copies = [transform.clone(), pickle.loads(pickle.dumps(transform)), copy.deepcopy(transform), fresh]
+    results = []
+    for other in copies:
+        if kind is prototype:
+            other.generator = seeded(11)
+        results.append(other(td.clone())["next", "intrinsic_reward"])
+    assert all(torch.equal(result, results[0]) for result in results)
+    assert all(torch.equal(value, before[name]) for name, value in transform.state_dict().items())
+
+
+@each
+def test_a_vectorised_environment_earns_at_every_step_what_a_replay_batch_of_it_earns(kind):
+    torch.manual_seed(0)
+    encoder = small_encoder()
+    offline = kind(encoder, coef=0.2)
+    online = copy.deepcopy(offline)
+    env = TransformedEnv(SerialEnv(N, FakePixelEnv), Compose(FrozenEncoder(encoder), online))
+    env.set_seed(0)
+    before = copy.deepcopy(online.state_dict())
+    assert "intrinsic_reward" not in env.reset()  # a reset is not rewarded and teaches nothing
+    assert all(torch.equal(value, before[name]) for name, value in online.state_dict().items())
+    rollout = env.rollout(EPISODE)
+    for t in range(EPISODE):
+        step = rollout[:, t].clone()
+        following = {"features": step["next", "features"], "reward": step["action"].mean(-1, keepdim=True)}
+        stored = offline(TensorDict({"skill": step["skill"], "next": following}, [N]))
+        for key in ("intrinsic_reward", "reward"):
+            torch.testing.assert_close(stored["next", key], step["next", key])
+        assert step["next", "intrinsic_reward"].any()
+
+
+@each
+@pytest.mark.parametrize("count", [1, N])
+@pytest.mark.parametrize("coef", [None, 0.2])
+def test_specs_hold_and_a_single_environment_earns_nothing(kind, count, coef):
+    encoder = small_encoder()
+    base = FakePixelEnv() if count == 1 else SerialEnv(count, FakePixelEnv)
+    env = TransformedEnv(base, Compose(FrozenEncoder(encoder), kind(encoder, coef=coef)))
+    assert set(env.full_reward_spec.keys(True, True)) == {"reward", "intrinsic_reward"}
+    check_env_specs(env, seed=0)
+    if count == 1:
+        assert not env.rollout(EPISODE)["next", "intrinsic_reward"].any()
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: on_latents(knn_k=0), "`knn_k` must be at least 1"),
+        (lambda: on_latents(knn_k=33), "`knn_k` must be at most 32"),
+        (lambda: on_latents(queue=torch.zeros(3, D)), "expected a queue"),
+        (lambda: PrototypeReward(None, Prototypes(512, 4), queue_size=2000), r"got 2000 and 512"),
+        (
+            lambda: PrototypeReward(Projector(10, 5), Prototypes(8, 4), queue_size=32),
+            "length 5, the prototypes 4",
+        ),
+        (lambda: on_latents().intrinsic_reward(torch.randn(3, D + 1)), f"length {D + 1}, the prototypes {D}"),
+        (lambda: ParticleReward(None, k=1), "`k` must be at least 2, got 1"),
+        (lambda: ContrastiveReward(None, temperature=0), "`temperature` must be positive, got 0"),
+    ],
+)
+def test_bad_settings_are_refused_by_name(make, named):
+    with pytest.raises(ValueError, match=named):
+        make()
+
+
+def test_sizes_of_any_number_type_are_plain_integers():
+    transform = on_latents(knn_k=np.int64(2), queue_size=32.0)
+    assert (type(transform.knn_k), transform.queue.shape[0]) == (int, 32)
