@@ -1,6 +1,6 @@
 """The whole of CRPTpro in small: collect at random, pre-train, freeze, learn a task, beside two controls.
 
-    python recipes/quickstart.py                    # about a quarter of an hour on two CPU cores, no GPU, no display
+    python recipes/quickstart.py                    # two CPU cores suffice; no GPU, no display
     python recipes/quickstart.py --out runs/other --seed 1
 
 The controls are the same agent on an encoder that was never trained, and the uniform random policy; all three are

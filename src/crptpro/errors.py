@@ -30,7 +30,7 @@ class WorldFailedError(RuntimeError):
 
 
 class WorkerLostError(CRPTproError):
-    """A process that collects or evaluates ended without a word: killed, as a rule, for want of memory."""
+    """A process that collects or evaluates ended without an error message; usually it was killed for lack of memory."""
 
 
 class DatasetError(CRPTproError):

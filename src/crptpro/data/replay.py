@@ -364,8 +364,8 @@ class _RingWriter(ImmutableDatasetWriter):
 class _WindowSampler(RandomSampler):
     """Draws uniformly, with replacement, from the transitions whose window of n lies in one episode.
 
-    For windows of 1 it is its base class, draw for draw. For longer ones a draw that does not fit is made again,
-    so that the cost does not grow with the ring.
+    For windows of 1 it is its base class, draw for draw. For longer ones a draw that does not fit is redrawn, so
+    that the cost does not grow with the ring.
     """
 
     def sample(self, storage: RingStorage, batch_size: int) -> tuple[Tensor, dict]:

@@ -337,7 +337,7 @@ def pretrain_active(
                                 slack=slack, dtype=dtype, env_factory=env_factory)  # fmt: skip
             stack.callback(explorer.close)
             explorers.append(explorer)
-        progressed = Turns()
+        progressed = DecisionCounter()
         run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor, turns=progressed,
                  **{f"explorer_{e.name}": e for e in explorers})  # fmt: skip
 
@@ -400,7 +400,7 @@ def pretrain_active(
         )  # fmt: skip
 
 
-class Turns(dict[str, int]):
+class DecisionCounter(dict[str, int]):
     """Decisions over all domains, and encoder updates; part of every checkpoint."""
 
     def __init__(self) -> None:
