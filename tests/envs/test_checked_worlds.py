@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import pytest
 import torch
 from fake_worlds import FakeDmEnv, OwnWorld, own, painter
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import step_mdp
 
 from crptpro.data import collect_random
 from crptpro.envs import make_env
@@ -319,3 +321,32 @@ def test_a_world_is_closed_once_however_often_it_is_asked() -> None:
             env.close()
             assert env.is_closed
     assert closed == ["own"]
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("other", ["cartpole_balance", "gymnasium:Reacher-v5"])
+@pytest.mark.parametrize("task", ["cartpole_balance", "gymnasium:Reacher-v5"])
+def test_worlds_that_come_and_go_in_a_thread_change_no_frame_of_another(task: str, other: str) -> None:
+    def frames(after_each: Callable[[], None]) -> torch.Tensor:
+        env, seen = make_env(task, seed=0, image_size=32), []
+        td = env.reset()
+        for _ in range(4):
+            td["action"] = torch.full(env.action_spec.shape, 0.5)
+            td = step_mdp(env.step(td))
+            seen.append(td["pixels"][-3:])
+            after_each()
+        env.close()
+        return torch.stack(seen)
+
+    beside: list[EnvBase] = []
+
+    def come_and_go() -> None:
+        beside.append(make_env(other, seed=1, image_size=32))
+        beside[-1].reset()
+        if len(beside) == 2:
+            beside.clear()  # nobody closes them
+            gc.collect()
+
+    expected = frames(lambda: None)
+    assert expected.float().std() > 1
+    assert torch.equal(frames(come_and_go), expected)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import dm_env
@@ -13,7 +14,7 @@ from torch import Tensor
 from torchrl.envs.libs.dm_control import DMControlWrapper
 
 from crptpro.domains import SUITE_TASKS, Domain
-from crptpro.envs.rendering import first_frame_watchdog
+from crptpro.envs.rendering import first_frame_watchdog, own_context
 from crptpro.envs.worlds import ActionRange, CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError, UnknownNameError
 
@@ -116,10 +117,23 @@ class SceneCamera:
     def render(self, physics: Any) -> np.ndarray:
         """Return the image, uint8 ``[H, W, 3]``, in a buffer that the next call overwrites."""
         if physics.model is self._model:
-            return self._camera.render()
-        with first_frame_watchdog():
+            with self.own_context(physics):
+                return self._camera.render()
+        with first_frame_watchdog(), self.own_context(physics):
             self._build(physics)
             return self._camera.render()
+
+    def own_context(self, physics: Any) -> AbstractContextManager[None]:
+        """Draw, or change what is drawn, in the body into the context of the physics, if it has one already."""
+        if physics.model is not self._model:
+            return own_context(None)
+        context = physics.contexts.gl
+
+        def make_current() -> None:
+            with context.make_current() as thread:
+                thread.call(context._platform_make_current)  # dm_control knows of no context but its own
+
+        return own_context(make_current)
 
     def release(self) -> None:
         """Drop the scene; the render context belongs to the physics."""
@@ -224,7 +238,9 @@ class AgentSteps(dm_env.Environment):
 
     def reset(self) -> dm_env.TimeStep:
         """Start an episode."""
-        self.env.reset()
+        # Some tasks send what they drew (quadruped_escape: its terrain) to the render context.
+        with nullcontext() if self._camera is None else self._camera.own_context(self.physics):
+            self.env.reset()
         return dm_env.restart(self._observe())
 
     def step(self, action: np.ndarray) -> dm_env.TimeStep:

@@ -14,7 +14,7 @@ from torchrl.envs.libs.gym import GymWrapper
 
 from crptpro.domains import GYMNASIUM_PREFIX
 from crptpro.envs.dm_control import FAST_SHADOW_SIZE, route_mujoco_warnings
-from crptpro.envs.rendering import first_frame_watchdog
+from crptpro.envs.rendering import first_frame_watchdog, own_context
 from crptpro.envs.worlds import ActionRange, CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError, RenderingError, WorldError
 
@@ -101,7 +101,11 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _draw(self) -> Tensor:
         if self._has_drawn:
-            with passed_on(self._world, "render"):
+            viewer = getattr(getattr(self.env.unwrapped, "mujoco_renderer", None), "viewer", None)
+            with (
+                passed_on(self._world, "render"),
+                own_context(getattr(viewer, "make_context_current", None)),
+            ):
                 image = self.env.render()
         else:
             with first_frame_watchdog(), passed_on(self._world, "render"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import logging
 import os
@@ -13,7 +14,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import IO, Any, NamedTuple
 
@@ -197,6 +198,27 @@ def first_frame_watchdog(timeout_s: float | None = None) -> Iterator[None]:
         yield
     finally:
         timer.cancel()
+
+
+@contextmanager
+def own_context(make_current: Callable[[], Any] | None) -> Iterator[None]:
+    """Draw in the body into one's own render context, whatever else was made or freed in this thread.
+
+    A context that is freed or made takes the thread's current one away (``eglReleaseThread``), and what is drawn
+    without one is black. The garbage collector may free one at any moment, so it waits until the body has ended.
+
+    Args:
+        make_current: makes the context current; ``None`` before there is one.
+    """
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        if make_current is not None:
+            make_current()
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 def default_timeout_s() -> float:
