@@ -12,6 +12,7 @@ import os
 import re
 import time
 import uuid
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,13 +51,13 @@ class RunLogger:
     """Writes ``metrics.jsonl`` and one CSV per stream, and copies them to W&B and TensorBoard if asked.
 
     Rows are complete on disk when :meth:`log` returns. ``metrics.jsonl`` is the truth: ``<stream>.csv`` is written anew
-    from it where the two disagree. A mirror that fails is switched off with one warning; the run continues. Usable as a
-    context manager. The directory is held for this process until :meth:`close`.
+    from it where the two disagree. Settings and mirrors begin with the first row, so that a request that is refused
+    leaves no trace. A mirror that fails is switched off with one warning; the run continues. Usable as a context
+    manager. The directory is held for this process until :meth:`close`.
 
     Args:
         run_dir: directory of the run, created if missing; rows found there are continued.
-        config: settings of the run, a mapping or a dataclass; kept in ``config.json`` with versions and hardware, from
-            the first row on.
+        config: settings of the run, a mapping or a dataclass; kept in ``config.json`` with versions and hardware.
         wandb: mirror to Weights & Biases; ``None`` for not.
         tensorboard: mirror to TensorBoard (needs the ``tensorboard`` extra).
 
@@ -82,17 +83,18 @@ class RunLogger:
     ) -> None:
         self.run_dir = as_path(run_dir, "run_dir")
         self.path = self.run_dir / JSONL_NAME
-        # Written with the first row: a request that is refused must not replace the settings of the run it found.
         self._config = as_plain(config or {}, "config")
         self._lock = DirectoryLock(self.run_dir, error=CheckpointError, is_reentrant=True)
-        self._columns: dict[str, list[str]] = {}
-        self._counts: dict[str, int] = {}
-        self._replace(self._read())
+        self._rows = self._read()
+        for stream in self._streams():
+            self._write_csv(stream)
+        self._has_begun = False
         self._mirrors: list[_Mirror] = []
+        self._wanted: dict[str, Callable[[], _Mirror]] = {}
         if wandb is not None:
-            self._open("Weights & Biases", lambda: _Wandb(wandb, self.run_dir, self._config))
+            self._wanted[_Wandb.name] = lambda: _Wandb(wandb, self.run_dir, self._config)
         if tensorboard:
-            self._open("TensorBoard", lambda: _TensorBoard(self.run_dir))
+            self._wanted[_TensorBoard.name] = lambda: _TensorBoard(self.run_dir)
 
     def __enter__(self) -> RunLogger:
         return self
@@ -126,27 +128,21 @@ class RunLogger:
                 )
         where = {name: as_int(value, name) for name, value in counters.items()}
         values = {key: _scalar(key, value) for key, value in metrics.items() if value is not None}
-        if self._config:
-            write_json(self.run_dir / "config.json", {"config": self._config, **provenance()})
-            self._config = {}
-        index = sum(self._counts.values())
+        if not self._has_begun:
+            if self._config:
+                write_json(self.run_dir / "config.json", {"config": self._config, **provenance()})
+            self._has_begun = True
+            for name, make in self._wanted.items():
+                self._open(name, make)
         row = {"stream": stream, **where, "unix_time_s": round(time.time(), 3), **values}
-        known = list(self._columns.get(stream, ()))
+        columns, index = self._columns(stream), len(self._rows)
         _append(self.path, json.dumps({key: _cell(value) for key, value in row.items()}) + "\n")
-        self._count(row)
-        if self._columns[stream] == known and self._csv(stream).exists():
-            _append(self._csv(stream), _csv_text([[row.get(name) for name in known]]))
+        self._rows.append({key: _cell(value) for key, value in row.items()})
+        if self._columns(stream) == columns:
+            _append(self._csv(stream), _csv_text([[row.get(name) for name in columns]]))
         else:
-            self._write_csvs(self._read(), only=stream)
+            self._write_csv(stream)
         self._mirror(lambda mirror: mirror.log(stream, where, values, index))
-
-    def event(self, text: str) -> None:
-        """Announce something on the console, one line."""
-        _LOG.info("%s", text)
-
-    def video(self, name: str, path: str | Path, **counters: int) -> None:
-        """Copy a video file to W&B, as ``name``."""
-        self._mirror(lambda mirror: mirror.video(name, Path(path), counters))
 
     def artifact(self, path: str | Path, *, name: str, kind: str) -> None:
         """Copy an artifact (a file or a directory) to W&B."""
@@ -154,7 +150,7 @@ class RunLogger:
 
     def rows(self, stream: str) -> list[dict[str, Any]]:
         """Return the rows of a stream so far, oldest first, without the stream's name."""
-        found = [row for row in self._read() if row["stream"] == stream]
+        found = [row for row in self._rows if row["stream"] == stream]
         return [{key: value for key, value in row.items() if key != "stream"} for row in found]
 
     def state_dict(self, streams: Iterable[str] | None = None) -> dict[str, Any]:
@@ -168,28 +164,28 @@ class RunLogger:
             with open(self.path, "rb") as file:
                 os.fsync(file.fileno())
         names = None if streams is None else list(streams)
-        return {"rows": {name: self._counts.get(name, 0) for name in names or self._counts}, "streams": names}
+        counts = {name: len(self.rows(name)) for name in names or self._streams()}
+        return {"rows": counts, "streams": names}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Take back the rows written after the checkpoint, so that the resumed run writes each row once."""
-        missing = {name: count - self._counts.get(name, 0) for name, count in state["rows"].items()}
-        for name, count in missing.items():
-            if count > 0:
+        for name, count in state["rows"].items():
+            if (missing := count - len(self.rows(name))) > 0:
                 _LOG.warning(
-                    "%s: %d rows of %r are missing that the checkpoint counted.", self.path, count, name
+                    "%s: %d rows of %r are missing that the checkpoint counted.", self.path, missing, name
                 )
         others = math.inf if state["streams"] is not None else 0
-        seen: dict[str, int] = {}
+        seen: Counter[str] = Counter()
         kept = []
-        for row in self._read():
-            seen[row["stream"]] = seen.get(row["stream"], 0) + 1
+        for row in self._rows:
+            seen[row["stream"]] += 1
             if seen[row["stream"]] <= state["rows"].get(row["stream"], others):
                 kept.append(row)
         self._replace(kept)
 
     def truncate_to(self, stream: str, counter: str, value: int) -> None:
         """Take back the rows of ``stream`` whose ``counter`` exceeds ``value`` (-1: all of them)."""
-        self._replace([r for r in self._read() if r["stream"] != stream or r.get(counter, 0) <= value])
+        self._replace([r for r in self._rows if r["stream"] != stream or r.get(counter, 0) <= value])
 
     def writes_into(self, directory: str | Path) -> bool:
         """Whether the record lies in ``directory`` or below it: only then is all of it that directory's own."""
@@ -201,16 +197,18 @@ class RunLogger:
         self._mirrors = []
         self._lock.release()
 
+    def _streams(self) -> list[str]:
+        return list(dict.fromkeys(row["stream"] for row in self._rows))
+
+    def _columns(self, stream: str) -> list[str]:
+        names = (key for row in self._rows if row["stream"] == stream for key in row)
+        return [name for name in dict.fromkeys(names) if name != "stream"]
+
     def _csv(self, stream: str) -> Path:
         return self.run_dir / f"{stream}.csv"
 
-    def _count(self, row: Mapping[str, Any]) -> None:
-        columns = self._columns.setdefault(row["stream"], [])
-        columns.extend(key for key in row if key != "stream" and key not in columns)
-        self._counts[row["stream"]] = self._counts.get(row["stream"], 0) + 1
-
     def _read(self) -> list[dict[str, Any]]:
-        """All rows; a torn or foreign line is dropped from the file with a warning."""
+        """Read all rows; a torn or foreign line is dropped from the file with a warning."""
         lines = self.path.read_bytes().splitlines(keepends=True) if self.path.exists() else []
         rows = []
         for line in lines:
@@ -227,26 +225,25 @@ class RunLogger:
 
     def _replace(self, rows: list[dict[str, Any]]) -> None:
         """Make these the rows of the record."""
-        if len(rows) < sum(self._counts.values()):
+        before = self._streams()
+        if len(rows) < len(self._rows):
             self._write_rows(rows)
-        before, self._columns, self._counts = set(self._columns), {}, {}
-        for row in rows:
-            self._count(row)
-        for stream in before - set(self._columns):
-            self._csv(stream).unlink(missing_ok=True)
-        self._write_csvs(rows)
+        self._rows = rows
+        for stream in before:
+            if stream in self._streams():
+                self._write_csv(stream)
+            else:
+                self._csv(stream).unlink(missing_ok=True)
 
     def _write_rows(self, rows: Iterable[Mapping[str, Any]]) -> None:
         write_whole(self.path, "".join(json.dumps(row) + "\n" for row in rows))
 
-    def _write_csvs(self, rows: list[dict[str, Any]], *, only: str | None = None) -> None:
-        for stream in self._columns if only is None else (only,):
-            columns = self._columns[stream]
-            cells = [[row.get(name) for name in columns] for row in rows if row["stream"] == stream]
-            content = _csv_text([columns, *cells])
-            path = self._csv(stream)
-            if not path.exists() or path.read_bytes() != content.encode():
-                write_whole(path, content)
+    def _write_csv(self, stream: str) -> None:
+        columns = self._columns(stream)
+        content = _csv_text([columns, *([row.get(name) for name in columns] for row in self.rows(stream))])
+        path = self._csv(stream)
+        if not path.exists() or path.read_bytes() != content.encode():
+            write_whole(path, content)
 
     def _open(self, name: str, make: Callable[[], _Mirror]) -> None:
         try:
@@ -274,7 +271,6 @@ class _Mirror:
     def log(self, stream: str, counters: Mapping[str, int], values: Mapping[str, Any], index: int) -> None:
         raise NotImplementedError
 
-    def video(self, name: str, path: Path, counters: Mapping[str, int]) -> None: ...
     def artifact(self, path: Path, name: str, kind: str) -> None: ...
     def close(self) -> None: ...
 
@@ -323,11 +319,6 @@ class _Wandb(_Mirror):
             self._streams.add(stream)
         row = {**counters, **{f"{stream}/{key}": value for key, value in values.items()}}
         self._logger.log_metrics(row, step=index, override_global_step=True)
-
-    def video(self, name: str, path: Path, counters: Mapping[str, int]) -> None:
-        import wandb
-
-        self._run.log({**counters, name: wandb.Video(str(path))}, commit=False)
 
     def artifact(self, path: Path, name: str, kind: str) -> None:
         import wandb
