@@ -92,10 +92,9 @@ def test_a_users_mujoco_gl_is_kept_and_proven(
     os.environ["MUJOCO_GL"] = spelling
     started = probe(ANSWER)
     with caplog.at_level(logging.WARNING):
-        assert select_backend("egl") == "osmesa"
+        assert select_backend() == "osmesa"
     assert os.environ["MUJOCO_GL"] == "osmesa", "as every library understands it"
     assert started.read_text().split() == ["osmesa"]
-    assert "egl is not used" in caplog.text
 
 
 def test_a_users_mujoco_gl_is_kept_even_if_it_does_not_render(probe: Probe) -> None:
@@ -118,17 +117,7 @@ def test_a_value_that_cannot_render_is_one_clear_error_and_starts_nothing(
     started = probe(ANSWER)
     with pytest.raises(RenderingError, match=complaint):
         select_backend()
-    del os.environ["MUJOCO_GL"]
-    with pytest.raises(RenderingError, match="'vulkan'"):
-        select_backend("vulkan")
     assert not started.exists()
-
-
-def test_a_preference_is_taken_and_may_change_later(probe: Probe) -> None:
-    started = probe(ANSWER)
-    assert select_backend("osmesa") == "osmesa"
-    assert select_backend("egl") == "egl"
-    assert started.read_text().split() == ["osmesa", "egl"]
 
 
 def test_the_next_backend_is_taken_and_the_failure_of_the_first_is_said(
@@ -223,9 +212,10 @@ def test_a_backend_that_dm_control_was_imported_with_is_said(
 ) -> None:
     monkeypatch.setattr(rendering, "_imported_backend", lambda: "glfw")
     probe("sys.exit('no display')")
-    with pytest.raises(RenderingError, match="already imported with the backend 'glfw'"):
-        select_backend("egl")
     with pytest.raises(RenderingError, match=r"(?s)imported with the backend 'glfw' before.*no display"):
+        select_backend()
+    os.environ["MUJOCO_GL"] = "egl"
+    with pytest.raises(RenderingError, match="already imported with the backend 'glfw'"):
         select_backend()
 
 

@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import IO, Any, NamedTuple
+from typing import IO, Any
 
 from crptpro.errors import RenderingError
 
@@ -101,22 +101,18 @@ def canonical_backend(text: str) -> str:
     return backend
 
 
-def select_backend(
-    preference: str | None = None, timeout_s: float | None = None, *, processes: int = 1
-) -> str:
+def select_backend(timeout_s: float | None = None, *, processes: int = 1) -> str:
     """Choose the GL backend, prove that it renders, set ``MUJOCO_GL``; call it before importing dm_control.
 
-    A ``MUJOCO_GL`` that the user has set is never overridden, only proven. Otherwise ``preference`` is
-    taken, or EGL, OSMesa and (with a display) GLFW are tried in this order. The proof is a frame with
-    content, rendered in a process of its own within the time limit. It holds for this process and its
-    children, on this machine and for one ``MUJOCO_EGL_DEVICE_ID``, so it is made once. With software GL,
-    ``LP_NUM_THREADS=1`` is set unless the user has set it: more threads cost a third more CPU time per frame
-    and hardly gain any.
+    A ``MUJOCO_GL`` that the user has set is never overridden, only proven. Otherwise EGL, OSMesa and (with a display)
+    GLFW are tried in this order. The proof is a frame with content, rendered in a process of its own within the time
+    limit. It holds for this process and its children, on this machine and for one ``MUJOCO_EGL_DEVICE_ID``. With
+    software GL, ``LP_NUM_THREADS=1`` is set unless the user has set it: more threads cost a third more CPU time per
+    frame and hardly gain any.
 
     Args:
-        preference: ``"egl"``, ``"osmesa"`` or ``"glfw"``.
-        timeout_s: Seconds each backend has for its first frame; by default 60, or ``CRPTPRO_GL_TIMEOUT_S``.
-        processes: Prove that so many processes can render at the same time, as parallel collection needs.
+        timeout_s: seconds each backend has for its first frame; by default 60, or ``CRPTPRO_GL_TIMEOUT_S``.
+        processes: prove that so many processes can render at the same time, as parallel collection needs.
 
     Returns:
         ``"egl"``, ``"osmesa"`` or ``"glfw"``.
@@ -125,22 +121,14 @@ def select_backend(
         RenderingError: naming, for every backend tried, what went wrong and what to do.
     """
     timeout_s = default_timeout_s() if timeout_s is None else timeout_s
-    proof = _proof()
-    requested = requested_backend()
-    if preference is not None and preference not in BACKENDS:
-        raise RenderingError(f"There is no GL backend {preference!r}; choose one of {', '.join(BACKENDS)}.")
-    if requested is not None and preference not in (None, requested):
-        logger.warning("MUJOCO_GL=%s is set and kept; %s is not used.", requested, preference)
-    wanted = requested or preference
-    imported = _imported_backend()
-    if imported is not None and wanted not in (None, imported):
+    proof, requested, imported = _proof(), _requested_backend(), _imported_backend()
+    if imported is not None and requested not in (None, imported):
         raise RenderingError(
-            f"dm_control was already imported with the backend {imported!r}, so {wanted!r} cannot be used in "
-            f"this process any more. Set MUJOCO_GL={wanted}, or make the first environment, before "
-            "importing dm_control."
+            f"dm_control was already imported with the backend {imported!r}, so {requested!r} cannot be used in this "
+            f"process any more. Set MUJOCO_GL={requested} before importing dm_control."
         )
-    only = wanted or imported
-    candidates = (only,) if only else platform_candidates()
+    only = requested or imported
+    candidates = (only,) if only else _platform_candidates()
     if proof and proof["backend"] in candidates:
         if proof["processes"] >= processes:
             os.environ["MUJOCO_GL"] = proof["backend"]
@@ -148,22 +136,31 @@ def select_backend(
         candidates = candidates[candidates.index(proof["backend"]) :]  # those before it have failed already
     failures: list[str] = []
     for backend in candidates:
-        attempt = attempt_backend(backend, timeout_s=timeout_s, processes=processes)
-        if not attempt.failure:
+        gl, failure = _try_backend(backend, timeout_s=timeout_s, processes=processes)
+        if not failure:
             for failure in failures:
                 logger.warning("%s Rendering with %s instead.", failure, backend)
-            _accept(attempt, processes=processes, chosen_by="user" if requested else "crptpro")
+            # A user's spelling ("EGL", "on") becomes the one that dm_control and Gymnasium both understand.
+            os.environ["MUJOCO_GL"] = backend
+            if gl.get("gl_kind") == "software":
+                os.environ.setdefault("LP_NUM_THREADS", "1")
+            facts = {
+                "backend": backend,
+                "processes": processes,
+                "chosen_by": "user" if requested else "crptpro",
+            }
+            os.environ[PROOF_VARIABLE] = json.dumps({**gl, **_place(), **facts})
+            logger.info("GL backend %s: %s", backend, gl.get("gl_renderer"))
             return backend
-        failures.append(attempt.failure)
+        failures.append(failure)
+    what = "No GL backend renders a frame."
     if requested:
         what = f"MUJOCO_GL={os.environ['MUJOCO_GL']} was set by you, is kept, and does not render a frame."
     elif imported:
         what = (
-            f"dm_control was imported with the backend {imported!r} before one could be chosen, and it does "
-            "not render a frame. Make the first environment before importing dm_control, or set MUJOCO_GL."
+            f"dm_control was imported with the backend {imported!r} before one could be chosen, and it does not "
+            "render a frame. Make the first environment before importing dm_control, or set MUJOCO_GL."
         )
-    else:
-        what = "No GL backend renders a frame."
     raise RenderingError("\n  ".join([what, *failures]))
 
 
@@ -230,7 +227,86 @@ def default_timeout_s() -> float:
         raise RenderingError(f"{TIMEOUT_VARIABLE} must be a number of seconds, got {text!r}.") from None
 
 
-def platform_candidates() -> tuple[str, ...]:
+def run_isolated(
+    commands: list[tuple[str, ...]], backend: str, *, timeout_s: float
+) -> list[tuple[int | None, str, str]]:
+    """Run commands at the same time with ``MUJOCO_GL=backend``; kill what is not done in time.
+
+    Output goes through files, not pipes, and nobody waits for long for a killed process: one that hangs in the kernel
+    cannot be reaped.
+
+    Returns:
+        For each command its exit status (``None``: killed), standard output and standard error.
+    """
+    environment = {**os.environ, "MUJOCO_GL": backend}
+    if "OpenGL" in sys.modules:  # then dm_control or mujoco has set it here, for the backend of this process
+        environment.pop("PYOPENGL_PLATFORM", None)
+    results: list[tuple[int | None, str, str]] = []
+    with contextlib.ExitStack() as stack:
+        jobs: list[tuple[subprocess.Popen[bytes], IO[bytes], IO[bytes]]] = []
+        for command in commands:
+            out: IO[bytes] = stack.enter_context(tempfile.TemporaryFile())
+            err: IO[bytes] = stack.enter_context(tempfile.TemporaryFile())
+            process = subprocess.Popen(
+                command,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=err,
+                start_new_session=True,
+            )
+            stack.callback(_kill, process)
+            jobs.append((process, out, err))
+        deadline = time.monotonic() + timeout_s
+        for process, *files in jobs:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(max(0.0, deadline - time.monotonic()))
+            for file in files:
+                file.seek(0)
+            output = [file.read().decode(errors="replace") for file in files]
+            results.append((process.returncode, output[0], output[1]))
+    return results
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(2.0)
+
+
+def _try_backend(backend: str, *, timeout_s: float, processes: int) -> tuple[dict[str, Any], str]:
+    """Render in ``processes`` simultaneous processes; returns what the probe saw, and why it failed, if it did."""
+    gl: dict[str, Any] = {}
+    for returncode, stdout, stderr in run_isolated([PROBE_COMMAND] * processes, backend, timeout_s=timeout_s):
+        if returncode is None:
+            where = f" from each of {processes} simultaneous processes" if processes > 1 else ""
+            late = f"{backend}: the first frame did not arrive{where} within {timeout_s:g} s."
+            return gl, f"{late} {HANG_CAUSE} {ALTERNATIVES}"
+        reason, lines = "", [line.strip() for line in stderr.splitlines() if line.strip()]
+        if returncode < 0:
+            reason = f"the GL driver crashed the process ({signal.Signals(-returncode).name})."
+        elif returncode > 0:
+            reason = (
+                f"{lines[-1] if lines else f'the probe ended with exit status {returncode}'}".rstrip(".")
+                + "."
+            )
+        else:
+            try:
+                gl = json.loads(stdout.strip().splitlines()[-1])
+            except (json.JSONDecodeError, IndexError):
+                reason = "the probe gave no answer."
+            else:
+                if not gl["alive"]:
+                    reason = "the frame came back without content; the GL driver does not work."
+        if reason:
+            remedy = "Unset PYOPENGL_PLATFORM." if "PYOPENGL_PLATFORM" in reason else REMEDIES[backend]
+            return gl, f"{backend}: {reason} {remedy}"
+    return gl, ""
+
+
+def _platform_candidates() -> tuple[str, ...]:
     """Return the backends worth trying here, best first."""
     if not sys.platform.startswith("linux"):
         return ("glfw",)
@@ -238,12 +314,8 @@ def platform_candidates() -> tuple[str, ...]:
     return BACKENDS if has_display else ("egl", "osmesa")
 
 
-def requested_backend() -> str | None:
-    """Return the backend of a MUJOCO_GL that is not our own doing, here or where the environment comes from.
-
-    Raises:
-        RenderingError: if MUJOCO_GL is no backend, or switches rendering off.
-    """
+def _requested_backend() -> str | None:
+    """Return the backend of a MUJOCO_GL that is not our own doing, here or where the environment comes from."""
     text = os.environ.get("MUJOCO_GL")
     proof = _carried_proof()
     if text is None or (proof and proof.get("chosen_by") == "crptpro" and text == proof["backend"]):
@@ -256,94 +328,9 @@ def requested_backend() -> str | None:
     return backend
 
 
-class Attempt(NamedTuple):
-    """How a backend did: ``failure`` says why not and what to do (empty: it rendered), ``gl`` is what the probe saw."""
-
-    backend: str
-    failure: str
-    gl: dict[str, Any]
-
-
-def attempt_backend(backend: str, *, timeout_s: float, processes: int = 1) -> Attempt:
-    """Render with ``backend`` in ``processes`` simultaneous processes, all within ``timeout_s``."""
-    gl: dict[str, Any] = {}
-    for returncode, stdout, stderr in run_isolated([PROBE_COMMAND] * processes, backend, timeout_s=timeout_s):
-        if returncode is None:
-            where = f" from each of {processes} simultaneous processes" if processes > 1 else ""
-            late = f"{backend}: the first frame did not arrive{where} within {timeout_s:g} s."
-            return Attempt(backend, f"{late} {HANG_CAUSE} {ALTERNATIVES}", {})
-        reason, remedy = "", REMEDIES[backend]
-        if returncode < 0:
-            reason = f"the GL driver crashed the process ({signal.Signals(-returncode).name})."
-        elif returncode > 0:
-            lines = [line.strip() for line in stderr.splitlines() if line.strip()]
-            reason = (
-                f"{lines[-1].rstrip('.')}." if lines else f"the probe ended with exit status {returncode}."
-            )
-            remedy = "Unset PYOPENGL_PLATFORM." if "PYOPENGL_PLATFORM" in reason else remedy
-        else:
-            try:
-                gl = json.loads(stdout.strip().splitlines()[-1])
-            except (json.JSONDecodeError, IndexError):
-                reason = "the probe gave no answer."
-            else:
-                if not gl.get("alive"):
-                    reason = "the frame came back without content; the GL driver does not work."
-        if reason:
-            return Attempt(backend, f"{backend}: {reason} {remedy}", {})
-    return Attempt(backend, "", gl)
-
-
-def run_isolated(
-    commands: list[tuple[str, ...]], backend: str, *, timeout_s: float
-) -> list[tuple[int | None, str, str]]:
-    """Run commands at the same time with ``MUJOCO_GL=backend``; kill what is not done in time.
-
-    Output goes through files, not pipes, and nobody waits for a killed process: one that hangs in the kernel
-    cannot be reaped.
-
-    Returns:
-        For each command its exit status (``None``: killed), standard output and standard error.
-    """
-    environment = {**os.environ, "MUJOCO_GL": backend}
-    if "OpenGL" in sys.modules:  # then dm_control or mujoco has set it here, for the backend of this process
-        environment.pop("PYOPENGL_PLATFORM", None)
-    jobs: list[tuple[subprocess.Popen[bytes], IO[bytes], IO[bytes]]] = []
-    with contextlib.ExitStack() as stack:
-        try:
-            for command in commands:
-                out: IO[bytes] = stack.enter_context(tempfile.TemporaryFile())
-                err: IO[bytes] = stack.enter_context(tempfile.TemporaryFile())
-                process = subprocess.Popen(
-                    command, env=environment, stdin=subprocess.DEVNULL, stdout=out, stderr=err,
-                    start_new_session=True,
-                )  # fmt: skip
-                jobs.append((process, out, err))
-            deadline = time.monotonic() + timeout_s
-            results = []
-            for process, out, err in jobs:
-                try:
-                    returncode: int | None = process.wait(max(0.0, deadline - time.monotonic()))
-                except subprocess.TimeoutExpired:
-                    returncode = None
-                results.append((returncode, _text(out), _text(err)))
-            return results
-        finally:
-            _kill([job[0] for job in jobs if job[0].poll() is None])
-
-
-def _kill(processes: list[subprocess.Popen[bytes]]) -> None:
-    for process in processes:
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGKILL)
-    for process in processes:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(2.0)
-
-
-def _text(file: IO[bytes]) -> str:
-    file.seek(0)
-    return file.read().decode(errors="replace")
+def _imported_backend() -> str | None:
+    name = getattr(sys.modules.get("dm_control._render"), "BACKEND", None)
+    return name if name in BACKENDS else None
 
 
 def _carried_proof() -> dict[str, Any] | None:
@@ -365,20 +352,3 @@ def _proof() -> dict[str, Any] | None:
 def _place() -> dict[str, Any]:
     """Return what a proof is bound to."""
     return {"host": socket.gethostname(), "egl_device": os.environ.get("MUJOCO_EGL_DEVICE_ID")}
-
-
-def _imported_backend() -> str | None:
-    name = getattr(sys.modules.get("dm_control._render"), "BACKEND", None)
-    return name if name in BACKENDS else None
-
-
-def _accept(attempt: Attempt, *, processes: int, chosen_by: str) -> None:
-    # A user's spelling ("EGL", "on") becomes the one that dm_control and Gymnasium both understand.
-    os.environ["MUJOCO_GL"] = attempt.backend
-    if attempt.gl.get("gl_kind") == "software":
-        os.environ.setdefault("LP_NUM_THREADS", "1")
-    proof = {
-        **attempt.gl, **_place(), "backend": attempt.backend, "processes": processes, "chosen_by": chosen_by,
-    }  # fmt: skip
-    os.environ[PROOF_VARIABLE] = json.dumps(proof)
-    logger.info("GL backend %s: %s", attempt.backend, attempt.gl.get("gl_renderer"))
