@@ -93,6 +93,8 @@ class PretrainUpdates:
             encoder_tau=method.encoder_tau, updates=method.updates, cuda_graph=cuda_graph,
         )  # fmt: skip
 
+        assert targets is not None
+
         def update(batch: TensorDictBase) -> TensorDictBase:
             normalise_prototypes(loss)
             losses = loss(batch)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
 from collections.abc import Mapping
+from statistics import fmean
 from typing import Any, Literal
 
 from torch import nn
@@ -14,6 +16,12 @@ _LOG = logging.getLogger(__name__)
 State = Literal["learning", "plateau", "dead"]
 
 
+LOSS_MARGIN = 0.005
+"""How near to ln(M) counts, as a fraction of it."""
+EXIT_OBSERVATIONS = 2
+"""Consecutive observations outside that end a plateau, so that noise does not."""
+
+
 class CollapseMonitor:
     """Watch a pre-training run for collapse and announce what it sees.
 
@@ -21,15 +29,12 @@ class CollapseMonitor:
     a mean pairwise cosine near 1 means that every observation has the same embedding. Small trials of the
     paper's loss stay there for about 1,200 updates and then leave, so being there is a ``plateau`` at first
     (announced once, as expected to pass) and ``dead`` only when it lasts longer than ``patience_updates``.
-    Training that ends on a plateau that is still short has proved neither: its verdict stays ``plateau``, which is
-    announced as an encoder that has not begun to learn.
+    Training that ends on a plateau that is still short has proved neither: its verdict stays ``plateau``.
 
     Args:
         num_prototypes: M; ``None`` for a loss without prototypes, which is watched by cosine only.
         patience_updates: length of a plateau, in updates, beyond which the run is called dead.
-        loss_margin: how near to ln(M) counts, as a fraction of ln(M).
         cosine_threshold: mean pairwise cosine above which embeddings count as collapsed.
-        exit_observations: consecutive observations outside that end a plateau, so that noise does not.
 
     Examples:
         >>> monitor = CollapseMonitor(512, patience_updates=1_000)
@@ -44,21 +49,15 @@ class CollapseMonitor:
         num_prototypes: int | None = None,
         *,
         patience_updates: int = 5_000,
-        loss_margin: float = 0.005,
         cosine_threshold: float = 0.99,
-        exit_observations: int = 2,
     ) -> None:
         self.floor = math.log(num_prototypes) if num_prototypes and num_prototypes > 1 else None
-        self.patience_updates = patience_updates
-        self.loss_margin = loss_margin
-        self.cosine_threshold = cosine_threshold
-        self.exit_observations = exit_observations
+        self.patience_updates, self.cosine_threshold = patience_updates, cosine_threshold
         self.state: State = "learning"
         self.plateaus: list[list[int | None]] = []  # [entry update, exit update or None]
-        self._outside_since: int | None = None
-        self._outside_count = 0
-        self._comp: float | None = None
-        self._cosines: dict[str, float] = {}
+        self.outside: list[int] = []  # observations outside the plateau that is not over yet
+        self.comp: float | None = None
+        self.cosines: dict[str, float] = {}
 
     @classmethod
     def of(cls, loss: nn.Module) -> CollapseMonitor:
@@ -84,25 +83,20 @@ class CollapseMonitor:
             cosine: mean pairwise cosine of embeddings in [-1, 1]: one number, or one per domain (their mean
                 decides).
         """
-        self._comp = comp
+        self.comp = comp
         if cosine is not None:
-            self._cosines = dict(cosine) if isinstance(cosine, Mapping) else {"all": float(cosine)}
+            self.cosines = dict(cosine) if isinstance(cosine, Mapping) else {"all": float(cosine)}
         reasons = self._reasons()
-        if reasons:
-            self._outside_since, self._outside_count = None, 0
-            if self.state == "learning":
-                self.state = "plateau"
-                self.plateaus.append([updates, None])
-                _LOG.info(
-                    "Update %d: plateau (%s). Expected to pass; called dead after %d updates of it.",
-                    updates, reasons, self.patience_updates,
-                )  # fmt: skip
-        elif self.state != "learning":
-            if self._outside_since is None:
-                self._outside_since = updates
-            self._outside_count += 1
-            if self._outside_count >= self.exit_observations:
-                self._leave()
+        if reasons and self.state == "learning":
+            self.state = "plateau"
+            self.plateaus.append([updates, None])
+            _LOG.info(
+                "Update %d: plateau (%s). Expected to pass; called dead after %d updates of it.",
+                updates, reasons, self.patience_updates,
+            )  # fmt: skip
+        self.outside = [] if reasons or self.state == "learning" else [*self.outside, updates]
+        if len(self.outside) >= EXIT_OBSERVATIONS:
+            self._leave()
         entered = self.plateaus[-1][0] if self.state == "plateau" else None
         if entered is not None and reasons and updates - entered > self.patience_updates:
             self.state = "dead"
@@ -114,7 +108,7 @@ class CollapseMonitor:
         return self.state
 
     def verdict(self, updates: int) -> dict[str, Any]:
-        """Return the judgement after ``updates`` updates as JSON-able values; changes nothing.
+        """Return the judgement after ``updates`` updates as plain values; changes nothing.
 
         Returns:
             ``verdict`` (``"learning"``, ``"plateau"`` or ``"dead"``), ``plateaus`` (entry and exit updates),
@@ -127,9 +121,9 @@ class CollapseMonitor:
             "plateaus": [{"entered": enter, "left": leave} for enter, leave in self.plateaus],
             "plateau_updates": length,
             "ln_num_prototypes": self.floor,
-            "comp": self._comp,
-            "cosine": dict(self._cosines),
-            "collapsed_domains": sorted(k for k, v in self._cosines.items() if v > self.cosine_threshold),
+            "comp": self.comp,
+            "cosine": dict(self.cosines),
+            "collapsed_domains": sorted(k for k, v in self.cosines.items() if v > self.cosine_threshold),
         }
 
     def finish(self, updates: int) -> dict[str, Any]:
@@ -142,11 +136,10 @@ class CollapseMonitor:
                 updates, self.plateaus[-1][0], self._reasons() or "not left yet",
             )  # fmt: skip
         elif self.state == "plateau":
-            entered = self.plateaus[-1][0] or 0
             _LOG.warning(
-                "Training ended at update %d on a plateau entered at update %d (%s): the encoder has not begun to "
+                "Training ended at update %d on a plateau entered at update %s (%s): the encoder has not begun to "
                 "learn. That may pass (small trials of the paper's loss took about 1,200 updates); train longer.",
-                updates, entered, self._reasons() or "not left yet",
+                updates, self.plateaus[-1][0], self._reasons() or "not left yet",
             )  # fmt: skip
         elif verdict["collapsed_domains"]:
             _LOG.warning(
@@ -157,41 +150,32 @@ class CollapseMonitor:
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a resumed run needs to judge as if never interrupted."""
-        return {
-            "state": self.state,
-            "plateaus": [list(plateau) for plateau in self.plateaus],
-            "outside_since": self._outside_since,
-            "outside_count": self._outside_count,
-            "comp": self._comp,
-            "cosines": dict(self._cosines),
-        }
+        return copy.deepcopy({name: getattr(self, name) for name in _KEPT})
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore :meth:`state_dict`."""
-        self.state = state["state"]
-        self.plateaus = [list(plateau) for plateau in state["plateaus"]]
-        self._outside_since, self._outside_count = state["outside_since"], state["outside_count"]
-        self._comp, self._cosines = state["comp"], dict(state["cosines"])
+        for name in _KEPT:
+            setattr(self, name, copy.deepcopy(state[name]))
 
     def _reasons(self) -> str:
-        """What is wrong now, in words; empty if nothing is."""
+        """Say what is wrong now; empty if nothing is."""
         found = []
-        floor, comp = self.floor, self._comp
-        if floor is not None and comp is not None and abs(comp - floor) <= self.loss_margin * floor:
+        floor, comp = self.floor, self.comp
+        if floor is not None and comp is not None and abs(comp - floor) <= LOSS_MARGIN * floor:
             found.append(f"loss {comp:.4f} at ln(M) = {floor:.4f}")
-        if self._cosines:
-            mean = sum(self._cosines.values()) / len(self._cosines)
-            if mean > self.cosine_threshold:
-                found.append(f"pairwise cosine {mean:.4f}")
+        if self.cosines and (mean := fmean(self.cosines.values())) > self.cosine_threshold:
+            found.append(f"pairwise cosine {mean:.4f}")
         return ", ".join(found)
 
     def _leave(self) -> None:
-        plateau = self.plateaus[-1]
-        plateau[1] = self._outside_since
-        duration = (self._outside_since or 0) - (plateau[0] or 0)
+        since, was_dead = self.outside[0], self.state == "dead"
+        self.plateaus[-1][1] = since
         _LOG.log(
-            logging.WARNING if self.state == "dead" else logging.INFO,
+            logging.WARNING if was_dead else logging.INFO,
             "Update %s: left the plateau after %d updates%s.",
-            self._outside_since, duration, " (it had been called dead)" if self.state == "dead" else "",
+            since, since - (self.plateaus[-1][0] or 0), " (it had been called dead)" if was_dead else "",
         )  # fmt: skip
-        self.state, self._outside_since, self._outside_count = "learning", None, 0
+        self.state, self.outside = "learning", []
+
+
+_KEPT = ("state", "plateaus", "outside", "comp", "cosines")

@@ -266,13 +266,13 @@ def train_downstream(
         replay = make_replay(env.env, settings, generators["replay"], run)
         memory = attach_transforms(replay, artifact, encoder, settings, generators, run,
                                    reserved_bytes=evaluator.workers * WORKER_BYTES)  # fmt: skip
-        counters = Counters()
+        counters = run.tally
+        counters.update(updates=0, episodes=0, next_evaluation=0, last_evaluation=-1)
         run.keep(
             **learner.components(),
             **memory,
             generators=generators,
             evaluator=evaluator,
-            counters=counters,
             **({} if is_complete(run, settings) else {"replay": replay}),
         )
 
@@ -356,21 +356,6 @@ def train_downstream(
 def is_complete(run: Run, config: Any) -> bool:
     """Whether nothing is left to do, so that the replay, which may be gone, is not needed."""
     return bool(run.saved.get("is_finished")) and run.saved["position"] >= config.env_steps
-
-
-class Counters(dict[str, int]):
-    """Where a run is beside its position; part of every checkpoint."""
-
-    def __init__(self) -> None:
-        super().__init__(updates=0, episodes=0, next_evaluation=0, last_evaluation=-1)
-
-    def state_dict(self) -> dict[str, int]:
-        """Return the counters."""
-        return dict(self)
-
-    def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Restore :meth:`state_dict`."""
-        self.update(state)
 
 
 def _artifact(pretrained: Pretrained | str | Path, seed: int) -> Pretrained:

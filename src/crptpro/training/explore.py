@@ -337,8 +337,9 @@ def pretrain_active(
                                 slack=slack, dtype=dtype, env_factory=env_factory)  # fmt: skip
             stack.callback(explorer.close)
             explorers.append(explorer)
-        progressed = DecisionCounter()
-        run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor, turns=progressed,
+        done = run.tally
+        done.update(decisions=0, updates=0)
+        run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor,
                  **{f"explorer_{e.name}": e for e in explorers})  # fmt: skip
 
         def update_encoder(batch: TensorDictBase) -> TensorDictBase:
@@ -347,11 +348,12 @@ def pretrain_active(
             optimizer.zero_grad(set_to_none=True)
             total_loss(losses).backward()
             optimizer.step()
-            targets.step()
+            if targets is not None:
+                targets.step()
             return losses.detach()
 
         for _ in run.until(plan.env_steps, checkpoint_interval=settings.checkpoint_interval_env_steps):
-            index = progressed["decisions"] % len(explorers)
+            index = done["decisions"] % len(explorers)
             explorer, agent_step = explorers[index], explorers[index].agent_steps
             explorer.begin_step()  # the next observation is drawn while the updates compute
             trains_encoder, trains_agent = plan.trains_encoder(agent_step), plan.trains_agent(agent_step)
@@ -363,10 +365,10 @@ def pretrain_active(
                     batch = explorer.encode(batch)
                 losses = update_encoder(batch)
                 schedule.step()
-                progressed["updates"] += 1
-                run.counters["updates"] = progressed["updates"]
+                done["updates"] += 1
+                run.counters["updates"] = done["updates"]
                 run.log(scalars(losses, explorer.name))
-                if progressed["updates"] % settings.log_interval == 0:
+                if done["updates"] % settings.log_interval == 0:
                     write_row(run, loss, monitor, batch, explorer.name)
                     run.write("explore")
             if trains_agent:
@@ -378,7 +380,7 @@ def pretrain_active(
                 )
             if (row := explorer.end_step()) is not None:
                 run.write("episodes", {"domain": explorer.name, **row}, episodes=explorer.episodes)
-            progressed["decisions"] += 1
+            done["decisions"] += 1
             run.advance(plan.repeats[index])
         run.finish()
         if run.means["pretrain"].counts:
@@ -386,7 +388,7 @@ def pretrain_active(
                 run, loss, monitor, explorers[0].sample(min(settings.batch_size, 64)), explorers[0].name
             )
             run.write("explore")
-        updates = progressed["updates"]
+        updates = done["updates"]
         collapse, metrics = monitor.finish(updates), run.last_row("pretrain")
         facts = [{"domain": e.name, "agent_steps": e.agent_steps, "episodes": e.episodes} for e in explorers]
         run.counters["updates"] = updates
@@ -398,21 +400,6 @@ def pretrain_active(
             env_steps=run.position, actor=explorers[0].actor if exploration.transfers_actor else None,
             queue=explorers[0].candidates(),
         )  # fmt: skip
-
-
-class DecisionCounter(dict[str, int]):
-    """Decisions over all domains, and encoder updates; part of every checkpoint."""
-
-    def __init__(self) -> None:
-        super().__init__(decisions=0, updates=0)
-
-    def state_dict(self) -> dict[str, int]:
-        """Return the counters."""
-        return dict(self)
-
-    def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Restore :meth:`state_dict`."""
-        self.update(state)
 
 
 class Explorer:

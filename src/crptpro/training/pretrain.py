@@ -204,7 +204,8 @@ def pretrain(
             if recipe.grad_clip is not None:
                 nn.utils.clip_grad_norm_(loss.parameters(), recipe.grad_clip)
             optimizer.step()
-            targets.step()
+            if targets is not None:
+                targets.step()
             return losses.detach()
 
         fast_update = accelerate(update, compile=settings.compile, cuda_graph=settings.cuda_graph)
@@ -296,24 +297,10 @@ def settings_of(
 # --- what active pre-training shares ---------------------------------------------------------------------------------
 
 
-class NoTargets:
-    """Stands for the target updater of a loss that has no target networks."""
-
-    def step(self) -> None:
-        """Do nothing."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return nothing."""
-        return {}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take nothing."""
-
-
 def make_optimizer(
     loss: LossModule, method: Method, *, learning_rate: float, warmup_updates: int, encoder_tau: float | None,
     updates: int, cuda_graph: bool = False,
-) -> tuple[torch.optim.Adam, torch.optim.lr_scheduler.LambdaLR, SoftUpdate | NoTargets]:  # fmt: skip
+) -> tuple[torch.optim.Adam, torch.optim.lr_scheduler.LambdaLR, SoftUpdate | None]:  # fmt: skip
     """Return Adam, the learning-rate schedule over ``updates``, and the EMA of the target networks.
 
     Raises:
@@ -340,7 +327,7 @@ def make_optimizer(
         name for name, _ in loss.named_children() if name.startswith("target_") and name.endswith("_params")
     ]
     if not names or encoder_tau is None:
-        return optimizer, schedule, NoTargets()
+        return optimizer, schedule, None
     # SoftUpdate begins by copying the sources; fine-tuning goes on with the targets that were saved.
     kept = {name: loss._modules[name].data.clone() for name in names}
     targets = SoftUpdate(loss, tau=encoder_tau)

@@ -133,6 +133,7 @@ class Run:
         position: progress in ``unit``, all resumptions included.
         resumed_from: position at which this call continued; 0 for a fresh run.
         counters: further counters for every row.
+        tally: whole numbers of the loop's own that every checkpoint holds; set them before :meth:`keep`.
         history: rows that this call wrote, by stream.
 
     Raises:
@@ -156,6 +157,7 @@ class Run:
         self.resume, self.progress = resume, progress
         self.position = self.resumed_from = 0
         self.counters: dict[str, int] = {}
+        self.tally: dict[str, int] = {}
         self.history: dict[str, list[dict[str, Any]]] = {stream: [] for stream in streams}
         self.means = {stream: Means() for stream in streams}
         self.settings: dict[str, Any] = {}
@@ -232,7 +234,8 @@ class Run:
     def keep(self, **components: Any) -> None:
         """Make objects with ``state_dict`` and ``load_state_dict`` part of every checkpoint, and restore them.
 
-        Without a checkpoint the rows of an attempt that was killed before its first one are removed.
+        ``None`` is left out. Without a checkpoint, the rows of an attempt that was killed before its first one are
+        removed.
 
         Raises:
             CheckpointError: a component does not fit its saved state.
@@ -240,7 +243,8 @@ class Run:
         self._modules = [value for value in components.values() if isinstance(value, nn.Module)]
         means = {f"means_{stream}": value for stream, value in self.means.items()}
         for name, component in {**components, **means, "global_rng": GlobalRNGState()}.items():
-            self._checkpoint.register(name, component)
+            if component is not None:
+                self._checkpoint.register(name, component)
         if self.saved:
             try:
                 self._checkpoint.load(self._latest)
@@ -250,6 +254,7 @@ class Run:
                 ) from reason
             self.position = self.resumed_from = self._row_position = self.saved["position"]
             self._earlier_seconds = self.saved["seconds"]
+            self.tally.update(self.saved["tally"])
             if self.records is not None and self.saved["record"] is not None:
                 self.records.load_state_dict(self.saved["record"])
             logger.info("Continues from %s %s.", f"{self.position:,}", self.unit)
@@ -431,6 +436,7 @@ class Run:
         self.saved = {
             "settings": self.settings,
             "position": self.position,
+            "tally": dict(self.tally),
             "seconds": self.seconds,
             "is_finished": is_finished,
             "record": None if self.records is None else self.records.state_dict(self.streams),
