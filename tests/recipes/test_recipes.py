@@ -209,6 +209,15 @@ def test_twice_the_budget_is_the_budget_and_the_same_call_again(
     assert [name for name in expected if expected[name] != found[name]] == []
 
 
+@pytest.mark.gl
+@pytest.mark.slow
+def test_the_method_is_written_with_torchrls_idioms_in_sixty_lines() -> None:
+    text = (RECIPES / "plain_torchrl.py").read_text()
+    assert len(text.splitlines()) <= 60
+    sac = load("plain_torchrl").main(TASK, transitions=100, updates=2, batch_size=8, agent_steps=12)
+    assert all(torch.isfinite(parameter).all() for parameter in sac.parameters())
+
+
 @pytest.mark.parametrize(
     ("recipe", "changes", "message"),
     [
