@@ -324,9 +324,12 @@ def test_a_world_is_closed_once_however_often_it_is_asked() -> None:
 
 
 @pytest.mark.gl
+@pytest.mark.parametrize("is_closed", [True, False])
 @pytest.mark.parametrize("other", ["cartpole_balance", "gymnasium:Reacher-v5"])
 @pytest.mark.parametrize("task", ["cartpole_balance", "gymnasium:Reacher-v5"])
-def test_worlds_that_come_and_go_in_a_thread_change_no_frame_of_another(task: str, other: str) -> None:
+def test_worlds_that_come_and_go_in_a_thread_change_no_frame_of_another(
+    task: str, other: str, is_closed: bool
+) -> None:
     def frames(after_each: Callable[[], None]) -> torch.Tensor:
         env, seen = make_env(task, seed=0, image_size=32), []
         td = env.reset()
@@ -341,11 +344,14 @@ def test_worlds_that_come_and_go_in_a_thread_change_no_frame_of_another(task: st
     beside: list[EnvBase] = []
 
     def come_and_go() -> None:
+        if beside:  # closed or not, it is garbage from here on, and collected while the other one is drawn
+            beside.clear()
+            gc.collect()
+            return
         beside.append(make_env(other, seed=1, image_size=32))
         beside[-1].reset()
-        if len(beside) == 2:
-            beside.clear()  # nobody closes them
-            gc.collect()
+        if is_closed:
+            beside[-1].close()
 
     expected = frames(lambda: None)
     assert expected.float().std() > 1

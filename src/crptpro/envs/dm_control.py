@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from typing import Any
 
 import dm_env
@@ -239,7 +239,7 @@ class AgentSteps(dm_env.Environment):
     def reset(self) -> dm_env.TimeStep:
         """Start an episode."""
         # Some tasks send what they drew (quadruped_escape: its terrain) to the render context.
-        with nullcontext() if self._camera is None else self._camera.own_context(self.physics):
+        with own_context(None) if self._camera is None else self._camera.own_context(self.physics):
             self.env.reset()
         return dm_env.restart(self._observe())
 

@@ -14,7 +14,7 @@ from torchrl.envs import CatFrames, Compose, DoubleToFloat, EnvBase, Transform, 
 from torchrl.envs.transforms import SelectTransform
 
 from crptpro.domains import GYMNASIUM_PREFIX, LONGEST_EPISODE_AGENT_STEPS, Domain, get_domain
-from crptpro.envs.rendering import backend_card, first_frame_watchdog, select_backend
+from crptpro.envs.rendering import backend_card, first_frame_watchdog, own_context, select_backend
 from crptpro.envs.worlds import CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError
 from crptpro.values import COLORS, QUALITIES, Colors, Quality, as_int
@@ -181,7 +181,7 @@ def _dm_control(
     scene = dm_control.SceneCamera(
         asked["image_size"], camera, shadow_size, reverses_background=colors == "reversed_background"
     )
-    with first_frame_watchdog():  # composer renders once when it is built
+    with first_frame_watchdog(), own_context(None):  # composer renders once when it is built
         env = dm_control.load_dm_env(domain)
     scene.prepare(env.physics)
     steps = dm_control.AgentSteps(env, scene if render else None, world=domain.task, **asked)

@@ -100,15 +100,13 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observed
 
     def _draw(self) -> Tensor:
+        viewer = getattr(getattr(self.env.unwrapped, "mujoco_renderer", None), "viewer", None)
+        own = own_context(getattr(viewer, "make_context_current", None))
         if self._has_drawn:
-            viewer = getattr(getattr(self.env.unwrapped, "mujoco_renderer", None), "viewer", None)
-            with (
-                passed_on(self._world, "render"),
-                own_context(getattr(viewer, "make_context_current", None)),
-            ):
+            with passed_on(self._world, "render"), own:
                 image = self.env.render()
         else:
-            with first_frame_watchdog(), passed_on(self._world, "render"):
+            with first_frame_watchdog(), passed_on(self._world, "render"), own:
                 try:
                     image = self.env.render()
                 except (ImportError, gymnasium.error.Error) as reason:

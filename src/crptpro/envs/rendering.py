@@ -199,10 +199,11 @@ def first_frame_watchdog(timeout_s: float | None = None) -> Iterator[None]:
 
 @contextmanager
 def own_context(make_current: Callable[[], Any] | None) -> Iterator[None]:
-    """Draw in the body into one's own render context, whatever else was made or freed in this thread.
+    """Draw in the body into one's own render context, and leave none current: contexts share a thread.
 
-    A context that is freed or made takes the thread's current one away (``eglReleaseThread``), and what is drawn
-    without one is black. The garbage collector may free one at any moment, so it waits until the body has ended.
+    What frees a world frees its textures and buffers in whichever context is current, and then takes that away from the
+    thread: the frames of another world would be black from there on. The garbage collector, which may free one at any
+    moment, waits until the body has ended.
 
     Args:
         make_current: makes the context current; ``None`` before there is one.
@@ -214,8 +215,19 @@ def own_context(make_current: Callable[[], Any] | None) -> Iterator[None]:
             make_current()
         yield
     finally:
+        _leave_none_current()
         if collects:
             gc.enable()
+
+
+def _leave_none_current() -> None:
+    backend = os.environ.get("MUJOCO_GL")
+    if backend == "egl" and (egl := sys.modules.get("OpenGL.EGL")) is not None:
+        egl.eglReleaseThread()
+    elif backend == "glfw" and (glfw := sys.modules.get("glfw")) is not None:
+        glfw.make_context_current(None)
+    elif backend == "osmesa" and (osmesa := sys.modules.get("OpenGL.osmesa")) is not None:
+        osmesa.OSMesaMakeCurrent(None, None, 0x1406, 0, 0)  # GL_FLOAT
 
 
 def default_timeout_s() -> float:
