@@ -38,7 +38,7 @@ def hardware() -> dict[str, Any]:
     """Return what decides how long work takes here.
 
     Returns:
-        ``cpu``, the model; ``cpu_instructions``, the vector instructions that torch uses, e.g. ``"AVX512, AVX512-BF16"``
+        ``cpu``, the model; ``cpu_instructions``, that torch uses, e.g. ``"AVX512, AVX512-BF16"``
         (in virtual machines two processors of one model may differ threefold in speed); ``cpu_cores``, that this
         process may use; ``ram_bytes``; ``gpus``, the names torch sees (or why it cannot use one).
     """

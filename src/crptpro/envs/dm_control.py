@@ -17,28 +17,37 @@ from crptpro.domains import SUITE_TASKS, Domain
 from crptpro.envs.rendering import first_frame_watchdog, own_context
 from crptpro.envs.worlds import ActionRange, CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError, UnknownNameError
+from crptpro.values import Quality
 
 logger = logging.getLogger(__name__)
 
-#: Side of the shadow map, texels, that ``quality="fast"`` uses instead of the model's own 2048 (suite) or
-#: 4096 (manipulation). On software GL the shadow map is half the cost of a frame; fewer than 1 % of pixels
-#: change (8 % on the terrain of quadruped_escape, which is all shadows).
+#: Side of the shadow map, texels, with ``quality="fast"``; the models' own are 2048 (suite) and 4096 (manipulation).
 FAST_SHADOW_SIZE = {"suite": 512, "manipulation": 1024}
 
 
-def load_dm_env(domain: Domain) -> dm_env.Environment:
-    """Load ``domain.task`` from dm_control, with all camera observations of composer tasks switched off.
+def make_dm_control(
+    domain: Domain, *, camera: Any, quality: Quality, reverses_background: bool, render: bool, **settings: Any
+) -> DMControlPixelEnv:
+    """Build a world of the suite or of manipulation; the settings are those of :func:`crptpro.envs.make_env`."""
+    shadow_size = FAST_SHADOW_SIZE[domain.source] if quality == "fast" else None
+    scene = SceneCamera(settings["image_size"], camera, shadow_size, reverses_background=reverses_background)
+    with first_frame_watchdog():  # composer renders once when it is built
+        env = load_dm_env(domain)
+    scene.prepare(env.physics)
+    return DMControlPixelEnv(AgentSteps(env, scene if render else None, world=domain.task, **settings))
 
-    The model does not depend on any seed (LQR draws its own from a fixed one), so that an episode depends on
-    nothing but the seed given before its reset.
+
+def load_dm_env(domain: Domain) -> dm_env.Environment:
+    """Load ``domain.task`` from dm_control, without the camera observations of composer tasks.
+
+    The model does not depend on a seed, so that an episode depends only on the seed given before its reset.
     """
     if domain.source == "manipulation":
         from dm_control import manipulation
 
         route_mujoco_warnings()
         env = manipulation.load(f"{domain.task}_vision", seed=0)
-        # The built-in camera renders at every env step, twice per agent step; SceneCamera replaces it. The
-        # switch takes effect at the first reset, which compiles the model anew.
+        # The built-in camera renders at every env step, twice per agent step; SceneCamera replaces it.
         for observable in env.task.observables.values():
             observable.enabled = False
         return env
@@ -55,10 +64,9 @@ def load_dm_env(domain: Domain) -> dm_env.Environment:
 
 
 def route_mujoco_warnings() -> None:
-    """Log MuJoCo's warnings; call it after importing dm_control, which sends them to absl.
+    """Log MuJoCo's warnings, deprecations at debug level; call it after importing dm_control, which sends them to absl.
 
     Without a handler MuJoCo prints them and appends to ``MUJOCO_LOG.TXT`` in the working directory.
-    Deprecations concern the authors of a model, not its users, and are logged at debug level.
     """
     import mujoco
 
@@ -70,18 +78,17 @@ def route_mujoco_warnings() -> None:
 
 
 class SceneCamera:
-    """One dm_control ``Camera`` kept over steps and resets.
+    """One dm_control ``Camera`` kept over steps and resets; the pixels are those of ``physics.render``.
 
-    ``physics.render``, which TorchRL's ``from_pixels`` and dm_control's ``pixels.Wrapper`` call, builds and frees a
-    camera and its scene for every image; this one is rebuilt only when the model changes, as composer environments do
-    at every reset. The pixels are identical. A frame of cheetah or walker takes 7 to 16 % less (software GL; nothing is
-    gained on manipulation), more than the 5 % for which this library keeps something of its own.
+    ``physics.render``, which TorchRL's ``from_pixels`` calls, builds a camera and its scene for every image; this one
+    is rebuilt only when the model changes, as in composer environments at every reset. A frame of cheetah or walker
+    takes 7 to 16 % less time (software GL; no gain on manipulation).
 
     Args:
         image_size: H = W, pixels.
-        camera: Index or name of a camera of the model, -1 for the free camera.
-        shadow_size: Side of the shadow map, texels; ``None`` keeps the model's.
-        reverses_background: Draw the background with its colours reversed.
+        camera: index or name of a camera of the model, -1 for the free camera.
+        shadow_size: side of the shadow map, texels; ``None`` keeps the model's.
+        reverses_background: draw the background with its colours reversed.
     """
 
     def __init__(
@@ -92,13 +99,11 @@ class SceneCamera:
         *,
         reverses_background: bool = False,
     ):
-        self._image_size = image_size
-        self._camera_id = camera
-        self._shadow_size = shadow_size
-        self._reverses_background = reverses_background
-        self._reversed_model: Any = None
-        self._model: Any = None
+        self._image_size, self._camera_id = image_size, camera
+        self._shadow_size, self._reverses_background = shadow_size, reverses_background
         self._camera: Any = None
+        self._model: Any = None
+        self._reversed_model: Any = None
 
     def prepare(self, physics: Any) -> None:
         """Set what a render context reads once, when it is made; call it before the first reset.
@@ -157,19 +162,17 @@ class SceneCamera:
 def reverse_background(model: Any) -> None:
     """Reverse the order of the red, green and blue values of a model's background, in place.
 
-    The paper tests unseen colours by reversing the RGB values of the background, without saying what that is. Here it
-    is the skybox, and the planes and height fields that are fixed to the world (floor, walls, terrain): their textures,
-    and the colours of the materials and geoms that tint them. A material or texture that something else wears too
-    keeps its colours: everything that moves looks as before.
+    The paper reverses the RGB values of the background without saying what that is. Here it is the skybox, and the
+    planes and height fields that are fixed to the world (floor, walls, terrain): their textures, materials and geoms. A
+    material or texture that something else uses too keeps its colours.
 
-    Call it before the render context is made, which is when textures are copied to it, and once per compiled model:
-    twice restores the colours.
+    Call it once per compiled model, before its render context is made: that is when textures are copied to it.
 
     Args:
         model: ``mujoco.MjModel``, 3.2 or later.
 
     Raises:
-        CRPTproError: if the model has no background to reverse.
+        CRPTproError: the model has no background to reverse.
     """
     import mujoco
 
@@ -177,9 +180,9 @@ def reverse_background(model: Any) -> None:
     is_fixed = model.body_weldid[model.geom_bodyid] == 0
     is_background = is_fixed & np.isin(model.geom_type, [int(kind) for kind in sheets])
     materials = np.setdiff1d(model.geom_matid[is_background], [*model.geom_matid[~is_background], -1])
-    worn_by_others = np.setdiff1d(np.arange(model.nmat), materials)
+    others = np.setdiff1d(np.arange(model.nmat), materials)
     roles = [int(mujoco.mjtTextureRole.mjTEXROLE_RGB), int(mujoco.mjtTextureRole.mjTEXROLE_RGBA)]
-    textures = np.setdiff1d(model.mat_texid[materials][:, roles], model.mat_texid[worn_by_others])
+    textures = np.setdiff1d(model.mat_texid[materials][:, roles], model.mat_texid[others])
     skyboxes = np.flatnonzero(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX))
     textures = np.union1d(textures[textures >= 0], skyboxes)
     if not (textures.size or is_background.any()):
@@ -198,15 +201,15 @@ def reverse_background(model: Any) -> None:
 
 
 class AgentSteps(dm_env.Environment):
-    """A dm_control world of which one step is one decision: repeated, summed, scaled, and drawn once.
+    """A dm_control world of which one step is one agent step: repeated, summed, scaled, and rendered once.
 
     Args:
-        env: With ``physics`` and either ``task.random`` (suite) or ``random_state`` (composer).
-        camera: Draws the images; ``None`` leaves them black.
-        world: Name for messages.
+        env: with ``physics`` and either ``task.random`` (suite) or ``random_state`` (composer).
+        camera: renders the images; ``None`` leaves them black.
+        world: name for messages.
         image_size: H = W, pixels.
-        action_repeat: Env steps per step, fewer where the episode ends.
-        physics_state: Also observe ``qpos`` and ``qvel``.
+        action_repeat: env steps per step, fewer where the episode ends.
+        physics_state: also observe ``qpos`` and ``qvel``.
     """
 
     def __init__(
@@ -296,17 +299,16 @@ class AgentSteps(dm_env.Environment):
 
 
 class DMControlPixelEnv(CheckedWorld, DMControlWrapper):
-    """TorchRL's ``DMControlWrapper`` with what it cannot do by itself.
+    """TorchRL's ``DMControlWrapper`` around :class:`AgentSteps`: float32 actions and rewards, seeds without a reset.
 
-    ``DMControlEnv(from_pixels=True)`` draws 240 x 320 whatever is asked for, refuses composer tasks (manipulation),
-    and draws every env step of a repeated action, which doubles the time of an agent step. Here the repeat lies below
-    the camera (:class:`AgentSteps`), actions and rewards are float32, and a seed does not reset the world.
+    ``DMControlEnv(from_pixels=True)`` renders 240 x 320 whatever is asked for, refuses composer tasks (manipulation),
+    and renders every env step of a repeated action, which doubles the time of an agent step.
     """
 
     def draw_state(self, qpos: np.ndarray, qvel: np.ndarray) -> Tensor:
         """Return the frame of a state, uint8 ``[3, H, W]``; the episode continues from there.
 
-        What a task draws at its reset and keeps in the model (targets, terrain, colours) stays as it is.
+        What a reset draws into the model (targets, terrain, colours) stays.
         """
         physics = self._env.physics
         physics.data.qpos[:], physics.data.qvel[:] = qpos, qvel
@@ -314,8 +316,7 @@ class DMControlPixelEnv(CheckedWorld, DMControlWrapper):
         return self._env.draw()
 
     def _check_kwargs(self, kwargs: dict[str, Any]) -> None:
-        if not isinstance(kwargs["env"], dm_env.Environment):
-            raise TypeError(f"env must be a dm_env.Environment, got {type(kwargs['env']).__name__}.")
+        pass  # TorchRL's refuses composer environments
 
     def _build_env(self, env: AgentSteps, **kwargs: Any) -> AgentSteps:
         self.from_pixels = self.pixels_only = True
