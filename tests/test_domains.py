@@ -1,12 +1,8 @@
 from __future__ import annotations
 
-import functools
-import logging
 import pickle
 import sys
-import types
 
-import gymnasium
 import numpy as np
 import pytest
 
@@ -20,7 +16,6 @@ from crptpro.domains import (
     get_domain,
     known_names,
     register_domain,
-    worker_obstacle,
 )
 from crptpro.errors import CRPTproError, UnknownNameError
 
@@ -118,29 +113,6 @@ def test_numbers_of_a_domain_are_the_plain_numbers_they_mean() -> None:
 def test_a_domain_travels_to_another_process() -> None:
     for domain in (*PAPER_DOMAINS.values(), Domain("lander", "lander", make=make_nothing)):
         assert pickle.loads(pickle.dumps(domain)) == domain
-        assert worker_obstacle(domain) is None
-    assert worker_obstacle("gymnasium:HalfCheetah-v5") is None
-
-
-def test_a_world_that_no_other_process_can_import_says_why(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    cell = types.ModuleType("__main__")  # a notebook's has no file
-    exec("def make_lander(seed): ...", cell.__dict__)
-    monkeypatch.setitem(sys.modules, "__main__", cell)
-    for make in (cell.make_lander, functools.partial(cell.make_lander, seed=1)):
-        obstacle = worker_obstacle(Domain("lander", "lander", make=make)) or ""
-        assert "make_lander is defined in a notebook or an interactive session" in obstacle
-        assert "top level of a file" in obstacle
-    gymnasium.register("CrptproCell-v0", cell.make_lander)
-    assert "notebook" in (worker_obstacle("gymnasium:CrptproCell-v0") or "")
-    del gymnasium.registry["CrptproCell-v0"]
-    cell.__file__ = __file__  # a script's is imported again by the other process
-    assert worker_obstacle(Domain("lander", "lander", make=cell.make_lander)) is None
-    with caplog.at_level(logging.WARNING):
-        register_domain(Domain("lander", "lander", make=lambda seed: None))  # type: ignore[arg-type,return-value]
-    assert "lander" in caplog.text
-    assert "top level" in caplog.text
 
 
 @pytest.mark.parametrize(("domain", "complaint"), [

@@ -3,22 +3,15 @@
 from __future__ import annotations
 
 import difflib
-import functools
-import logging
-import os
-import pickle
-import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.values import as_int
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
-
-logger = logging.getLogger(__name__)
 
 GYMNASIUM_PREFIX = "gymnasium:"
 
@@ -46,7 +39,7 @@ class Domain:
             ``action_repeat``, an agent step is one env step. With ``physics_state`` it may also emit ``qpos`` and
             ``qvel``; what its own transforms read back (``step_count``) stays, other entries are dropped. Its
             ``set_seed`` must make the next ``reset`` reproducible. Worker processes can build it if it is a function at
-            a module's top level or a ``functools.partial`` of one (:func:`worker_obstacle`).
+            a module's top level or a ``functools.partial`` of one.
         episode_env_steps: env steps of a full episode; if ``None``, unknown or unlimited, an episode is truncated after
             1000 agent steps.
         source: library that ``task`` is loaded with; ``"own"`` goes with ``make``.
@@ -182,38 +175,9 @@ def register_domain(domain: Domain) -> Domain:
             raise CRPTproError(
                 f"{name!r} is one of the built-in names; register the domain under another one."
             )
-    if obstacle := worker_obstacle(domain):
-        logger.warning("Domain %r cannot be built in worker processes: %s", domain.name, obstacle)
     for key in (domain.task, domain.name):
         _registered[key] = domain
     return domain
-
-
-def worker_obstacle(domain: str | Domain) -> str | None:
-    """Return why a worker process could not build a domain's world, and what to do; ``None`` if it could.
-
-    A worker process imports the code of a world by its module's name, which a notebook cell or an interactive session
-    does not have.
-    """
-    domain = get_domain(domain)
-    builder: Any = domain.make
-    if domain.source == "gymnasium":
-        import gymnasium
-
-        builder = gymnasium.spec(domain.task.removeprefix(GYMNASIUM_PREFIX)).entry_point
-    while isinstance(builder, functools.partial):
-        builder = builder.func
-    name, home = getattr(builder, "__qualname__", builder), getattr(builder, "__module__", None)
-    remedy = (
-        "Put it at the top level of a file of its own, and import it from there; or collect with one process."
-    )
-    if home == "__main__" and not os.path.isfile(getattr(sys.modules["__main__"], "__file__", None) or ""):
-        return f"{name} is defined in a notebook or an interactive session, which no other process can import. {remedy}"
-    try:
-        pickle.dumps(domain)
-    except Exception as reason:
-        return f"it cannot be pickled ({reason}). {remedy}"
-    return None
 
 
 def get_domain(name: str | Domain) -> Domain:

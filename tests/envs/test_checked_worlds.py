@@ -258,14 +258,14 @@ def test_action_spaces_that_cannot_be_mapped_from_minus_1_to_1_are_refused_by_na
 @pytest.mark.parametrize("bound", [np.inf, HUGE, 1e10])
 def test_an_actuator_of_dm_control_without_bounds_takes_the_action_as_it_is(bound: float) -> None:
     env = FakeDmEnv(bounds=([-bound, 0.0], [bound, 4.0]))
-    steps = AgentSteps(env, None, world="fake", image_size=SIZE, action_repeat=1, physics_state=False)
+    steps = AgentSteps(env, world="fake", image_size=SIZE, action_repeat=1, render=False)
     steps.reset()
     for action in ([-1, -1], [0.5, 1]):
         steps.step(np.array(action, np.float32))
     np.testing.assert_allclose(env.actions, [[-1.0, 0.0], [0.5, 4.0]], atol=1e-12)
     env = FakeDmEnv(bounds=([-1.0, 0.0], [bound, 4.0]))
     with pytest.raises(CRPTproError, match="one side only"):
-        AgentSteps(env, None, world="fake", image_size=SIZE, action_repeat=1, physics_state=False)
+        AgentSteps(env, world="fake", image_size=SIZE, action_repeat=1, render=False)
 
 
 def test_numbers_are_taken_as_what_they_mean_and_refused_before_anything_is_loaded() -> None:

@@ -25,16 +25,12 @@ logger = logging.getLogger(__name__)
 FAST_SHADOW_SIZE = {"suite": 512, "manipulation": 1024}
 
 
-def make_dm_control(
-    domain: Domain, *, camera: Any, quality: Quality, reverses_background: bool, render: bool, **settings: Any
-) -> DMControlPixelEnv:
-    """Build a world of the suite or of manipulation; the settings are those of :func:`crptpro.envs.make_env`."""
+def make_dm_control(domain: Domain, *, quality: Quality, **settings: Any) -> DMControlPixelEnv:
+    """Build a world of the suite or of manipulation; the settings are those of :class:`AgentSteps`."""
     shadow_size = FAST_SHADOW_SIZE[domain.source] if quality == "fast" else None
-    scene = SceneCamera(settings["image_size"], camera, shadow_size, reverses_background=reverses_background)
     with first_frame_watchdog():  # composer renders once when it is built
         env = load_dm_env(domain)
-    scene.prepare(env.physics)
-    return DMControlPixelEnv(AgentSteps(env, scene if render else None, world=domain.task, **settings))
+    return DMControlPixelEnv(AgentSteps(env, world=domain.task, shadow_size=shadow_size, **settings))
 
 
 def load_dm_env(domain: Domain) -> dm_env.Environment:
@@ -47,7 +43,7 @@ def load_dm_env(domain: Domain) -> dm_env.Environment:
 
         route_mujoco_warnings()
         env = manipulation.load(f"{domain.task}_vision", seed=0)
-        # The built-in camera renders at every env step, twice per agent step; SceneCamera replaces it.
+        # The built-in camera renders at every env step, twice per agent step.
         for observable in env.task.observables.values():
             observable.enabled = False
         return env
@@ -75,88 +71,6 @@ def route_mujoco_warnings() -> None:
         logger.log(logging.DEBUG if "deprecated" in text else logging.WARNING, "MuJoCo: %s", text)
 
     mujoco.set_mju_user_warning(log)
-
-
-class SceneCamera:
-    """One dm_control ``Camera`` kept over steps and resets; the pixels are those of ``physics.render``.
-
-    ``physics.render``, which TorchRL's ``from_pixels`` calls, builds a camera and its scene for every image; this one
-    is rebuilt only when the model changes, as in composer environments at every reset. A frame of cheetah or walker
-    takes 7 to 16 % less time (software GL; no gain on manipulation).
-
-    Args:
-        image_size: H = W, pixels.
-        camera: index or name of a camera of the model, -1 for the free camera.
-        shadow_size: side of the shadow map, texels; ``None`` keeps the model's.
-        reverses_background: draw the background with its colours reversed.
-    """
-
-    def __init__(
-        self,
-        image_size: int,
-        camera: int | str,
-        shadow_size: int | None = None,
-        *,
-        reverses_background: bool = False,
-    ):
-        self._image_size, self._camera_id = image_size, camera
-        self._shadow_size, self._reverses_background = shadow_size, reverses_background
-        self._camera: Any = None
-        self._model: Any = None
-        self._reversed_model: Any = None
-
-    def prepare(self, physics: Any) -> None:
-        """Set what a render context reads once, when it is made; call it before the first reset.
-
-        Some tasks (quadruped_escape, for its terrain) make the context while they start an episode.
-        """
-        visual = physics.model.vis
-        if self._shadow_size is not None:
-            visual.quality.shadowsize = min(self._shadow_size, visual.quality.shadowsize)
-        visual.global_.offwidth = max(self._image_size, visual.global_.offwidth)
-        visual.global_.offheight = max(self._image_size, visual.global_.offheight)
-        if self._reverses_background and physics.model.ptr is not self._reversed_model:
-            reverse_background(physics.model.ptr)
-            self._reversed_model = physics.model.ptr
-
-    def render(self, physics: Any) -> np.ndarray:
-        """Return the image, uint8 ``[H, W, 3]``, in a buffer that the next call overwrites."""
-        if physics.model is self._model:
-            with self.own_context(physics):
-                return self._camera.render()
-        with first_frame_watchdog(), self.own_context(physics):
-            self._build(physics)
-            return self._camera.render()
-
-    def own_context(self, physics: Any) -> AbstractContextManager[None]:
-        """Draw, or change what is drawn, in the body into the context of the physics, if it has one already."""
-        if physics.model is not self._model:
-            return own_context(None)
-        context = physics.contexts.gl
-
-        def make_current() -> None:
-            with context.make_current() as thread:
-                thread.call(context._platform_make_current)  # dm_control knows of no context but its own
-
-        return own_context(make_current)
-
-    def release(self) -> None:
-        """Drop the scene; the render context belongs to the physics."""
-        self._camera = self._model = None
-
-    def _build(self, physics: Any) -> None:
-        from dm_control.mujoco.engine import Camera
-
-        self.prepare(physics)  # a composer environment has compiled a new model since
-        model = physics.model
-        names = [model.id2name(index, "camera") or str(index) for index in range(model.ncam)]
-        if self._camera_id not in (*names, *range(-1, model.ncam)):
-            raise CRPTproError(
-                f"This model has no camera {self._camera_id!r}. It has {', '.join(names) or 'none'}, or 0 to "
-                f"{model.ncam - 1}; -1 is the free camera."
-            )
-        self._camera = Camera(physics, self._image_size, self._image_size, camera_id=self._camera_id)
-        self._model = model
 
 
 def reverse_background(model: Any) -> None:
@@ -203,31 +117,49 @@ def reverse_background(model: Any) -> None:
 class AgentSteps(dm_env.Environment):
     """A dm_control world of which one step is one agent step: repeated, summed, scaled, and rendered once.
 
+    Its camera is kept over steps and resets. ``physics.render``, which TorchRL's ``from_pixels`` calls, gives the same
+    pixels and builds a camera and its scene for every image; this one is rebuilt only when the model changes, as in
+    composer environments at every reset. A frame of cheetah or walker takes 7 to 16 % less time (software GL; no gain
+    on manipulation).
+
     Args:
         env: with ``physics`` and either ``task.random`` (suite) or ``random_state`` (composer).
-        camera: renders the images; ``None`` leaves them black.
         world: name for messages.
         image_size: H = W, pixels.
         action_repeat: env steps per step, fewer where the episode ends.
+        camera: index or name of a camera of the model, -1 for the free camera.
+        render: ``False`` leaves every image black.
         physics_state: also observe ``qpos`` and ``qvel``.
+        shadow_size: side of the shadow map, texels; ``None`` keeps the model's.
+        reverses_background: render the background with its colours reversed.
     """
 
     def __init__(
         self,
         env: dm_env.Environment,
-        camera: SceneCamera | None,
         *,
         world: str,
         image_size: int,
         action_repeat: int,
-        physics_state: bool,
+        camera: Any = 0,
+        render: bool = True,
+        physics_state: bool = False,
+        shadow_size: int | None = None,
+        reverses_background: bool = False,
     ):
         self.env, self.physics_state = env, physics_state
-        self._camera, self._world, self._action_repeat = camera, world, action_repeat
+        self._world, self._action_repeat = world, action_repeat
+        self._image_size, self._camera_id, self._renders = image_size, camera, render
+        self._shadow_size, self._reverses_background = shadow_size, reverses_background
         self._read_frame, self._image_shape = FrameReader(world), (3, image_size, image_size)
+        self._camera: Any = None
+        self._model: Any = None
+        self._prepared: Any = None
         spec = env.action_spec()
         low, high = (np.broadcast_to(bound, spec.shape) for bound in (spec.minimum, spec.maximum))
         self._to_actuators = ActionRange(low, high, spec.dtype, world)
+        if render:
+            self._prepare()  # quadruped_escape makes the render context while it starts an episode
 
     @property
     def physics(self) -> Any:
@@ -241,8 +173,7 @@ class AgentSteps(dm_env.Environment):
 
     def reset(self) -> dm_env.TimeStep:
         """Start an episode."""
-        # Some tasks send what they drew (quadruped_escape: its terrain) to the render context.
-        with nullcontext() if self._camera is None else self._camera.own_context(self.physics):
+        with self._own_context():  # quadruped_escape sends its terrain to the render context
             self.env.reset()
         return dm_env.restart(self._observe())
 
@@ -259,10 +190,56 @@ class AgentSteps(dm_env.Environment):
 
     def draw(self) -> Tensor:
         """Return the frame of the current state, uint8 ``[3, H, W]``."""
-        if self._camera is None:
+        if not self._renders:
             return torch.zeros(self._image_shape, dtype=torch.uint8)
-        with passed_on(self._world, "render"):
-            return self._read_frame(self._camera.render(self.physics))
+        is_first = self.physics.model is not self._model
+        with (
+            passed_on(self._world, "render"),
+            first_frame_watchdog() if is_first else nullcontext(),
+            self._own_context(),
+        ):
+            if is_first:
+                self._build_camera()
+            return self._read_frame(self._camera.render())
+
+    def _own_context(self) -> AbstractContextManager[None]:
+        """Render, or change what is rendered, in the body into the context of the physics, if it has one already."""
+        if not self._renders or self.physics.model is not self._model:
+            return own_context(None)
+        context = self.physics.contexts.gl
+
+        def make_current() -> None:
+            with context.make_current() as thread:
+                thread.call(context._platform_make_current)  # dm_control knows of no context but its own
+
+        return own_context(make_current)
+
+    def _prepare(self) -> None:
+        """Set what a render context reads once, when it is made."""
+        model = self.physics.model
+        if model.ptr is self._prepared:
+            return
+        self._prepared, visual = model.ptr, model.vis
+        if self._shadow_size is not None:
+            visual.quality.shadowsize = min(self._shadow_size, visual.quality.shadowsize)
+        visual.global_.offwidth = max(self._image_size, visual.global_.offwidth)
+        visual.global_.offheight = max(self._image_size, visual.global_.offheight)
+        if self._reverses_background:
+            reverse_background(model.ptr)
+
+    def _build_camera(self) -> None:
+        from dm_control.mujoco.engine import Camera
+
+        self._prepare()  # a composer environment has compiled a new model since
+        model = self.physics.model
+        names = [model.id2name(index, "camera") or str(index) for index in range(model.ncam)]
+        if self._camera_id not in (*names, *range(-1, model.ncam)):
+            raise CRPTproError(
+                f"This model has no camera {self._camera_id!r}. It has {', '.join(names) or 'none'}, or 0 to "
+                f"{model.ncam - 1}; -1 is the free camera."
+            )
+        self._camera = Camera(self.physics, self._image_size, self._image_size, camera_id=self._camera_id)
+        self._model = model
 
     def _observe(self) -> dict[str, Any]:
         observation = {"pixels": self.draw()}
@@ -292,8 +269,7 @@ class AgentSteps(dm_env.Environment):
 
     def close(self) -> None:
         """Free the physics and its render context."""
-        if self._camera is not None:
-            self._camera.release()
+        self._camera = self._model = None
         self.physics.free()
         self.env.close()
 
