@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 import psutil
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from crptpro import provenance
 from crptpro.domains import PAPER_DOMAINS, expand_groups
@@ -91,8 +92,15 @@ def run_doctor(domains: Iterable[str] | None = None) -> DoctorReport:
         f"  disk  {free_disk / _GB:.1f} GB free at {here}",
         "",
     ]
+    installed = {canonicalize_name(each.name): each.version for each in importlib.metadata.distributions()}
+    declared = importlib.metadata.requires("crptpro") if "crptpro" in installed else None
+    requirements = [text for text in declared or () if "extra ==" not in text]
     drawn, problems = _check_rendering(names, has_gpu=bool(gpus))
-    findings = [*check_versions(*_versions()), *_check_machine(free_ram, free_disk, gpus), *problems]
+    findings = [
+        *check_versions(installed, requirements),
+        *_check_machine(free_ram, free_disk, gpus),
+        *problems,
+    ]
     findings.sort(key=lambda finding: ("error", "warning", "note").index(finding.severity))
     return DoctorReport((*facts, *drawn), tuple(findings))
 
@@ -107,16 +115,14 @@ def check_versions(installed: Mapping[str, str], requirements: Iterable[str]) ->
         []
     """
     findings: list[Finding] = []
-    severity: Severity
     for requirement in map(Requirement, requirements):
-        name, wanted = requirement.name.lower(), f'pip install "{requirement.name}{requirement.specifier}"'
+        name, wanted = canonicalize_name(requirement.name), f'pip install "{requirement}"'
         version = installed.get(name)
         if version is None:
             findings.append(Finding("error", f"{name} is not installed.", wanted))
         elif not requirement.specifier.contains(version, prereleases=True):
-            severity, why = (
-                ("error", "is known to break") if name in _BREAKING else ("warning", "is untested")
-            )
+            severity: Severity = "error" if name in _BREAKING else "warning"
+            why = "is known to break" if severity == "error" else "is untested"
             what = f"{name} {version} is outside {requirement.specifier}, which {why}."
             findings.append(Finding(severity, what, wanted))
     if leftovers := [name for name in _LEFTOVERS if name in installed]:
@@ -124,22 +130,6 @@ def check_versions(installed: Mapping[str, str], requirements: Iterable[str]) ->
         remedy = f'pip uninstall -y {" ".join(leftovers)}; pip install --force-reinstall "mujoco>=3.17,<4"'
         findings.append(Finding("warning", what, remedy))
     return findings
-
-
-def _versions() -> tuple[dict[str, str], list[str]]:
-    """Return installed versions, and what the package requires, extras excepted."""
-    try:
-        declared = importlib.metadata.requires("crptpro") or []
-    except importlib.metadata.PackageNotFoundError:
-        declared = []
-    requirements = [text for text in declared if "extra ==" not in text]
-    found = {}
-    for name in {Requirement(text).name.lower() for text in requirements} | set(_LEFTOVERS):
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-    return found, requirements
 
 
 def _check_machine(free_ram: int, free_disk: int, gpus: Sequence[str]) -> list[Finding]:

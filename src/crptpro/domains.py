@@ -121,19 +121,10 @@ SUITE_TASKS: dict[str, tuple[str, ...]] = {
 
 #: Manipulation tasks that have a camera observation.
 MANIPULATION_TASKS = (
-    "stack_2_bricks",
-    "stack_2_bricks_moveable_base",
-    "stack_3_bricks",
-    "stack_2_of_3_bricks_random_order",
-    "reassemble_3_bricks_fixed_order",
-    "reassemble_5_bricks_random_order",
-    "lift_brick",
-    "lift_large_box",
-    "place_brick",
-    "place_cradle",
-    "reach_duplo",
-    "reach_site",
-)
+    "stack_2_bricks", "stack_2_bricks_moveable_base", "stack_3_bricks", "stack_2_of_3_bricks_random_order",
+    "reassemble_3_bricks_fixed_order", "reassemble_5_bricks_random_order", "lift_brick", "lift_large_box",
+    "place_brick", "place_cradle", "reach_duplo", "reach_site",
+)  # fmt: skip
 
 Named = TypeVar("Named", str, str | Domain)
 

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from crptpro.domains import GYMNASIUM_PREFIX, Domain, get_domain
-from crptpro.errors import RenderingError, UnknownNameError
-
-if TYPE_CHECKING:
-    import dm_env
+from crptpro.errors import UnknownNameError
 
 JointKind = Literal["free", "ball", "slide", "hinge", "turning"]
 
@@ -37,7 +33,7 @@ def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
         ``None`` where they are not known: worlds of your own, and those without a MuJoCo model.
 
     Raises:
-        RenderingError: for the manipulation tasks, which cannot be loaded where nothing renders.
+        RenderingError: dm_control's worlds cannot be loaded where nothing renders.
     """
     try:
         domain = get_domain(domain)
@@ -45,7 +41,11 @@ def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
         return None
     env: Any
     if domain.source in ("suite", "manipulation"):
-        env = _load_without_rendering(domain)
+        from crptpro.envs.dm_control import load_dm_env
+        from crptpro.envs.rendering import select_backend
+
+        select_backend()  # importing dm_control fixes it
+        env = load_dm_env(domain)
         model = env.physics.model.ptr
     elif domain.source == "gymnasium":
         import gymnasium
@@ -58,25 +58,6 @@ def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
         return None if model is None else _joints(model)
     finally:
         env.close()
-
-
-def _load_without_rendering(domain: Domain) -> dm_env.Environment:
-    from crptpro.envs.dm_control import load_dm_env
-    from crptpro.envs.rendering import select_backend
-
-    try:
-        select_backend()  # importing dm_control fixes it
-    except RenderingError:
-        if domain.source != "suite":
-            raise
-        before = os.environ.get("MUJOCO_GL")
-        os.environ["MUJOCO_GL"] = "disable"
-        try:
-            return load_dm_env(domain)
-        finally:
-            del os.environ["MUJOCO_GL"]
-            os.environ.update({} if before is None else {"MUJOCO_GL": before})
-    return load_dm_env(domain)
 
 
 def _joints(model: Any) -> tuple[Joint, ...]:

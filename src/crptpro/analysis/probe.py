@@ -31,20 +31,16 @@ class ProbeSamples:
 
     Attributes:
         pixels: uint8 ``[N, C, H, W]``.
-        positions: float64 ``[N, P]``.
-        velocities: float64 ``[N, V]``.
-        position_names: P names.
-        velocity_names: V names.
+        targets: float64 ``[N, T]``, positions and velocities.
+        names: of the targets, each ``"position"`` or ``"velocity"`` and the coordinate, for two may share its name.
         train: int64, rows to fit; likewise ``validation`` (to choose the penalty) and ``test`` (to judge). No episode
             contributes to two of them.
         held_out_episodes: how many episodes ``test`` comes from.
     """
 
     pixels: Tensor
-    positions: Tensor
-    velocities: Tensor
-    position_names: list[str]
-    velocity_names: list[str]
+    targets: Tensor
+    names: list[tuple[str, str]]
     train: Tensor
     validation: Tensor
     test: Tensor
@@ -124,13 +120,16 @@ def probe_samples(
         joints = joints_of(dataset.card.get("task", dataset.domain))
     position_names, positions = position_coordinates(state["qpos"], joints)
     velocity_names, velocities = velocity_coordinates(state["qvel"], joints)
+    names = [
+        *(("position", name) for name in position_names),
+        *(("velocity", name) for name in velocity_names),
+    ]
     rows = stack_rows(row, step, frame_stack or dataset.frame_stack)
     wanted = colors or dataset.card.get("colors", "normal")
     frames = redraw(dataset, rows.reshape(-1), colors=wanted, drawn=drawn)
     pixels = frames.reshape(len(rows), -1, *frames.shape[-2:])
-    return ProbeSamples(
-        pixels, positions, velocities, position_names, velocity_names, train, validation, test, held_out
-    )
+    targets = torch.cat([positions, velocities], 1)
+    return ProbeSamples(pixels, targets, names, train, validation, test, held_out)
 
 
 def probe_frame_rows(
@@ -181,12 +180,7 @@ def probe_embeddings(samples: ProbeSamples, embeddings: Tensor) -> ProbeResult:
 
     train, validation, test = (part.numpy() for part in (samples.train, samples.validation, samples.test))
     fitted = np.concatenate([train, validation])
-    targets = torch.cat([samples.positions, samples.velocities], 1).double().numpy()
-    # A velocity may have the name of its position.
-    names = [
-        *(("position", name) for name in samples.position_names),
-        *(("velocity", name) for name in samples.velocity_names),
-    ]
+    targets, names = samples.targets.numpy(), samples.names
     spread = np.stack([targets[part].std(0, ddof=1) for part in (train, fitted, test)]).min(0)
     varies = (spread > LEAST_SPREAD).nonzero()[0]
     targets = targets[:, varies]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import gymnasium
@@ -101,20 +102,17 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
         return observed
 
     def _draw(self) -> Tensor:
-        if self._has_drawn:
-            viewer = getattr(getattr(self.env.unwrapped, "mujoco_renderer", None), "viewer", None)
-            with (
-                passed_on(self._world, "render"),
-                own_context(getattr(viewer, "make_context_current", None)),
-            ):
+        viewer = getattr(getattr(self.env.unwrapped, "mujoco_renderer", None), "viewer", None)
+        with (
+            passed_on(self._world, "render"),
+            nullcontext() if self._has_drawn else first_frame_watchdog(),
+            own_context(getattr(viewer, "make_context_current", None)),
+        ):
+            try:
                 image = self.env.render()
-        else:
-            with first_frame_watchdog(), passed_on(self._world, "render"):
-                try:
-                    image = self.env.render()
-                except (ImportError, gymnasium.error.Error) as reason:
-                    raise RenderingError(f"{self._world} does not render: {reason}") from reason
-            self._has_drawn = True
+            except (ImportError, gymnasium.error.Error) as reason:
+                raise RenderingError(f"{self._world} does not render: {reason}") from reason
+        self._has_drawn = True
         return resize(self._read_frame(image), self._image_size)
 
 
