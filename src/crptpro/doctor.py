@@ -92,7 +92,9 @@ def run_doctor(domains: Iterable[str] | None = None) -> DoctorReport:
         f"  disk  {free_disk / _GB:.1f} GB free at {here}",
         "",
     ]
-    installed = {canonicalize_name(each.name): each.version for each in importlib.metadata.distributions()}
+    installed: dict[str, str] = {
+        canonicalize_name(each.name): each.version for each in importlib.metadata.distributions()
+    }
     declared = importlib.metadata.requires("crptpro") if "crptpro" in installed else None
     requirements = [text for text in declared or () if "extra ==" not in text]
     drawn, problems = _check_rendering(names, has_gpu=bool(gpus))
