@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import time
 from pathlib import Path
 
 import torch
@@ -23,8 +22,7 @@ def make_task(task: Domain, name: str, **settings: object) -> object:
     return make_env(task, **settings)
 
 
-def test_collect_pretrain_freeze_and_learn_in_under_twenty_seconds(tmp_path: Path) -> None:
-    started = time.monotonic()
+def test_collect_pretrain_freeze_and_learn(tmp_path: Path) -> None:
     paths = collect_group(
         [FIXED, VARIABLE], tmp_path / "data", transitions=100, image_size=12, progress=False
     )
@@ -50,4 +48,3 @@ def test_collect_pretrain_freeze_and_learn_in_under_twenty_seconds(tmp_path: Pat
         assert torch.equal(agent.encoder.state_dict()[key], value), key
     episodes = evaluate(agent, make_env(FIXED, seed=0, image_size=12), episodes=2, progress=False)
     assert [episode.agent_steps for episode in episodes] == [10, 10]
-    assert time.monotonic() - started < 20

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -34,28 +35,25 @@ def fails(error: BaseException) -> Callable[[], None]:
     return main
 
 
-@pytest.mark.parametrize("error", [CRPTproError("no such thing"), DatasetError("no such thing")])
-def test_an_expected_error_is_one_line_and_exit_status_1(
-    error: CRPTproError, capsys: pytest.CaptureFixture[str]
-) -> None:
+def stopped_by(main: Callable[[], object]) -> Any:
     with pytest.raises(SystemExit) as stopped:
-        run_main(fails(error))
-    assert stopped.value.code == 1
-    assert capsys.readouterr() == ("", "error: no such thing\n")
+        run_main(main)
     assert stopped.value.__suppress_context__  # nothing is printed below it
+    return stopped.value.code
 
 
-def test_a_setting_that_the_library_refuses_is_one_line_too(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stopped:
-        run_main(lambda: DownstreamConfig(batch_size=0))
-    assert stopped.value.code == 1
-    assert capsys.readouterr().err == "error: `batch_size` must be at least 1, got 0.\n"
-
-
-def test_a_file_that_cannot_be_opened_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        run_main((tmp_path / "absent").read_text)
-    assert str(tmp_path / "absent") in capsys.readouterr().err
+@pytest.mark.parametrize(("main", "status", "line"), [
+    (fails(CRPTproError("no such thing")), 1, "error: no such thing"),
+    (fails(DatasetError("no such thing")), 1, "error: no such thing"),
+    (lambda: DownstreamConfig(batch_size=0), 1, "error: `batch_size` must be at least 1, got 0."),
+    (Path("/absent/file").read_text, 1, "error: [Errno 2] No such file or directory: '/absent/file'"),
+    (fails(KeyboardInterrupt()), 130, "interrupted; the same command continues from the last checkpoint."),
+])  # fmt: skip
+def test_an_expected_error_is_one_line_and_an_exit_status(
+    main: Callable[[], object], status: int, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert stopped_by(main) == status
+    assert capsys.readouterr() == ("", f"{line}\n")
 
 
 def test_a_full_disk_is_no_defect_though_the_system_names_no_file(capsys: pytest.CaptureFixture[str]) -> None:
@@ -63,9 +61,7 @@ def test_a_full_disk_is_no_defect_though_the_system_names_no_file(capsys: pytest
         with open("/dev/full", "w") as file:
             file.write("x")
 
-    with pytest.raises(SystemExit) as stopped:
-        run_main(main)
-    assert stopped.value.code == 1
+    assert stopped_by(main) == 1
     assert capsys.readouterr().err == "error: [Errno 28] No space left on device\n"
     with pytest.raises(OSError, match="Input/output error"):  # anything else may be one
         run_main(fails(OSError(errno.EIO, os.strerror(errno.EIO))))
@@ -80,13 +76,6 @@ def test_a_full_disk_is_no_defect_though_the_system_names_no_file(capsys: pytest
 def test_a_defect_keeps_its_traceback(main: Callable[[], object]) -> None:
     with pytest.raises((KeyError, ValueError, RuntimeError)):
         run_main(main)
-
-
-def test_an_interrupt_exits_with_130_and_says_how_to_go_on(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stopped:
-        run_main(fails(KeyboardInterrupt()))
-    assert stopped.value.code == 130
-    assert capsys.readouterr().err == "interrupted; the same command continues from the last checkpoint.\n"
 
 
 def test_events_are_plain_lines_and_warnings_are_marked(capsys: pytest.CaptureFixture[str]) -> None:

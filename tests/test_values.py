@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from crptpro.values import as_float, as_int, as_path
+from crptpro.values import as_float, as_int, as_path, check_numbers
 
 
 @pytest.mark.parametrize(
@@ -34,11 +35,28 @@ def test_what_is_no_finite_number_is_refused_with_its_name_and_value(value: Any)
         as_float(value, "rate")
 
 
-def test_a_number_outside_its_range_is_refused() -> None:
-    with pytest.raises(ValueError, match="`seed` must be at least 0, got -1"):
-        as_int(-1, "seed", minimum=0)
-    with pytest.raises(ValueError, match=r"`tau` must be at most 1, got 1\.5"):
-        as_float(1.5, "tau", maximum=1)
+@dataclass(frozen=True)
+class Stage:
+    updates: Any = None
+    tau: Any = None
+    seed: Any = 0
+
+    def __post_init__(self) -> None:
+        check_numbers(self, counts={"updates": 1}, rates={"tau": 1})
+
+
+def test_numbers_of_a_stage_are_plain_and_in_their_range_or_left_open() -> None:
+    assert repr(Stage(np.int64(3), torch.tensor(0.5), 7.0)) == "Stage(updates=3, tau=0.5, seed=7)"
+    assert Stage() == Stage(None, None, 0)
+    for wrong, message in (
+        ({"updates": 0}, "`updates` must be at least 1, got 0"),
+        ({"tau": 1.5}, r"`tau` must be at most 1, got 1\.5"),
+        ({"tau": -1}, "`tau` must be at least 0, got -1"),
+        ({"seed": -1}, "`seed` must be at least 0, got -1"),
+        ({"seed": 2**32}, "`seed` must be at most"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Stage(**wrong)
 
 
 def test_a_path_is_expanded_and_one_that_no_record_can_hold_is_refused() -> None:

@@ -25,12 +25,10 @@ class _BarFriendlyHandler(logging.Handler):
 
 def configure_logging(level: int = logging.INFO) -> None:
     """Show the library's log lines on standard error; other packages' from warnings upwards."""
-    handler = _BarFriendlyHandler()
     root = logging.getLogger("crptpro")
-    root.handlers[:] = [handler]
+    root.handlers[:] = [_BarFriendlyHandler()]
     root.setLevel(level)
     root.propagate = False
-    # absl and TorchRL announce things no user can act on at INFO.
     logging.getLogger("absl").setLevel(logging.ERROR)
 
 
@@ -38,31 +36,28 @@ def run_main(main: Callable[[], object]) -> None:
     """Run a program: expected errors become one line and exit status 1, Ctrl-C exits with 130.
 
     Expected are this library's own errors, a setting it refuses, and a file that cannot be read or written. Anything
-    else is a defect and keeps its traceback. What a terminal cannot show is printed as escapes, and a reader that has
-    seen enough (``| head``) ends the program quietly, with the status of SIGPIPE.
+    else is a defect and keeps its traceback. Characters that the terminal cannot show are printed as escapes, and a
+    closed pipe (``| head``) ends the program quietly, with the status of SIGPIPE.
     """
-    for stream in (sys.stdout, sys.stderr):  # a terminal without UTF-8 gets "?" for what it cannot show
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
-    configure_logging()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    configure_logging()
     try:
         try:
             main()
         finally:
             if sys.stdout is not None:
-                sys.stdout.flush()  # not at exit, where nobody could catch what comes of it
+                sys.stdout.flush()  # at the interpreter's exit nobody could catch a broken pipe
     except BrokenPipeError:
-        unread = [stream for stream in (sys.stdout, sys.stderr) if _is_unread(stream)]
-        if not unread:
+        closed = [stream for stream in (sys.stdout, sys.stderr) if _is_closed_pipe(stream)]
+        if not closed:
             raise
-        for stream in unread:  # what is still in its buffer goes nowhere
+        for stream in closed:  # discards what is still buffered
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         raise SystemExit(128 + 13) from None
     except (CRPTproError, ValueError, OSError) as error:
-        if not is_expected(error):
+        if not _is_expected(error):
             raise
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from None
@@ -71,8 +66,7 @@ def run_main(main: Callable[[], object]) -> None:
         raise SystemExit(130) from None
 
 
-def _is_unread(stream: TextIO) -> bool:
-    """Whether a stream is a pipe that nobody reads any more."""
+def _is_closed_pipe(stream: TextIO) -> bool:
     try:
         poll = select.poll()
         poll.register(stream.fileno(), 0)
@@ -81,12 +75,11 @@ def _is_unread(stream: TextIO) -> bool:
     return bool(poll.poll(0))
 
 
-def is_expected(error: BaseException) -> bool:
+def _is_expected(error: BaseException) -> bool:
     """Whether an error is one that a user can act on, not a defect."""
     if isinstance(error, CRPTproError):
         return True
     if isinstance(error, OSError):
-        # The message names the file; of one that it has open, the system tells only that the disk is full.
         return error.filename is not None or is_disk_full(error)
     # A ValueError that this library's own code raised names a setting; one from below is a defect.
     origin = error.__traceback__

@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import difflib
-import functools
-import logging
-import os
-import pickle
-import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.values import as_int
@@ -18,10 +13,7 @@ from crptpro.values import as_int
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
-logger = logging.getLogger(__name__)
-
 GYMNASIUM_PREFIX = "gymnasium:"
-
 
 LONGEST_EPISODE_AGENT_STEPS = 1000
 """Where an episode is truncated whose world sets no limit of its own (LQR): one of 100,000 transitions would not fit in
@@ -35,27 +27,22 @@ class Domain:
     The paper pre-trains on domains and evaluates on tasks; tasks of one domain share their pixels.
 
     Args:
-        name: Name of the domain, and of its dataset directory.
-        task: Task used for collection, a name that :func:`crptpro.envs.make_env` understands.
-        action_repeat: Default number of env steps per agent step.
-        camera: Camera index or name that is rendered by default; ``None`` leaves it to the environment.
-        make: For a world of your own: a callable that is given, by keyword, those of ``seed`` (int),
-            ``image_size`` (int, pixels), ``action_repeat`` (int), ``camera``, ``quality`` and
-            ``physics_state`` (bool) that its signature names, and returns an unbatched TorchRL
-            environment on CPU whose ``pixels`` are one RGB image ``[H, W, 3]`` or ``[3, H, W]``, uint8 or floats in
-            [0, 1], with ``H = W = image_size``, whose ``action`` is continuous in [-1, 1], and whose reward has shape
-            ``[1]``. An environment whose ``done_spec`` has no ``truncated`` is taken to end episodes by
-            termination alone. It repeats the action
-            itself if it names ``action_repeat``; otherwise an agent step is one env step. Frame stacking and the
-            choice of dtypes are done by ``make_env``. With ``physics_state`` it may also emit ``qpos`` and
+        name: of the domain, and of its dataset directory.
+        task: used for collection, a name that :func:`crptpro.envs.make_env` understands.
+        action_repeat: default number of env steps per agent step.
+        camera: index or name of the camera that is rendered by default; ``None`` leaves it to the environment.
+        make: for a world of your own: builds an unbatched TorchRL environment on the CPU. It is given, by keyword,
+            those of ``seed``, ``image_size``, ``action_repeat``, ``camera``, ``quality`` and ``physics_state`` that its
+            signature names. ``pixels`` is one RGB image ``[H, W, 3]`` or ``[3, H, W]`` with ``H = W = image_size``,
+            uint8 or floats in [0, 1]; ``action`` is a float vector in [-1, 1]; the reward has shape ``[1]``. Without
+            ``truncated`` in its ``done_spec``, episodes end by termination alone. If it does not name
+            ``action_repeat``, an agent step is one env step. With ``physics_state`` it may also emit ``qpos`` and
             ``qvel``; what its own transforms read back (``step_count``) stays, other entries are dropped. Its
-            ``set_seed`` must make the next ``reset`` reproducible.
-            To be built in worker processes it must be a function at a module's top level, or a
-            ``functools.partial`` of one: they receive the ``Domain`` by pickling and import ``make`` by its module's
-            name (:func:`worker_obstacle`).
-        episode_env_steps: Env steps of a full episode, ``None`` if unknown or unlimited; such an episode is
-            truncated after 1000 agent steps.
-        source: What ``task`` is loaded with; ``"own"`` goes with ``make``.
+            ``set_seed`` must make the next ``reset`` reproducible. Worker processes can build it if it is a function at
+            a module's top level or a ``functools.partial`` of one.
+        episode_env_steps: env steps of a full episode; if ``None``, unknown or unlimited, an episode is truncated after
+            1000 agent steps.
+        source: library that ``task`` is loaded with; ``"own"`` goes with ``make``.
     """
 
     name: str
@@ -134,38 +121,41 @@ SUITE_TASKS: dict[str, tuple[str, ...]] = {
 
 #: Manipulation tasks that have a camera observation.
 MANIPULATION_TASKS = (
-    "stack_2_bricks",
-    "stack_2_bricks_moveable_base",
-    "stack_3_bricks",
-    "stack_2_of_3_bricks_random_order",
-    "reassemble_3_bricks_fixed_order",
-    "reassemble_5_bricks_random_order",
-    "lift_brick",
-    "lift_large_box",
-    "place_brick",
-    "place_cradle",
-    "reach_duplo",
-    "reach_site",
-)
+    "stack_2_bricks", "stack_2_bricks_moveable_base", "stack_3_bricks", "stack_2_of_3_bricks_random_order",
+    "reassemble_3_bricks_fixed_order", "reassemble_5_bricks_random_order", "lift_brick", "lift_large_box",
+    "place_brick", "place_cradle", "reach_duplo", "reach_site",
+)  # fmt: skip
 
 Named = TypeVar("Named", str, str | Domain)
 
-_MANIPULATION_PREFIXES = ("manipulation_", "manip_")
+
+def _built_in() -> dict[str, Domain]:
+    found: dict[str, Domain] = {}
+    for name, tasks in SUITE_TASKS.items():
+        # Every task of the suite is limited to 1000 control steps, except LQR's, which have no time limit.
+        limit = None if name == "lqr" else 1000
+        domain = PAPER_DOMAINS.get(name) or Domain(name, tasks[0], episode_env_steps=limit, source="suite")
+        found[name] = domain
+        found |= {task: replace(domain, task=task) for task in tasks}
+    found |= {task: replace(PAPER_DOMAINS["manipulation"], task=task) for task in MANIPULATION_TASKS}
+    return found | PAPER_DOMAINS
+
+
+_BUILT_IN = _built_in()
 _registered: dict[str, Domain] = {}
 
 
 def register_domain(domain: Domain) -> Domain:
-    """Make a domain known by its name and by its task's name, in this process; returns it.
+    """Register a domain under its name and its task's name, in this process; returns it.
 
     Further tasks of a domain are registered under its name with their own ``task``: all stay known, and the domain's
-    name stands for the one registered last. A task that is registered again takes the place of the former.
+    name stands for the one registered last.
 
-    A spawned worker process starts with an empty registry. Either pass the ``Domain`` itself where a name is
-    accepted (it is pickled with the job), or call ``register_domain`` at the top level of the module that
-    defines ``make``: unpickling ``make`` imports that module, which registers the domain again.
+    A worker process starts without registered domains. Pass the ``Domain`` itself where a name is accepted, or call
+    ``register_domain`` at the top level of the module that defines ``make``, which unpickling imports.
 
     Raises:
-        CRPTproError: if the domain has no ``make``, or its name belongs to the paper's domains or tasks.
+        CRPTproError: the domain has no ``make``, or its name belongs to the paper's domains or tasks.
     """
     if domain.make is None and domain.source == "own":
         raise CRPTproError(
@@ -176,45 +166,16 @@ def register_domain(domain: Domain) -> Domain:
             raise CRPTproError(
                 f"{name!r} is one of the built-in names; register the domain under another one."
             )
-    if obstacle := worker_obstacle(domain):
-        logger.warning("Domain %r cannot be built in worker processes: %s", domain.name, obstacle)
     for key in (domain.task, domain.name):
         _registered[key] = domain
     return domain
-
-
-def worker_obstacle(domain: str | Domain) -> str | None:
-    """Return why another process could not build a domain's world, and what to do; ``None`` if it could.
-
-    A worker process imports the code of a world by its module's name. A notebook cell and an interactive session have
-    no module that could be imported, whether or not a script guards its ``__main__``.
-    """
-    domain = get_domain(domain)
-    builder: Any = domain.make
-    if domain.source == "gymnasium":
-        import gymnasium
-
-        builder = gymnasium.spec(domain.task.removeprefix(GYMNASIUM_PREFIX)).entry_point
-    while isinstance(builder, functools.partial):
-        builder = builder.func
-    name, home = getattr(builder, "__qualname__", builder), getattr(builder, "__module__", None)
-    remedy = (
-        "Put it at the top level of a file of its own, and import it from there; or collect with one process."
-    )
-    if home == "__main__" and not os.path.isfile(getattr(sys.modules["__main__"], "__file__", None) or ""):
-        return f"{name} is defined in a notebook or an interactive session, which no other process can import. {remedy}"
-    try:
-        pickle.dumps(domain)
-    except Exception as reason:
-        return f"it cannot be pickled ({reason}). {remedy}"
-    return None
 
 
 def get_domain(name: str | Domain) -> Domain:
     """Return the domain behind a domain name, a task name, ``gymnasium:<id>`` or a registered name.
 
     A task's name gives its domain with that task in ``Domain.task``; a ``Domain`` is returned as it is.
-    dm_control is not imported, so that the render backend can still be chosen afterwards.
+    dm_control is not imported, so that the render backend can still be chosen.
 
     Raises:
         UnknownNameError: with the nearest known names.
@@ -229,25 +190,19 @@ def get_domain(name: str | Domain) -> Domain:
     """
     if isinstance(name, Domain):
         return name
-    if name in _registered:
-        return _registered[name]
-    if name in PAPER_DOMAINS:
-        return PAPER_DOMAINS[name]
-    if name in TASKS:
-        return PAPER_DOMAINS[TASKS[name]]
+    if found := _registered.get(name) or _BUILT_IN.get(name):
+        return found
     if name.startswith(GYMNASIUM_PREFIX):
         return _gymnasium_domain(name)
-    bare = _without_manipulation_prefix(name)
-    if bare in TASKS:
-        return PAPER_DOMAINS[TASKS[bare]]
+    bare = name.removeprefix("manipulation_").removeprefix("manip_").removesuffix("_vision")
     if bare in MANIPULATION_TASKS:
-        return replace(PAPER_DOMAINS["manipulation"], task=bare)
-    for domain_name, tasks in SUITE_TASKS.items():
-        if name == domain_name:
-            return _suite_domain(domain_name, tasks[0])
-        if name in tasks:
-            return _suite_domain(domain_name, name)
-    raise UnknownNameError(_unknown(name))
+        return _BUILT_IN[bare]
+    near = difflib.get_close_matches(name.lower().replace("-", "_"), known_names(), n=5, cutoff=0.5)
+    hint = f"Nearest: {', '.join(near)}." if near else f"Domains: {', '.join(PAPER_DOMAINS)}."
+    raise UnknownNameError(
+        f"There is no domain or task {name!r}. {hint} Gymnasium environments are written gymnasium:<id>; "
+        "your own are made known with register_domain."
+    )
 
 
 def expand_groups(names: Iterable[Named]) -> list[Named]:
@@ -275,15 +230,7 @@ def expand_groups(names: Iterable[Named]) -> list[Named]:
 
 def known_names() -> list[str]:
     """Return every name :func:`get_domain` accepts, ``gymnasium:<id>`` and prefixed aliases excepted."""
-    suite = {task for tasks in SUITE_TASKS.values() for task in tasks}
-    return sorted({*PAPER_DOMAINS, *SUITE_TASKS, *suite, *MANIPULATION_TASKS, *_registered})
-
-
-def _suite_domain(domain_name: str, task: str) -> Domain:
-    if domain_name in PAPER_DOMAINS:
-        return replace(PAPER_DOMAINS[domain_name], task=task)
-    # Every task of the suite is limited to 1000 control steps, except LQR's, which have no time limit.
-    return Domain(domain_name, task, episode_env_steps=None if domain_name == "lqr" else 1000, source="suite")
+    return sorted({*_BUILT_IN, *_registered})
 
 
 def _gymnasium_domain(name: str) -> Domain:
@@ -297,19 +244,3 @@ def _gymnasium_domain(name: str) -> Domain:
         hint = f" Nearest: {', '.join(GYMNASIUM_PREFIX + n for n in near)}." if near else ""
         raise UnknownNameError(f"Gymnasium has no environment {env_id!r}.{hint}") from None
     return Domain(name, name, camera=None, episode_env_steps=spec.max_episode_steps, source="gymnasium")
-
-
-def _without_manipulation_prefix(name: str) -> str:
-    for prefix in _MANIPULATION_PREFIXES:
-        if name.startswith(prefix):
-            name = name[len(prefix) :]
-    return name.removesuffix("_vision")
-
-
-def _unknown(name: str) -> str:
-    near = difflib.get_close_matches(name.lower().replace("-", "_"), known_names(), n=5, cutoff=0.5)
-    hint = f" Nearest: {', '.join(near)}." if near else f" Domains: {', '.join(PAPER_DOMAINS)}."
-    return (
-        f"There is no domain or task {name!r}.{hint} Gymnasium environments are written gymnasium:<id>; "
-        "your own are made known with register_domain."
-    )

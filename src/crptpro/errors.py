@@ -15,22 +15,22 @@ class UnknownNameError(CRPTproError):
 
 
 class RenderingError(CRPTproError):
-    """No GL backend renders a live frame, or the first frame did not arrive in time."""
+    """No GL backend renders, or the first frame did not arrive in time."""
 
 
 class WorldError(CRPTproError):
-    """A world showed or answered what no world may; the message names it."""
+    """A world returned an image or a step that cannot be used; the message names it."""
 
 
 class WorldFailedError(RuntimeError):
-    """A world's own code raised an exception: the message is its own, with the name of the world and the call.
+    """A world's own code raised an exception; the message adds the world's name and the call.
 
-    It is a defect of the world, not a setting that could be mended, and keeps its traceback on the command line.
+    It is a defect of the world, not a wrong setting, and keeps its traceback on the command line.
     """
 
 
 class WorkerLostError(CRPTproError):
-    """A process that collects or evaluates ended without an error message; usually it was killed for lack of memory."""
+    """A worker process ended without an error message; usually it was killed for lack of memory."""
 
 
 class DatasetError(CRPTproError):
@@ -38,7 +38,7 @@ class DatasetError(CRPTproError):
 
 
 class DiskSpaceError(CRPTproError):
-    """A write was announced that the disk cannot hold."""
+    """The disk is full, or cannot hold what is about to be written."""
 
 
 class CheckpointError(CRPTproError):
@@ -54,31 +54,15 @@ class RecordError(CRPTproError):
 
 
 class NonFiniteError(CRPTproError):
-    """A loss, a gradient, or what a world answered became NaN or infinite."""
+    """A loss, a gradient, a weight, or a value returned by a world became NaN or infinite."""
 
 
 class SubmissionError(CRPTproError):
-    """A cluster's queue refused a job, which it may take another time."""
+    """A cluster's queue refused a job; submitting it later may work."""
 
 
 class CompileError(CRPTproError):
-    """``torch.compile`` was asked for and does not work on this machine, or not for this loss."""
-
-
-def error_name(reason: BaseException) -> str:
-    """Return the name under which another process can raise this error again; empty if it is not one of ours."""
-    return type(reason).__name__ if isinstance(reason, CRPTproError) else ""
-
-
-def error_named(name: str, message: str) -> CRPTproError | None:
-    """Rebuild an error that another process named by :func:`error_name`; ``None`` if it was not one of ours.
-
-    Examples:
-        >>> error_named(error_name(DatasetError("gone")), "gone")
-        DatasetError('gone')
-    """
-    known = globals().get(name)
-    return known(message) if isinstance(known, type) and issubclass(known, CRPTproError) else None
+    """``torch.compile`` was requested and does not work on this machine or for this loss."""
 
 
 def is_disk_full(reason: BaseException) -> bool:
@@ -89,13 +73,9 @@ def is_disk_full(reason: BaseException) -> bool:
 
 
 def writing_error(path: Path, reason: OSError | DiskSpaceError) -> OSError | DiskSpaceError:
-    """Return the error to raise when ``path`` could not be written: it names the path.
+    """Return the error to raise when ``path`` could not be written, which names the path.
 
-    The system names a file that it cannot open; of one that is open it says no more than what went wrong.
-
-    Args:
-        path: what the caller knows it as; a temporary file beside it may be what was being written.
-        reason: why it could not.
+    The system names a file that it cannot open, but not one that is open.
     """
     if is_disk_full(reason):
         return DiskSpaceError(f"The disk is full: {path} cannot be written. Free space and start again.")

@@ -1,4 +1,4 @@
-"""Modules of the user's own, run before anything else, so that what they register has names in this process."""
+"""Modules of the user's own, imported first, so that the domains and methods they register are known."""
 
 from __future__ import annotations
 
@@ -21,14 +21,13 @@ def load_plugin(name: str) -> None:
         name: of an installed module or one in the working directory, or a path that ends in ``.py``.
 
     Raises:
-        CRPTproError: there is none of this name, it cannot be imported, or the file has another module's name.
+        CRPTproError: it does not exist, cannot be imported, or the file has another module's name.
     """
     path = Path(name)
     is_file = path.suffix == ".py"
     if is_file and not path.is_file():
         raise CRPTproError(f"{FLAG} {name}: there is no such file.")
-    # An installed command does not look where it is called. Last on the path: nothing installed is hidden. Processes
-    # that the command starts have the same path and find the module by its name.
+    # Last on the path, so that it hides nothing that is installed.
     folder = str(path.resolve().parent if is_file else Path.cwd())
     if folder not in sys.path:
         sys.path.append(folder)
@@ -50,16 +49,10 @@ def load_plugin(name: str) -> None:
 
 
 def load_plugins(arguments: Sequence[str]) -> list[str]:
-    """Import every module that ``--plugin`` names, anywhere on a command line.
-
-    Args:
-        arguments: of the command.
-
-    Returns:
-        The other arguments.
+    """Import every module that ``--plugin`` names, anywhere on a command line, and return the other arguments.
 
     Raises:
-        CRPTproError: nothing is named, or as of :func:`load_plugin`.
+        CRPTproError: nothing is named, or as :func:`load_plugin`.
     """
     rest: list[str] = []
     words = iter(arguments)
@@ -76,15 +69,11 @@ def load_plugins(arguments: Sequence[str]) -> list[str]:
 
 
 def load_again(names: Iterable[str]) -> None:
-    """Load what another process had loaded (:func:`loaded_plugins`) before it started this one.
-
-    Raises:
-        CRPTproError: as of :func:`load_plugin`.
-    """
+    """Load in a worker process the plugins (:func:`loaded_plugins`) of the process that started it."""
     for name in names:
         load_plugin(name)
 
 
 def loaded_plugins() -> tuple[str, ...]:
-    """Return what :func:`load_plugin` has loaded in this process, files by their absolute paths."""
+    """Return the plugins of this process, files by their absolute paths."""
     return tuple(_loaded)

@@ -17,8 +17,8 @@ PACKAGES = (
     "crptpro", "torch", "torchrl", "tensordict", "dm-control", "mujoco", "gymnasium", "numpy", "wandb",
 )  # fmt: skip
 
-#: How the name of a GPU begins that torch sees and cannot use.
 UNUSABLE = "unusable"
+"""How the name of a GPU begins that torch sees and cannot use."""
 
 
 @cache
@@ -38,32 +38,24 @@ def hardware() -> dict[str, Any]:
     """Return what decides how long work takes here.
 
     Returns:
-        ``cpu``, the model; ``cpu_instructions``, see :func:`cpu_instructions`; ``cpu_cores``, that this process may
-        use; ``ram_bytes``; ``gpus``, the names torch sees (or why it cannot use one).
+        ``cpu``, the model; ``cpu_instructions``, that torch uses, e.g. ``"AVX512, AVX512-BF16"``
+        (in virtual machines two processors of one model may differ threefold in speed); ``cpu_cores``, that this
+        process may use; ``ram_bytes``; ``gpus``, the names torch sees (or why it cannot use one).
     """
     cpu = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
         cpu = names[0].split(":", 1)[1].strip() if names else cpu
+    probes = {"_is_avx512_bf16_supported": "AVX512-BF16", "_is_amx_tile_supported": "AMX"}
+    present = [name for probe, name in probes.items() if getattr(torch.cpu, probe, lambda: False)()]
     return {
         "cpu": cpu,
-        "cpu_instructions": cpu_instructions(),
+        "cpu_instructions": ", ".join([torch.backends.cpu.get_cpu_capability(), *present]),
         "cpu_cores": cpu_cores(),
         "ram_bytes": psutil.virtual_memory().total,
         "gpus": [_gpu_name(index) for index in range(torch.cuda.device_count())],
     }
-
-
-def cpu_instructions() -> str:
-    """Return the vector instructions that torch computes with, e.g. ``"AVX512, AVX512-BF16"``.
-
-    Virtual machines hide the model: two of one name may differ threefold in speed, and one of them multiply no
-    bfloat16.
-    """
-    probes = {"_is_avx512_bf16_supported": "AVX512-BF16", "_is_amx_tile_supported": "AMX"}
-    there = [name for probe, name in probes.items() if getattr(torch.cpu, probe, lambda: False)()]
-    return ", ".join([torch.backends.cpu.get_cpu_capability(), *there])
 
 
 def cpu_cores() -> int:

@@ -1,4 +1,4 @@
-"""Values from users: taken as the plain value they mean, or refused before any work starts."""
+"""Values from users: converted to plain Python values, or refused before any work starts."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import numpy as np
 import torch
 
 Switch = Literal["auto", "on", "off"]
-"""On, off, or left to what pays on this machine."""
 
 Quality = Literal["exact", "fast"]
 """How frames are rendered. ``"fast"`` uses smaller shadow maps: up to twice as fast on software GL, with fewer than 1 %
@@ -30,16 +29,7 @@ COLORS: tuple[str, ...] = get_args(Colors)
 
 
 def as_int(value: Any, name: str, *, minimum: int | None = None, maximum: int | None = None) -> int:
-    """Return a count, size or seed as a plain ``int``.
-
-    NumPy and torch scalars and floats of integer value (``1e5``) are taken as the number they mean, so that cards,
-    checkpoints and file names hold nothing else.
-
-    Args:
-        value: the number.
-        name: of the setting, for the message.
-        minimum: smallest allowed value.
-        maximum: largest allowed value.
+    """Return a count, size or seed as a plain ``int``: of an int, a NumPy or torch scalar, or a float such as ``1e5``.
 
     Raises:
         ValueError: naming the setting, its value and what is allowed.
@@ -66,12 +56,6 @@ def as_int(value: Any, name: str, *, minimum: int | None = None, maximum: int | 
 def as_float(value: Any, name: str, *, minimum: float | None = None, maximum: float | None = None) -> float:
     """Return a coefficient or rate as a plain finite ``float``.
 
-    Args:
-        value: the number.
-        name: of the setting, for the message.
-        minimum: smallest allowed value.
-        maximum: largest allowed value.
-
     Raises:
         ValueError: naming the setting, its value and what is allowed.
 
@@ -93,10 +77,6 @@ def as_float(value: Any, name: str, *, minimum: float | None = None, maximum: fl
 
 def as_path(value: str | os.PathLike[str], name: str = "path") -> Path:
     """Return a path with ``~`` expanded.
-
-    Args:
-        value: as the user wrote it.
-        name: of the setting, for the message.
 
     Raises:
         ValueError: for an empty path, or one whose bytes are not UTF-8 and could not be written into a record.
@@ -120,12 +100,8 @@ def as_plain(value: Any, name: str) -> Any:
 
     NumPy and torch scalars become numbers, arrays and tensors lists, dataclasses dicts, paths and dtypes texts.
 
-    Args:
-        value: the setting.
-        name: of it, for the message.
-
     Raises:
-        ValueError: naming the entry that is nothing of that.
+        ValueError: naming an entry that has no such form.
 
     Examples:
         >>> as_plain({"size": np.int64(84), "out": Path("runs")}, "card")
@@ -154,6 +130,30 @@ def as_plain(value: Any, name: str) -> Any:
     raise ValueError(f"`{name}` is no plain value: {value!r} is a {type(value).__name__}.")
 
 
+def check_numbers(config: Any, *, counts: Mapping[str, int], rates: Mapping[str, float | None]) -> None:
+    """Convert the numbers of a stage's frozen dataclass to plain ones; ``None`` stays ``None``.
+
+    Its ``seed`` may be from 0 to 2**32 - 1.
+
+    Args:
+        config: the dataclass, in its ``__post_init__``.
+        counts: smallest value of each whole number.
+        rates: largest value of each ``float``, ``None`` without a limit; the smallest is 0.
+
+    Raises:
+        ValueError: naming the setting, its value and what is allowed.
+    """
+    values: dict[str, Any] = {"seed": as_int(config.seed, "seed", minimum=0, maximum=2**32 - 1)}
+    for name, minimum in counts.items():
+        if (value := getattr(config, name)) is not None:
+            values[name] = as_int(value, name, minimum=minimum)
+    for name, maximum in rates.items():
+        if (value := getattr(config, name)) is not None:
+            values[name] = as_float(value, name, minimum=0, maximum=maximum)
+    for name, value in values.items():
+        object.__setattr__(config, name, value)
+
+
 def check_switch(name: str, value: str) -> None:
     """Refuse anything but ``"auto"``, ``"on"`` and ``"off"``.
 
@@ -165,7 +165,7 @@ def check_switch(name: str, value: str) -> None:
 
 
 def is_drawn(stored: Colors, wanted: Colors) -> bool:
-    """Whether a picture in the wanted colours must be drawn: it cannot be made of the stored one."""
+    """Whether the wanted colours need a new rendering: reversing whole images does not."""
     return stored != wanted and {stored, wanted} != {"normal", "reversed_image"}
 
 

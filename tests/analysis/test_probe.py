@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 from typing import Any
@@ -62,10 +63,9 @@ def test_what_a_picture_shows_is_found_and_what_only_marks_an_episode_is_not(dat
     assert result.velocity_r2 < 0.1
     mixed = torch.randperm(len(samples.pixels), generator=torch.Generator().manual_seed(0))
     third = len(mixed) // 3
-    leaking = ProbeSamples(
-        samples.pixels, samples.positions, samples.velocities, samples.position_names, samples.velocity_names,
-        mixed[:third], mixed[third : 2 * third], mixed[2 * third :], 0,
-    )  # fmt: skip
+    leaking = dataclasses.replace(
+        samples, train=mixed[:third], validation=mixed[third : 2 * third], test=mixed[2 * third :]
+    )
     assert probe(leaking, Flatten())["features"].velocity_r2 > 0.9
 
 
@@ -79,7 +79,7 @@ def test_samples_are_split_by_episode_and_states_belong_to_the_newest_frame(data
     assert len(episodes[0] | episodes[1] | episodes[2]) == sum(map(len, episodes))
     assert len(episodes[2]) == 3
     newest = samples.pixels[:, -3:, 0, 0].double() / 255
-    torch.testing.assert_close(newest, samples.positions[:, :3], atol=0.002, rtol=0)
+    torch.testing.assert_close(newest, samples.targets[:, :3], atol=0.002, rtol=0)
     rows = probe_frame_rows(dataset, samples=100)  # what a sample reads is known beforehand
     assert (
         dataset.frames_at(rows).unique(dim=0).equal(samples.pixels.reshape(-1, 3, SIZE, SIZE).unique(dim=0))
@@ -91,8 +91,8 @@ def test_the_same_seed_draws_the_same_samples_in_every_colour(dataset: FrameData
     first, again, other = (probe_samples(dataset, samples=50, seed=seed) for seed in (0, 0, 1))
     swapped = probe_samples(dataset, samples=50, colors="reversed_image")
     assert first.pixels.equal(again.pixels)
-    assert not first.positions.equal(other.positions)
-    assert swapped.positions.equal(first.positions)
+    assert not first.targets.equal(other.targets)
+    assert swapped.targets.equal(first.targets)
     assert swapped.test.equal(first.test)
     assert swapped.pixels[:, :3].equal(first.pixels[:, :3].flip(1))
 
@@ -124,24 +124,20 @@ def test_data_that_cannot_be_split_or_have_no_state_are_refused(
         probe_samples(FrameDataset.open(tmp_path / "stateless"))
 
 
-# --- the regression -----------------------------------------------------------------------------------------------
-
 ROWS = torch.arange(240)
 TRAIN, VALIDATION, TEST = ROWS[:120], ROWS[120:160], ROWS[160:]
 FITTED = ROWS[:160]
 
 
 def fit(features: Tensor, targets: Tensor, **parts: Any) -> ProbeResult:
-    names = [f"t{index}" for index in range(targets.shape[1])]
+    names = [("position", f"t{index}") for index in range(targets.shape[1])]
     split = {"train": TRAIN, "validation": VALIDATION, "test": TEST, **parts}
-    nothing = torch.zeros(240, 0)
-    return probe_embeddings(
-        ProbeSamples(torch.zeros(240), targets.double(), nothing, names, [], held_out_episodes=1, **split),
-        features,
-    )
+    samples = ProbeSamples(torch.zeros(240), targets.double(), names, held_out_episodes=1, **split)
+    return probe_embeddings(samples, features)
 
 
 def r2(features: Tensor, targets: Tensor) -> Tensor:
+    """Of each target, on the last third of 240 rows."""
     return torch.tensor(list(fit(features, targets).positions.values()))
 
 

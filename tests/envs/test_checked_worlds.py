@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 from fake_worlds import FakeDmEnv, OwnWorld, own, painter
+from gymnasium.spaces import Box, Discrete
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
@@ -78,17 +79,10 @@ def test_floats_between_0_and_1_are_scaled_once_and_said(
 
 
 @both
-@pytest.mark.parametrize(
-    ("image", "complaint"),
-    [
-        (grey(300, np.uint16), "uint16"),
-        (grey(3, np.int64), "int64"),
-        (grey(True, bool), "bool"),
-        (grey(np.nan, np.float32), "nan"),
-        (grey(200.0, np.float32), "200"),
-        (grey(-0.5, np.float64), "-0.5"),
-    ],
-)
+@pytest.mark.parametrize(("image", "complaint"), [
+    (grey(300, np.uint16), "uint16"), (grey(3, np.int64), "int64"), (grey(True, bool), "bool"),
+    (grey(np.nan, np.float32), "nan"), (grey(200.0, np.float32), "200"), (grey(-0.5, np.float64), "-0.5"),
+])  # fmt: skip
 def test_images_that_are_neither_uint8_nor_floats_between_0_and_1_are_refused_by_name(
     library: str, image: np.ndarray, complaint: str
 ) -> None:
@@ -201,18 +195,14 @@ def test_an_exception_of_a_worlds_own_is_passed_on_with_its_name_and_the_call() 
 
 
 def test_an_exception_of_a_worlds_own_is_never_taken_for_a_setting() -> None:
-    class Picky(gymnasium.Env):  # type: ignore[type-arg]
-        metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+    def picky(render_mode: str = "", camera_id: int = 0) -> Any:
+        raise TypeError("unsupported operand type(s) for +: 'int' and 'str'")
 
-        def __init__(self, render_mode: str = "", camera_id: int = 0):
-            raise TypeError("unsupported operand type(s) for +: 'int' and 'str'")
-
-    gymnasium.register("CrptproPicky-v0", Picky, disable_env_checker=True)
-    try:
-        with pytest.raises(WorldFailedError, match=r"unsupported operand.*make\(\).*CrptproPicky") as caught:
-            make_env("gymnasium:CrptproPicky-v0", seed=0, camera=0)
-    finally:
-        del gymnasium.registry["CrptproPicky-v0"]
+    picky.metadata = {"render_modes": ["rgb_array"]}  # type: ignore[attr-defined]
+    gymnasium.register("CrptproPicky-v0", picky, disable_env_checker=True)
+    with pytest.raises(WorldFailedError, match=r"unsupported operand.*make\(\).*CrptproPicky") as caught:
+        make_env("gymnasium:CrptproPicky-v0", seed=0, camera=0)
+    del gymnasium.registry["CrptproPicky-v0"]
     assert __file__ in str(caught.value)
     assert "takes no camera" not in str(caught.value)
 
@@ -236,18 +226,12 @@ def test_a_step_of_the_old_api_is_answered_with_what_is_expected(limit: int | No
 HUGE = float(np.finfo(np.float32).max)
 
 
-@pytest.mark.parametrize(
-    ("space", "complaint"),
-    [
-        (gymnasium.spaces.Discrete(3), "Discrete actions"),
-        (gymnasium.spaces.Box(0, 10, (2,), np.int64), "actions of int64"),
-        (gymnasium.spaces.Box(-1.0, 1.0, (0,)), "empty action"),
-        (gymnasium.spaces.Box(-HUGE, HUGE, (2,)), "without bounds"),
-        (gymnasium.spaces.Box(-np.inf, np.inf, (2,)), "without bounds"),
-        (gymnasium.spaces.Box(0.0, HUGE, (2,)), "one side only"),
-        (gymnasium.spaces.Box(1.0, 1.0, (2,)), "hold nothing"),
-    ],
-)
+@pytest.mark.parametrize(("space", "complaint"), [
+    (Discrete(3), "Discrete actions"), (Box(0, 10, (2,), np.int64), "actions of int64"),
+    (Box(-1.0, 1.0, (0,)), "empty action"), (Box(-HUGE, HUGE, (2,)), "without bounds"),
+    (Box(-np.inf, np.inf, (2,)), "without bounds"), (Box(0.0, HUGE, (2,)), "one side only"),
+    (Box(1.0, 1.0, (2,)), "hold nothing"),
+])  # fmt: skip
 def test_action_spaces_that_cannot_be_mapped_from_minus_1_to_1_are_refused_by_name(
     space: Any, complaint: str
 ) -> None:
@@ -258,14 +242,14 @@ def test_action_spaces_that_cannot_be_mapped_from_minus_1_to_1_are_refused_by_na
 @pytest.mark.parametrize("bound", [np.inf, HUGE, 1e10])
 def test_an_actuator_of_dm_control_without_bounds_takes_the_action_as_it_is(bound: float) -> None:
     env = FakeDmEnv(bounds=([-bound, 0.0], [bound, 4.0]))
-    steps = AgentSteps(env, None, world="fake", image_size=SIZE, action_repeat=1, physics_state=False)
+    steps = AgentSteps(env, world="fake", image_size=SIZE, action_repeat=1, render=False)
     steps.reset()
     for action in ([-1, -1], [0.5, 1]):
         steps.step(np.array(action, np.float32))
     np.testing.assert_allclose(env.actions, [[-1.0, 0.0], [0.5, 4.0]], atol=1e-12)
     env = FakeDmEnv(bounds=([-1.0, 0.0], [bound, 4.0]))
     with pytest.raises(CRPTproError, match="one side only"):
-        AgentSteps(env, None, world="fake", image_size=SIZE, action_repeat=1, physics_state=False)
+        AgentSteps(env, world="fake", image_size=SIZE, action_repeat=1, render=False)
 
 
 def test_numbers_are_taken_as_what_they_mean_and_refused_before_anything_is_loaded() -> None:

@@ -221,9 +221,7 @@ def test_every_suite_task_is_built_by_its_name_and_its_pixels_change(task: str) 
 
 
 def steps_of(env: FakeDmEnv, action_repeat: int = 2) -> AgentSteps:
-    steps = AgentSteps(
-        env, None, world="fake", image_size=8, action_repeat=action_repeat, physics_state=False
-    )
+    steps = AgentSteps(env, world="fake", image_size=8, action_repeat=action_repeat, render=False)
     steps.reset()
     return steps
 

@@ -38,13 +38,10 @@ def test_a_world_that_draws_without_gl_asks_for_no_backend_and_names_none(
     assert not [name for name in env.card() if name.startswith("gl_")]
 
 
-@pytest.mark.parametrize(
-    ("task", "answer"),
-    [
-        ("walker_run", True), ("reach_duplo", True), ("gymnasium:HalfCheetah-v5", True),
-        ("gymnasium:Pendulum-v1", False), (Domain("own", "own", make=lambda: None), False),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("task", "answer"), [
+    ("walker_run", True), ("reach_duplo", True), ("gymnasium:HalfCheetah-v5", True),
+    ("gymnasium:Pendulum-v1", False), (Domain("own", "own", make=lambda: None), False),
+])  # fmt: skip
 def test_who_needs_gl(task: Any, answer: bool) -> None:
     assert needs_gl(task) is answer
 

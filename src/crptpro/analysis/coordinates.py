@@ -1,20 +1,15 @@
-"""A simulator's positions and velocities as named numbers that a linear probe can be asked for."""
+"""A simulator's positions and velocities as named numbers that a linear probe can predict."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from crptpro.domains import GYMNASIUM_PREFIX, Domain, get_domain
-from crptpro.errors import RenderingError, UnknownNameError
-
-if TYPE_CHECKING:
-    import dm_env
+from crptpro.errors import UnknownNameError
 
 JointKind = Literal["free", "ball", "slide", "hinge", "turning"]
 
@@ -24,34 +19,33 @@ _SIZES: dict[JointKind, tuple[int, int]] = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Joint:
-    """One joint of a MuJoCo model.
-
-    Args:
-        name: As in the model.
-        kind: ``"hinge"`` has limits, ``"turning"`` is a hinge without any.
-    """
+class Joint(NamedTuple):
+    """One joint of a MuJoCo model; a ``"hinge"`` has limits, ``"turning"`` is a hinge without any."""
 
     name: str
     kind: JointKind
 
 
 def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
-    """Return the joints behind a domain's ``qpos`` and ``qvel``, in order; nothing is drawn.
+    """Return the joints behind a domain's ``qpos`` and ``qvel``, in order; nothing is rendered.
 
     Returns:
         ``None`` where they are not known: worlds of your own, and those without a MuJoCo model.
 
     Raises:
-        RenderingError: for the manipulation tasks, which cannot even be loaded where nothing renders.
+        RenderingError: dm_control's worlds cannot be loaded where nothing renders.
     """
     try:
         domain = get_domain(domain)
     except UnknownNameError:  # a world of one's own that is not registered in this process
         return None
+    env: Any
     if domain.source in ("suite", "manipulation"):
-        env = _load_undrawn(domain)
+        from crptpro.envs.dm_control import load_dm_env
+        from crptpro.envs.rendering import select_backend
+
+        select_backend()  # importing dm_control fixes it
+        env = load_dm_env(domain)
         model = env.physics.model.ptr
     elif domain.source == "gymnasium":
         import gymnasium
@@ -66,34 +60,14 @@ def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
         env.close()
 
 
-def _load_undrawn(domain: Domain) -> dm_env.Environment:
-    """Load a dm_control world for its model alone: one of the suite where nothing renders, too."""
-    from crptpro.envs.dm_control import load_dm_env
-    from crptpro.envs.rendering import select_backend
-
-    try:
-        select_backend()  # importing dm_control fixes it
-    except RenderingError:
-        if domain.source != "suite":
-            raise
-        before = os.environ.get("MUJOCO_GL")
-        os.environ["MUJOCO_GL"] = "disable"
-        try:
-            return load_dm_env(domain)
-        finally:
-            del os.environ["MUJOCO_GL"]
-            os.environ.update({} if before is None else {"MUJOCO_GL": before})
-    return load_dm_env(domain)
-
-
-def _joints(model: object) -> tuple[Joint, ...]:
+def _joints(model: Any) -> tuple[Joint, ...]:
     import mujoco
 
-    kinds: tuple[JointKind, ...] = ("free", "ball", "slide", "hinge")
+    kinds: tuple[JointKind, ...] = ("free", "ball", "slide", "hinge")  # in the order of mjtJoint
     joints = []
-    for index in range(model.njnt):  # type: ignore[attr-defined]
-        kind = kinds[model.jnt_type[index]]  # type: ignore[attr-defined]
-        if kind == "hinge" and not model.jnt_limited[index]:  # type: ignore[attr-defined]
+    for index in range(model.njnt):
+        kind = kinds[model.jnt_type[index]]
+        if kind == "hinge" and not model.jnt_limited[index]:
             kind = "turning"
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, index)
         joints.append(Joint(name or f"joint{index}", kind))
@@ -101,15 +75,14 @@ def _joints(model: object) -> tuple[Joint, ...]:
 
 
 def position_coordinates(qpos: Tensor, joints: Sequence[Joint] | None) -> tuple[list[str], Tensor]:
-    """Return positions as numbers that do not jump where the picture does not.
+    """Return positions as numbers that are continuous where the picture is.
 
-    Slides and limited hinges are themselves. A hinge without limits becomes its sine and cosine, for a whole turn
-    changes nothing. The orientation of a ball or free joint becomes the first two columns of its rotation matrix,
-    which determine it: unlike a quaternion, one rotation has one such form.
+    Slides and limited hinges are kept. A hinge without limits becomes its sine and cosine. The orientation of a ball or
+    free joint becomes the first two columns of its rotation matrix, which determine it.
 
     Args:
         qpos: ``[N, nq]``, metres, radians, and quaternions (w, x, y, z).
-        joints: As of :func:`joints_of`; ``None``, or joints of another model, leaves ``qpos`` as it is.
+        joints: of :func:`joints_of`; with ``None``, or joints of another model, ``qpos`` is returned as it is.
 
     Returns:
         Names, and float64 ``[N, len(names)]``.
@@ -119,10 +92,7 @@ def position_coordinates(qpos: Tensor, joints: Sequence[Joint] | None) -> tuple[
         return [f"qpos[{index}]" for index in range(qpos.shape[1])], qpos
     names: list[str] = []
     columns: list[Tensor] = []
-    first = 0
-    for joint in joints:
-        values = qpos[:, first : first + _SIZES[joint.kind][0]]
-        first += values.shape[1]
+    for joint, values in zip(joints, qpos.split([_SIZES[joint.kind][0] for joint in joints], dim=1)):
         if joint.kind in ("slide", "hinge"):
             names.append(joint.name)
         elif joint.kind == "turning":
@@ -138,11 +108,11 @@ def position_coordinates(qpos: Tensor, joints: Sequence[Joint] | None) -> tuple[
 
 
 def velocity_coordinates(qvel: Tensor, joints: Sequence[Joint] | None) -> tuple[list[str], Tensor]:
-    """Return velocities, as they are, with their names.
+    """Return velocities with their names.
 
     Args:
         qvel: ``[N, nv]``, m/s and rad/s.
-        joints: As of :func:`joints_of`.
+        joints: of :func:`joints_of`.
 
     Returns:
         Names, and float64 ``[N, nv]``.

@@ -7,18 +7,16 @@ from torch import Tensor
 
 from crptpro.objectives.functional import knn_distances, particle_entropy
 
-NEIGHBOURS = 12
-"""Nearest other observations that an estimate looks at, as APT's reward does."""
 _BATCH = 64
 
 
 @torch.no_grad()
-def coverage(embeddings: Tensor, *, k: int = NEIGHBOURS) -> float:
+def coverage(embeddings: Tensor, *, k: int = 12) -> float:
     r"""Return the mean of :math:`\log(1 + \frac1k\sum_{j=1}^k \lVert z_i - z_i^{(j)}\rVert)` over observations.
 
-    :math:`z_i^{(j)}` is the j-th nearest other embedding; APT (arXiv 2103.04551) and Proto-RL (arXiv 2102.11271) pay
-    their explorers with such terms. The paper plots "a particle-based estimator" and states neither k, nor the number
-    of observations, nor the encoder: these are this project's choice.
+    :math:`z_i^{(j)}` is the j-th nearest other embedding, as in the rewards of APT (arXiv 2103.04551) and Proto-RL
+    (arXiv 2102.11271). The paper plots "a particle-based estimator" and states neither k, nor the number of
+    observations, nor the encoder: these are this project's choice.
 
     The value falls with the number of observations, whose neighbours then come closer: compare equal numbers.
 
@@ -34,9 +32,8 @@ def coverage(embeddings: Tensor, *, k: int = NEIGHBOURS) -> float:
     """
     if len(embeddings) <= k:
         raise ValueError(f"{k} neighbours need more than {k} observations, got {len(embeddings)}.")
-    total = embeddings.new_zeros((), dtype=torch.float64)
+    total = 0.0
     for part in embeddings.split(_BATCH):  # the differences to all neighbours of all would not fit
-        # Each finds itself, at exactly 0 and so in the first place.
-        distances = knn_distances(part, embeddings, k=k + 1)[:, 1:]
-        total += particle_entropy(distances).double().sum()
-    return float(total / len(embeddings))
+        distances = knn_distances(part, embeddings, k=k + 1)[:, 1:]  # the nearest is the observation itself
+        total += float(particle_entropy(distances).double().sum())
+    return total / len(embeddings)

@@ -10,35 +10,26 @@ from torchrl.data import ReplayBuffer
 from crptpro.modules.precision import device_of
 
 _BATCH = 64
-FEATURES = 4096
-"""That are taken to float64 at a time: all at once would take gigabytes."""
 
 
 def sample_pixels(dataset: ReplayBuffer, samples: int, *, seed: int) -> Tensor:
-    """Draw the same observations whenever asked with the same seed; the dataset's own generator is put back.
+    """Draw observations, the same for the same seed, whatever was sampled before.
 
     Args:
-        dataset: its samples hold ``pixels``.
+        dataset: its samples hold ``pixels``; later samples continue from this seed.
         samples: B, how many.
         seed: which ones.
 
     Returns:
         ``[B, C, H, W]``, dtype and device as the dataset has them.
     """
-    before = getattr(dataset, "_rng", None)  # TorchRL has a setter but no getter
-    device = getattr(dataset.storage, "device", "cpu") if before is None else before.device
-    if not isinstance(device, torch.device):
-        device = torch.device("cpu")  # "auto": nobody has said
-    dataset.set_rng(torch.Generator(device).manual_seed(seed))
-    try:
-        return dataset.sample(samples)["pixels"]
-    finally:
-        dataset.set_rng(before)
+    dataset.set_rng(torch.Generator().manual_seed(seed))
+    return dataset.sample(samples)["pixels"]
 
 
 @torch.no_grad()
 def embed_pixels(encoder: nn.Module, pixels: Tensor, *, projector: nn.Module | None = None) -> Tensor:
-    """Encode observations without augmentation, where the encoder lives, some at a time.
+    """Encode observations without augmentation, in batches, on the encoder's device.
 
     Args:
         encoder: maps uint8 ``[B, C, H, W]`` to features ``[B, D]``.
@@ -57,51 +48,36 @@ def embed_pixels(encoder: nn.Module, pixels: Tensor, *, projector: nn.Module | N
 
 
 def principal_components(points: Tensor, *, components: int = 3) -> tuple[Tensor, Tensor]:
-    """Project centred points on their leading principal directions.
+    """Project centred points on their leading principal directions (scikit-learn's ``PCA``).
 
     Args:
-        points: float ``[N, D]`` with ``N`` at least 2, not all equal.
+        points: float ``[N, D]`` on the CPU, not all equal.
         components: how many directions, at most ``min(N, D)``.
 
     Returns:
-        Coordinates ``[N, components]`` and the fraction of the total variance each explains
-        ``[components]``, in [0, 1] and in decreasing order. The sign of each direction is fixed so that
-        its largest coordinate is positive.
+        Coordinates ``[N, components]`` and the fraction of the total variance that each explains ``[components]``, in
+        decreasing order.
 
     Raises:
-        ValueError: fewer than two points, or ``components`` outside ``1..min(N, D)``.
+        ValueError: ``components`` outside ``1..min(N, D)``.
     """
-    if points.shape[0] < 2:
-        raise ValueError(f"`points` must be at least 2, got {points.shape[0]}: one point has no variance.")
-    if not 1 <= components <= min(points.shape):
-        raise ValueError(f"`components` must be at most min(N, D) = {min(points.shape)}, got {components}.")
-    centred = (points - points.mean(0)).double()
-    left, singular, _ = torch.linalg.svd(centred, full_matrices=False)
-    coordinates = left[:, :components] * singular[:components]
-    largest = coordinates.abs().argmax(0)
-    coordinates = coordinates * coordinates[largest, torch.arange(components)].sign()
-    variance = singular.square()
-    return coordinates.to(points.dtype), (variance[:components] / variance.sum()).to(points.dtype)
+    from sklearn.decomposition import PCA
+
+    pca = PCA(components, svd_solver="full")
+    coordinates = pca.fit_transform(points.double().numpy())
+    return torch.from_numpy(coordinates), torch.from_numpy(pca.explained_variance_ratio_)
 
 
 def gram_matrix(features: Tensor, mean: Tensor, scale: Tensor) -> np.ndarray:
-    """Return the inner products of ``(features - mean) / scale``, summed in float64.
+    """Return the inner products, float64 ``[N, N]``, of ``(features - mean) / scale``.
 
     Args:
         features: ``[N, D]``, any floating dtype, on the CPU.
         mean: ``[D]``.
         scale: ``[D]``.
-
-    Returns:
-        float64 ``[N, N]``.
     """
-    from scipy.linalg.blas import dsyrk
-
-    upper = np.zeros((len(features), len(features)), order="F")
-    for block, m, s in zip(*(each.split(FEATURES, dim=-1) for each in (features, mean, scale))):
-        standardized = (block.double() - m) / s
-        upper = dsyrk(1.0, standardized.numpy().T, beta=1.0, c=upper, trans=1, overwrite_c=1)
-    return np.triu(upper) + np.triu(upper, 1).T
+    standardized = features.to(torch.float64, copy=True).sub_(mean).div_(scale).numpy()
+    return standardized @ standardized.T
 
 
 def effective_rank(features: Tensor) -> float:

@@ -1,4 +1,4 @@
-"""What a frozen encoder knows of the simulator's state: the question "did pre-training learn anything?" without RL."""
+"""What a frozen encoder knows of the simulator's state: a measure of pre-training that needs no RL."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from crptpro.analysis.coordinates import Joint, joints_of, position_coordinates, velocity_coordinates
-from crptpro.analysis.embeddings import FEATURES, effective_rank, embed_pixels, gram_matrix, mean_cosine
+from crptpro.analysis.embeddings import effective_rank, embed_pixels, gram_matrix, mean_cosine
 from crptpro.data import FrameDataset
 from crptpro.data.redraw import DrawnFrames, redraw
 from crptpro.data.storage import stack_rows
@@ -18,7 +18,7 @@ from crptpro.seeding import derive_seed
 from crptpro.values import Colors
 
 HELD_OUT = 0.25
-"""Part of the episodes that are held out, and of the others by which the penalty is chosen."""
+"""Fraction of the episodes that is held out, and of the others by which the penalty is chosen."""
 LEAST_SPREAD = 1e-3
 """Standard deviation (m, rad, m/s, rad/s; 1 for sines and rotations) below which a coordinate counts as constant."""
 PENALTIES = tuple(10.0**power for power in range(-6, 3))
@@ -31,20 +31,16 @@ class ProbeSamples:
 
     Attributes:
         pixels: uint8 ``[N, C, H, W]``.
-        positions: float64 ``[N, P]``.
-        velocities: float64 ``[N, V]``.
-        position_names: P names.
-        velocity_names: V names.
+        targets: float64 ``[N, T]``, positions and velocities.
+        names: of the targets, each ``"position"`` or ``"velocity"`` and the coordinate, for two may share its name.
         train: int64, rows to fit; likewise ``validation`` (to choose the penalty) and ``test`` (to judge). No episode
             contributes to two of them.
-        held_out_episodes: How many episodes ``test`` comes from.
+        held_out_episodes: how many episodes ``test`` comes from.
     """
 
     pixels: Tensor
-    positions: Tensor
-    velocities: Tensor
-    position_names: list[str]
-    velocity_names: list[str]
+    targets: Tensor
+    names: list[tuple[str, str]]
     train: Tensor
     validation: Tensor
     test: Tensor
@@ -53,14 +49,14 @@ class ProbeSamples:
 
 @dataclass(frozen=True)
 class ProbeResult:
-    """How well one kind of embedding of one domain tells the state.
+    """How well the state is predicted from one kind of embedding of one domain.
 
     Attributes:
         positions: R2 on held-out episodes by coordinate.
-        velocities: Likewise.
-        left_out: Coordinates that hardly vary, in the training or in the held-out episodes.
-        effective_rank: Of the embeddings, see :func:`~crptpro.analysis.embeddings.effective_rank`.
-        mean_cosine: Mean cosine between different observations' embeddings; 1 if all point the same way.
+        velocities: likewise.
+        left_out: coordinates that hardly vary, in the training or in the held-out episodes.
+        effective_rank: of the embeddings, see :func:`~crptpro.analysis.embeddings.effective_rank`.
+        mean_cosine: of different observations' embeddings, see :func:`~crptpro.analysis.embeddings.mean_cosine`.
     """
 
     positions: dict[str, float]
@@ -71,7 +67,7 @@ class ProbeResult:
 
     @property
     def position_r2(self) -> float:
-        """Mean R2 of the positions, each at least 0: what is predicted worse than by a constant is not known."""
+        """Mean R2 of the positions; one that is predicted worse than by its mean counts as 0."""
         return _mean(self.positions)
 
     @property
@@ -90,23 +86,19 @@ def probe_samples(
     joints: tuple[Joint, ...] | None = None,
     drawn: DrawnFrames | None = None,
 ) -> ProbeSamples:
-    """Draw observations and states of a dataset, and divide its episodes.
-
-    The same seed draws the same observations and splits, whatever the colours.
+    """Draw observations and states of a dataset, and split its episodes; the same for a seed in all colours.
 
     Args:
-        dataset: With physical state.
+        dataset: with physical state.
         samples: N, drawn without replacement; all transitions if there are fewer.
-        seed: Which ones, and which episodes are held out.
-        colors: In which colours; those that the dataset was collected in if ``None``. Others are drawn again, see
-            :func:`~crptpro.data.redraw.redraw`.
-        frame_stack: Frames per observation; the dataset's if ``None``.
-        joints: What ``qpos`` and ``qvel`` are, see :func:`~crptpro.analysis.coordinates.joints_of`, which is asked
-            if ``None``.
-        drawn: Frames in other colours that were drawn before, see :func:`probe_frame_rows`.
+        seed: which ones, and which episodes are held out.
+        colors: in which they are shown (default: the dataset's own), see :func:`~crptpro.data.redraw.redraw`.
+        frame_stack: frames per observation; the dataset's if ``None``.
+        joints: what ``qpos`` and ``qvel`` are; of :func:`~crptpro.analysis.coordinates.joints_of` if ``None``.
+        drawn: frames in other colours that were drawn before, see :func:`probe_frame_rows`.
 
     Raises:
-        DatasetError: if there is no physical state, or episodes or samples are too few to split.
+        DatasetError: there is no physical state, or too few episodes or samples to split.
     """
     transitions = dataset.transitions
     generator = _generator(dataset, seed)
@@ -128,13 +120,16 @@ def probe_samples(
         joints = joints_of(dataset.card.get("task", dataset.domain))
     position_names, positions = position_coordinates(state["qpos"], joints)
     velocity_names, velocities = velocity_coordinates(state["qvel"], joints)
+    names = [
+        *(("position", name) for name in position_names),
+        *(("velocity", name) for name in velocity_names),
+    ]
     rows = stack_rows(row, step, frame_stack or dataset.frame_stack)
-    own = dataset.card.get("colors", "normal")
-    frames = redraw(dataset, rows.reshape(-1), colors=own if colors is None else colors, drawn=drawn)
+    wanted = colors or dataset.card.get("colors", "normal")
+    frames = redraw(dataset, rows.reshape(-1), colors=wanted, drawn=drawn)
     pixels = frames.reshape(len(rows), -1, *frames.shape[-2:])
-    return ProbeSamples(
-        pixels, positions, velocities, position_names, velocity_names, train, validation, test, held_out
-    )
+    targets = torch.cat([positions, velocities], 1)
+    return ProbeSamples(pixels, targets, names, train, validation, test, held_out)
 
 
 def probe_frame_rows(
@@ -151,7 +146,6 @@ def _generator(dataset: FrameDataset, seed: int) -> torch.Generator:
 
 
 def _choose(dataset: FrameDataset, samples: int, generator: torch.Generator) -> Tensor:
-    """Draw transitions without replacement, ascending."""
     return torch.randperm(len(dataset.transitions), generator=generator)[:samples].sort().values
 
 
@@ -165,9 +159,9 @@ def probe(
     standardising, or choosing the penalty. Images are not augmented.
 
     Args:
-        samples: As of :func:`probe_samples`.
-        encoder: uint8 ``[B, C, H, W]`` to features ``[B, D]``; used where it lives.
-        projector: Features to latents ``[B, d]``.
+        samples: of :func:`probe_samples`.
+        encoder: maps uint8 ``[B, C, H, W]`` to features ``[B, D]``.
+        projector: maps features to latents ``[B, d]``.
 
     Returns:
         By ``"features"`` and, with a projector, ``"z"``.
@@ -186,12 +180,7 @@ def probe_embeddings(samples: ProbeSamples, embeddings: Tensor) -> ProbeResult:
 
     train, validation, test = (part.numpy() for part in (samples.train, samples.validation, samples.test))
     fitted = np.concatenate([train, validation])
-    targets = torch.cat([samples.positions, samples.velocities], 1).double().numpy()
-    # A velocity may bear the name of its position.
-    names = [
-        *(("position", name) for name in samples.position_names),
-        *(("velocity", name) for name in samples.velocity_names),
-    ]
+    targets, names = samples.targets.numpy(), samples.names
     spread = np.stack([targets[part].std(0, ddof=1) for part in (train, fitted, test)]).min(0)
     varies = (spread > LEAST_SPREAD).nonzero()[0]
     targets = targets[:, varies]
@@ -213,14 +202,11 @@ def probe_embeddings(samples: ProbeSamples, embeddings: Tensor) -> ProbeResult:
 def _standardized_gram(features: Tensor, fitted: Tensor) -> np.ndarray:
     """Return the inner products ``[N, N]`` of all samples' standardised features.
 
-    Each feature is centred at the fitted samples' mean and divided by their standard deviation plus the root mean
-    square of all features' deviations. That summand matters for ReLU features: one that is active in a handful of
-    samples would become a large number that says which sample this is. Without it, the R2 of velocities from 39,200
-    features fell from 0.6 to 0.
+    A feature's scale is its deviation plus the root mean square of all features' deviations. Without that summand, a
+    ReLU feature that is active in a handful of samples became a large number that identifies the sample, and the R2 of
+    velocities from 39,200 features fell from 0.6 to 0.
     """
-    blocks = features[fitted].split(FEATURES, dim=1)
-    moments = [torch.std_mean(block.double(), 0, correction=0) for block in blocks]
-    deviation, mean = (torch.cat(each) for each in zip(*moments))
+    deviation, mean = torch.std_mean(features[fitted].double(), 0, correction=0)
     usual = deviation.square().mean().sqrt()
     return gram_matrix(features, mean, deviation + usual if usual else torch.ones_like(mean))
 
@@ -233,7 +219,7 @@ def _predictions(gram: np.ndarray, targets: np.ndarray, fitted: np.ndarray, aske
     inner, across = gram[np.ix_(fitted, fitted)], gram[np.ix_(asked, fitted)]
     centre = KernelCenterer().fit(inner)
     inner, across = centre.transform(inner), centre.transform(across)
-    scale = np.trace(inner) / len(fitted) or 1.0  # features that say nothing predict the mean
+    scale = np.trace(inner) / len(fitted) or 1.0  # constant features predict the mean
     mean = targets[fitted].mean(0)
     fits = [
         KernelRidge(alpha=penalty * scale, kernel="precomputed").fit(inner, targets[fitted] - mean)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from contextlib import AbstractContextManager
 from typing import Any
 
 import dm_env
@@ -17,28 +16,33 @@ from crptpro.domains import SUITE_TASKS, Domain
 from crptpro.envs.rendering import first_frame_watchdog, own_context
 from crptpro.envs.worlds import ActionRange, CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError, UnknownNameError
+from crptpro.values import Quality
 
 logger = logging.getLogger(__name__)
 
-#: Side of the shadow map, texels, that ``quality="fast"`` uses instead of the model's own 2048 (suite) or
-#: 4096 (manipulation). On software GL the shadow map is half the cost of a frame; fewer than 1 % of pixels
-#: change (8 % on the terrain of quadruped_escape, which is all shadows).
+#: Side of the shadow map, texels, with ``quality="fast"``; the models' own are 2048 (suite) and 4096 (manipulation).
 FAST_SHADOW_SIZE = {"suite": 512, "manipulation": 1024}
 
 
-def load_dm_env(domain: Domain) -> dm_env.Environment:
-    """Load ``domain.task`` from dm_control, with all camera observations of composer tasks switched off.
+def make_dm_control(domain: Domain, *, quality: Quality, **settings: Any) -> DMControlPixelEnv:
+    """Build a world of the suite or of manipulation; the settings are those of :class:`AgentSteps`."""
+    shadow_size = FAST_SHADOW_SIZE[domain.source] if quality == "fast" else None
+    with first_frame_watchdog(), own_context(None):  # composer renders once when it is built
+        env = load_dm_env(domain)
+    return DMControlPixelEnv(AgentSteps(env, world=domain.task, shadow_size=shadow_size, **settings))
 
-    The model does not depend on any seed (LQR draws its own from a fixed one), so that an episode depends on
-    nothing but the seed given before its reset.
+
+def load_dm_env(domain: Domain) -> dm_env.Environment:
+    """Load ``domain.task`` from dm_control, without the camera observations of composer tasks.
+
+    The model does not depend on a seed, so that an episode depends only on the seed given before its reset.
     """
     if domain.source == "manipulation":
         from dm_control import manipulation
 
         route_mujoco_warnings()
         env = manipulation.load(f"{domain.task}_vision", seed=0)
-        # The built-in camera renders at every env step, twice per agent step; SceneCamera replaces it. The
-        # switch takes effect at the first reset, which compiles the model anew.
+        # The built-in camera renders at every env step, twice per agent step.
         for observable in env.task.observables.values():
             observable.enabled = False
         return env
@@ -55,10 +59,9 @@ def load_dm_env(domain: Domain) -> dm_env.Environment:
 
 
 def route_mujoco_warnings() -> None:
-    """Log MuJoCo's warnings; call it after importing dm_control, which sends them to absl.
+    """Log MuJoCo's warnings, deprecations at debug level; call it after importing dm_control, which sends them to absl.
 
     Without a handler MuJoCo prints them and appends to ``MUJOCO_LOG.TXT`` in the working directory.
-    Deprecations concern the authors of a model, not its users, and are logged at debug level.
     """
     import mujoco
 
@@ -69,107 +72,20 @@ def route_mujoco_warnings() -> None:
     mujoco.set_mju_user_warning(log)
 
 
-class SceneCamera:
-    """One dm_control ``Camera`` kept over steps and resets.
-
-    ``physics.render``, which TorchRL's ``from_pixels`` and dm_control's ``pixels.Wrapper`` call, builds and frees a
-    camera and its scene for every image; this one is rebuilt only when the model changes, as composer environments do
-    at every reset. The pixels are identical. A frame of cheetah or walker takes 7 to 16 % less (software GL; nothing is
-    gained on manipulation), more than the 5 % for which this library keeps something of its own.
-
-    Args:
-        image_size: H = W, pixels.
-        camera: Index or name of a camera of the model, -1 for the free camera.
-        shadow_size: Side of the shadow map, texels; ``None`` keeps the model's.
-        reverses_background: Draw the background with its colours reversed.
-    """
-
-    def __init__(
-        self,
-        image_size: int,
-        camera: int | str,
-        shadow_size: int | None = None,
-        *,
-        reverses_background: bool = False,
-    ):
-        self._image_size = image_size
-        self._camera_id = camera
-        self._shadow_size = shadow_size
-        self._reverses_background = reverses_background
-        self._reversed_model: Any = None
-        self._model: Any = None
-        self._camera: Any = None
-
-    def prepare(self, physics: Any) -> None:
-        """Set what a render context reads once, when it is made; call it before the first reset.
-
-        Some tasks (quadruped_escape, for its terrain) make the context while they start an episode.
-        """
-        visual = physics.model.vis
-        if self._shadow_size is not None:
-            visual.quality.shadowsize = min(self._shadow_size, visual.quality.shadowsize)
-        visual.global_.offwidth = max(self._image_size, visual.global_.offwidth)
-        visual.global_.offheight = max(self._image_size, visual.global_.offheight)
-        if self._reverses_background and physics.model.ptr is not self._reversed_model:
-            reverse_background(physics.model.ptr)
-            self._reversed_model = physics.model.ptr
-
-    def render(self, physics: Any) -> np.ndarray:
-        """Return the image, uint8 ``[H, W, 3]``, in a buffer that the next call overwrites."""
-        if physics.model is self._model:
-            with self.own_context(physics):
-                return self._camera.render()
-        with first_frame_watchdog(), self.own_context(physics):
-            self._build(physics)
-            return self._camera.render()
-
-    def own_context(self, physics: Any) -> AbstractContextManager[None]:
-        """Draw, or change what is drawn, in the body into the context of the physics, if it has one already."""
-        if physics.model is not self._model:
-            return own_context(None)
-        context = physics.contexts.gl
-
-        def make_current() -> None:
-            with context.make_current() as thread:
-                thread.call(context._platform_make_current)  # dm_control knows of no context but its own
-
-        return own_context(make_current)
-
-    def release(self) -> None:
-        """Drop the scene; the render context belongs to the physics."""
-        self._camera = self._model = None
-
-    def _build(self, physics: Any) -> None:
-        from dm_control.mujoco.engine import Camera
-
-        self.prepare(physics)  # a composer environment has compiled a new model since
-        model = physics.model
-        names = [model.id2name(index, "camera") or str(index) for index in range(model.ncam)]
-        if self._camera_id not in (*names, *range(-1, model.ncam)):
-            raise CRPTproError(
-                f"This model has no camera {self._camera_id!r}. It has {', '.join(names) or 'none'}, or 0 to "
-                f"{model.ncam - 1}; -1 is the free camera."
-            )
-        self._camera = Camera(physics, self._image_size, self._image_size, camera_id=self._camera_id)
-        self._model = model
-
-
 def reverse_background(model: Any) -> None:
     """Reverse the order of the red, green and blue values of a model's background, in place.
 
-    The paper tests unseen colours by reversing the RGB values of the background, without saying what that is. Here it
-    is the skybox, and the planes and height fields that are fixed to the world (floor, walls, terrain): their textures,
-    and the colours of the materials and geoms that tint them. A material or texture that something else wears too
-    keeps its colours: everything that moves looks as before.
+    The paper reverses the RGB values of the background without saying what that is. Here it is the skybox, and the
+    planes and height fields that are fixed to the world (floor, walls, terrain): their textures, materials and geoms. A
+    material or texture that something else uses too keeps its colours.
 
-    Call it before the render context is made, which is when textures are copied to it, and once per compiled model:
-    twice restores the colours.
+    Call it once per compiled model, before its render context is made: that is when textures are copied to it.
 
     Args:
         model: ``mujoco.MjModel``, 3.2 or later.
 
     Raises:
-        CRPTproError: if the model has no background to reverse.
+        CRPTproError: the model has no background to reverse.
     """
     import mujoco
 
@@ -177,9 +93,9 @@ def reverse_background(model: Any) -> None:
     is_fixed = model.body_weldid[model.geom_bodyid] == 0
     is_background = is_fixed & np.isin(model.geom_type, [int(kind) for kind in sheets])
     materials = np.setdiff1d(model.geom_matid[is_background], [*model.geom_matid[~is_background], -1])
-    worn_by_others = np.setdiff1d(np.arange(model.nmat), materials)
+    others = np.setdiff1d(np.arange(model.nmat), materials)
     roles = [int(mujoco.mjtTextureRole.mjTEXROLE_RGB), int(mujoco.mjtTextureRole.mjTEXROLE_RGBA)]
-    textures = np.setdiff1d(model.mat_texid[materials][:, roles], model.mat_texid[worn_by_others])
+    textures = np.setdiff1d(model.mat_texid[materials][:, roles], model.mat_texid[others])
     skyboxes = np.flatnonzero(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX))
     textures = np.union1d(textures[textures >= 0], skyboxes)
     if not (textures.size or is_background.any()):
@@ -198,33 +114,51 @@ def reverse_background(model: Any) -> None:
 
 
 class AgentSteps(dm_env.Environment):
-    """A dm_control world of which one step is one decision: repeated, summed, scaled, and drawn once.
+    """A dm_control world of which one step is one agent step: repeated, summed, scaled, and rendered once.
+
+    Its camera is kept over steps and resets. ``physics.render``, which TorchRL's ``from_pixels`` calls, gives the same
+    pixels and builds a camera and its scene for every image; this one is rebuilt only when the model changes, as in
+    composer environments at every reset. A frame of cheetah or walker takes 7 to 16 % less time (software GL; no gain
+    on manipulation).
 
     Args:
-        env: With ``physics`` and either ``task.random`` (suite) or ``random_state`` (composer).
-        camera: Draws the images; ``None`` leaves them black.
-        world: Name for messages.
+        env: with ``physics`` and either ``task.random`` (suite) or ``random_state`` (composer).
+        world: name for messages.
         image_size: H = W, pixels.
-        action_repeat: Env steps per step, fewer where the episode ends.
-        physics_state: Also observe ``qpos`` and ``qvel``.
+        action_repeat: env steps per step, fewer where the episode ends.
+        camera: index or name of a camera of the model, -1 for the free camera.
+        render: ``False`` leaves every image black.
+        physics_state: also observe ``qpos`` and ``qvel``.
+        shadow_size: side of the shadow map, texels; ``None`` keeps the model's.
+        reverses_background: render the background with its colours reversed.
     """
 
     def __init__(
         self,
         env: dm_env.Environment,
-        camera: SceneCamera | None,
         *,
         world: str,
         image_size: int,
         action_repeat: int,
-        physics_state: bool,
+        camera: Any = 0,
+        render: bool = True,
+        physics_state: bool = False,
+        shadow_size: int | None = None,
+        reverses_background: bool = False,
     ):
         self.env, self.physics_state = env, physics_state
-        self._camera, self._world, self._action_repeat = camera, world, action_repeat
+        self._world, self._action_repeat = world, action_repeat
+        self._image_size, self._camera_id, self._renders = image_size, camera, render
+        self._shadow_size, self._reverses_background = shadow_size, reverses_background
         self._read_frame, self._image_shape = FrameReader(world), (3, image_size, image_size)
+        self._camera: Any = None
+        self._model: Any = None
+        self._prepared: Any = None
         spec = env.action_spec()
         low, high = (np.broadcast_to(bound, spec.shape) for bound in (spec.minimum, spec.maximum))
         self._to_actuators = ActionRange(low, high, spec.dtype, world)
+        if render:
+            self._prepare()  # quadruped_escape makes the render context while it starts an episode
 
     @property
     def physics(self) -> Any:
@@ -238,8 +172,8 @@ class AgentSteps(dm_env.Environment):
 
     def reset(self) -> dm_env.TimeStep:
         """Start an episode."""
-        # Some tasks send what they drew (quadruped_escape: its terrain) to the render context.
-        with own_context(None) if self._camera is None else self._camera.own_context(self.physics):
+        is_same = self._camera is not None and self.physics.model is self._model
+        with own_context(self._make_current if is_same else None):  # quadruped_escape sends its terrain there
             self.env.reset()
         return dm_env.restart(self._observe())
 
@@ -256,10 +190,47 @@ class AgentSteps(dm_env.Environment):
 
     def draw(self) -> Tensor:
         """Return the frame of the current state, uint8 ``[3, H, W]``."""
-        if self._camera is None:
+        if not self._renders:
             return torch.zeros(self._image_shape, dtype=torch.uint8)
-        with passed_on(self._world, "render"):
-            return self._read_frame(self._camera.render(self.physics))
+        is_first = self.physics.model is not self._model
+        with passed_on(self._world, "render"), first_frame_watchdog() if is_first else nullcontext():
+            if is_first:
+                self._prepare()  # a composer environment has compiled a new model since
+            with own_context(self._make_current):
+                if is_first:
+                    self._build_camera()
+                return self._read_frame(self._camera.render())
+
+    def _make_current(self) -> None:
+        context = self.physics.contexts.gl
+        with context.make_current() as thread:
+            thread.call(context._platform_make_current)  # dm_control knows of no context but its own
+
+    def _prepare(self) -> None:
+        """Set what a render context reads once, when it is made."""
+        model = self.physics.model
+        if model.ptr is self._prepared:
+            return
+        self._prepared, visual = model.ptr, model.vis
+        if self._shadow_size is not None:
+            visual.quality.shadowsize = min(self._shadow_size, visual.quality.shadowsize)
+        visual.global_.offwidth = max(self._image_size, visual.global_.offwidth)
+        visual.global_.offheight = max(self._image_size, visual.global_.offheight)
+        if self._reverses_background:
+            reverse_background(model.ptr)
+
+    def _build_camera(self) -> None:
+        from dm_control.mujoco.engine import Camera
+
+        model = self.physics.model
+        names = [model.id2name(index, "camera") or str(index) for index in range(model.ncam)]
+        if self._camera_id not in (*names, *range(-1, model.ncam)):
+            raise CRPTproError(
+                f"This model has no camera {self._camera_id!r}. It has {', '.join(names) or 'none'}, or 0 to "
+                f"{model.ncam - 1}; -1 is the free camera."
+            )
+        self._camera = Camera(self.physics, self._image_size, self._image_size, camera_id=self._camera_id)
+        self._model = model
 
     def _observe(self) -> dict[str, Any]:
         observation = {"pixels": self.draw()}
@@ -289,24 +260,22 @@ class AgentSteps(dm_env.Environment):
 
     def close(self) -> None:
         """Free the physics and its render context."""
-        if self._camera is not None:
-            self._camera.release()
+        self._camera = self._model = None
         self.physics.free()
         self.env.close()
 
 
 class DMControlPixelEnv(CheckedWorld, DMControlWrapper):
-    """TorchRL's ``DMControlWrapper`` with what it cannot do by itself.
+    """TorchRL's ``DMControlWrapper`` around :class:`AgentSteps`: float32 actions and rewards, seeds without a reset.
 
-    ``DMControlEnv(from_pixels=True)`` draws 240 x 320 whatever is asked for, refuses composer tasks (manipulation),
-    and draws every env step of a repeated action, which doubles the time of an agent step. Here the repeat lies below
-    the camera (:class:`AgentSteps`), actions and rewards are float32, and a seed does not reset the world.
+    ``DMControlEnv(from_pixels=True)`` renders 240 x 320 whatever is asked for, refuses composer tasks (manipulation),
+    and renders every env step of a repeated action, which doubles the time of an agent step.
     """
 
     def draw_state(self, qpos: np.ndarray, qvel: np.ndarray) -> Tensor:
         """Return the frame of a state, uint8 ``[3, H, W]``; the episode continues from there.
 
-        What a task draws at its reset and keeps in the model (targets, terrain, colours) stays as it is.
+        What a reset draws into the model (targets, terrain, colours) stays.
         """
         physics = self._env.physics
         physics.data.qpos[:], physics.data.qvel[:] = qpos, qvel
@@ -314,8 +283,7 @@ class DMControlPixelEnv(CheckedWorld, DMControlWrapper):
         return self._env.draw()
 
     def _check_kwargs(self, kwargs: dict[str, Any]) -> None:
-        if not isinstance(kwargs["env"], dm_env.Environment):
-            raise TypeError(f"env must be a dm_env.Environment, got {type(kwargs['env']).__name__}.")
+        pass  # TorchRL's refuses composer environments
 
     def _build_env(self, env: AgentSteps, **kwargs: Any) -> AgentSteps:
         self.from_pixels = self.pixels_only = True

@@ -14,15 +14,12 @@ from torchrl.envs import CatFrames, Compose, DoubleToFloat, EnvBase, Transform, 
 from torchrl.envs.transforms import SelectTransform
 
 from crptpro.domains import GYMNASIUM_PREFIX, LONGEST_EPISODE_AGENT_STEPS, Domain, get_domain
-from crptpro.envs.rendering import backend_card, first_frame_watchdog, own_context, select_backend
+from crptpro.envs.rendering import backend_card, select_backend
 from crptpro.envs.worlds import CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError
 from crptpro.values import COLORS, QUALITIES, Colors, Quality, as_int
 
 logger = logging.getLogger(__name__)
-
-#: What the ``make`` of a domain of one's own may name in its signature.
-OFFERED = ("seed", "image_size", "action_repeat", "camera", "quality", "physics_state")
 
 
 def make_env(
@@ -41,39 +38,35 @@ def make_env(
     """Build an unbatched CPU environment that renders once per agent step.
 
     dm_control's worlds are TorchRL's ``DMControlWrapper`` (:class:`~crptpro.envs.dm_control.DMControlPixelEnv`),
-    Gymnasium's its ``GymWrapper``, your own what their ``make`` returns; ``CatFrames`` stacks the frames.
+    Gymnasium's its ``GymWrapper``, your own what their ``make`` returns; ``CatFrames`` stacks the frames. All are
+    checked as :class:`~crptpro.envs.worlds.CheckedWorld` says.
 
     Output keys: ``pixels`` uint8 ``[3 * frame_stack, H, W]``, oldest to newest (a reset repeats its first
     frame); ``action`` float32 ``[A]`` in [-1, 1]; ``("next", "reward")`` float32 ``[1]``, summed over the
     repeated env steps; ``done``, ``terminated``, ``truncated`` (time limits truncate; where a world has none,
-    1000 agent steps do). Consecutive frames are ``action_repeat`` env steps apart. ``env.set_seed(s)``
-    re-seeds the simulator without resetting, and the next ``reset`` starts the episode that belongs to ``s``.
-    ``env.card()`` says what shaped the pixels (not in worlds of your own).
-    ``env.close()`` frees the render context; at the interpreter's exit it is called for whatever is open.
-
-    Whatever the world, it is watched as :class:`~crptpro.envs.worlds.CheckedWorld` says: rewards that are not finite,
-    exceptions of its own, images of another kind, and episodes in which nothing moves are reported with its name.
+    1000 agent steps do). ``env.set_seed(s)`` re-seeds the simulator without resetting; the next ``reset`` starts the
+    episode that belongs to ``s``. ``env.card()`` says what shaped the pixels (not in worlds of your own).
 
     Args:
-        task: Any name that :func:`crptpro.domains.get_domain` knows, or a :class:`~crptpro.domains.Domain`.
-        seed: Seed of the simulator's first episode, from 0 to 2**32 - 1.
+        task: a name that :func:`crptpro.domains.get_domain` knows, or a :class:`~crptpro.domains.Domain`.
+        seed: of the simulator's first episode, from 0 to 2**32 - 1.
         image_size: H = W, pixels.
-        action_repeat: Env steps per agent step; ``None`` takes the domain's (2).
-        frame_stack: Frames per observation; 1 gives the single frame ``[3, H, W]``.
-        camera: Camera index or name; ``None`` takes the domain's.
-        quality: ``"exact"`` renders the model as it is; ``"fast"`` uses smaller shadow maps, up to twice as
-            fast on software GL, with fewer than 1 % of the pixels changed (quadruped_escape: 8 %).
+        action_repeat: env steps per agent step; ``None`` takes the domain's (2).
+        frame_stack: frames per observation; 1 gives the single frame ``[3, H, W]``.
+        camera: index or name; ``None`` takes the domain's.
+        quality: ``"fast"`` renders smaller shadow maps, up to twice as fast on software GL, with fewer than 1 % of the
+            pixels changed (quadruped_escape: 8 %).
         colors: ``"reversed_background"`` reverses the order of the RGB values of skybox and floor, the paper's unseen
             colours (dm_control only); ``"reversed_image"`` that of whole images.
-        physics_state: Also emit ``qpos`` and ``qvel``, float64, where the world has a MuJoCo state.
-        render: ``False`` leaves every image black, for policies that do not look: rewards and episodes are the
-            same, ten times sooner. Environments of your own draw all the same.
+        physics_state: also emit ``qpos`` and ``qvel``, float64, where the world has a MuJoCo state.
+        render: ``False`` leaves every image black, for policies that do not look: ten times faster, with the same
+            rewards. Worlds of your own draw all the same.
 
     Raises:
-        UnknownNameError: for a task nobody knows.
-        RenderingError: if no GL backend renders.
-        ValueError: for a number that is none, or out of range.
-        CRPTproError: for options or an own environment that cannot be used.
+        UnknownNameError: the task is unknown.
+        RenderingError: no GL backend renders.
+        ValueError: a number is none, or out of range.
+        CRPTproError: options or a world of your own cannot be used.
     """
     domain = get_domain(task)
     seed = as_int(seed, "seed", minimum=0, maximum=2**32 - 1)
@@ -83,13 +76,12 @@ def make_env(
     camera = domain.camera if camera is None else camera
     if camera is not None and not isinstance(camera, str):
         camera = as_int(camera, "camera")
-    if quality not in QUALITIES:
-        raise CRPTproError(f"quality must be {' or '.join(map(repr, QUALITIES))}, got {quality!r}.")
-    if colors not in COLORS:
-        raise CRPTproError(f"colors must be {', '.join(map(repr, COLORS))}, got {colors!r}.")
+    for name, value, allowed in (("quality", quality, QUALITIES), ("colors", colors, COLORS)):
+        if value not in allowed:
+            raise CRPTproError(f"{name} must be {' or '.join(map(repr, allowed))}, got {value!r}.")
     if colors == "reversed_background" and domain.source not in ("suite", "manipulation"):
         raise CRPTproError(
-            f"What the background of {domain.name!r} is, is known for dm_control's worlds alone; "
+            f"The background of {domain.name!r} is not known: only dm_control's worlds can have it reversed. "
             "colors='reversed_image' reverses the colours of whole images in any world."
         )
     card = {
@@ -99,22 +91,29 @@ def make_env(
     if needs_gl(domain):
         select_backend()
         card |= backend_card()
-    asked: dict[str, Any] = {
-        "image_size": image_size, "action_repeat": action_repeat, "physics_state": physics_state,
+    settings: dict[str, Any] = {
+        "image_size": image_size, "action_repeat": action_repeat, "camera": camera, "quality": quality,
+        "physics_state": physics_state,
     }  # fmt: skip
     world: Any
     if domain.source == "own":
-        world = _own(domain, seed=seed, camera=camera, quality=quality, **asked)
+        world = _own(domain, seed=seed, **settings)
         card = {"task": domain.task}  # its make decides what the settings shape
     elif domain.source == "gymnasium":
-        world = _gymnasium(domain, camera, quality, render=render, **asked)
+        from crptpro.envs.gymnasium_worlds import make_gymnasium
+
+        world = make_gymnasium(domain.task, render=render, **settings)
     else:
-        world = _dm_control(domain, camera, quality, colors, render=render, **asked)
+        # Imported late: dm_control keeps the GL backend that it is imported with.
+        from crptpro.envs.dm_control import make_dm_control
+
+        reverses_background = colors == "reversed_background"
+        world = make_dm_control(domain, render=render, reverses_background=reverses_background, **settings)
     limit = LONGEST_EPISODE_AGENT_STEPS if domain.episode_env_steps is None else None
     world.watch(card, agent_step_limit=limit, checks_frames=render or domain.source == "own")
     transforms: list[Transform] = []
     if colors == "reversed_image":
-        # Imported late: transforms stand on networks, which no environment needs.
+        # Imported late: transforms depend on networks, which no environment needs.
         from crptpro.transforms.color_swap import ColorSwap
 
         transforms.append(ColorSwap(in_keys=["pixels"]))
@@ -138,15 +137,15 @@ def resolve_action_repeat(task: str | Domain, action_repeat: int | None = None) 
         action_repeat = as_int(action_repeat, "action_repeat", minimum=1)
     domain = get_domain(task)
     make = domain.make if domain.source == "own" else None
-    if make is not None and not _named_by(make, {"action_repeat": None}):
-        fixed = as_int(_bound(make).get("action_repeat", 1), "action_repeat", minimum=1)
-        if action_repeat not in (None, fixed):
-            logger.warning(
-                "The make of domain %r takes no action_repeat: a decision is %d env step(s), not %d.",
-                domain.name, fixed, action_repeat,
-            )  # fmt: skip
-        return fixed
-    return domain.action_repeat if action_repeat is None else action_repeat
+    if make is None or _named_by(make, {"action_repeat": None}):
+        return action_repeat or domain.action_repeat
+    fixed = as_int(_bound(make).get("action_repeat", 1), "action_repeat", minimum=1)
+    if action_repeat not in (None, fixed):
+        logger.warning(
+            "The make of domain %r takes no action_repeat: a decision is %d env step(s), not %d.",
+            domain.name, fixed, action_repeat,
+        )  # fmt: skip
+    return fixed
 
 
 def episode_length(task: str | Domain, *, action_repeat: int | None = None) -> int | None:
@@ -157,10 +156,9 @@ def episode_length(task: str | Domain, *, action_repeat: int | None = None) -> i
 
 
 def needs_gl(task: str | Domain) -> bool:
-    """Tell whether MuJoCo draws the frames, so that a GL backend must be chosen and proven first.
+    """Whether MuJoCo renders the frames, so that a GL backend must be selected first.
 
-    dm_control's worlds need one, and Gymnasium's where MuJoCo or its robotics package simulates. Other Gymnasium
-    worlds (``gymnasium:Pendulum-v1``) and your own draw by themselves; a dataset of theirs names no backend.
+    True for dm_control's worlds, and Gymnasium's where MuJoCo or its robotics package simulates.
     """
     domain = get_domain(task)
     if domain.source != "gymnasium":
@@ -171,34 +169,6 @@ def needs_gl(task: str | Domain) -> bool:
     return any(name in made_by for name in ("mujoco", "dm_control", "gymnasium_robotics"))
 
 
-def _dm_control(
-    domain: Domain, camera: Any, quality: Quality, colors: Colors, *, render: bool, **asked: Any
-) -> EnvBase:
-    # Imported late: dm_control keeps the GL backend that it is imported with.
-    from crptpro.envs import dm_control
-
-    shadow_size = dm_control.FAST_SHADOW_SIZE[domain.source] if quality == "fast" else None
-    scene = dm_control.SceneCamera(
-        asked["image_size"], camera, shadow_size, reverses_background=colors == "reversed_background"
-    )
-    with first_frame_watchdog(), own_context(None):  # composer renders once when it is built
-        env = dm_control.load_dm_env(domain)
-    scene.prepare(env.physics)
-    steps = dm_control.AgentSteps(env, scene if render else None, world=domain.task, **asked)
-    return dm_control.DMControlPixelEnv(steps)
-
-
-def _gymnasium(domain: Domain, camera: Any, quality: Quality, *, render: bool, **asked: Any) -> EnvBase:
-    from crptpro.envs import gymnasium_worlds
-
-    env_id = domain.task[len(GYMNASIUM_PREFIX) :]
-    env = gymnasium_worlds.load_gymnasium_env(
-        env_id, camera=camera, image_size=asked["image_size"], quality=quality
-    )
-    steps = gymnasium_worlds.AgentSteps(env, world=domain.task, render=render, **asked)
-    return gymnasium_worlds.GymnasiumPixelEnv(env=steps)
-
-
 class OwnEnv(CheckedWorld, TransformedEnv):
     """A user's TorchRL environment, with transforms of its own inside and what makes it like all others outside."""
 
@@ -207,9 +177,6 @@ class FrameTransform(Transform):
     """Makes ``pixels`` frames (:class:`~crptpro.envs.worlds.FrameReader`), and adds ``truncated`` if it is missing.
 
     TorchRL's ``PermuteTransform`` returns a view of the world's own buffer, ``ToTensorImage`` divides uint8 by 255.
-
-    Args:
-        world: Name for messages.
     """
 
     def __init__(self, world: str):
@@ -240,19 +207,18 @@ class FrameTransform(Transform):
         return next_tensordict
 
 
-def _own(domain: Domain, *, image_size: int, **settings: Any) -> EnvBase:
+def _own(domain: Domain, **settings: Any) -> EnvBase:
     make = domain.make
     if make is None:
         raise CRPTproError(f"Domain {domain.name!r} has no make, the function that builds its environment.")
-    named = _named_by(make, {"image_size": image_size, **settings})
+    named = _named_by(make, settings)
     if settings["quality"] != "exact" and "quality" not in named:
         logger.warning(
-            "The make of domain %r takes no quality: it draws as ever, not with quality=%r.",
-            domain.name, settings["quality"],
+            "The make of domain %r takes no quality: quality=%r changes nothing.", domain.name, settings["quality"]
         )  # fmt: skip
     with passed_on(domain.task, "make"):
         env = make(**named)
-    _require_contract(domain, env, image_size)
+    _require_contract(domain, env, settings["image_size"])
     state = ("qpos", "qvel") if settings["physics_state"] else ()
     present = set(env.observation_spec.keys(True, True))
     kept = [key for key in ("pixels", *state, *_read_back(env)) if key in present]
@@ -267,11 +233,7 @@ def _own(domain: Domain, *, image_size: int, **settings: Any) -> EnvBase:
 
 
 def _read_back(env: EnvBase) -> list[Any]:
-    """Return the observations that the environment itself reads at the next step.
-
-    A transform that counts (``StepCounter``, ``RewardSum``) keeps its count in the tensordict, and so does an
-    environment without a state of its own: what is dropped there is missing one step later.
-    """
+    """Return the observations that the environment reads at the next step: counts of ``StepCounter``, own states."""
     base = env
     while isinstance(base, TransformedEnv):
         base = base.base_env
@@ -290,15 +252,13 @@ def _named_by(make: Any, settings: dict[str, Any]) -> dict[str, Any]:
     parameters = inspect.signature(make.__init__ if inspect.isclass(make) else make).parameters
     takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
     return {
-        name: settings[name]
-        for name in OFFERED
-        if name in settings and (takes_all or name in parameters) and name not in _bound(make)
+        name: value
+        for name, value in settings.items()
+        if (takes_all or name in parameters) and name not in _bound(make)
     }
 
 
 def _require_contract(domain: Domain, env: Any, image_size: int) -> None:
-    """Raise for what the rest of the library cannot use."""
-
     def refuse(what: str) -> CRPTproError:
         return CRPTproError(f"The environment of domain {domain.name!r} {what} (see crptpro.domains.Domain).")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from typing import Any
 
 import gymnasium
@@ -17,20 +18,21 @@ from crptpro.envs.dm_control import FAST_SHADOW_SIZE, route_mujoco_warnings
 from crptpro.envs.rendering import first_frame_watchdog, own_context
 from crptpro.envs.worlds import ActionRange, CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError, RenderingError, WorldError
+from crptpro.values import Quality
 
 
 class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """A Gymnasium world of which one step is one decision: repeated, summed, scaled, and drawn once.
+    """A Gymnasium world of which one step is one agent step: repeated, summed, scaled, and rendered once.
 
-    Gymnasium's own wrappers for this need OpenCV (``ResizeObservation``), render every repeated step
+    Gymnasium's own wrappers need OpenCV (``ResizeObservation``), render every repeated step
     (``AddRenderObservation``), and none repeats an action.
 
     Args:
-        env: Made with ``render_mode="rgb_array"``.
-        world: Name for messages.
+        env: made with ``render_mode="rgb_array"``.
+        world: name for messages.
         image_size: H = W, pixels; images of another size are resized.
         action_repeat: Gymnasium steps per step, on top of any frame skip of the environment.
-        physics_state: Also observe ``qpos`` and ``qvel``, where it has them.
+        physics_state: also observe ``qpos`` and ``qvel``, where it has them.
         render: ``False`` leaves every image black.
 
     Raises:
@@ -101,47 +103,39 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _draw(self) -> Tensor:
         viewer = getattr(getattr(self.env.unwrapped, "mujoco_renderer", None), "viewer", None)
-        own = own_context(getattr(viewer, "make_context_current", None))
-        if self._has_drawn:
-            with passed_on(self._world, "render"), own:
+        with (
+            passed_on(self._world, "render"),
+            nullcontext() if self._has_drawn else first_frame_watchdog(),
+            own_context(getattr(viewer, "make_context_current", None)),
+        ):
+            try:
                 image = self.env.render()
-        else:
-            with first_frame_watchdog(), passed_on(self._world, "render"), own:
-                try:
-                    image = self.env.render()
-                except (ImportError, gymnasium.error.Error) as reason:
-                    raise RenderingError(f"{self._world} does not render: {reason}") from reason
-            self._has_drawn = True
+            except (ImportError, gymnasium.error.Error) as reason:
+                raise RenderingError(f"{self._world} does not render: {reason}") from reason
+        self._has_drawn = True
         return resize(self._read_frame(image), self._image_size)
 
 
 class GymnasiumPixelEnv(CheckedWorld, GymWrapper):
-    """TorchRL's ``GymWrapper`` whose seed waits for the next reset, the only moment at which Gymnasium takes one.
-
-    Images are what ``render_mode="rgb_array"`` returns, resized without aliasing (bilinear with the filter
-    widened to the scale; TorchRL's ``Resize`` needs torchvision); Gymnasium's MuJoCo environments render at twice
-    ``image_size``, others at their own size.
-    """
+    """TorchRL's ``GymWrapper`` whose seed waits for the next reset, the only moment at which Gymnasium takes one."""
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self._env.episode_seed = seed
 
 
-def load_gymnasium_env(env_id: str, *, camera: int | str | None, image_size: int, quality: str) -> Any:
-    """Make a Gymnasium environment that renders RGB.
+def make_gymnasium(
+    task: str, *, camera: int | str | None, quality: Quality, image_size: int, **settings: Any
+) -> GymnasiumPixelEnv:
+    """Build ``gymnasium:<id>``; the settings are those of :func:`crptpro.envs.make_env`.
 
-    Args:
-        env_id: Id in Gymnasium's registry.
-        camera: Camera index or name of a MuJoCo environment; ``None`` keeps the environment's own.
-        image_size: MuJoCo environments of Gymnasium's own render at twice this size.
-        quality: ``"fast"`` renders MuJoCo's shadows from smaller maps.
+    Gymnasium's MuJoCo environments render at twice ``image_size``, others at their own size; images are resized.
 
     Raises:
-        CRPTproError: if it cannot be made so, or has no such camera.
-        WorldFailedError: if its own code fails.
+        CRPTproError: it cannot be made with RGB rendering, or has no such camera.
+        WorldFailedError: its own code fails.
     """
-    name = f"{GYMNASIUM_PREFIX}{env_id}"
+    env_id = task[len(GYMNASIUM_PREFIX) :]
     options: dict[str, Any] = {}
     if camera is not None:
         options["camera_name" if isinstance(camera, str) else "camera_id"] = camera
@@ -149,30 +143,30 @@ def load_gymnasium_env(env_id: str, *, camera: int | str | None, image_size: int
         # Their 480 x 480 by default costs twice the time on software GL and ends as the same few pixels.
         options.update(width=2 * image_size, height=2 * image_size)
         route_mujoco_warnings()
-    with passed_on(name, "make"):
+    with passed_on(task, "make"):
         try:
             env: Any = gymnasium.make(env_id, render_mode="rgb_array", disable_env_checker=True, **options)
         except TypeError as reason:
             if not any(f"unexpected keyword argument '{option}'" in str(reason) for option in options):
                 raise  # the world's own
             hint = " It takes no camera; leave camera unset." if camera is not None else ""
-            raise CRPTproError(f"{name} cannot be made with rgb_array rendering: {reason}.{hint}") from reason
+            raise CRPTproError(f"{task} cannot be made with rgb_array rendering: {reason}.{hint}") from reason
         except (ImportError, gymnasium.error.Error) as reason:
-            raise CRPTproError(f"{name} cannot be made: {reason}") from reason
+            raise CRPTproError(f"{task} cannot be made: {reason}") from reason
     model: Any = getattr(env.unwrapped, "model", None)
     if isinstance(camera, int) and not -1 <= camera < getattr(model, "ncam", camera + 1):
         env.close()  # MuJoCo would end the process
-        raise CRPTproError(f"{name} has no camera {camera}; its model has {model.ncam}, numbered from 0.")
+        raise CRPTproError(f"{task} has no camera {camera}; its model has {model.ncam}, numbered from 0.")
     _fix_free_camera(env)
     if quality == "fast" and hasattr(model, "vis"):
         model.vis.quality.shadowsize = min(FAST_SHADOW_SIZE["suite"], model.vis.quality.shadowsize)
-    return env
+    return GymnasiumPixelEnv(env=AgentSteps(env, world=task, image_size=image_size, **settings))
 
 
 def resize(frame: Tensor, size: int) -> Tensor:
-    """Resize a uint8 frame ``[3, H, W]`` to ``[3, size, size]``, bilinear and antialiased.
+    """Resize a uint8 frame ``[3, H, W]`` to ``[3, size, size]``, bilinear and antialiased (without torchvision).
 
-    A non-square frame is squeezed, not cropped: everything that is rendered stays visible.
+    A frame that is not square is squeezed, not cropped.
     """
     if frame.shape[1:] == (size, size):
         return frame
@@ -183,10 +177,9 @@ def resize(frame: Tensor, size: int) -> Tensor:
 
 
 def _fix_free_camera(env: Any) -> None:
-    """Point Gymnasium's free camera at where the model's default pose lies.
+    """Point Gymnasium's free camera at the model's default pose.
 
-    By itself it looks at the middle of whatever state is drawn first, for good: the same episode would be drawn
-    differently as the second one of a process than as the first of a resumed one.
+    It would keep looking at the middle of the first state that is rendered, which differs after a resume.
     """
     renderer = getattr(env.unwrapped, "mujoco_renderer", None)
     config = getattr(renderer, "default_cam_config", None) or {}

@@ -1,4 +1,4 @@
-"""What every world must keep, whoever wrote it: frames that are images, finite numbers, errors with its name."""
+"""Checks of every world, whoever wrote it: frames that are images, finite numbers, errors with its name."""
 
 from __future__ import annotations
 
@@ -20,27 +20,24 @@ from crptpro.errors import CRPTproError, NonFiniteError, WorldError, WorldFailed
 
 logger = logging.getLogger(__name__)
 
-#: Bounds of an action from which on they are taken for "none": MuJoCo's mjMAXVAL. A ``Box`` of float32's range
-#: (3.4e38) means the same.
+#: Magnitude from which on a bound of an action means "none": MuJoCo's mjMAXVAL (float32's largest is above it).
 NO_BOUND = 1e10
-#: Agent steps from which on an episode that was left before its end is looked at as a whole one.
+#: Agent steps from which on an episode that was left before its end is judged by its frames.
 LONG_EPISODE = 25
 
-_open: weakref.WeakValueDictionary[int, EnvBase] = weakref.WeakValueDictionary()
+_open: weakref.WeakSet[EnvBase] = weakref.WeakSet()
 
 
 class CheckedWorld:
-    """Mixed into the class that steps a world: checks what it answers, and names it in what goes wrong.
+    """Mixed into the class that steps a world: checks what it returns, and names it in errors.
 
-    - An exception of the world's own code is passed on as :class:`~crptpro.errors.WorldFailedError`, with its name and
-      the call.
+    - An exception of the world's own code is raised again as :class:`~crptpro.errors.WorldFailedError`.
     - An action, a reward or a physical state that is not finite raises :class:`~crptpro.errors.NonFiniteError` with
       the episode and the agent step, before anything can store it.
     - An episode whose frames are all alike is reported by one warning per environment.
     - After ``agent_step_limit`` agent steps an episode is truncated. (TorchRL's ``StepCounter`` would add
-      ``step_count`` to every observation and read it back, so no replay could leave it out.)
-    - The environment is closed at the interpreter's exit, if nobody did it before: a render context that is freed
-      later prints errors.
+      ``step_count`` to every observation and read it back.)
+    - The environment is closed at the interpreter's exit: a render context that is freed later prints errors.
     """
 
     world: str = ""
@@ -56,10 +53,10 @@ class CheckedWorld:
     def watch(
         self, card: dict[str, Any], *, agent_step_limit: int | None = None, checks_frames: bool = True
     ) -> None:
-        """Begin to watch: ``card["task"]`` is the name in messages."""
+        """Set the card, whose ``task`` is the name in messages, and what is checked."""
         self._card, self.world = card, card["task"]
         self.agent_step_limit, self.checks_frames = agent_step_limit, checks_frames
-        _open[id(self)] = cast(EnvBase, self)
+        _open.add(cast(EnvBase, self))
 
     def card(self) -> dict[str, Any]:
         """Return what shaped the pixels: task, camera, GL backend, quality, colours, action repeat."""
@@ -96,7 +93,7 @@ class CheckedWorld:
             if value is not None and not value.isfinite().all():
                 raise NonFiniteError(
                     f"The world {self.world!r} {verb} {key} {value.tolist()} in agent step {self._agent_step} of "
-                    f"episode {self._episode} (this environment's first is 0). Nothing of this step is stored; mend "
+                    f"episode {self._episode} (this environment's first is 0). Nothing of this step is stored; fix "
                     "what computes it, or keep the actions where the world is stable."
                 )
 
@@ -113,12 +110,12 @@ class CheckedWorld:
         )  # fmt: skip
 
     def read_obs(self, observations: dict[str, Any]) -> dict[str, Any]:
-        """Take frames as they are; TorchRL's would compare each of their bytes with the spec's bounds."""
+        """Pass frames on; TorchRL's method would compare each of their bytes with the spec's bounds."""
         return dict(observations)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Free the world and its render context; calling it twice is harmless."""
-        _open.pop(id(self), None)
+        _open.discard(cast(EnvBase, self))
         if not self._was_closed:
             self._was_closed = True
             super().close(raise_if_closed=False)  # type: ignore[misc]
@@ -126,17 +123,17 @@ class CheckedWorld:
 
 @atexit.register
 def _close_what_is_open() -> None:
-    for env in list(_open.values()):
+    for env in list(_open):
         with suppress(Exception):
             env.close()
 
 
 @contextmanager
 def passed_on(world: str, call: str) -> Iterator[None]:
-    """Pass an exception of a world's own code on with the world's name and the call.
+    """Raise exceptions of a world's own code in the body again, with the world's name and the call.
 
     Raises:
-        WorldFailedError: from the world's exception; errors of this library stay what they are.
+        WorldFailedError: from the world's exception; errors of this library are left alone.
     """
     try:
         yield
@@ -154,13 +151,9 @@ def passed_on(world: str, call: str) -> Iterator[None]:
 
 
 class FrameReader:
-    """Turns what a world shows into a frame of one's own: a copy, uint8 ``[3, H, W]``.
+    """Converts an image of a world to a frame: a copy, uint8 ``[3, H, W]``, because a world may reuse its buffer.
 
-    uint8 is taken as it is, floats in [0, 1] are multiplied by 255, which is said once. A world may hand out a view of
-    a buffer that it uses again: the frame is always a copy.
-
-    Args:
-        world: Name for messages.
+    uint8 is kept; floats in [0, 1] are multiplied by 255, which is logged once.
     """
 
     def __init__(self, world: str):
@@ -171,7 +164,7 @@ class FrameReader:
         """Return the frame of an image ``[H, W, 3]`` or ``[3, H, W]`` (array or tensor).
 
         Raises:
-            WorldError: for what is no RGB image, for other dtypes, and for floats outside [0, 1] or NaN.
+            WorldError: for other shapes, other dtypes, and floats outside [0, 1] or NaN.
         """
         if not isinstance(image, (np.ndarray, Tensor)):
             raise self._refusal(f"is {type(image).__name__}", "an RGB array [H, W, 3]")
@@ -206,12 +199,6 @@ def _is_plain(image: np.ndarray) -> bool:
 
 class ActionRange:
     """The affine map from [-1, 1] to a world's own bounds; without bounds an action is passed on as it is.
-
-    Args:
-        low: Lower bounds, of the shape that the world takes.
-        high: Upper bounds.
-        dtype: What the world takes.
-        world: Name for messages.
 
     Raises:
         CRPTproError: for integer or empty actions, for bounds in the wrong order, or on one side only.

@@ -49,7 +49,7 @@ from crptpro.transforms import (
 )
 from crptpro.transforms.free_memory import free_bytes
 from crptpro.transforms.prototype_reward import warn_if_mostly_zero
-from crptpro.values import Colors, Quality, as_float, as_int
+from crptpro.values import Colors, Quality, check_numbers
 
 logger = logging.getLogger(__name__)
 
@@ -124,36 +124,21 @@ class DownstreamConfig:
     """where networks and features are"""
 
     def __post_init__(self) -> None:
-        """Take numbers as the plain values they mean.
+        """Convert numbers to plain values.
 
         Raises:
             ValueError: naming the setting, its value and what is allowed.
         """
-        counts = (
-            "env_steps", "batch_size", "replay_capacity", "knn_k", "queue_size", "hidden_dim", "action_repeat",
-            "eval_interval_env_steps", "eval_episodes", "checkpoint_interval_env_steps", "log_interval_env_steps",
-        )  # fmt: skip
-        values: dict[str, Any] = {
-            name: as_int(getattr(self, name), name, minimum=1)
-            for name in counts
-            if getattr(self, name) is not None
-        }
-        values["seed"] = as_int(self.seed, "seed", minimum=0, maximum=2**32 - 1)
-        values["random_agent_steps"] = as_int(self.random_agent_steps, "random_agent_steps", minimum=1)
-        if self.eval_workers is not None:
-            values["eval_workers"] = as_int(self.eval_workers, "eval_workers", minimum=0)
-        largest = {"discount": 1, "critic_tau": 1}
-        for name in (
-            "discount",
-            "critic_tau",
-            "learning_rate",
-            "initial_temperature",
-            "intrinsic_reward_coef",
-        ):
-            if getattr(self, name) is not None:
-                values[name] = as_float(getattr(self, name), name, minimum=0, maximum=largest.get(name))
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        counts = {
+            "env_steps": 1, "batch_size": 1, "replay_capacity": 1, "random_agent_steps": 1, "knn_k": 1, "queue_size": 1,
+            "hidden_dim": 1, "action_repeat": 1, "eval_interval_env_steps": 1, "eval_episodes": 1, "eval_workers": 0,
+            "checkpoint_interval_env_steps": 1, "log_interval_env_steps": 1,
+        }  # fmt: skip
+        rates = {
+            "intrinsic_reward_coef": None, "discount": 1, "learning_rate": None, "initial_temperature": None,
+            "critic_tau": 1,
+        }  # fmt: skip
+        check_numbers(self, counts=counts, rates=rates)
         if self.features not in ("auto", "dense", "dense-bf16", "reencode"):
             raise ValueError(
                 f"`features` must be auto, dense, dense-bf16 or reencode, got {self.features!r}."

@@ -65,7 +65,7 @@ from crptpro.training.pretrain import (
 from crptpro.training.run import Generators, Run
 from crptpro.transforms import ContrastiveReward, FrozenEncoder, ParticleReward, PrototypeReward, RandomShift
 from crptpro.transforms.prototype_reward import warn_if_mostly_zero
-from crptpro.values import Quality, as_float, as_int
+from crptpro.values import Quality, check_numbers
 
 logger = logging.getLogger(__name__)
 
@@ -117,27 +117,17 @@ class ExploreConfig:
     """simulator steps, over all domains, between two checkpoints"""
 
     def __post_init__(self) -> None:
-        """Take numbers as the plain values they mean.
+        """Convert numbers to plain values.
 
         Raises:
             ValueError: naming the setting, its value and what is allowed.
         """
-        counts = (
-            "env_steps", "batch_size", "encoder_update_interval", "replay_capacity", "hidden_dim",
-            "queue_size", "log_interval", "checkpoint_interval_env_steps",
-        )  # fmt: skip
-        values: dict[str, Any] = {
-            name: as_int(getattr(self, name), name, minimum=1)
-            for name in counts
-            if getattr(self, name) is not None
-        }
-        values["seed"] = as_int(self.seed, "seed", minimum=0, maximum=2**32 - 1)
-        if self.random_agent_steps is not None:
-            values["random_agent_steps"] = as_int(self.random_agent_steps, "random_agent_steps", minimum=0)
-        if self.learning_rate is not None:
-            values["learning_rate"] = as_float(self.learning_rate, "learning_rate", minimum=0)
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        counts = {
+            "env_steps": 1, "batch_size": 1, "encoder_update_interval": 1, "random_agent_steps": 0,
+            "replay_capacity": 1, "hidden_dim": 1, "queue_size": 1, "log_interval": 1,
+            "checkpoint_interval_env_steps": 1,
+        }  # fmt: skip
+        check_numbers(self, counts=counts, rates={"learning_rate": None})
 
     def resolved(self, method: Method) -> Any:
         """Return the settings with the method's values where they were left open."""

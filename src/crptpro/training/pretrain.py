@@ -32,7 +32,7 @@ from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.compile import accelerate
 from crptpro.training.run import Generators, Run
 from crptpro.transforms import RandomShift
-from crptpro.values import as_float, as_int
+from crptpro.values import as_int, check_numbers
 
 SHIFT_PAD = 4
 COSINE_ROWS = 128
@@ -71,25 +71,17 @@ class PretrainConfig:
     """updates between two checkpoints (default: about every five minutes)"""
 
     def __post_init__(self) -> None:
-        """Take numbers as the plain values they mean.
+        """Convert numbers to plain values.
 
         Raises:
             ValueError: naming the setting, its value and what is allowed.
         """
-        values: dict[str, Any] = {
-            "seed": as_int(self.seed, "seed", minimum=0, maximum=2**32 - 1),
-            "snapshots": tuple(as_int(done, "snapshots", minimum=1) for done in self.snapshots),
-        }
-        for name in ("updates", "batch_size", "log_interval", "checkpoint_interval"):
-            if getattr(self, name) is not None:
-                values[name] = as_int(getattr(self, name), name, minimum=1)
-        if self.warmup_updates is not None:
-            values["warmup_updates"] = as_int(self.warmup_updates, "warmup_updates", minimum=0)
-        for name, largest in (("learning_rate", None), ("encoder_tau", 1)):
-            if getattr(self, name) is not None:
-                values[name] = as_float(getattr(self, name), name, minimum=0, maximum=largest)
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        counts = {
+            "updates": 1, "batch_size": 1, "warmup_updates": 0, "log_interval": 1, "checkpoint_interval": 1,
+        }  # fmt: skip
+        check_numbers(self, counts=counts, rates={"learning_rate": None, "encoder_tau": 1})
+        snapshots = tuple(as_int(done, "snapshots", minimum=1) for done in self.snapshots)
+        object.__setattr__(self, "snapshots", snapshots)
 
     def resolved(self, method: Method) -> Any:
         """Return these settings with the method's values where they were left open."""
