@@ -144,7 +144,7 @@ def _locked(directory: Path) -> Iterator[None]:
         lock.acquire(timeout=0)
     except Timeout:
         logger.warning("Another process runs %s; waiting until it ends.", directory.name)
-        lock.acquire(poll_interval=1)
+        lock.acquire(timeout=1e9, poll_interval=1)
     try:
         yield
     finally:
@@ -509,7 +509,7 @@ def run_jobs(
         What was not finished: failures first, then what depends on them.
 
     Raises:
-        SubmissionError: a queue refuses a job while none runs.
+        SubmissionError: a queue refuses the first job.
         KeyboardInterrupt: after Ctrl-C, when all jobs have ended.
         SystemExit: likewise after SIGTERM.
     """
@@ -596,8 +596,8 @@ class _Loop:
             try:
                 handle = self.launcher.start(work, is_exclusive=job.is_exclusive)
             except SubmissionError as refusal:
-                if not self.running:
-                    raise
+                if not self.tried:
+                    raise  # what is wrong with the first is wrong with all
                 self.resumes = time.monotonic() + REFUSED_S
                 logger.warning("%s: %s It is tried again in %g s.", job.key, refusal, REFUSED_S)
                 return False
