@@ -1,17 +1,14 @@
-"""Curves, marks, clouds of points and pictures, drawn from data frames without a window; every axis names its unit."""
+"""Curves, marks and clouds of points, drawn from data frames without a window; every axis names its unit."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
-
-if TYPE_CHECKING:
-    from torchrl.data import ReplayBuffer
 
 COLORS = {
     "crptpro": "#0b80c3", "crptpro-fast": "#3d44d8", "crptpro-finetune": "#5fc0f0", "proto-rl-c": "#d9640a",
@@ -202,27 +199,6 @@ def scatter(points: pd.DataFrame, components: Sequence[str]) -> Any:
             )
             axis.set(xlabel=components[x], ylabel=components[y])
     _legend(figure, handles)
-    return figure
-
-
-def stacks(datasets: Mapping[str, ReplayBuffer], count: int = 4) -> Any:
-    """Show sampled observations, a dataset a row: the pictures of each stack, oldest to newest, side by side.
-
-    Args:
-        datasets: name to replay buffer whose samples hold ``pixels`` uint8 ``[B, 3k, H, W]``.
-        count: observations of each.
-    """
-    from crptpro.analysis.embeddings import sample_pixels
-
-    figure, axes = grid(count * len(datasets), count, width=2.6, height=1.1)
-    for place, (name, dataset) in enumerate(datasets.items()):
-        pixels = sample_pixels(dataset, count, seed=0).cpu()  # (B, C, H, W)
-        strips = pixels.unflatten(1, (-1, 3)).permute(0, 3, 1, 4, 2).flatten(2, 3).numpy()  # (B, H, k W, 3)
-        for axis, strip in zip(axes[place * count :], strips):
-            axis.imshow(strip)
-            axis.grid(visible=False)
-            axis.set(xticks=[], yticks=[])
-        axes[place * count].set_ylabel(_literal(name), fontsize=8)
     return figure
 
 

@@ -23,7 +23,7 @@ import pandas as pd
 from crptpro.artifact import read_json, write_whole
 from crptpro.errors import CRPTproError, RecordError
 from crptpro.experiments import published
-from crptpro.experiments.figures import curves, dots, in_order, scatter, stacks
+from crptpro.experiments.figures import curves, dots, in_order, scatter
 from crptpro.experiments.jobs import load_results
 from crptpro.experiments.launch import duration
 from crptpro.experiments.matrix import EXPERIMENTS
@@ -77,7 +77,6 @@ def build_report(root: str | Path, *, out: str | Path | None = None) -> Path:
         order = {label: place for place, label in enumerate(in_order(own["label"]))}
         own = own.sort_values("label", key=lambda labels, order=order: labels.map(order), kind="stable")
         _experiment(page, experiment, scale, own.dropna(axis=1, how="all").reset_index(drop=True), jobs)
-    _observations(page, jobs)
     _provenance(page, jobs)
     scales = " and ".join(dict.fromkeys(filter(None, cells["scale"])))
     now = f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d at %H:%M} UTC"
@@ -127,13 +126,11 @@ class Page:
             ]
             self._add(kind="table", caption=caption, columns=[*map(str, frame)], rows=shown, fold=fold)
 
-    def figure(self, name: str, caption: str, figure: Any | None) -> None:
-        """Write a figure and show it; ``None`` shows one that is there. The same numbers give the same file."""
-        file = f"figures/{_plain(name)}.png"
-        if figure is not None:
-            pixels = io.BytesIO()
-            figure.savefig(pixels, format="png", dpi=110, metadata={"Software": None})
-            write_whole(self.folder / file, pixels.getvalue())
+    def figure(self, name: str, caption: str, figure: Any) -> None:
+        """Write a figure and show it; the same numbers give the same file."""
+        file, pixels = f"figures/{_plain(name)}.png", io.BytesIO()
+        figure.savefig(pixels, format="png", dpi=110, metadata={"Software": None})
+        write_whole(self.folder / file, pixels.getvalue())
         self._add(kind="figure", file=file, caption=caption)
 
     def write(self, title: str, summary: str) -> Path:
@@ -358,30 +355,6 @@ def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     page.table("Budgets beside the paper's; a dash stands where nothing was asked for.", table)
     page.text("What this cannot show:", "warning")
     page.bullets(SHORTCOMINGS)
-
-
-def _observations(page: Page, jobs: pd.DataFrame) -> None:
-    """Show observations of the first dataset of every domain and colours that still has its frames."""
-    from crptpro.data import FrameDataset
-
-    page.section("What the data looks like", "observations")
-    opened: dict[str, FrameDataset] = {}
-    gone: dict[str, None] = {}
-    for path in jobs.loc[(jobs["kind"] == "dataset") & jobs["done"].astype(bool), "path"]:
-        for card in sorted(path.glob("*/card.json")):
-            told = _json(card)
-            name = f"{told.get('domain')}, {told.get('colors', 'normal')}".removesuffix(", normal")
-            try:
-                opened[name] = opened.get(name) or FrameDataset.open(card.parent)
-            except (CRPTproError, OSError):
-                gone[name] = None
-    caption = "4 observations of each domain as a random policy collected them, each of several pictures, oldest first."
-    if opened:
-        page.figure("observations", caption, stacks(opened))
-    elif (page.folder / "figures" / "observations.png").exists():
-        page.figure("observations", f"{caption} Drawn when the datasets were here.", None)
-    if gone:
-        page.text(f"Datasets without their frames: {', '.join(gone)}.", "note")
 
 
 def _provenance(page: Page, jobs: pd.DataFrame) -> None:
