@@ -70,7 +70,8 @@ class Records(contextlib.ExitStack):
 
     def __init__(self, make: Callable[[], RunLogger] | None) -> None:
         super().__init__()
-        self.make, self.logger = make, None
+        self.make: Any = make
+        self.logger: RunLogger | None = None
 
     def __enter__(self) -> Any:
         return None if self.make is None else super().__enter__()
@@ -405,7 +406,7 @@ class Probe:
             if network is not None:
                 network.to(self.device)
         table, measures = [], []
-        settings = {"encoder": self.encoder, "samples": self.samples, "seed": self.seed}
+        settings: dict[str, Any] = {"encoder": self.encoder, "samples": self.samples, "seed": self.seed}
         try:
             for path in self.datasets:
                 rows, numbers = probe_rows(pretrained, FrameDataset.open(path), **settings)
@@ -438,23 +439,18 @@ class Report:
 
 
 def write_video(frames: Sequence[Any], path: Path) -> None:
-    """Write RGB pictures, uint8 ``[3, H, W]``, as an MP4 at 25 pictures a second.
-
-    Raises:
-        CRPTproError: the ``video`` extra is missing, or encoding failed.
-    """
+    """Write RGB pictures, uint8 ``[3, H, W]``, as an MP4 at 25 pictures a second."""
     try:
         import imageio.v2 as imageio
         import imageio_ffmpeg  # noqa: F401 - the encoder behind the FFMPEG format
         import torch
 
         # Nearest-neighbour enlargement keeps 84 pixels visible on a screen; the codec wants even sizes.
-        large = (
-            torch.stack(list(frames)).repeat_interleave(4, -1).repeat_interleave(4, -2).permute(0, 2, 3, 1)
-        )
+        large = torch.stack(list(frames)).repeat_interleave(4, -1).repeat_interleave(4, -2)
         path.parent.mkdir(parents=True, exist_ok=True)
         aside = path.with_name(f".{path.name}")
-        imageio.mimwrite(aside, list(large.numpy()), format="FFMPEG", fps=25, macro_block_size=4)
+        pictures = list(large.permute(0, 2, 3, 1).numpy())
+        imageio.mimwrite(aside, pictures, format="FFMPEG", fps=25, macro_block_size=4)
         aside.replace(path)
     except ImportError:
         raise CRPTproError("--video needs the `video` extra: pip install 'crptpro[video]'.") from None
@@ -464,9 +460,6 @@ def write_video(frames: Sequence[Any], path: Path) -> None:
 
 def named_values(option: str, words: Sequence[str]) -> dict[str, Any]:
     """Read settings given as ``NAME=VALUE``.
-
-    Raises:
-        CRPTproError: naming what is none.
 
     Examples:
         >>> named_values("--loss", ["num_prototypes=16", "intr_loss_coef=5e-3", "kind=mean"])
@@ -485,12 +478,7 @@ def named_values(option: str, words: Sequence[str]) -> dict[str, Any]:
 
 
 def explored_domains(names: Sequence[str], method: str) -> list[str]:
-    """Expand the domains that a method is to explore.
-
-    Raises:
-        CRPTproError: if one is a path: such a method collects its own data.
-        UnknownNameError: if no name is given, or one that nobody knows.
-    """
+    """Expand the domains that a method is to explore; it collects its own data, so that a path is refused."""
     for name in names:
         is_path = Path(name).is_dir() or ("/" in name and not name.startswith(GYMNASIUM_PREFIX))
         if is_path and name not in (*GROUPS, *known_names()):  # a folder may be called walker
@@ -502,14 +490,7 @@ def explored_domains(names: Sequence[str], method: str) -> list[str]:
 
 
 def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
-    """Open every dataset and check that all show images of one form.
-
-    Returns:
-        Image size in pixels and frames per stack.
-
-    Raises:
-        DatasetError: if there is none, one cannot be read, or they differ.
-    """
+    """Open every dataset and return the image size and frames per stack, which all must share."""
     from crptpro.data import FrameDataset
 
     if not datasets:
@@ -531,24 +512,12 @@ def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
 
 
 def require_writable(path: Path, option: str = "--csv") -> None:
-    """Refuse what no file can become, and make nothing yet.
-
-    Args:
-        path: of the file to be.
-        option: by which it was asked for.
-
-    Raises:
-        CRPTproError: it is a directory or a device, or lies below a file or in a directory that may not be written to.
-    """
-    if path.is_dir():
-        raise CRPTproError(f"{option} {path} is a directory; name a file in it.")
+    """Refuse what no file can become, and make nothing yet."""
     if path.exists() and not path.is_file():  # a finished file takes its place: /dev/stdout would be gone
         raise CRPTproError(f"{option} {path} is no ordinary file; name one.")
     there = next(parent for parent in path.absolute().parents if parent.exists())
-    if not there.is_dir():
-        raise CRPTproError(f"{option} {path} cannot be written: {there} is a file.")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise CRPTproError(f"{option} {path} cannot be written: you may not write to {there}.")
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        raise CRPTproError(f"{option} {path} cannot be written: {there} is a file, or not yours to write to.")
 
 
 def pretrain_command(arguments: Sequence[str]) -> type[Pretrain] | type[Explore]:

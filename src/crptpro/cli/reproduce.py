@@ -97,7 +97,7 @@ class Reproduce:
 
         root = as_path(self.out, "out")
         self._refuse_options()
-        given = {"device": self.device, "jobs": self.jobs, "cores": self.cores_per_job}
+        given: dict[str, Any] = {"device": self.device, "jobs": self.jobs, "cores": self.cores_per_job}
         resources = divide(self.launcher, **given, jobs_per_gpu=self.jobs_per_gpu)
         request = self._request(resources)
         wanted = self._wanted(request)

@@ -112,12 +112,9 @@ class Work:
             clock = _clock(self.directory)
             reason = _command(self.arguments(), self.directory / LOG)
             if not reason:
-                made = {
-                    "seconds": clock["seconds"] + time.time() - clock["began"],
-                    "attempts": clock["attempts"],
-                }
-                made |= {"device": self.device, "threads": self.threads, **provenance()}
-                write_json(self.directory / DONE, made)
+                seconds = clock["seconds"] + time.time() - clock["began"]
+                how = {"device": self.device, "threads": self.threads, "attempts": clock["attempts"]}
+                write_json(self.directory / DONE, {"seconds": seconds, **how, **provenance()})
                 (self.directory / CLOCK).unlink(missing_ok=True)
                 for name in LEFTOVERS.get(self.key.split("-")[0], ()):
                     shutil.rmtree(self.directory / name, ignore_errors=True)
@@ -212,26 +209,20 @@ def _output_to(path: Path) -> Iterator[None]:
 
 
 class Handle(Protocol):
-    """A job that was started."""
+    """A job that was started: ``poll`` is ``None`` while it runs or is queued, then why it was lost, or nothing."""
 
-    def poll(self) -> str | None:
-        """``None`` while it runs or is queued; then why it was lost, or nothing if its log tells all."""
+    def poll(self) -> str | None: ...  # noqa: D102
 
-    def stop(self) -> None:
-        """Ask it to write a checkpoint and end; asked again, to end at once."""
+    def stop(self) -> None: ...  # noqa: D102 - ask it to write a checkpoint and end; asked again, to end at once
 
 
 class Launcher(Protocol):
-    """A place where jobs run; ``is_one_machine`` says whether all of them share this machine's cores."""
+    """A place where jobs run; a queue that does not take one now raises ``SubmissionError``."""
 
     is_one_machine: bool
+    """Whether all jobs share this machine's cores."""
 
-    def start(self, work: Work, *, is_exclusive: bool) -> Handle:
-        """Start a job, or queue it.
-
-        Raises:
-            SubmissionError: a queue does not take it now; nothing was started.
-        """
+    def start(self, work: Work, *, is_exclusive: bool) -> Handle: ...  # noqa: D102
 
 
 @dataclass
@@ -374,8 +365,6 @@ class SlurmLauncher:
 
     def job_parameters(self, work: Work, *, is_exclusive: bool) -> dict[str, Any]:
         """Return what submitit is told of one job."""
-        if self.cluster != "slurm":
-            return self.parameters
         # Since Slurm 22.05 srun does not ask for the cores that sbatch was given, and would run the job on one.
         setup = [f"export {name}={work.threads}" for name in (*THREAD_VARIABLES, "SRUN_CPUS_PER_TASK")]
         own = {"job_name": work.key, "cpus_per_task": work.threads, "setup": setup, "exclusive": is_exclusive}
