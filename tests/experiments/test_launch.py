@@ -256,7 +256,7 @@ def test_gpus_are_shared_evenly_and_jobs_have_their_threads(
     assert sorted(environments) == [("0", "3"), ("0", "3"), ("1", "3"), ("1", "3")]
 
 
-def test_what_slurm_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_slurm_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     usual = {"partition": None, "hours": 1.0, "memory_gb": 2.0, "sbatch": (), "has_gpu": False}
     assert slurm_parameters(**usual) == {"time": 60, "mem": "2048M"}  # type: ignore[arg-type]
     gpu = slurm_parameters(**{**usual, "has_gpu": True, "sbatch": ("--qos=high",)})  # type: ignore[arg-type]
@@ -264,10 +264,28 @@ def test_what_slurm_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("shutil.which", lambda name: None)
     with pytest.raises(CRPTproError, match="needs sbatch and srun"):
         SlurmLauncher({})
-    monkeypatch.setattr("shutil.which", lambda name: name)
-    found = SlurmLauncher({"time": 5}).job_parameters(Work(str(tmp_path), "k", threads=4), is_exclusive=True)
-    assert (found["slurm_cpus_per_task"], found["slurm_time"], found["slurm_exclusive"]) == (4, 5, True)
-    assert {"export OMP_NUM_THREADS=4", "export SRUN_CPUS_PER_TASK=4"} <= set(found["slurm_setup"])
+
+
+def test_a_slurm_job_asks_for_its_cores_and_a_refusal_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    for name in ("sbatch", "srun", "scancel"):
+        (folder / name).write_text("#!/bin/sh\necho Submitted batch job 12\n")
+        (folder / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+    parameters = {"time": 5, "mem": "2048M", "gpus_per_node": 1, "additional_parameters": {"qos": "high"}}
+    launcher, work = SlurmLauncher(parameters), Work(str(tmp_path), "key", threads=4)
+    launcher.start(work, is_exclusive=True)
+    [script] = (tmp_path / "submitted").rglob("12_submission.sh")
+    lines = script.read_text().splitlines()
+    for option in ("cpus-per-task=4", "time=5", "mem=2048M", "exclusive", "gpus-per-node=1", "qos=high"):
+        assert f"#SBATCH --{option}" in lines
+    assert {"export OMP_NUM_THREADS=4", "export SRUN_CPUS_PER_TASK=4"} <= set(lines)
+    (folder / "sbatch").write_text("#!/bin/sh\necho Invalid partition >&2\nexit 1\n")
+    with pytest.raises(SubmissionError, match=r"sbatch refused a job: .*Change --partition"):
+        launcher.start(work, is_exclusive=False)
 
 
 # --- real processes -------------------------------------------------------------------------------------------------

@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterable, Mapping
 from html.parser import HTMLParser
 from pathlib import Path
@@ -175,7 +174,7 @@ def test_both_files_show_every_table_and_figures_that_are_there(seen: Report) ->
     assert {path.name for path in (seen.folder / "figures").iterdir()} == {Path(file).name for file in shown}
     for file in shown:
         assert len(np.unique(imread(seen.folder / file)[..., 0])) > 20, file
-    assert len(shown) == 8
+    assert len(shown) == 7
 
 
 # --- made-up records ------------------------------------------------------------------------------------------------
@@ -281,7 +280,6 @@ def test_from_five_runs_on_every_task_aggregates_have_intervals(made: Reproducti
     assert chance == r"1.00 \[1.00, 1.00\]"
     assert "Brackets are 95% intervals" in report.text
     assert "5: 84%" in report.text
-    assert (report.folder / "figures" / "seen-paper-improvement.png").exists()
 
 
 def test_a_partial_reproduction_says_what_is_missing(made: Reproduction) -> None:
@@ -386,7 +384,7 @@ def test_the_same_records_give_the_same_files(made: Reproduction) -> None:
     first = {path.name: path.read_bytes() for path in (made.report().folder / "figures").iterdir()}
     again = {path.name: path.read_bytes() for path in (made.report().folder / "figures").iterdir()}
     assert first == again
-    assert len(first) == 2
+    assert len(first) == 1
 
 
 @pytest.mark.parametrize(("losses", "left"), [
@@ -406,19 +404,6 @@ def test_a_plateau_is_left_where_the_loss_stays_below_it(losses: tuple[float, ..
 
 
 # --- the command, other directories, a browser ----------------------------------------------------------------------
-
-
-def test_on_an_ascii_terminal_the_page_is_written_first_and_its_name_shown_as_it_can_be(
-    tmp_path: Path,
-) -> None:
-    made = Reproduction(tmp_path / "r\N{LATIN SMALL LETTER E WITH ACUTE}sultats")
-    made.ask("seen", made.runs("crptpro", "walker_run", [500.0]))
-    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "CUDA_VISIBLE_DEVICES": ""}
-    command = [sys.executable, "-c", "from crptpro.cli import main; main()", "report", str(made.root)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, env=environment)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == ascii(str(made.root / "report" / "index.html"))[1:-1]
-    assert "500 (n = 1)" in (made.root / "report" / "report.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

@@ -433,9 +433,7 @@ class Report:
         """Write the page, then say where it is."""
         from crptpro.experiments.report import build_report
 
-        page = str(build_report(self.directory, out=self.out))
-        encoding = sys.stdout.encoding or "utf-8"
-        print(page.encode(encoding, "backslashreplace").decode(encoding))  # whatever the terminal can show
+        print(build_report(self.directory, out=self.out))
 
 
 def write_video(frames: Sequence[Any], path: Path) -> None:

@@ -88,7 +88,6 @@ def curves(
     marks: Mapping[str, Mapping[str, float]] | None = None,
     ticks: Sequence[str] = (),
     columns: int = 3,
-    compresses: bool = False,
 ) -> Any:
     """Draw curves in panels, with one legend below.
 
@@ -100,7 +99,6 @@ def curves(
         marks: title of a panel to heights of dashed lines, with what they say.
         ticks: names of the places 0, 1, ... of the horizontal axis, instead of numbers.
         columns: panels side by side.
-        compresses: draw heights far from 0 closer together where a few of them would press all others flat.
     """
     usual = {"panel": "", "line": "", "n": np.nan, "low": np.nan, "high": np.nan, "thin": False}
     points = points.assign(**{name: value for name, value in usual.items() if name not in points})
@@ -125,8 +123,6 @@ def curves(
                 )
         for name, at in (marks or {}).get(title, {}).items():
             handles.setdefault(name, axis.axhline(at, color=GREY, linestyle=(0, (4, 3)), linewidth=0.9))
-        if compresses and (near := _linear_width(here)):
-            axis.set_yscale("symlog", linthresh=near)
         if ticks:
             axis.set_xticks(range(len(ticks)), ticks)
         axis.set_title(_literal(title), fontsize=9.5, loc="left")
@@ -220,10 +216,3 @@ def _literal(name: Any) -> str:
 
 def _or(values: Iterable[float]) -> str:
     return " or ".join(f"{value:,.0f}" for value in sorted(set(values)))
-
-
-def _linear_width(points: pd.DataFrame) -> float:
-    """Return the height of a usual curve if the highest is more than ten times as high; 0 if it is not."""
-    heights = points.groupby(["label", "line"])["y"].agg(lambda own: own.abs().max())
-    usual = float(heights.median())
-    return usual if usual and heights.max() > 10 * usual else 0.0

@@ -508,7 +508,7 @@ def _scores(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> N
         _score_table(page, long, "last_score", f"Episode return over the last {LAST} evaluations{of}")
         if varied:
             _sensitivity(page, f"{name}-{varied}", part, str(varied))
-    _aggregates(page, name, runs)
+    _aggregates(page, runs)
     _learning_curves(page, name, runs, points)
     _spending(page, runs, jobs)
 
@@ -566,7 +566,7 @@ def _score_table(page: Page, runs: pd.DataFrame, score: str, caption: str) -> No
         page.table(caption, [{"task": t} | {label: cells[label, t] for label in labels} for t in tasks])
 
 
-def _aggregates(page: Page, name: str, runs: pd.DataFrame) -> None:
+def _aggregates(page: Page, runs: pd.DataFrame) -> None:
     """Aggregate over the tasks on which every method has runs."""
     labels = in_order(runs["label"])
     has_run = runs.groupby(["task", "label"], sort=False).size().unstack().reindex(columns=labels).notna()
@@ -630,9 +630,7 @@ def _aggregates(page: Page, name: str, runs: pd.DataFrame) -> None:
     if missing := sorted(kept.loc[kept["expert"].isna(), "task_name"].unique()):
         page.text(f"The paper has no DrQ score for {', '.join(missing)}: in the mean score only.", "note")
     if len(normal):
-        _improvement(page, name, normal)
-        if not kept["varied"].any():  # a dozen values of one setting would hide each other
-            _profiles(page, name, normal)
+        _improvement(page, normal)
 
 
 def _paper_mean(label: str, places: Sequence[Sequence[str]], normalized: bool = False) -> str:
@@ -650,7 +648,7 @@ def _paper_mean(label: str, places: Sequence[Sequence[str]], normalized: bool = 
     return f"{np.mean(values):.{digits}f}" if values and len(values) == len(found) else ""
 
 
-def _improvement(page: Page, name: str, runs: pd.DataFrame) -> None:
+def _improvement(page: Page, runs: pd.DataFrame) -> None:
     ours = runs[runs["label"] == "crptpro"]
     found = {
         label: estimate(probability_of_improvement, ours, runs[runs["label"] == label])
@@ -665,35 +663,12 @@ def _improvement(page: Page, name: str, runs: pd.DataFrame) -> None:
     page.table(
         caption, [{"other method": m, "runs of both": e.runs, title: f"{e:.2f}"} for m, e in found.items()]
     )
-    if any(e.low is not None for e in found.values()):
-        points = [
-            {"panel": title, "row": m, "label": m, "x": e.value[0], **_ends(e)} for m, e in found.items()
-        ]
-        page.figure(f"{name}-improvement", caption, dots(pd.DataFrame(points), mark=0.5))
 
 
 def _ends(found: Any) -> dict[str, Any]:
     """Return an interval as columns of points; NaN where there is none."""
     ends = {end: getattr(found, end) for end in ("low", "high")}
     return {end: math.nan if at is None else at if len(at) > 1 else at[0] for end, at in ends.items()}
-
-
-def _profiles(page: Page, name: str, runs: pd.DataFrame) -> None:
-    thresholds = np.linspace(0, max(min(runs["score"].max() * 1.05, 4.0), 0.05), 61)
-    columns = [f"above {place}" for place in range(len(thresholds))]
-    above = pd.DataFrame(runs["score"].to_numpy()[:, None] > thresholds, runs.index, columns, dtype=float)
-    points = []
-    for label, own in runs.join(above).groupby("label", sort=False):
-        found = estimate(mean, own, columns=columns)
-        points.append(
-            pd.DataFrame({"label": label, "x": thresholds, "y": found.value, "n": found.runs, **_ends(found)})
-        )
-    page.figure(
-        f"{name}-profiles",
-        f"Performance profiles: the fraction of runs above a score (n counts runs of all tasks), with {CONFIDENCE:.0%} "
-        f"intervals where every task has {MIN_RUNS} runs.",
-        curves(pd.concat(points), "score / the paper's DrQ", "fraction of runs above it"),
-    )
 
 
 def _learning_curves(page: Page, name: str, runs: pd.DataFrame, points: pd.DataFrame) -> None:
@@ -917,9 +892,8 @@ def _prototypes(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -
     )
     page.figure(
         f"{name}-spread",
-        "Spread of the prototypes along training, a line per encoder. Where some lie more than ten times as far from 0 "
-        "as most, heights are to scale near 0 only.",
-        curves(points, "encoder updates", columns=2, compresses=True),
+        "Spread of the prototypes along training, a line per encoder.",
+        curves(points, "encoder updates", columns=2),
     )
 
 
