@@ -8,14 +8,13 @@ import shlex
 import shutil
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as F
 import tyro
-from torch import Tensor
 from tyro.conf import Positional, UseAppendAction
 
 from crptpro.artifact import read_json, write_json, write_whole
@@ -169,40 +168,42 @@ def prototypes(encoder: Positional[Path], *, out: Path) -> None:
     write_rows(out / "prototypes.csv", rows)
 
 
-def _load(encoder: Path, device: str) -> Any:
-    from crptpro.pretrained import load_pretrained
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Random data beside an explorer's, as an encoder sees both."""
 
-    pretrained = load_pretrained(encoder)
-    for network in (pretrained.encoder, pretrained.projector):
-        if network is not None:
-            network.to(device)
-    return pretrained
+    encoder: Path
+    """which embeds all observations"""
+    explorer: Path
+    """its encoder, in its run directory"""
+    replays: tuple[Path, ...]
+    """what the explorer saw, a directory for each domain"""
+    datasets: tuple[Path, ...]
+    """random transitions of each domain"""
+    out: Path
+    """directory to write to"""
+    samples: int = 1_024
+    """observations of each source"""
+    seed: int = 0
+    """of the draw"""
+    device: str = "cpu"
+    """where the encoder runs"""
+
+    def load(self) -> Any:
+        """Return the artifact of the encoder, on its device."""
+        from crptpro.pretrained import load_pretrained
+
+        pretrained = load_pretrained(self.encoder)
+        for network in (pretrained.encoder, pretrained.projector):
+            if network is not None:
+                network.to(self.device)
+        return pretrained
 
 
-def coverage(
-    *,
-    encoder: Path,
-    explorer: Path,
-    replays: tuple[Path, ...],
-    datasets: tuple[Path, ...],
-    out: Path,
-    samples: int = 1_024,
-    seed: int = 0,
-    device: str = "cpu",
-) -> None:
+def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
     """Write how widely an explorer's observations are spread along its training, beside random data: OUT/coverage.csv.
 
     A window has the same decisions of both sources. Where one does not have enough of them, it has no row.
-
-    Args:
-        encoder: which embeds all observations.
-        explorer: its encoder, in its run directory.
-        replays: what the explorer saw, a directory for each domain.
-        datasets: random transitions, one for each domain.
-        out: directory to write to.
-        samples: observations of each source.
-        seed: of the draw.
-        device: where the encoder runs.
     """
     from crptpro.analysis import coverage as estimate
     from crptpro.analysis.embeddings import embed_pixels
@@ -210,15 +211,16 @@ def coverage(
     from crptpro.pretrained import load_pretrained
     from crptpro.seeding import derive_seed
 
-    pretrained, explored = _load(encoder, device), load_pretrained(explorer)
+    pretrained, explored = of.load(), load_pretrained(of.explorer)
     frame_stack, training = pretrained.encoder.in_channels // 3, explored.card["training"]
     decisions = {entry["domain"]: int(entry["agent_steps"]) for entry in training["datasets"]}
     least = min(decisions.values())
-    windows = max(1, min(COVERAGE_WINDOWS, least // samples))
-    samples = min(samples, least // windows)
+    windows = max(1, min(COVERAGE_WINDOWS, least // of.samples))
+    samples = min(of.samples, least // windows)
     rows = []
-    for path, replay_path in zip(datasets, replays, strict=True):
-        random, replay = FrameDataset.open(path), StoredReplay(replay_path, frame_stack=frame_stack)
+    for path, replay_path in zip(of.datasets, of.replays, strict=True):
+        random = FrameDataset.open(path, frame_stack=frame_stack)
+        replay = StoredReplay(replay_path, frame_stack=frame_stack)
         total = decisions[random.domain]
         lost = total - len(replay)  # the oldest decisions, of a ring that went round
         for window in range(windows):
@@ -227,15 +229,11 @@ def coverage(
             for source, (first, last) in spans.items():
                 if last - first < samples:
                     continue  # estimates of fewer observations cannot be compared
-                draw = derive_seed(seed, "coverage", source, random.domain, window)
+                draw = derive_seed(of.seed, "coverage", source, random.domain, window)
                 order = torch.randperm(last - first, generator=torch.Generator().manual_seed(draw))
                 chosen = first + order[:samples].sort().values
                 is_random = source == "random"
-                pixels = (
-                    _observations(random, chosen, frame_stack)
-                    if is_random
-                    else replay.observations(chosen - lost)
-                )
+                pixels = random[chosen]["pixels"] if is_random else replay.observations(chosen - lost)
                 points = embed_pixels(pretrained.encoder, pixels, projector=pretrained.projector)
                 rows.append({
                     "source": source, "method": "" if is_random else explored.method, "domain": random.domain,
@@ -243,64 +241,35 @@ def coverage(
                     "coverage": estimate.coverage(F.normalize(points, dim=-1)), "samples": samples,
                 })  # fmt: skip
     columns = ("source", "method", "domain", "env_steps", "coverage", "samples")
-    write_rows(out / "coverage.csv", rows, columns)
+    write_rows(of.out / "coverage.csv", rows, columns)
 
 
-def _observations(dataset: Any, index: Tensor, frame_stack: int) -> Tensor:
-    """Observations before transitions of a dataset."""
-    from crptpro.data.storage import stack_rows
-
-    row, step = (dataset.transitions.get(name)[index] for name in ("row", "step"))
-    return dataset.frames_at(stack_rows(row, step, frame_stack)).flatten(1, 2)
-
-
-def embeddings(
-    *,
-    encoder: Path,
-    explorer: Path,
-    replays: tuple[Path, ...],
-    datasets: tuple[Path, ...],
-    out: Path,
-    samples: int = 1_024,
-    seed: int = 0,
-    device: str = "cpu",
-) -> None:
-    """Write principal components of random data and of an explorer's last quarter: OUT/embeddings.csv.
-
-    Args:
-        encoder: which embeds all observations together.
-        explorer: not read.
-        replays: what the explorer saw, a directory for each domain.
-        datasets: random transitions, one for each domain.
-        out: directory to write to.
-        samples: observations of each source.
-        seed: of the draw.
-        device: where the encoder runs.
-    """
+def embeddings(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
+    """Write principal components of random data and of an explorer's last quarter: OUT/embeddings.csv."""
     from crptpro.analysis.embeddings import embed_pixels, principal_components, sample_pixels
     from crptpro.data import FrameDataset, StoredReplay
     from crptpro.seeding import derive_seed
 
-    pretrained = _load(encoder, device)
+    pretrained = of.load()
     frame_stack, pixels = pretrained.encoder.in_channels // 3, {}
-    for path in datasets:
+    for path in of.datasets:
         random = FrameDataset.open(path, frame_stack=frame_stack)
-        pixels[f"{random.domain} random"] = sample_pixels(random, samples, seed=seed)
-    for path in replays:
+        pixels[f"{random.domain} random"] = sample_pixels(random, of.samples, seed=of.seed)
+    for path in of.replays:
         replay = StoredReplay(path, frame_stack=frame_stack)
         late = len(replay) - int(0.75 * len(replay))
-        draw = torch.Generator().manual_seed(derive_seed(seed, "embeddings", path.name))
-        chosen = torch.randperm(late, generator=draw)[:samples].sort().values
+        draw = torch.Generator().manual_seed(derive_seed(of.seed, "embeddings", path.name))
+        chosen = torch.randperm(late, generator=draw)[: of.samples].sort().values
         pixels[f"{path.name} explorer"] = replay.observations(len(replay) - late + chosen)
     points = torch.cat([embed_pixels(pretrained.encoder, images) for images in pixels.values()]).cpu()
     coordinates, explained = principal_components(points)
-    write_json(out / "explained.json", {"explained_variance_ratio": explained.tolist()})
+    write_json(of.out / "explained.json", {"explained_variance_ratio": explained.tolist()})
     sources = [source for source, images in pixels.items() for _ in images]
     rows = [
         {"source": source, **{f"pc{number}": value for number, value in enumerate(point, 1)}}
         for source, point in zip(sources, coordinates.tolist())
     ]
-    write_rows(out / "embeddings.csv", rows)
+    write_rows(of.out / "embeddings.csv", rows)
 
 
 # --- cost of pre-training -------------------------------------------------------------------------------------------
