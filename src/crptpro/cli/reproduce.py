@@ -195,9 +195,8 @@ class Reproduce:
         from crptpro.experiments.launch import LocalLauncher, RayLauncher, SlurmLauncher, slurm_parameters
 
         if self.launcher == "ray":
-            return RayLauncher(
-                self.ray_address, gpus=1 / self.jobs_per_gpu if self.device.startswith("cuda") else 0
-            )
+            gpus = 1 / self.jobs_per_gpu if self.device.startswith("cuda") else 0
+            return RayLauncher(self.ray_address, cores=resources.cores, gpus=gpus)
         if self.launcher == "slurm":
             return SlurmLauncher(slurm_parameters(**self._slurm()))
         return LocalLauncher(resources.gpus)

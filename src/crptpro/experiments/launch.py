@@ -398,6 +398,7 @@ class RayLauncher:
 
     Args:
         address: of the cluster's head; ``None`` for ``RAY_ADDRESS``, a cluster that runs here, or a new one.
+        cores: of each job.
         gpus: of each job, a whole number or a fraction of one.
 
     Raises:
@@ -406,7 +407,7 @@ class RayLauncher:
 
     is_one_machine = False
 
-    def __init__(self, address: str | None = None, *, gpus: float = 0) -> None:
+    def __init__(self, address: str | None = None, *, cores: int = 1, gpus: float = 0) -> None:
         try:
             import ray
         except ImportError as reason:
@@ -431,6 +432,12 @@ class RayLauncher:
                 f"The Ray cluster {address or 'of this machine'} cannot be used: {said}. Give the address that "
                 "`ray start --head` printed, as --ray-address HOST:6379, or ray://HOST:10001."
             ) from reason
+        sizes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        if not any(size.get("CPU", 0) >= cores and size.get("GPU", 0) >= gpus for size in sizes):
+            asked = f"{cores} cores and {gpus:g} GPUs"
+            logger.warning(
+                "No node of the Ray cluster has the %s that a job asks for: jobs wait for one.", asked
+            )
         self._ray, self._gpus = ray, gpus
         # A worker ends with its job, as a process of its own would: nothing of a job is left for the next.
         self._run = ray.remote(max_retries=0, max_calls=1)(_run_alone)
