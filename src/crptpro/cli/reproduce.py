@@ -203,14 +203,7 @@ class Reproduce:
 
 
 def plan_text(plan: Plan, root: Path, disk: int, jobs: int) -> str:
-    """Return how many jobs of each kind are needed, done and to do, with their env steps, and what they take.
-
-    Args:
-        plan: of the experiments.
-        root: where finished jobs are found, whose time is quoted.
-        disk: bytes that must be free.
-        jobs: at a time.
-    """
+    """Return how many jobs of each kind are needed, done and to do, with their env steps, and what they take."""
     import pandas as pd
 
     from crptpro.artifact import read_json

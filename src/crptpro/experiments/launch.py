@@ -460,14 +460,7 @@ def _run_alone(work: Work) -> str:
 
 @dataclass(frozen=True)
 class Failure:
-    """A job that is not finished.
-
-    Args:
-        key: of the job.
-        reason: why, in a line.
-        log: what it printed; ``None`` if it was not started, since something that it needs failed.
-        attempts: how often it was tried.
-    """
+    """A job that is not finished; without a ``log`` it was not started, since something that it needs failed."""
 
     key: str
     reason: str

@@ -65,49 +65,32 @@ SEEDS = 1_000
 
 @dataclass(frozen=True)
 class Scale:
-    """Every budget of every experiment; the values here are the paper's.
-
-    Args:
-        name: as on the command line.
-        transitions: random transitions per domain.
-        quality: render quality of everything; ``None`` for the exact one.
-        updates: encoder updates on datasets, over all domains.
-        batch_size: transitions per pre-training update; ``None`` for the method's own.
-        loss: options of losses, by name of their class.
-        explore: settings of exploring, with the encoder update interval of a method that makes one update each time.
-        explore_single: the same of the (S) methods.
-        single_ablation: settings of exploring that an (S) method has in ``ablation`` besides.
-        run: settings of every downstream run.
-        seeds: number of downstream runs on each encoder unless the caller says otherwise.
-        alphas: weights of the dispersion loss in ``sensitivity``, besides none and the method's own.
-        capacities: random transitions per domain in ``sensitivity``.
-        probe_samples: observations of a state probe.
-        probe_transitions: of a dataset that is probed, which needs several episodes, if not ``transitions``.
-        timing_updates: encoder updates that ``efficiency`` times, after as many to warm up.
-        paper_timing_updates: the same with the paper's batches and intervals; 0 for none.
-        coverage_samples: observations of a coverage estimate.
-        embedded_samples: observations of each source in ``visualize``.
-    """
+    """Every budget of every experiment; the values here are the paper's."""
 
     name: str
-    transitions: int = 100_000
-    quality: str | None = None
-    updates: int = 50_000
-    batch_size: int | None = None
-    loss: Mapping[str, Settings] = field(default_factory=dict)
+    transitions: int = 100_000  # random transitions per domain
+    quality: str | None = None  # render quality of everything; ``None`` for the exact one
+    updates: int = 50_000  # encoder updates on datasets, over all domains
+    batch_size: int | None = None  # transitions per pre-training update; ``None`` for the method's own
+    loss: Mapping[str, Settings] = field(default_factory=dict)  # options of losses, by name of their class
+    # settings of exploring, with the encoder update interval of a method that makes one update each time
     explore: Settings = field(default_factory=dict)
-    explore_single: Settings = field(default_factory=dict)
+    explore_single: Settings = field(default_factory=dict)  # the same of the (S) methods
+    # settings of exploring that an (S) method has in ``ablation`` besides
     single_ablation: Settings = field(default_factory=dict)
-    run: Settings = field(default_factory=dict)
-    seeds: int = 3
+    run: Settings = field(default_factory=dict)  # settings of every downstream run
+    seeds: int = 3  # number of downstream runs on each encoder unless the caller says otherwise
+    # weights of the dispersion loss in ``sensitivity``, besides none and the method's own
     alphas: tuple[float, ...] = (5e-4, 5e-2, 5e-1)
+    # random transitions per domain in ``sensitivity``
     capacities: tuple[int, ...] = (10_000, 50_000, 100_000)
-    probe_samples: int = 4_000
+    probe_samples: int = 4_000  # observations of a state probe
+    # of a dataset that is probed, which needs several episodes, if not ``transitions``
     probe_transitions: int | None = None
-    timing_updates: int = 100
-    paper_timing_updates: int = 0
-    coverage_samples: int = 1_024
-    embedded_samples: int = 125
+    timing_updates: int = 100  # encoder updates that ``efficiency`` times, after as many to warm up
+    paper_timing_updates: int = 0  # the same with the paper's batches and intervals; 0 for none
+    coverage_samples: int = 1_024  # observations of a coverage estimate
+    embedded_samples: int = 125  # observations of each source in ``visualize``
 
     @property
     def training(self) -> dict[str, Any]:
@@ -326,14 +309,7 @@ def encoder(
 ) -> Job:
     """Return the encoder that a system has for domains, in ``<job>/encoder``.
 
-    Args:
-        scale: its budgets.
-        system: a registered method, or one that starts from the encoder of another.
-        domains: a single one for the (S) methods.
-        seed: of data and training.
-        transitions: of each domain, instead of the scale's.
-        loss: options of the loss, instead of or besides the scale's.
-        explore: settings of exploring, likewise.
+    `loss` and `explore` are settings instead of, or besides, the scale's.
     """
     method = pretraining_of(system)
     names = [get_domain(domain).name for domain in domains]
@@ -389,13 +365,7 @@ def encoder_for_task(
 def run(scale: Scale, system: str, task: str, base: Job | None, seed: int, *, colors: str = "normal") -> Job:
     """Return a system's learning of a task; the job's directory is the run directory.
 
-    Args:
-        scale: its budgets.
-        system: any of :data:`METHODS`, or a user's own.
-        task: what is learned.
-        base: the frozen encoder; ``None`` for DrQ.
-        seed: second of the two seed levels; runs of several tasks with one seed have nothing else in common.
-        colors: of the world.
+    ``base`` is the frozen encoder, or ``None`` for DrQ. Runs of several tasks with one seed share nothing else.
     """
     config = {**scale.run, **({"quality": scale.quality} if scale.quality else {})}
     config |= {"intrinsic_reward_coef": 0} if system == NO_BONUS else {}
