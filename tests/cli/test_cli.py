@@ -18,7 +18,7 @@ from crptpro.pretrained import load_pretrained
 from crptpro.training import load_agent
 
 COMMANDS = (
-    "doctor", "collect", "pretrain", "finetune", "downstream", "evaluate", "probe", "reproduce", "report", "measure",
+    "doctor", "collect", "pretrain", "finetune", "downstream", "evaluate", "probe", "reproduce", "report",
 )  # fmt: skip
 
 
@@ -34,7 +34,7 @@ COMMANDS = (
     (("downstream",), ["--pretrained", "random-encoder", "drq", "--replay-capacity", "--features", "500,000"]),
     (("evaluate",), ["random-policy", "--task", "--episodes", "--csv", "--video", "--colors"]),
     (("report",), ["--out"]),
-    (("probe",), ["random-encoder", "--samples", "--colors", "--csv", "held-out"]),
+    (("probe",), ["random-encoder", "--samples", "--csv", "held-out"]),
 ])  # fmt: skip
 def test_help_names_every_argument(call: Call, command: tuple[str, ...], named: list[str]) -> None:
     status, out, err = call(*command, "--help")
@@ -300,3 +300,26 @@ def test_a_run_with_other_settings_is_not_continued(call: Call, dataset: Path, t
     before = (tmp_path / "out" / "pretrain.csv").read_bytes()
     assert "batch_size was 4, now 6" in refused(call(*common, "--batch-size", 6))
     assert (tmp_path / "out" / "pretrain.csv").read_bytes() == before
+
+
+@pytest.mark.parametrize("arguments", [
+    ("downstream", TASK, "--pretrained", "absent"),
+    ("downstream", TASK, "--pretrained", "random-encoder", "--discount", "2"),
+    ("pretrain", TASK, "--method", "proto-rl-c", "--queue-size", "7"),
+])  # fmt: skip
+def test_a_refused_request_opens_no_mirror_either(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...]
+) -> None:
+    import wandb
+
+    monkeypatch.setattr(wandb, "init", lambda **_: pytest.fail("W&B was asked for a run"))
+    mirrors = ("--logging.wandb", "offline", "--logging.tensorboard")
+    refused(call(*arguments, *mirrors, "--out", tmp_path / "out"))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_is_mirrored_with_its_encoder(call: Call, dataset: Path, tmp_path: Path) -> None:
+    few = ("--updates", 2, "--batch-size", 4, "--log-interval", 1)
+    assert call("pretrain", dataset, "--out", tmp_path / "out", *few, "--logging.tensorboard")[0] == 0
+    assert list((tmp_path / "out" / "tensorboard").iterdir())
+    assert len(rows(tmp_path / "out" / "pretrain.csv")) == 2

@@ -8,8 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from crptpro.experiments.jobs import collect_job
-from crptpro.experiments.matrix import EXPERIMENTS, Cell, Experiment, Request
+from crptpro.experiments.matrix import EXPERIMENTS, Cell, Experiment, Request, dataset
 
 WORLD = "SlowWorld-v0"
 
@@ -47,7 +46,7 @@ gymnasium.register(WORLD, SlowWorld, max_episode_steps=20)
 
 def slow(request: Request) -> list[Cell]:
     """A collection of some seconds."""
-    return [Cell("slow", collect_job(f"gymnasium:{WORLD}", 400, 0), {"seed": 0})]
+    return [Cell("slow", dataset(request.scale, f"gymnasium:{WORLD}", 0, 400), {"seed": 0})]
 
 
 EXPERIMENTS["slow"] = Experiment("Slow", "A collection of some seconds.", slow)

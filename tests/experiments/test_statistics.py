@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import mannwhitneyu, trim_mean
+from scipy.stats import mannwhitneyu
 
 from crptpro.experiments import statistics
 from crptpro.experiments.statistics import (
@@ -20,7 +20,6 @@ from crptpro.experiments.statistics import (
     optimality_gap,
     probability_of_improvement,
     relative_mean,
-    resample,
 )
 
 TWO_TASKS = [np.array([1.0, 2.0, 3.0, 10.0]), np.array([0.0, 0.5, 0.5, 3.0])]
@@ -48,13 +47,6 @@ def test_aggregates_are_what_a_hand_computes(aggregate: Callable, by_hand: float
     # Replicates and curves are further axes before the runs.
     stacked = [np.stack([task, task + 1]) for task in TWO_TASKS]
     np.testing.assert_allclose(aggregate(stacked)[0], by_hand)
-
-
-def test_tasks_count_the_same_whatever_their_runs_and_the_middle_half_is_scipys() -> None:
-    uneven = [np.array([1.0]), np.array([2.0, 4.0, 6.0])]
-    assert mean(uneven) == pytest.approx((1.0 + 4.0) / 2)
-    assert iqm(uneven) == pytest.approx(trim_mean([1, 2, 4, 6], 0.25))
-    assert median([np.array([1.0]), np.array([5.0]), np.array([2.0, 4.0])]) == pytest.approx(3.0)
 
 
 def test_the_probability_of_improvement_counts_pairs_and_halves_ties() -> None:
@@ -135,35 +127,12 @@ def test_runs_that_share_encoders_have_the_wider_interval_of_their_encoders() ->
     np.testing.assert_allclose([one.low, one.high], [alone.low, alone.high], atol=0.12)
 
 
-def test_an_encoder_is_drawn_once_for_all_tasks_and_its_runs_for_each() -> None:
-    rng = np.random.default_rng(0)
-    encoders = [["x", "x", "y", "y"], ["x", "y", "y", "x"]]
-    first, second = resample(encoders, [list("abcd"), list("efgh")], replicates=4_000, rng=rng)
-    drawn = [np.array(labels)[index] for labels, index in zip(encoders, (first, second))]
-    assert (drawn[0][:, 0] == drawn[0][:, 1]).all()  # a place keeps one encoder
-    assert (drawn[0][:, 0] == drawn[1][:, 0]).all()  # and it is the same on the other task
-    assert (first[:, 0] != first[:, 1]).any()
-    assert (drawn[0][:, 0] == "x").mean() == pytest.approx(0.5, abs=0.03)
-    apart = resample([["x", "y"], ["u", "v"]], [["a", "b"], ["c", "d"]], replicates=4_000, rng=rng)
-    assert (apart[0] == apart[1]).mean() == pytest.approx(
-        0.5, abs=0.03
-    )  # tasks that share none are independent
-
-
 def test_a_run_that_stands_under_two_tasks_is_drawn_alike_and_counts_once() -> None:
     own = runs({"A walker_run": [1.0, 2.0, 3.0, 4.0, 5.0]})
     both = pd.concat([own, own.assign(task="D walker_run")])
     alone, twice = estimate(mean, own), estimate(mean, both)
     assert twice.runs == 5
     np.testing.assert_allclose([twice.low, twice.high], [alone.low, alone.high])
-
-
-def test_a_curve_has_an_interval_at_each_point() -> None:
-    own = runs({"a": [1.0, 2.0, 3.0, 4.0, 5.0]}).assign(late=[5.0, 5.0, 5.0, 5.0, 5.0])
-    found = estimate(mean, own, columns=["score", "late"])
-    np.testing.assert_allclose(found.value, [3.0, 5.0])
-    assert found.low[0] < 3.0 < found.high[0]
-    assert found.low[1] == found.high[1] == 5.0
 
 
 def test_what_cannot_be_estimated_is_refused_by_name() -> None:

@@ -5,26 +5,25 @@ Every stage's settings are the dataclass that its function takes; nothing is nam
 
 from __future__ import annotations
 
+import ast
+import contextlib
 import itertools
 import logging
+import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from crptpro.cli.probe import Probe
-from crptpro.cli.report import Report
 from crptpro.cli.reproduce import Reproduce
-from crptpro.cli.request import Logging, explored_domains, image_format, named_values, require_writable
 from crptpro.console import run_main
-from crptpro.domains import expand_groups
-from crptpro.errors import CRPTproError
-from crptpro.experiments.measure import Measure
-from crptpro.logging import RunLogger
+from crptpro.domains import GROUPS, GYMNASIUM_PREFIX, PAPER_DOMAINS, TASKS, expand_groups, known_names
+from crptpro.errors import CRPTproError, DatasetError
+from crptpro.logging import RunLogger, WandbOptions
 from crptpro.plugins import load_plugins
 from crptpro.provenance import cpu_cores
 from crptpro.training.downstream import DownstreamConfig
@@ -34,12 +33,53 @@ from crptpro.values import Colors, Quality, as_path
 
 logger = logging.getLogger(__name__)
 
-FINETUNE_UPDATES = 2_000
 DESCRIPTION = """Cross-domain random pre-training with prototypes for reinforcement learning from pixels.
 Start with `crptpro doctor`, then collect, pretrain and downstream; each stage continues where it was killed.
 Or `crptpro reproduce` a whole experiment of the paper.
 With `--plugin FILE.py` (or a module) any command runs a file of yours first: methods and domains that it registers
 then have names here."""
+
+
+@dataclass(frozen=True)
+class Logging:
+    """Where metrics go besides the local CSV and JSONL records, which are always written."""
+
+    wandb: Literal["off", "auto", "offline", "online"] = "off"
+    """mirror to Weights & Biases; auto is online when logged in, else offline"""
+    wandb_project: str | None = None
+    """W&B project (default: $WANDB_PROJECT, or crptpro)"""
+    wandb_group: str | None = None
+    """W&B group (default: $WANDB_RUN_GROUP, or none)"""
+    wandb_tags: Annotated[tuple[str, ...], arg(help_behavior_hint="(default: none)")] = ()
+    """W&B tags"""
+    tensorboard: bool = False
+    """also write TensorBoard event files"""
+
+    def records(self, run_dir: Path, config: Any) -> Records:
+        """Return the record of a run and its mirrors; without mirrors the run opens a record of its own."""
+        options = None
+        if self.wandb != "off":
+            options = WandbOptions(self.wandb_project, self.wandb_group, None, self.wandb_tags, self.wandb)
+        is_mirrored = options is not None or self.tensorboard
+        make = lambda: RunLogger(run_dir, config=config, wandb=options, tensorboard=self.tensorboard)  # noqa: E731
+        return Records(make if is_mirrored else None)
+
+
+class Records(contextlib.ExitStack):
+    """A run's record that is opened when the run first uses it: a request that is refused leaves none behind."""
+
+    def __init__(self, make: Callable[[], RunLogger] | None) -> None:
+        super().__init__()
+        self.make: Any = make
+        self.logger: RunLogger | None = None
+
+    def __enter__(self) -> Any:
+        return None if self.make is None else super().__enter__()
+
+    def __getattr__(self, name: str) -> Any:
+        if self.logger is None:
+            self.logger = self.enter_context(self.make())
+        return getattr(self.logger, name)
 
 
 @dataclass(frozen=True)
@@ -162,7 +202,7 @@ class Pretrain(Pretraining):
             logger.info("untrained encoder: %s", save_pretrained(encoder, self.out / "encoder"))
             return
         loss = self.build(self.config.seed, image_size=image_size, frame_stack=frame_stack)
-        with self.logging.open(self.out, self) as records:
+        with self.logging.records(self.out, self) as records:
             result = pretrain(
                 loss, datasets, method=self.method, run_dir=self.out, config=self.config, records=records
             )
@@ -182,7 +222,7 @@ class Explore(Pretraining):
 
         domains = explored_domains(self.sources, self.method)
         loss = self.build(self.config.seed)
-        with self.logging.open(self.out, self) as records:
+        with self.logging.records(self.out, self) as records:
             result = pretrain_active(
                 loss, domains, method=self.method, run_dir=self.out, config=self.config, records=records
             )
@@ -207,13 +247,15 @@ class Finetune:
 
     def run(self) -> None:
         """Fine-tune, or continue, and write the artifact."""
+        from crptpro.objectives import get_method
         from crptpro.pretrained import load_pretrained
         from crptpro.training import finetune
 
         image_size, frame_stack = image_format([self.dataset])
         pretrained = load_pretrained(self.pretrained).require(image_size=image_size, frame_stack=frame_stack)
-        with self.logging.open(self.out, self) as records:
-            config = replace(self.config, updates=self.config.updates or FINETUNE_UPDATES)
+        with self.logging.records(self.out, self) as records:
+            updates = self.config.updates or get_method("crptpro-finetune").updates
+            config = replace(self.config, updates=updates)
             result = finetune(pretrained, self.dataset, run_dir=self.out, config=config, records=records)
             Pretraining.keep(self, result, records)  # type: ignore[arg-type]
 
@@ -240,7 +282,7 @@ class Downstream:
         from crptpro.training import train_downstream
 
         get_domain(self.task)  # an unknown name is refused before the run directory is made
-        with self.logging.open(self.out, self) as records:
+        with self.logging.records(self.out, self) as records:
             result = train_downstream(
                 self.task, self.pretrained, run_dir=self.out, config=self.config, records=records
             )
@@ -326,29 +368,154 @@ class Evaluate:
         )
 
 
-def write_video(frames: Sequence[Any], path: Path) -> None:
-    """Write RGB pictures, uint8 ``[3, H, W]``, as an MP4 at 25 pictures a second.
+@dataclass(frozen=True)
+class Probe:
+    """Predict positions and velocities from frozen features by ridge regression, on held-out episodes."""
 
-    Raises:
-        CRPTproError: the ``video`` extra is missing, or encoding failed.
-    """
+    encoder: Positional[str]
+    """directory of a pretrained encoder, or `random-encoder` for the untrained control"""
+    datasets: Annotated[Positional[tuple[Path, ...]], arg(help_behavior_hint="(required)")]
+    """datasets, e.g. data/walker data/finger; each is probed alone, seen in pre-training or not"""
+    samples: int = 2_000
+    """observations per dataset; time and memory grow with their square"""
+    seed: int = 0
+    """which observations, which episodes are held out, and the random encoder's initialisation"""
+    csv: Path | None = None
+    """write every number here, each coordinate's R2 among them"""
+    device: str = "cpu"
+    """where the encoder runs"""
+
+    def run(self) -> None:
+        """Print a table, and write what was asked for."""
+        from crptpro.data import FrameDataset
+        from crptpro.experiments.measure import PROBE_COLUMNS, probe_rows, write_rows
+        from crptpro.modules import usable_device
+        from crptpro.pretrained import load_pretrained, random_pretrained
+
+        if self.samples < 1:
+            raise CRPTproError(f"--samples must be at least 1, got {self.samples}.")
+        if self.csv is not None:
+            require_writable(self.csv)  # before minutes of probing
+        usable_device(self.device)
+        image_size, frame_stack = image_format(self.datasets)
+        if self.encoder == "random-encoder":
+            pretrained = random_pretrained(self.seed, image_size=image_size, in_channels=3 * frame_stack)
+        else:
+            pretrained = load_pretrained(self.encoder).require(image_size=image_size)
+        for network in (pretrained.encoder, pretrained.projector):
+            if network is not None:
+                network.to(self.device)
+        table, measures = [], []
+        settings: dict[str, Any] = {"encoder": self.encoder, "samples": self.samples, "seed": self.seed}
+        try:
+            for path in self.datasets:
+                rows, numbers = probe_rows(pretrained, FrameDataset.open(path), **settings)
+                table += rows
+                measures += numbers
+                if self.csv is not None:
+                    write_rows(self.csv, measures, PROBE_COLUMNS)
+        finally:  # a later dataset may be refused, and writing may fail
+            if table:
+                lines = [list(table[0]), ["---"] * len(table[0]), *(list(row.values()) for row in table)]
+                print("\n".join(f"| {' | '.join(line)} |" for line in lines))
+
+
+@dataclass(frozen=True)
+class Report:
+    """Write tables beside the paper's, figures and jobs as an HTML page, and as Markdown."""
+
+    directory: Positional[Path]
+    """directory of `crptpro reproduce`, or any with downstream runs in or below it"""
+    out: Path | None = None
+    """directory of the report (default: DIRECTORY/report)"""
+
+    def run(self) -> None:
+        """Write the page, then say where it is."""
+        from crptpro.experiments.report import build_report
+
+        print(build_report(self.directory, out=self.out))
+
+
+def write_video(frames: Sequence[Any], path: Path) -> None:
+    """Write RGB pictures, uint8 ``[3, H, W]``, as an MP4 at 25 pictures a second."""
     try:
         import imageio.v2 as imageio
         import imageio_ffmpeg  # noqa: F401 - the encoder behind the FFMPEG format
         import torch
 
         # Nearest-neighbour enlargement keeps 84 pixels visible on a screen; the codec wants even sizes.
-        large = (
-            torch.stack(list(frames)).repeat_interleave(4, -1).repeat_interleave(4, -2).permute(0, 2, 3, 1)
-        )
+        large = torch.stack(list(frames)).repeat_interleave(4, -1).repeat_interleave(4, -2)
         path.parent.mkdir(parents=True, exist_ok=True)
         aside = path.with_name(f".{path.name}")
-        imageio.mimwrite(aside, list(large.numpy()), format="FFMPEG", fps=25, macro_block_size=4)
+        pictures = list(large.permute(0, 2, 3, 1).numpy())
+        imageio.mimwrite(aside, pictures, format="FFMPEG", fps=25, macro_block_size=4)
         aside.replace(path)
     except ImportError:
         raise CRPTproError("--video needs the `video` extra: pip install 'crptpro[video]'.") from None
     except (OSError, RuntimeError, ValueError) as reason:
         raise CRPTproError(f"--video {path} was not written: {reason}") from reason
+
+
+def named_values(option: str, words: Sequence[str]) -> dict[str, Any]:
+    """Read settings given as ``NAME=VALUE``.
+
+    Examples:
+        >>> named_values("--loss", ["num_prototypes=16", "intr_loss_coef=5e-3", "kind=mean"])
+        {'num_prototypes': 16, 'intr_loss_coef': 0.005, 'kind': 'mean'}
+    """
+    found = {}
+    for word in words:
+        name, equals, value = word.partition("=")
+        if not name.isidentifier() or not equals:
+            raise CRPTproError(f"{option} {word}: write NAME=VALUE, e.g. num_prototypes=128.")
+        try:
+            found[name] = ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            found[name] = value
+    return found
+
+
+def explored_domains(names: Sequence[str], method: str) -> list[str]:
+    """Expand the domains that a method is to explore; it collects its own data, so that a path is refused."""
+    for name in names:
+        is_path = Path(name).is_dir() or ("/" in name and not name.startswith(GYMNASIUM_PREFIX))
+        if is_path and name not in (*GROUPS, *known_names()):  # a folder may be called walker
+            raise CRPTproError(
+                f"{method} explores and collects its own data; {name} is a path. Name domains, tasks or groups "
+                f"({', '.join(GROUPS)}), or choose a method that learns from datasets."
+            )
+    return expand_groups(names)
+
+
+def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
+    """Open every dataset and return the image size and frames per stack, which all must share."""
+    from crptpro.data import FrameDataset
+
+    if not datasets:
+        raise DatasetError(
+            "Name at least one dataset directory, e.g. data/walker (made by `crptpro collect`)."
+        )
+    for path in datasets:
+        if not path.exists() and str(path) in (*GROUPS, *PAPER_DOMAINS, *TASKS):
+            raise DatasetError(
+                f"{path} is no directory. This method learns from datasets: `crptpro collect {path}` makes them, "
+                "data/... by default."
+            )
+    opened = {path: FrameDataset.open(path) for path in datasets}
+    sizes = {path: (dataset.image_size, dataset.frame_stack) for path, dataset in opened.items()}
+    if len(set(sizes.values())) > 1:
+        listed = ", ".join(f"{path} has {size} px, {stack} frames" for path, (size, stack) in sizes.items())
+        raise DatasetError(f"One encoder needs images of one size and stack: {listed}.")
+    return next(iter(sizes.values()))
+
+
+def require_writable(path: Path, option: str = "--csv") -> None:
+    """Refuse what no file can become, and make nothing yet."""
+    if path.exists() and not path.is_file():  # a finished file takes its place: /dev/stdout would be gone
+        raise CRPTproError(f"{option} {path} is no ordinary file; name one.")
+    there = next(parent for parent in path.absolute().parents if parent.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        raise CRPTproError(f"{option} {path} cannot be written: {there} is a file, or not yours to write to.")
 
 
 def pretrain_command(arguments: Sequence[str]) -> type[Pretrain] | type[Explore]:
@@ -367,10 +534,14 @@ def main() -> None:
 
     def run() -> None:
         arguments = load_plugins(sys.argv[1:])
+        if arguments[:1] == ["measure"]:  # what jobs of `reproduce` call
+            from crptpro.experiments.measure import main as measure
+
+            measure(arguments[1:])
+            return
         commands: dict[str, Any] = {
             "doctor": Doctor, "collect": Collect, "pretrain": pretrain_command(arguments), "finetune": Finetune,
             "downstream": Downstream, "evaluate": Evaluate, "probe": Probe, "reproduce": Reproduce, "report": Report,
-            "measure": Measure,
         }  # fmt: skip
         union: Any = None
         for name, command in commands.items():

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -15,7 +14,7 @@ from tyro.conf import Positional, arg
 from crptpro.errors import CRPTproError, UnknownNameError
 
 if TYPE_CHECKING:
-    from crptpro.experiments.jobs import Job, Plan
+    from crptpro.experiments.jobs import Plan
     from crptpro.experiments.launch import Failure, Launcher, Resources
     from crptpro.experiments.matrix import Cell, Request
 
@@ -34,7 +33,7 @@ class Reproduce:
     """Reproduce an experiment of the paper: print the plan, then run whatever job is missing.
 
     Experiments: seen, unseen, colors, finetune, efficiency, ablation, sensitivity, prototypes, coverage, stability,
-    visualize, probe, study, or all. Whatever is finished, by this or another experiment, is used again; interrupted,
+    visualize, probe, or all. Whatever is finished, by this or another experiment, is used again; interrupted,
     the same command continues. At the end `crptpro report ROOT` makes tables and figures of it. The default of at most
     three runs on one encoder is below the paper's six evaluations of each number: --encoder-seeds 0 1 has as many.
     """
@@ -66,8 +65,8 @@ class Reproduce:
     """print the plan and run nothing"""
     device: str = "cpu"
     """of networks: cpu, cuda (jobs share this machine's GPUs, or have one of the cluster's), or cuda:1"""
-    launcher: Literal["local", "slurm", "ray", "inline"] = "local"
-    """local: processes here; slurm, ray: a cluster whose nodes share ROOT; inline: in this process, one at a time"""
+    launcher: Literal["local", "slurm", "ray"] = "local"
+    """local: processes here; slurm, ray: a cluster whose nodes share ROOT"""
     jobs: int | None = None
     """most jobs at a time, each with its own memory (default: one per core, or as many as the GPUs take by
     --jobs-per-gpu, which is also the most here; on a cluster 16)"""
@@ -92,31 +91,14 @@ class Reproduce:
         """Print the plan, run what is missing, list what failed."""
         from crptpro.artifact import require_disk
         from crptpro.experiments.jobs import bytes_of, make_plan, write_cells
-        from crptpro.experiments.launch import divide, run_jobs, slurm_parameters
-        from crptpro.modules import usable_device
+        from crptpro.experiments.launch import divide, run_jobs
         from crptpro.plugins import loaded_plugins
         from crptpro.values import as_path
 
         root = as_path(self.out, "out")
-        if self.attempts < 1:
-            raise CRPTproError(f"--attempts must be at least 1, got {self.attempts}.")
-        self._refuse_options_of_others()
-        slurm = slurm_parameters(
-            partition=self.partition,
-            hours=self.hours,
-            memory_gb=self.memory_gb,
-            sbatch=self.sbatch,
-            has_gpu=self.device.startswith("cuda"),
-        )
-        if self.launcher in ("local", "inline"):
-            usable_device(self.device)
-        resources = divide(
-            self.launcher,
-            device=self.device,
-            jobs=self.jobs,
-            cores=self.cores_per_job,
-            jobs_per_gpu=self.jobs_per_gpu,
-        )
+        self._refuse_options()
+        given: dict[str, Any] = {"device": self.device, "jobs": self.jobs, "cores": self.cores_per_job}
+        resources = divide(self.launcher, **given, jobs_per_gpu=self.jobs_per_gpu)
         request = self._request(resources)
         wanted = self._wanted(request)
         plan = make_plan([cell.job for cells in wanted.values() for cell in cells], root)
@@ -130,123 +112,100 @@ class Reproduce:
             print(
                 f"\nRuns behind each score: {evaluations}; the paper has {PAPER_RUNS} (--seeds, --encoder-seeds)."
             )
-        if idle := self._without_effect(request, [cell for cells in wanted.values() for cell in cells]):
-            print(f"\nWithout effect on {', '.join(wanted)}: {', '.join(idle)}.", flush=True)
         if self.dry_run:
             return
         require_disk(root, disk, "What this plan has yet to make")
         # What a launcher lacks is said before anything is written.
-        launcher = self._launcher(resources, slurm) if plan.missing else None
+        launcher = self._launcher(resources) if plan.missing else None
         asked = {**dataclasses.asdict(request), "scale": self.scale}
         for name, cells in wanted.items():
             rows = [(cell.label, cell.job.key, cell.place) for cell in cells]
             write_cells(root, name, self.scale, asked, rows)
         if launcher is not None:
-            failures: list[Failure] = []
-            try:
-                run_jobs(
-                    plan, root, launcher, jobs=resources.jobs, cores=resources.cores, device=self.device,
-                    plugins=loaded_plugins(), attempts=self.attempts, failures=failures,
-                )  # fmt: skip
-            finally:
-                launcher.close()
-                if failures:  # also where Ctrl-C or an error ended it
-                    print(failures_text(failures), flush=True)
+            failures = run_jobs(
+                plan, root, launcher, jobs=resources.jobs, cores=resources.cores, device=self.device,
+                plugins=loaded_plugins(), attempts=self.attempts,
+            )  # fmt: skip
             if failures:
+                print(failures_text(failures), flush=True)
                 raise SystemExit(1)
         print(f"\nAll of it is there. Tables and figures: crptpro report {root}", flush=True)
 
-    def _refuse_options_of_others(self) -> None:
-        """An option that the launcher does not read was meant for another one."""
-        usual = {field.name: field.default for field in dataclasses.fields(self)}
-        for name, launchers in _READ_BY.items():
-            if getattr(self, name) != usual[name] and self.launcher not in launchers:
+    def _refuse_options(self) -> None:
+        """Refuse what cannot be met, and an option that the launcher does not read: it was meant for another one."""
+        from crptpro.experiments.launch import slurm_parameters
+        from crptpro.modules import usable_device
+
+        if self.attempts < 1:
+            raise CRPTproError(f"--attempts must be at least 1, got {self.attempts}.")
+        for each in dataclasses.fields(self):
+            launchers = _READ_BY.get(each.name, (self.launcher,))
+            if getattr(self, each.name) != each.default and self.launcher not in launchers:
                 raise CRPTproError(
-                    f"--{name.replace('_', '-')} is for --launcher {' or '.join(launchers)}; "
+                    f"--{each.name.replace('_', '-')} is for --launcher {' or '.join(launchers)}; "
                     f"--launcher {self.launcher} does not read it."
                 )
-        if self.launcher == "inline" and (self.jobs or 1) > 1:
-            raise CRPTproError(f"--launcher inline runs one job at a time, not --jobs {self.jobs}.")
         if self.jobs_per_gpu != 1 and not self.device.startswith("cuda"):
             raise CRPTproError(f"--jobs-per-gpu is for --device cuda, not {self.device}.")
-        if self.launcher in ("slurm", "ray") and self.device.startswith("cuda:"):
+        if self.launcher == "local":
+            usable_device(self.device)
+        elif self.device.startswith("cuda:"):
             raise CRPTproError(
                 f"--launcher {self.launcher} gives each job a GPU of its own: write --device cuda, not {self.device}."
             )
+        slurm_parameters(**self._slurm())
+
+    def _slurm(self) -> dict[str, Any]:
+        options = {name: getattr(self, name) for name in ("partition", "hours", "memory_gb", "sbatch")}
+        return {**options, "has_gpu": self.device.startswith("cuda")}
 
     def _request(self, resources: Resources) -> Request:
         from crptpro.experiments.matrix import SCALES, Request
 
-        is_here = self.launcher in ("local", "inline")
+        names = ("methods", "groups", "tasks", "encoder_seeds", "seeds", "device")
         return Request(
             SCALES[self.scale],
-            methods=self.methods,
-            groups=self.groups,
-            tasks=self.tasks,
-            encoder_seeds=self.encoder_seeds,
-            seeds=self.seeds,
+            **{name: getattr(self, name) for name in names},
             colors="reversed_image" if self.colors_by == "image" else "reversed_background",
-            device=self.device,
-            threads=resources.cores * (resources.jobs if is_here else 1),
+            threads=resources.cores * (resources.jobs if self.launcher == "local" else 1),
         )
 
     def _wanted(self, request: Request) -> dict[str, list[Cell]]:
         """Cells by experiment. One that was named must have some; of all, those that have are meant."""
         from crptpro.experiments.matrix import EXPERIMENTS
 
-        wanted = {name: EXPERIMENTS[name].cells(request) for name in _names(self.experiments)}
+        if not self.experiments:
+            raise UnknownNameError(f"Name an experiment: {', '.join(EXPERIMENTS)}, or {ALL}.")
+        for name in self.experiments:
+            if name not in (*EXPERIMENTS, ALL):
+                raise UnknownNameError(
+                    f"There is no experiment {name!r}; choose from {', '.join(EXPERIMENTS)}, or {ALL}."
+                )
+        names = EXPERIMENTS if ALL in self.experiments else dict.fromkeys(self.experiments)
+        wanted = {name: EXPERIMENTS[name].cells(request) for name in names}
         empty = [name for name, cells in wanted.items() if not cells]
-        if empty:
-            nothing = f"Nothing of {', '.join(empty)} is among these groups, tasks and methods"
-            if ALL not in self.experiments or {*empty} & {*self.experiments} or len(empty) == len(wanted):
-                raise CRPTproError(f"{nothing}; leave out --groups, --tasks or --methods.")
-            print(f"{nothing}.\n")
+        if {*empty} & {*self.experiments} or len(empty) == len(wanted):
+            raise CRPTproError(
+                f"Nothing of {', '.join(empty)} is among these groups, tasks and methods; leave out --groups, --tasks "
+                "or --methods."
+            )
         return {name: cells for name, cells in wanted.items() if cells}
 
-    def _without_effect(self, request: Request, cells: Sequence[Cell]) -> list[str]:
-        """Name methods, groups and tasks that no cell has, and seeds and colours that none reads."""
-        places = [(cell.label, cell.job.facts.get("domains", ()), cell.place) for cell in cells]
-        said = []
-        for name in ("methods", "groups", "tasks"):
-            for value in getattr(request, name):
-                if not any(_mentions(name, value, *place) for place in places):
-                    said.append(f"--{name} {value}")
-        if self.seeds and not any("seed" in cell.place for cell in cells):
-            said.append(f"--seeds {' '.join(map(str, self.seeds))}")
-        if self.colors_by == "image" and not any("colors" in cell.place for cell in cells):
-            said.append("--colors-by image")
-        return said
-
-    def _launcher(self, resources: Resources, slurm: dict[str, Any]) -> Launcher:
-        from crptpro.experiments.launch import InlineLauncher, LocalLauncher, RayLauncher, SlurmLauncher
+    def _launcher(self, resources: Resources) -> Launcher:
+        from crptpro.experiments.launch import LocalLauncher, RayLauncher, SlurmLauncher, slurm_parameters
 
         if self.launcher == "ray":
             gpus = 1 / self.jobs_per_gpu if self.device.startswith("cuda") else 0
             return RayLauncher(self.ray_address, cores=resources.cores, gpus=gpus)
         if self.launcher == "slurm":
-            return SlurmLauncher(slurm)
-        return InlineLauncher() if self.launcher == "inline" else LocalLauncher(resources.gpus)
-
-
-def _mentions(name: str, value: str, label: str, domains: Sequence[str], place: Mapping[str, Any]) -> bool:
-    from crptpro.domains import get_domain
-
-    if name == "methods":
-        return value == label.split(",")[0].split(" ")[0]
-    if name == "tasks" and get_domain(value).name in (*domains, place.get("domain")):
-        return True
-    return value in place.values()
+            return SlurmLauncher(slurm_parameters(**self._slurm()))
+        return LocalLauncher(resources.gpus)
 
 
 def plan_text(plan: Plan, root: Path, disk: int, jobs: int) -> str:
-    """Return how many jobs of each kind are needed, done and to do, with their env steps, and what they take.
+    """Return how many jobs of each kind are needed, done and to do, with their env steps, and what they take."""
+    import pandas as pd
 
-    Args:
-        plan: of the experiments.
-        root: where finished jobs are found, whose time is quoted.
-        disk: bytes that must be free.
-        jobs: at a time.
-    """
     from crptpro.artifact import read_json
     from crptpro.experiments.jobs import DONE, JOBS, KINDS
     from crptpro.experiments.launch import duration
@@ -254,38 +213,19 @@ def plan_text(plan: Plan, root: Path, disk: int, jobs: int) -> str:
     spent: dict[str, list[float]] = {}
     for path in root.glob(f"{JOBS}/*/{DONE}"):
         spent.setdefault(path.parent.name.split("-")[0], []).append(float(read_json(path)["seconds"]))
-    missing = {job.key for job in plan.missing}
-    rows: list[tuple[str, ...]] = [("jobs", "needed", "done", "to do", "env steps", "took each")]
+    rows = []
     for kind, name in KINDS.items():
-        of_kind = [job for job in plan.jobs if job.kind == kind]
-        if not of_kind:
-            continue
-        left = [job for job in of_kind if job.key in missing]
-        env_steps = sum(_env_steps(job) for job in left)
-        took = duration(statistics.median(spent[kind])) if kind in spent else ""
-        numbers = (len(of_kind), len(of_kind) - len(left), len(left))
-        rows.append((name, *(f"{n:,}" for n in numbers), f"{env_steps:,}" if env_steps else "", took))
-    widths = [max(map(len, column)) for column in zip(*rows)]
-    lines = [
-        "  ".join(
-            [row[0].ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(row[1:], widths[1:]))]
-        ).rstrip()
-        for row in rows
-    ]
-    lines.insert(1, "-" * len(lines[0]))
+        needed, left = ([job for job in each if job.kind == kind] for each in (plan.jobs, plan.missing))
+        if needed:
+            counts = {"needed": len(needed), "done": len(needed) - len(left), "to do": len(left)}
+            counts["env steps"] = sum(job.facts.get("env_steps", 0) for job in left)
+            took = duration(statistics.median(spent[kind])) if kind in spent else ""
+            rows.append({"jobs": name, **{key: f"{n:,}" for key, n in counts.items()}, "took each": took})
+    text = pd.DataFrame(rows).to_string(index=False)
     if plan.missing:
-        lines += ["", f"{jobs} at a time; the disk needs {max(disk, 10**6) / 1e9:,.2f} GB."]
-        if spent:
-            lines.append("The last column is the median of what finished jobs in this directory took.")
-    return "\n".join(lines)
-
-
-def _env_steps(job: Job) -> int:
-    from crptpro.envs import resolve_action_repeat
-
-    if job.kind == "dataset":
-        return job.facts["transitions"] * resolve_action_repeat(job.facts["domain"], None)
-    return job.facts["env_steps"] if job.kind in ("explored", "run") else 0
+        text += f"\n\n{jobs} at a time; the disk needs {max(disk, 10**6) / 1e9:,.2f} GB."
+        text += "\nThe last column is the median of what finished jobs in this directory took." * bool(spent)
+    return text
 
 
 def failures_text(failures: Sequence[Failure]) -> str:
@@ -301,19 +241,3 @@ def failures_text(failures: Sequence[Failure]) -> str:
         lines += [f"  {failure.key}" for failure in skipped]
     lines.append("The same command tries them again; everything else is kept.")
     return "\n".join(lines)
-
-
-def _names(experiments: Sequence[str]) -> list[str]:
-    """Check names, put every experiment for `all`, and drop repeats."""
-    from crptpro.experiments.matrix import EXPERIMENTS
-
-    if not experiments:
-        raise UnknownNameError(f"Name an experiment: {', '.join(EXPERIMENTS)}, or {ALL}.")
-    for name in experiments:
-        if name not in (*EXPERIMENTS, ALL):
-            near = difflib.get_close_matches(name, EXPERIMENTS, n=1, cutoff=0.5)
-            hint = f" Did you mean {near[0]!r}?" if near else ""
-            raise UnknownNameError(
-                f"There is no experiment {name!r}.{hint} There are {', '.join(EXPERIMENTS)}."
-            )
-    return list(EXPERIMENTS) if ALL in experiments else list(dict.fromkeys(experiments))

@@ -1,17 +1,14 @@
-"""Curves, marks, clouds of points and pictures, drawn from data frames without a window; every axis names its unit."""
+"""Curves, marks and clouds of points, drawn from data frames without a window; every axis names its unit."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
-
-if TYPE_CHECKING:
-    from torchrl.data import ReplayBuffer
 
 COLORS = {
     "crptpro": "#0b80c3", "crptpro-fast": "#3d44d8", "crptpro-finetune": "#5fc0f0", "proto-rl-c": "#d9640a",
@@ -91,7 +88,6 @@ def curves(
     marks: Mapping[str, Mapping[str, float]] | None = None,
     ticks: Sequence[str] = (),
     columns: int = 3,
-    compresses: bool = False,
 ) -> Any:
     """Draw curves in panels, with one legend below.
 
@@ -103,7 +99,6 @@ def curves(
         marks: title of a panel to heights of dashed lines, with what they say.
         ticks: names of the places 0, 1, ... of the horizontal axis, instead of numbers.
         columns: panels side by side.
-        compresses: draw heights far from 0 closer together where a few of them would press all others flat.
     """
     usual = {"panel": "", "line": "", "n": np.nan, "low": np.nan, "high": np.nan, "thin": False}
     points = points.assign(**{name: value for name, value in usual.items() if name not in points})
@@ -128,8 +123,6 @@ def curves(
                 )
         for name, at in (marks or {}).get(title, {}).items():
             handles.setdefault(name, axis.axhline(at, color=GREY, linestyle=(0, (4, 3)), linewidth=0.9))
-        if compresses and (near := _linear_width(here)):
-            axis.set_yscale("symlog", linthresh=near)
         if ticks:
             axis.set_xticks(range(len(ticks)), ticks)
         axis.set_title(_literal(title), fontsize=9.5, loc="left")
@@ -205,27 +198,6 @@ def scatter(points: pd.DataFrame, components: Sequence[str]) -> Any:
     return figure
 
 
-def stacks(datasets: Mapping[str, ReplayBuffer], count: int = 4) -> Any:
-    """Show sampled observations, a dataset a row: the pictures of each stack, oldest to newest, side by side.
-
-    Args:
-        datasets: name to replay buffer whose samples hold ``pixels`` uint8 ``[B, 3k, H, W]``.
-        count: observations of each.
-    """
-    from crptpro.analysis.embeddings import sample_pixels
-
-    figure, axes = grid(count * len(datasets), count, width=2.6, height=1.1)
-    for place, (name, dataset) in enumerate(datasets.items()):
-        pixels = sample_pixels(dataset, count, seed=0).cpu()  # (B, C, H, W)
-        strips = pixels.unflatten(1, (-1, 3)).permute(0, 3, 1, 4, 2).flatten(2, 3).numpy()  # (B, H, k W, 3)
-        for axis, strip in zip(axes[place * count :], strips):
-            axis.imshow(strip)
-            axis.grid(visible=False)
-            axis.set(xticks=[], yticks=[])
-        axes[place * count].set_ylabel(_literal(name), fontsize=8)
-    return figure
-
-
 def _legend(figure: Any, named: Mapping[str, Any]) -> None:
     """Draw one legend for all panels below them; the figure grows by what it takes."""
     if not named:
@@ -244,10 +216,3 @@ def _literal(name: Any) -> str:
 
 def _or(values: Iterable[float]) -> str:
     return " or ".join(f"{value:,.0f}" for value in sorted(set(values)))
-
-
-def _linear_width(points: pd.DataFrame) -> float:
-    """Return the height of a usual curve if the highest is more than ten times as high; 0 if it is not."""
-    heights = points.groupby(["label", "line"])["y"].agg(lambda own: own.abs().max())
-    usual = float(heights.median())
-    return usual if usual and heights.max() > 10 * usual else 0.0

@@ -1,11 +1,10 @@
-"""Run the missing jobs of a plan: in processes of this machine, on a Slurm cluster, on Ray, or in this process."""
+"""Run the missing jobs of a plan: in processes of this machine, on a Slurm cluster, or on Ray."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import datetime
-import io
 import json
 import logging
 import math
@@ -48,16 +47,15 @@ logger = logging.getLogger(__name__)
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """What numpy and torch read when they are loaded."""
-LEFTOVERS = {
-    "run": ("checkpoints", "replay"), "encoder": ("checkpoints",), "explored": ("checkpoints",),
-    "finetuned": ("checkpoints",),
-}  # fmt: skip
+LEFTOVERS = {"run": ("checkpoints", "replay")} | dict.fromkeys(
+    ("encoder", "explored", "finetuned"), ("checkpoints",)
+)
 """Directories that only an unfinished job needs."""
 WITH_DEVICE = ("encoder", "explored", "finetuned", "run", "probe", "coverage", "embeddings")
 CLUSTER_JOBS, CLUSTER_GPU_CORES = 16, 4
 MAX_REQUEUES = 1_000
 """How often a Slurm job is queued again when its time was up. Each time it has got further."""
-POLL_S, CLOCK_S, REFUSED_S, LAST_WAIT_S, PREEMPTED_S, SLURM_LOOK_S = 0.2, 20.0, 60.0, 10.0, 600.0, 10.0
+POLL_S, REFUSED_S, LAST_WAIT_S, SLURM_LOOK_S = 0.2, 60.0, 10.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -90,17 +88,13 @@ class Work:
         content = read_json(self.directory / DESCRIPTION, error=RecordError)
         places = {f"{{{key}}}": str(directory_of(Path(self.root), key)) for key in content["needs"]}
         places[OWN] = str(self.directory)
-        words = []
-        for word in content["command"]:
-            for mark, path in places.items():
-                word = word.replace(mark, path)
-            words.append(word)
+        words = content["command"]
+        for mark, path in places.items():
+            words = [word.replace(mark, path) for word in words]
         words += [part for plugin in self.plugins for part in ("--plugin", plugin)]
         if content["kind"] == "dataset":
             words += ["--workers", str(self.workers)]
-        elif content["kind"] in WITH_DEVICE:
-            words += ["--device", self.device]
-        return words
+        return words + (["--device", self.device] if content["kind"] in WITH_DEVICE else [])
 
     def run(self) -> str:
         """Run the job in this process, or continue it, unless another process has finished it meanwhile.
@@ -115,19 +109,20 @@ class Work:
             if (self.directory / DONE).exists():
                 return ""
             torch.set_num_threads(self.threads)
-            with _Clock(self.directory / CLOCK) as clock:
-                reason = _command(self.arguments(), self.directory / LOG)
+            clock = _clock(self.directory)
+            reason = _command(self.arguments(), self.directory / LOG)
             if not reason:
-                how = {"device": self.device, "threads": self.threads, **clock.spent()}
-                write_json(self.directory / DONE, {**how, **provenance()})
-                clock.path.unlink(missing_ok=True)
+                seconds = clock["seconds"] + time.time() - clock["began"]
+                how = {"device": self.device, "threads": self.threads, "attempts": clock["attempts"]}
+                write_json(self.directory / DONE, {"seconds": seconds, **how, **provenance()})
+                (self.directory / CLOCK).unlink(missing_ok=True)
                 for name in LEFTOVERS.get(self.key.split("-")[0], ()):
                     shutil.rmtree(self.directory / name, ignore_errors=True)
         print(f"error: {reason}" if reason else "finished", flush=True)
         return reason
 
     def run_alone(self) -> str:
-        """Do the same in a process that has nothing else to do: all that it says goes to the job's log."""
+        """Do the same in a process that has nothing else to do: all that it prints goes to the job's log."""
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, _leave)
         with _output_to(self.directory / LOG):
@@ -146,13 +141,23 @@ def _locked(directory: Path) -> Iterator[None]:
         lock.acquire(timeout=0)
     except Timeout:
         logger.warning("Another process runs %s; waiting until it ends.", directory.name)
-        while not lock.is_locked:
-            with contextlib.suppress(Timeout):
-                lock.acquire(timeout=1)
+        lock.acquire(timeout=1e9, poll_interval=1)
     try:
         yield
     finally:
         lock.release()
+
+
+def _clock(directory: Path) -> dict[str, float]:
+    """Begin an attempt; one that was killed lasted until the last change of a file of the job."""
+    before: dict[str, Any] = {"seconds": 0.0, "attempts": 0}
+    with contextlib.suppress(RecordError):
+        before = read_json(directory / CLOCK, error=RecordError)
+        last = max(path.stat().st_mtime for path in directory.iterdir() if path.name not in (LOCK, LOG))
+        before["seconds"] += max(0.0, last - before["began"])
+    clock = {"seconds": before["seconds"], "attempts": before["attempts"] + 1, "began": time.time()}
+    write_json(directory / CLOCK, clock)
+    return clock
 
 
 def _command(arguments: Sequence[str], log: Path) -> str:
@@ -180,39 +185,6 @@ def _last_line(path: Path) -> str:
     return next(filter(None, words), "")
 
 
-class _Clock:
-    """Counts wall clock over all attempts at a job, also over those that were killed."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.began = path, time.monotonic()
-        kept: dict[str, Any] = {}
-        with contextlib.suppress(RecordError):  # of a job that was not begun
-            kept = read_json(path, error=RecordError)
-        self.before, self.attempts = float(kept.get("seconds", 0)), int(kept.get("attempts", 0)) + 1
-        self._ended = threading.Event()
-
-    def __enter__(self) -> _Clock:
-        self._write()
-        threading.Thread(target=self._run, daemon=True).start()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._ended.set()
-        self._write()
-
-    def spent(self) -> dict[str, Any]:
-        return {"seconds": self.before + time.monotonic() - self.began, "attempts": self.attempts}
-
-    def _run(self) -> None:
-        while not self._ended.wait(CLOCK_S):
-            self._write()
-
-    def _write(self) -> None:
-        # A full disk is for those to report who lose something by it.
-        with contextlib.suppress(OSError, CRPTproError):
-            write_json(self.path, self.spent())
-
-
 @contextlib.contextmanager
 def _output_to(path: Path) -> Iterator[None]:
     """Append standard output and error to a file, those of child processes too."""
@@ -237,77 +209,20 @@ def _output_to(path: Path) -> Iterator[None]:
 
 
 class Handle(Protocol):
-    """A job that was started."""
+    """A job that was started: ``poll`` is ``None`` while it runs or is queued, then why it was lost, or nothing."""
 
-    def poll(self) -> str | None:
-        """``None`` while it runs or waits for its turn; then why it was lost, or nothing if its log tells all."""
+    def poll(self) -> str | None: ...  # noqa: D102
 
-    def stop(self) -> None:
-        """Ask it to write a checkpoint and end; asked again, to end at once."""
+    def stop(self) -> None: ...  # noqa: D102 - ask it to write a checkpoint and end; asked again, to end at once
 
 
 class Launcher(Protocol):
-    """A place where jobs run; ``is_one_machine`` says whether all of them share this machine's cores."""
+    """A place where jobs run; a queue that does not take one now raises ``SubmissionError``."""
 
     is_one_machine: bool
+    """Whether all jobs share this machine's cores."""
 
-    def start(self, work: Work, *, is_exclusive: bool) -> Handle:
-        """Start a job, or queue it.
-
-        Raises:
-            SubmissionError: a queue does not take it now; nothing was started.
-        """
-
-    def close(self) -> None:
-        """Free what is held; no job is running."""
-
-
-class InlineLauncher:
-    """Runs a job in this process, to its end, when it is started: for a debugger."""
-
-    is_one_machine = True
-
-    def start(self, work: Work, *, is_exclusive: bool) -> Handle:
-        """Run the job; what it says is seen, and goes to its log."""
-        with (
-            open(work.directory / LOG, "a", encoding="utf-8") as log,
-            contextlib.redirect_stdout(_Both(sys.stdout, log)),
-            contextlib.redirect_stderr(_Both(sys.stderr, log)),
-        ):
-            try:
-                work.run()
-            except SystemExit as end:
-                if end.code == 130:
-                    raise KeyboardInterrupt from None
-                raise
-        return _Ended()
-
-    def close(self) -> None:
-        """Nothing is held."""
-
-
-class _Ended:
-    def poll(self) -> str:
-        return ""
-
-    def stop(self) -> None:
-        pass
-
-
-class _Both(io.TextIOBase):
-    """Writes to two streams."""
-
-    def __init__(self, *streams: Any) -> None:
-        self.streams = streams
-
-    def write(self, text: str) -> int:
-        for stream in self.streams:
-            stream.write(text)
-            stream.flush()
-        return len(text)
-
-    def isatty(self) -> bool:
-        return bool(self.streams[0].isatty())
+    def start(self, work: Work, *, is_exclusive: bool) -> Handle: ...  # noqa: D102
 
 
 @dataclass
@@ -339,7 +254,7 @@ class LocalLauncher:
         self.gpus, self._running = tuple(gpus), list[_Process]()
 
     def start(self, work: Work, *, is_exclusive: bool) -> Handle:
-        """Start a process that ends with this one, and hears no Ctrl-C of the terminal's."""
+        """Start a process that ends with this one; Ctrl-C in the terminal does not reach it."""
         self._running = [each for each in self._running if each.poll() is None]
         environment, gpu = os.environ | dict.fromkeys(THREAD_VARIABLES, str(work.threads)), None
         if self.gpus:
@@ -353,9 +268,6 @@ class LocalLauncher:
             )
         self._running.append(_Process(process, gpu))
         return self._running[-1]
-
-    def close(self) -> None:
-        """Nothing is held."""
 
 
 @dataclass(frozen=True)
@@ -377,53 +289,39 @@ class _Submitted:
 
 
 @dataclass
-class SlurmJob:
-    """A job of Slurm's, as submitit knows it."""
-
+class _SlurmJob:
     job: Any
     folder: Path
     log: Path
-    is_asked_to_stop: bool = field(default=False, init=False)
-    _preempted_since: float = field(default=math.inf, init=False)
-    _looked: float = field(default=-math.inf, init=False)
+    is_stopping: bool = False
+    looked: float = -math.inf
 
     def poll(self) -> str | None:
-        """As of :class:`Handle`; submitit holds that a preempted job comes back, where the cluster may cancel it."""
-        if (
-            self.is_asked_to_stop and time.monotonic() - self._looked > SLURM_LOOK_S
-        ):  # submitit asks every ten minutes
-            self._looked = time.monotonic()
-            self.job.watcher.get_state(self.job.job_id, mode="force")
-        is_preempted = str(self.job.state).upper().startswith("PREEMPTED")
-        self._preempted_since = min(self._preempted_since, time.monotonic()) if is_preempted else math.inf
-        is_lost = time.monotonic() - self._preempted_since > PREEMPTED_S
-        if not self.job.done() and not is_lost:
+        # Left alone, submitit asks Slurm every ten minutes.
+        is_due = self.is_stopping and time.monotonic() - self.looked > SLURM_LOOK_S
+        self.looked = time.monotonic() if is_due else self.looked
+        if not self.job.done(force_check=is_due):
             return None
-        failure = None if is_lost else self.job.exception()
         reason = ""
-        if is_lost or type(failure).__name__ == "UncompletedJobError":
+        if type(self.job.exception()).__name__ == "UncompletedJobError":
             reason = f"the job was lost ({str(self.job.state).lower()})"
-            said = (self.job.stderr() or "").strip()
-            if said:  # it did not get as far as its log, or the system said why it ended the job
-                with open(self.log, "a", encoding="utf-8") as log:
-                    log.write(said + "\n")
+            with open(self.log, "a", encoding="utf-8") as log:  # it may not have got as far as its log
+                log.write((self.job.stderr() or "").strip() + "\n")
         shutil.rmtree(self.folder, ignore_errors=True)
         return reason
 
     def stop(self) -> None:
-        """Have Slurm pass SIGTERM on, or take the job from the queue; asked again, cancel it."""
-        options = [[]] if self.is_asked_to_stop else [["--state=PENDING"], ["--signal=TERM"]]
-        for each in options:
+        for options in [[]] if self.is_stopping else [["--state=PENDING"], ["--signal=TERM"]]:
             with contextlib.suppress(OSError):
-                subprocess.call(["scancel", *each, self.job.job_id])
-        self.is_asked_to_stop = True
+                subprocess.call(["scancel", *options, self.job.job_id])
+        self.is_stopping = True
 
 
 class SlurmLauncher:
     """A Slurm cluster, whose nodes share ROOT and the environment of this process.
 
     Args:
-        parameters: of submitit's executor; lines of ``setup`` follow those that set the numbers of threads.
+        parameters: of submitit's executor.
         cluster: submitit's name of it; tests have ``"local"``.
 
     Raises:
@@ -448,55 +346,38 @@ class SlurmLauncher:
 
     def start(self, work: Work, *, is_exclusive: bool) -> Handle:
         """Queue a job; an exclusive one asks for a node of its own."""
-        from submitit import LocalExecutor
-        from submitit.slurm.slurm import SlurmExecutor
+        from submitit import AutoExecutor
+        from submitit.core.utils import FailedJobError
 
         parent = Path(work.root) / "submitted"
         parent.mkdir(exist_ok=True)
         folder = Path(tempfile.mkdtemp(prefix=f"{work.key}-", dir=parent))
-        executor: Any = (
-            SlurmExecutor(folder, max_num_timeout=MAX_REQUEUES)
-            if self.cluster == "slurm"
-            else LocalExecutor(folder)
-        )
+        executor = AutoExecutor(folder, cluster=self.cluster, slurm_max_num_timeout=MAX_REQUEUES)
         executor.update_parameters(**self.job_parameters(work, is_exclusive=is_exclusive))
         try:
-            submitted = executor.submit(_Submitted(work))
-        except Exception as reason:
-            if type(reason).__name__ != "FailedJobError":
-                raise
+            return _SlurmJob(executor.submit(_Submitted(work)), folder, work.directory / LOG)
+        except FailedJobError as reason:
             shutil.rmtree(folder, ignore_errors=True)
             said = (str(reason).strip().splitlines() or ["it gave no reason"])[-1]
             raise SubmissionError(
                 f"sbatch refused a job: {said} Change --partition, --hours or --sbatch."
             ) from reason
-        return SlurmJob(submitted, folder, work.directory / LOG)
 
     def job_parameters(self, work: Work, *, is_exclusive: bool) -> dict[str, Any]:
         """Return what submitit is told of one job."""
-        if self.cluster != "slurm":
-            return self.parameters
-        threads = work.threads
         # Since Slurm 22.05 srun does not ask for the cores that sbatch was given, and would run the job on one.
-        setup = [f"export {name}={threads}" for name in (*THREAD_VARIABLES, "SRUN_CPUS_PER_TASK")]
-        found = {"job_name": work.key, "cpus_per_task": threads, **self.parameters}
-        found["setup"] = [*setup, *self.parameters.get("setup", ())]
-        return found | ({"exclusive": True} if is_exclusive else {})
-
-    def close(self) -> None:
-        """Nothing is held."""
+        setup = [f"export {name}={work.threads}" for name in (*THREAD_VARIABLES, "SRUN_CPUS_PER_TASK")]
+        own = {"job_name": work.key, "cpus_per_task": work.threads, "setup": setup, "exclusive": is_exclusive}
+        return {f"slurm_{name}": value for name, value in {**own, **self.parameters}.items() if value}
 
 
 @dataclass
-class RayJob:
-    """A task of Ray's."""
-
+class _RayJob:
     ray: Any
     task: Any
-    is_asked_to_stop: bool = field(default=False, init=False)
+    is_stopping: bool = field(default=False, init=False)
 
     def poll(self) -> str | None:
-        """As of :class:`Handle`."""
         if not self.ray.wait([self.task], timeout=0)[0]:
             return None
         try:
@@ -508,9 +389,8 @@ class RayJob:
         return ""
 
     def stop(self) -> None:
-        """Interrupt it as Ctrl-C would; asked again, end its worker."""
-        self.ray.cancel(self.task, force=self.is_asked_to_stop)
-        self.is_asked_to_stop = True
+        self.ray.cancel(self.task, force=self.is_stopping)
+        self.is_stopping = True
 
 
 class RayLauncher:
@@ -534,7 +414,6 @@ class RayLauncher:
             raise CRPTproError(
                 f"--launcher ray needs Ray ({reason}): pip install 'crptpro[ray]', or choose --launcher local."
             ) from None
-        self._ray, self._gpus = ray, gpus
         options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
         address = address or os.environ.get("RAY_ADDRESS") or None
         try:
@@ -555,10 +434,11 @@ class RayLauncher:
             ) from reason
         sizes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         if not any(size.get("CPU", 0) >= cores and size.get("GPU", 0) >= gpus for size in sizes):
+            asked = f"{cores} cores and {gpus:g} GPUs"
             logger.warning(
-                "No node of the Ray cluster has the %d cores and %g GPUs that a job asks for: jobs wait until one is "
-                "started. If none can be, change --cores-per-job or --device.", cores, gpus,
-            )  # fmt: skip
+                "No node of the Ray cluster has the %s that a job asks for: jobs wait for one.", asked
+            )
+        self._ray, self._gpus = ray, gpus
         # A worker ends with its job, as a process of its own would: nothing of a job is left for the next.
         self._run = ray.remote(max_retries=0, max_calls=1)(_run_alone)
 
@@ -568,11 +448,7 @@ class RayLauncher:
         task = self._run.options(
             name=work.key, num_cpus=work.threads, num_gpus=self._gpus, runtime_env={"env_vars": variables}
         ).remote(work)
-        return RayJob(self._ray, task)
-
-    def close(self) -> None:
-        """Leave the cluster; one that was started here ends."""
-        self._ray.shutdown()
+        return _RayJob(self._ray, task)
 
 
 def _run_alone(work: Work) -> str:
@@ -584,14 +460,7 @@ def _run_alone(work: Work) -> str:
 
 @dataclass(frozen=True)
 class Failure:
-    """A job that is not finished.
-
-    Args:
-        key: of the job.
-        reason: why, in a line.
-        log: what it said; ``None`` if it was not started, since something that it needs failed.
-        attempts: how often it was tried.
-    """
+    """A job that is not finished; without a ``log`` it was not started, since something that it needs failed."""
 
     key: str
     reason: str
@@ -609,7 +478,6 @@ def run_jobs(
     device: str = "cpu",
     plugins: tuple[str, ...] = (),
     attempts: int = 3,
-    failures: list[Failure] | None = None,
 ) -> list[Failure]:
     """Run every missing job of a plan as soon as all that it needs is finished.
 
@@ -625,7 +493,6 @@ def run_jobs(
         device: of networks.
         plugins: modules that jobs load first.
         attempts: how often a job is tried; each attempt continues the one before.
-        failures: a list that gets what was not finished, also where an error ends this.
 
     Returns:
         What was not finished: failures first, then what depends on them.
@@ -637,17 +504,17 @@ def run_jobs(
     """
     describe(root, plan)
     usual = Work(str(root.resolve()), "", device, cores, cores, plugins)
-    loop = _Loop(plan, usual, launcher, jobs, attempts, [] if failures is None else failures)
-    signals, heeded = list[int](), 0
-    with _signals_to(signals):
+    loop = _Loop(plan, usual, launcher, jobs, attempts)
+    heeded = 0
+    with _signals() as received:
         try:
             while loop.waiting or loop.running:
-                if len(signals) > heeded:
+                if len(received) > heeded:
                     heeded += 1
                     loop.stop()
                 loop.look()
                 if heeded and not loop.running:
-                    raise KeyboardInterrupt if signals[0] == signal.SIGINT else SystemExit(128 + signals[0])
+                    raise KeyboardInterrupt if received[0] == signal.SIGINT else SystemExit(128 + received[0])
                 if heeded or not loop.start():
                     time.sleep(POLL_S)
         except BaseException:
@@ -661,8 +528,9 @@ def run_jobs(
 
 
 @contextlib.contextmanager
-def _signals_to(received: list[int]) -> Iterator[None]:
+def _signals() -> Iterator[list[int]]:
     """Note signals that ask to stop, instead of being interrupted by them; a third one interrupts."""
+    received: list[int] = []
 
     def note(number: int, frame: object) -> None:
         if len(received) > 1:
@@ -672,12 +540,13 @@ def _signals_to(received: list[int]) -> Iterator[None]:
         received.append(number)
 
     is_main = threading.current_thread() is threading.main_thread()
-    numbers = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
     # What the caller ignores (nohup) stays ignored.
-    numbers = [number for number in numbers if is_main and signal.getsignal(number) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, note) for number in numbers}
+    numbers = [
+        n for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN
+    ]
+    before = {number: signal.signal(number, note) for number in numbers if is_main}
     try:
-        yield
+        yield received
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -690,19 +559,17 @@ class _Loop:
     launcher: Launcher
     jobs: int
     attempts: int
-    failures: list[Failure]
 
     def __post_init__(self) -> None:
         self.waiting = list(self.plan.missing)
-        missing = {job.key for job in self.waiting}
-        self.finished = {job.key for job in self.plan.jobs} - missing
+        self.finished = {job.key for job in self.plan.jobs} - {job.key for job in self.waiting}
         self.running: list[tuple[Job, Handle, float]] = []
+        self.failures: list[Failure] = []
         self.tried: Counter[str] = Counter()
         self.is_stopping, self.resumes = False, -math.inf
 
     def start(self) -> bool:
-        """Start what can be started, and say whether anything was."""
-        self._skip()
+        """Start what can be started, and return whether anything was."""
         if time.monotonic() < self.resumes or any(job.is_exclusive for job, *_ in self.running):
             return False
         ready = [job for job in self.waiting if all(needed.key in self.finished for needed in job.needs)]
@@ -715,8 +582,6 @@ class _Loop:
                 work = replace(work, workers=work.workers * share)
             if self.launcher.is_one_machine and job.is_exclusive:
                 work = replace(work, threads=work.threads * self.jobs)
-            began = time.monotonic()
-            logger.info("%s: started", job.key)
             try:
                 handle = self.launcher.start(work, is_exclusive=job.is_exclusive)
             except SubmissionError as refusal:
@@ -725,55 +590,45 @@ class _Loop:
                 self.resumes = time.monotonic() + REFUSED_S
                 logger.warning("%s: %s It is tried again in %g s.", job.key, refusal, REFUSED_S)
                 return False
+            logger.info("%s: started", job.key)
             self.waiting.remove(job)
             self.tried[job.key] += 1
-            self.running.append((job, handle, began))
+            self.running.append((job, handle, time.monotonic()))
         return bool(chosen)
 
     def look(self) -> None:
-        """Take in what has ended."""
+        """Take in what has ended; give up or try again what has failed."""
         for entry in list(self.running):
             job, handle, began = entry
             lost = handle.poll()
             if lost is None:
                 continue
             self.running.remove(entry)
-            took = duration(time.monotonic() - began)
-            directory = directory_of(Path(self.usual.root), job.key)
+            took, directory = duration(time.monotonic() - began), directory_of(Path(self.usual.root), job.key)
+            log, tried = directory / LOG, self.tried[job.key]
             # The job's own record decides: it may have been lost after its work was done.
             if (directory / DONE).exists():
                 self.finished.add(job.key)
                 count = f"{len(self.finished)} of {len(self.plan.jobs)}"
                 logger.info("%s: finished in %s (%s)", job.key, took, count)
-            elif self.is_stopping:
+                continue
+            if self.is_stopping:
                 logger.info("%s: stopped after %s", job.key, took)
-            else:
-                reason = lost or _last_line(directory / LOG).removeprefix("error: ")
-                self._retry(job, reason or "it ended unfinished", took, directory / LOG)
-
-    def _retry(self, job: Job, reason: str, took: str, log: Path) -> None:
-        tried = self.tried[job.key]
-        if tried >= self.attempts:
-            self.failures.append(Failure(job.key, reason, log, tried))
+                continue
+            reason = lost or _last_line(log).removeprefix("error: ") or "it ended unfinished"
+            if tried < self.attempts:
+                self.waiting.insert(0, job)
+                again = f"attempt {tried + 1} of {self.attempts}"
+                logger.warning("%s: %s after %s; %s (log: %s)", job.key, reason, took, again, log)
+                continue
             logger.error("%s: failed after %s: %s (log: %s)", job.key, took, reason, log)
-            return
-        self.waiting.insert(0, job)
-        logger.warning(
-            "%s: %s after %s; attempt %d of %d (log: %s)",
-            job.key,
-            reason,
-            took,
-            tried + 1,
-            self.attempts,
-            log,
-        )
+            self.failures.append(Failure(job.key, reason, log, tried))
+            self._skip({job.key})
 
-    def _skip(self) -> None:
+    def _skip(self, lost: set[str]) -> None:
         """Give up what needs something that failed; the plan's order has needs first."""
-        lost = {failure.key for failure in self.failures}
         for job in list(self.waiting):
-            failed = [needed.key for needed in job.needs if needed.key in lost]
-            if failed:
+            if failed := [needed.key for needed in job.needs if needed.key in lost]:
                 self.waiting.remove(job)
                 lost.add(job.key)
                 self.failures.append(Failure(job.key, f"needs {failed[0]}"))
@@ -800,14 +655,6 @@ def duration(seconds: float) -> str:
 # --- what jobs have -------------------------------------------------------------------------------------------------
 
 
-def visible_gpus() -> tuple[str, ...]:
-    """Return numbers or names as ``CUDA_VISIBLE_DEVICES`` lists them; without that variable, every GPU's number."""
-    listed = os.environ.get("CUDA_VISIBLE_DEVICES")
-    if listed is not None:
-        return tuple(part.strip() for part in listed.split(",") if part.strip())
-    return tuple(map(str, range(torch.cuda.device_count())))
-
-
 @dataclass(frozen=True)
 class Resources:
     """What jobs have: how many at a time, cores of each, and the GPUs of this machine that they share."""
@@ -831,17 +678,19 @@ def divide(
     for name, value in (("jobs", jobs), ("cores-per-job", cores), ("jobs-per-gpu", jobs_per_gpu)):
         if value is not None and value < 1:
             raise CRPTproError(f"--{name} must be at least 1, got {value}.")
-    if launcher in ("slurm", "ray"):
+    if launcher != "local":
         return Resources(
             jobs or CLUSTER_JOBS, cores or (CLUSTER_GPU_CORES if device.startswith("cuda") else 1)
         )
-    gpus = visible_gpus() if device == "cuda" else ()
-    if device == "cuda" and not (gpus and torch.cuda.device_count()):
-        raise CRPTproError(
-            "--device cuda: this machine has no GPU that torch can use; --device cpu always works."
-        )
-    if launcher == "inline":
-        return Resources(1, cores or cpu_cores())
+    gpus: tuple[str, ...] = ()
+    if device == "cuda":
+        listed = os.environ.get("CUDA_VISIBLE_DEVICES")
+        names = map(str, range(torch.cuda.device_count())) if listed is None else listed.split(",")
+        gpus = tuple(filter(None, (name.strip() for name in names)))
+        if not gpus or not torch.cuda.device_count():
+            raise CRPTproError(
+                "--device cuda: this machine has no GPU that torch can use; --device cpu always works."
+            )
     room = jobs_per_gpu * (len(gpus) or int(device.startswith("cuda")))
     if room and (jobs or 0) > room:
         raise CRPTproError(
@@ -852,19 +701,13 @@ def divide(
     return Resources(jobs, cores or max(1, cpu_cores() // jobs), gpus)
 
 
-OWN_OPTIONS = {
-    "cpus-per-task": "--cores-per-job", "time": "--hours", "mem": "--memory-gb", "partition": "--partition",
-}  # fmt: skip
-"""Options of sbatch that every job is given by one of ours."""
-
-
 def slurm_parameters(
     *, partition: str | None, hours: float, memory_gb: float, sbatch: Sequence[str], has_gpu: bool
 ) -> dict[str, Any]:
     """Return the parameters of submitit's Slurm executor that hold for every job.
 
     Raises:
-        CRPTproError: no time, no memory, an option that is not ``key=value``, or one that has an option of its own.
+        CRPTproError: no time, no memory, or an option that is not ``key=value``.
 
     Examples:
         >>> slurm_parameters(partition="short", hours=2, memory_gb=8, sbatch=("qos=high",), has_gpu=False)
@@ -879,8 +722,6 @@ def slurm_parameters(
         key, equals, value = option.partition("=")
         if not key or not equals:
             raise CRPTproError(f"--sbatch {option}: write key=value, e.g. qos=high or account=robots.")
-        if instead := OWN_OPTIONS.get(key.lstrip("-").replace("_", "-")):
-            raise CRPTproError(f"--sbatch {option} would be overruled: say it by {instead}.")
         further[key.lstrip("-")] = value
     found: dict[str, Any] = {"time": round(hours * 60), "mem": f"{round(memory_gb * 1024)}M"}
     found |= {} if partition is None else {"partition": partition}

@@ -3,41 +3,35 @@
 from __future__ import annotations
 
 import inspect
+import re
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from crptpro.domains import GROUPS, get_domain
+from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CRPTproError, UnknownNameError
-from crptpro.experiments.jobs import (
-    Job,
-    collect_job,
-    comparison_job,
-    downstream_job,
-    explore_job,
-    finetune_job,
-    pretrain_job,
-    probe_job,
-    prototypes_job,
-    timing_job,
-    untrained_job,
-)
+from crptpro.experiments.jobs import OWN, Job, options, plugins_digest
+from crptpro.experiments.published import FINETUNE_UPDATES
 from crptpro.objectives import Method, get_method
+from crptpro.seeding import derive_seed
+from crptpro.training.explore import ExploreConfig, plan_exploration
 from crptpro.values import as_int
 
 Settings = Mapping[str, Any]
 NONE: Settings = {}
 
 FAST, NO_BONUS, FINETUNE, DRQ = "crptpro-fast", "crptpro-no-bonus", "crptpro-finetune", "drq"
-RANDOM_ENCODER = "random-encoder"
+RANDOM, STANDARDISED = "random-encoder", "random-encoder-standardised"
 METHODS = (
     "crptpro", FAST, NO_BONUS, FINETUNE, "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-s", "becl", DRQ,
-    RANDOM_ENCODER,
+    RANDOM, STANDARDISED,
 )  # fmt: skip
 """Every system of the comparison, in the order of tables."""
-PRETRAINED = tuple(name for name in METHODS if name not in (NO_BONUS, FINETUNE, DRQ, RANDOM_ENCODER))
+PRETRAINED = ("crptpro", FAST, "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-s", "becl")
 """Those with a pre-training of their own."""
-CROSS_DOMAIN = ("crptpro", FAST, "proto-rl-c", "atc", "apt-c", "becl", RANDOM_ENCODER)
+CROSS_DOMAIN = ("crptpro", FAST, "proto-rl-c", "atc", "apt-c", "becl", RANDOM)
 """Those whose one encoder serves several domains, with the control."""
 
 UNSEEN_TASKS = {
@@ -47,14 +41,6 @@ UNSEEN_TASKS = {
 """Tasks of domains that a group's encoder never saw, in the paper's table."""
 COLORS_TASKS = {"C": ("reach_duplo", "pendulum_swingup", "cheetah_run")}
 """Tasks with a reversed background, likewise."""
-FINETUNE_UPDATES = {
-    "pendulum": 2_000,
-    "manipulation": 2_000,
-    "cartpole": 3_000,
-    "cheetah": 1_000,
-    "walker": 500,
-}
-"""Domain to encoder updates of fine-tuning the group A encoder (section IV.D)."""
 
 DISPERSION, NO_DISPERSION = {"intr_loss_coef": 5e-3}, {"intr_loss_coef": 0.0}
 VARIANTS: dict[str, tuple[tuple[str, Settings], ...]] = {
@@ -79,67 +65,41 @@ SEEDS = 1_000
 
 @dataclass(frozen=True)
 class Scale:
-    """Every budget of every experiment; the values here are the paper's.
-
-    Args:
-        name: as on the command line.
-        transitions: random transitions per domain.
-        quality: render quality of everything.
-        updates: encoder updates on datasets, over all domains.
-        batch_size: transitions per pre-training update; ``None`` for the method's own.
-        loss: options of losses, by name of their class.
-        explore: settings of exploring, with the encoder update interval of a method that makes one update each time.
-        explore_single: the same of the (S) methods.
-        single_ablation: settings of exploring that an (S) method has in ``ablation`` besides.
-        finetune_updates: encoder updates of fine-tuning, by domain; others take the largest.
-        run: settings of every downstream run.
-        seeds: number of downstream runs on each encoder unless the caller says otherwise.
-        alphas: weights of the dispersion loss in ``sensitivity``, besides none and the method's own.
-        capacities: random transitions per domain in ``sensitivity``.
-        probe_samples: observations of a state probe.
-        probe_transitions: of a dataset that is probed, which needs several episodes, if not ``transitions``.
-        timing_updates: encoder updates that ``efficiency`` times, after as many to warm up.
-        paper_timing_updates: the same with the paper's batches and intervals; 0 for none.
-        coverage_samples: observations of a coverage estimate.
-        embedded_samples: observations of each source in ``visualize``.
-        study_prototypes: prototypes of the study's encoders, if not those of ``loss``.
-        study_updates: encoder updates of the study's full-length trials, if not ``updates``.
-    """
+    """Every budget of every experiment; the values here are the paper's."""
 
     name: str
-    transitions: int = 100_000
-    quality: str = "exact"
-    updates: int = 50_000
-    batch_size: int | None = None
-    loss: Mapping[str, Settings] = field(default_factory=dict)
+    transitions: int = 100_000  # random transitions per domain
+    quality: str | None = None  # render quality of everything; ``None`` for the exact one
+    updates: int = 50_000  # encoder updates on datasets, over all domains
+    batch_size: int | None = None  # transitions per pre-training update; ``None`` for the method's own
+    loss: Mapping[str, Settings] = field(default_factory=dict)  # options of losses, by name of their class
+    # settings of exploring, with the encoder update interval of a method that makes one update each time
     explore: Settings = field(default_factory=dict)
-    explore_single: Settings = field(default_factory=dict)
+    explore_single: Settings = field(default_factory=dict)  # the same of the (S) methods
+    # settings of exploring that an (S) method has in ``ablation`` besides
     single_ablation: Settings = field(default_factory=dict)
-    finetune_updates: Mapping[str, int] = field(default_factory=lambda: FINETUNE_UPDATES)
-    run: Settings = field(default_factory=dict)
-    seeds: int = 3
+    run: Settings = field(default_factory=dict)  # settings of every downstream run
+    seeds: int = 3  # number of downstream runs on each encoder unless the caller says otherwise
+    # weights of the dispersion loss in ``sensitivity``, besides none and the method's own
     alphas: tuple[float, ...] = (5e-4, 5e-2, 5e-1)
+    # random transitions per domain in ``sensitivity``
     capacities: tuple[int, ...] = (10_000, 50_000, 100_000)
-    probe_samples: int = 4_000
+    probe_samples: int = 4_000  # observations of a state probe
+    # of a dataset that is probed, which needs several episodes, if not ``transitions``
     probe_transitions: int | None = None
-    timing_updates: int = 100
-    paper_timing_updates: int = 0
-    coverage_samples: int = 1_024
-    embedded_samples: int = 125
-    study_prototypes: int | None = None
-    study_updates: int | None = None
+    timing_updates: int = 100  # encoder updates that ``efficiency`` times, after as many to warm up
+    paper_timing_updates: int = 0  # the same with the paper's batches and intervals; 0 for none
+    coverage_samples: int = 1_024  # observations of a coverage estimate
+    embedded_samples: int = 125  # observations of each source in ``visualize``
 
+    @property
     def training(self) -> dict[str, Any]:
-        """Return the settings of every encoder's training."""
+        """Settings of every encoder's training."""
         return {} if self.batch_size is None else {"batch_size": self.batch_size}
 
-    def exploration(self, method: Method) -> dict[str, Any]:
-        """Return the settings of a method's exploring."""
-        assert method.exploration is not None
-        chosen = dict(self.explore_single if method.exploration.is_single_domain else self.explore)
-        if "encoder_update_interval" in chosen:
-            chosen["encoder_update_interval"] *= method.exploration.encoder_updates_each
-        return chosen | ({} if self.quality == "exact" else {"quality": self.quality})
+    def finetune_updates(self, domain: str) -> int:
+        """Return the encoder updates of fine-tuning on a domain: in proportion to the paper's."""
+        return max(2, FINETUNE_UPDATES.get(domain, 3_000) * self.updates // 50_000)
 
 
 # 20,000 decisions and, after the random ones, as many encoder updates as the methods on random data have.
@@ -160,7 +120,6 @@ SMALL = Scale(
     loss={"ProtoLoss": {"num_prototypes": 128}},
     explore={**_SMALL_EXPLORER, "random_agent_steps": 667},
     explore_single={**_SMALL_EXPLORER, "random_agent_steps": 2_000},
-    finetune_updates={domain: updates * 3_000 // 50_000 for domain, updates in FINETUNE_UPDATES.items()},
     run={
         "env_steps": 20_000, "batch_size": 128, "learning_rate": 1e-3, "replay_capacity": 12_000,
         "checkpoint_interval_env_steps": 2_000,
@@ -171,8 +130,6 @@ SMALL = Scale(
     timing_updates=25,
     paper_timing_updates=7,  # as many rows
     coverage_samples=512,
-    study_prototypes=512,
-    study_updates=10_000,
 )  # fmt: skip
 """A fifth of the data, 6 % of the updates, 4 % of the env steps, a quarter of the batch: a day on two CPU cores."""
 TINY = Scale(
@@ -187,7 +144,6 @@ TINY = Scale(
     },
     explore=_TINY_EXPLORER,
     explore_single=_TINY_EXPLORER,
-    finetune_updates=dict.fromkeys(FINETUNE_UPDATES, 2),
     run={
         "env_steps": 60, "random_agent_steps": 12, "batch_size": 4, "replay_capacity": 40, "hidden_dim": 16,
         "queue_size": 32, "eval_interval_env_steps": 60, "eval_episodes": 1, "checkpoint_interval_env_steps": 30,
@@ -254,8 +210,7 @@ class Request:
     def __post_init__(self) -> None:
         """Refuse names that nobody knows; a domain's name becomes that of its task."""
         for method in self.methods:
-            if method not in METHODS:
-                get_method(method, besides=METHODS)
+            get_method(method)
         for group in self.groups:
             if group not in GROUPS:
                 raise UnknownNameError(f"There is no group {group!r}; choose from {', '.join(GROUPS)}.")
@@ -295,72 +250,21 @@ class Request:
 # --- jobs at a scale ------------------------------------------------------------------------------------------------
 
 
-def method_of(system: str) -> Method | None:
-    """Return the method that trains a system's encoder; ``None`` where none is pre-trained."""
-    if system in (DRQ, RANDOM_ENCODER):
-        return None
-    return get_method("crptpro" if system in (NO_BONUS, FINETUNE) else system)
+def pretraining_of(system: str) -> Method:
+    """Return the method that trains a system's encoder, or whose encoder it starts from."""
+    method = get_method(system)
+    return method if method.starts_from is None else get_method(method.starts_from)
 
 
 def explores(system: str) -> bool:
     """Whether a system's encoder is trained on what its own agents see."""
-    method = method_of(system)
-    return method is not None and method.exploration is not None
+    return pretraining_of(system).exploration is not None
 
 
 def is_single_domain(system: str) -> bool:
     """Whether a system has an encoder per domain because it cannot be trained on several: the (S) methods."""
-    method = method_of(system)
-    return method is not None and method.exploration is not None and method.exploration.is_single_domain
-
-
-def disperses(system: str) -> bool:
-    """Whether a system's loss has a dispersion term."""
-    method = method_of(system)
-    return method is not None and "intr_loss_coef" in _loss_defaults(method)
-
-
-def dataset(scale: Scale, domain: str, seed: int, transitions: int | None = None) -> Job:
-    """Return a domain's random dataset."""
-    return collect_job(domain, transitions or scale.transitions, seed, quality=scale.quality)
-
-
-def encoder(
-    scale: Scale,
-    method: str,
-    domains: Iterable[str],
-    seed: int,
-    *,
-    transitions: int | None = None,
-    loss: Settings = NONE,
-    explore: Settings = NONE,
-    **settings: Any,
-) -> Job:
-    """Return the encoder that a method trains on domains.
-
-    Args:
-        scale: its budgets.
-        method: a registered name, or a system's that has the encoder of one.
-        domains: a single one for the (S) methods.
-        seed: of data and training.
-        transitions: of each domain, instead of the scale's.
-        loss: options of the loss, instead of or besides the scale's.
-        explore: settings of exploring, likewise.
-        **settings: further ones of :func:`~crptpro.experiments.jobs.pretrain_job`.
-    """
-    registered = method_of(method)
-    if registered is None or registered.loss_class is None:
-        return untrained_job(seed)
-    options = _departures(registered, {**scale.loss.get(registered.loss_class.__name__, {}), **loss})
-    if registered.exploration is not None:
-        exploring = {**scale.exploration(registered), **explore}
-        return explore_job(
-            registered, list(domains), seed, explore=exploring, training=scale.training(), loss=options
-        )
-    data = [dataset(scale, domain, seed, transitions) for domain in domains]
-    training = {**scale.training(), **settings.pop("training", {})}
-    usual = {"updates": scale.updates, "training": training, "loss": options}
-    return pretrain_job(registered, data, seed, **{**usual, **settings})
+    exploration = pretraining_of(system).exploration
+    return exploration is not None and exploration.is_single_domain
 
 
 def _loss_defaults(method: Method) -> dict[str, Any]:
@@ -369,86 +273,213 @@ def _loss_defaults(method: Method) -> dict[str, Any]:
     return {name: each.default for name, each in inspect.signature(method.loss_class).parameters.items()}
 
 
-def _departures(method: Method, options: Settings) -> dict[str, Any]:
-    """Options of a loss without those that its method has anyway: they would make the same encoder another job."""
+def _definition(*domains: str, method: Method | None = None) -> str:
+    is_own = method is not None and not method.is_builtin
+    return plugins_digest() if is_own or any(get_domain(each).source == "own" for each in domains) else ""
+
+
+def _encoder_of(job: Job) -> str:
+    return f"{{{job.key}}}/encoder"
+
+
+def _dataset_of(job: Job) -> str:
+    directory = re.sub(r"[^\w.+-]+", "-", job.facts["domain"])
+    return f"{{{job.key}}}/{directory}"
+
+
+def dataset(scale: Scale, domain: str, seed: int, transitions: int | None = None) -> Job:
+    """Return the collection of a domain's random transitions, in ``<job>/<domain>``."""
+    name, transitions = get_domain(domain).name, transitions or scale.transitions
+    command = ["collect", name, "--out", OWN]
+    command += options(transitions=transitions, seed=seed, quality=scale.quality)
+    facts = {"domain": name, "transitions": transitions, "seed": seed, "quality": scale.quality or "exact"}
+    facts["env_steps"] = transitions * resolve_action_repeat(name, None)
+    return Job("dataset", f"{name} seed {seed}", tuple(command), facts, definition=_definition(name))
+
+
+def encoder(
+    scale: Scale,
+    system: str,
+    domains: Iterable[str],
+    seed: int,
+    *,
+    transitions: int | None = None,
+    loss: Settings = NONE,
+    explore: Settings = NONE,
+) -> Job:
+    """Return the encoder that a system has for domains, in ``<job>/encoder``.
+
+    `loss` and `explore` are settings instead of, or besides, the scale's.
+    """
+    method = pretraining_of(system)
+    names = [get_domain(domain).name for domain in domains]
+    title = f"{method.name} {'+'.join(names)} seed {seed}"
+    command, facts = ["--method", method.name, "--out", OWN], {"method": method.name, "seed": seed}
+    if method.loss_class is None:
+        data = [dataset(scale, name, seed, transitions) for name in names] if system == STANDARDISED else []
+        command = ["pretrain", *map(_dataset_of, data), *command, *options(seed=seed)]
+        title = title if data else f"seed {seed}"
+        return Job("untrained", title, tuple(command), facts, tuple(data))
+    # What the method's loss has anyway is no option: it would make the same encoder another job.
     usual = {**_loss_defaults(method), **method.loss_options}
-    return {name: value for name, value in options.items() if name not in usual or usual[name] != value}
+    asked = {**scale.loss.get(method.loss_class.__name__, {}), **loss}
+    settings = {"loss": {k: v for k, v in asked.items() if k not in usual or usual[k] != v}, **scale.training}
+    facts |= {"domains": names, **settings}
+    if method.exploration is not None:
+        exploring = dict(scale.explore_single if method.exploration.is_single_domain else scale.explore)
+        if "encoder_update_interval" in exploring:
+            exploring["encoder_update_interval"] *= method.exploration.encoder_updates_each
+        exploring |= {**({"quality": scale.quality} if scale.quality else {}), **explore}
+        plan = plan_exploration(method, names, ExploreConfig(**exploring))
+        facts |= {"explore": exploring, "env_steps": plan.env_steps, "decisions": plan.decisions}
+        facts |= {"updates": plan.encoder_updates}
+        command = ["pretrain", *names, *command, *options(seed=seed, **settings, **exploring)]
+        return Job("explored", title, tuple(command), facts, (), _definition(*names, method=method))
+    data = [dataset(scale, name, seed, transitions) for name in names]
+    facts |= {"updates": scale.updates, "transitions": data[0].facts["transitions"]}
+    command = ["pretrain", *map(_dataset_of, data), *command]
+    command += options(seed=seed, updates=scale.updates, **settings)
+    return Job("encoder", title, tuple(command), facts, tuple(data), _definition(method=method))
 
 
 def encoder_for_task(
-    scale: Scale, method: str, domains: Iterable[str], task: str, seed: int, **settings: Any
+    scale: Scale, system: str, domains: Iterable[str], task: str, seed: int, **settings: Any
 ) -> Job | None:
     """Return the encoder that a task of a group is learned on; ``None`` for DrQ, which trains its own.
 
     The (S) methods have one per domain, and fine-tuning continues the group's on the task's domain.
     """
-    if method == DRQ:
-        return None
     domain = get_domain(task).name
-    if method == FINETUNE:
-        updates = scale.finetune_updates.get(domain, max(scale.finetune_updates.values()))
-        base, data = encoder(scale, method, domains, seed, **settings), dataset(scale, domain, seed)
-        return finetune_job(base, data, seed, updates=updates, training=scale.training())
-    return encoder(scale, method, (domain,) if is_single_domain(method) else domains, seed, **settings)
+    if system == DRQ:
+        return None
+    base = encoder(scale, system, (domain,) if is_single_domain(system) else domains, seed, **settings)
+    if system != FINETUNE:
+        return base
+    data, updates = dataset(scale, domain, seed), scale.finetune_updates(domain)
+    command = ["finetune", _encoder_of(base), _dataset_of(data), "--out", OWN]
+    command += options(seed=seed, updates=updates, **scale.training)
+    facts = {"method": FINETUNE, "domains": [domain], "seed": seed, "updates": updates, **scale.training}
+    return Job("finetuned", f"{FINETUNE} on {domain} seed {seed}", tuple(command), facts, (base, data))
 
 
-def runs(
+def run(scale: Scale, system: str, task: str, base: Job | None, seed: int, *, colors: str = "normal") -> Job:
+    """Return a system's learning of a task; the job's directory is the run directory.
+
+    ``base`` is the frozen encoder, or ``None`` for DrQ. Runs of several tasks with one seed share nothing else.
+    """
+    config = {**scale.run, **({"quality": scale.quality} if scale.quality else {})}
+    config |= {"intrinsic_reward_coef": 0} if system == NO_BONUS else {}
+    config |= {} if colors == "normal" else {"colors": colors}
+    facts: dict[str, Any] = {"method": DRQ}
+    if base is None:
+        config.pop("queue_size", None)  # it has no bonus
+    else:
+        facts = {"method": NO_BONUS if system == NO_BONUS else base.facts["method"]}
+        facts["encoder_seed"] = base.facts["seed"]
+    command = ["downstream", task, "--pretrained", DRQ if base is None else _encoder_of(base)]
+    command += ["--out", OWN, *options(seed=derive_seed(seed, "task", task), **config)]
+    facts |= {"task": task, "domain": get_domain(task).name, "seed": seed, "colors": colors}
+    facts |= {"env_steps": 1_000_000 if base is None else 500_000, **config}
+    by = "" if base is None else f" encoder {base.facts['seed']}"
+    title = f"{task}{'' if colors == 'normal' else f' {colors}'} {facts['method']}{by} seed {seed}"
+    needs = () if base is None else (base,)
+    return Job("run", title, tuple(command), facts, needs, _definition(task))
+
+
+def probe(scale: Scale, base: Job, data: Job) -> Job:
+    """Return the state probe of an encoder on a domain, ``<job>/probe.csv``."""
+    command = ["probe", _encoder_of(base), _dataset_of(data), "--csv", f"{OWN}/probe.csv"]
+    command += options(samples=scale.probe_samples, seed=0)
+    facts = {
+        "method": base.facts["method"],
+        "encoder_seed": base.facts["seed"],
+        "domain": data.facts["domain"],
+    }
+    title = f"{facts['method']} seed {facts['encoder_seed']} on {facts['domain']}"
+    return Job("probe", title, tuple(command), facts, (base, data))
+
+
+def _about(job: Job) -> tuple[str, dict[str, Any]]:
+    facts = {name: job.facts[name] for name in ("method", "domains", "seed")}
+    return f"{facts['method']} {'+'.join(facts['domains'])} seed {facts['seed']}", facts
+
+
+def spread(base: Job) -> Job:
+    """Return how far an encoder's prototypes have spread, along its training and at its end."""
+    title, facts = _about(base)
+    return Job(
+        "prototypes", title, ("measure", "prototypes", _encoder_of(base), "--out", OWN), facts, (base,)
+    )
+
+
+def comparison(
+    kind: str, base: Job, explorer: Job, datasets: Sequence[Job], *, samples: int, seed: int
+) -> Job:
+    """Return what compares an explorer's data with random data: ``coverage`` or ``embeddings``."""
+    replays = [f"{{{explorer.key}}}/replay/{domain}" for domain in explorer.facts["domains"]]
+    command = ["measure", kind, "--encoder", _encoder_of(base), "--explorer", _encoder_of(explorer)]
+    command += ["--replays", *replays, "--datasets", *map(_dataset_of, datasets), "--out", OWN]
+    command += options(samples=samples, seed=seed)
+    title, facts = _about(explorer)
+    needs = tuple(dict.fromkeys((base, explorer, *datasets)))
+    return Job(kind, title, tuple(command), facts | {"samples": samples}, needs)
+
+
+def timing(request: Request, system: str, domain_sets: Sequence[Sequence[str]], seed: int) -> Job:
+    """Return the timing of encoders' training, ``<job>/timing.csv``: of one, or of several whose costs add up."""
+    scale, device, threads = request.scale, request.device, request.threads
+    here, paper = ([encoder(at, system, domains, seed) for domains in domain_sets] for at in (scale, PAPER))
+    command = ["measure", "timing", "--out", OWN, *options(
+        updates=scale.timing_updates, paper_updates=scale.paper_timing_updates, device=device, threads=threads,
+    )]  # fmt: skip
+    for trained, whole in zip(here, paper):
+        # What is in the data does not change the time: both are timed on this scale's.
+        command += ["--training", _as_word(trained, trained), "--paper-training", _as_word(whole, trained)]
+    domains = [domain for job in here for domain in job.facts["domains"]]
+    facts = {"method": here[0].facts["method"], "domains": domains, "seed": seed}
+    facts |= {"device": device, "threads": threads}
+    needs = tuple(dict.fromkeys(needed for job in here for needed in job.needs))
+    title = f"{facts['method']} {'+'.join(domains)} {device} {threads}"
+    return Job("timing", title, tuple(command), facts, needs)
+
+
+def _as_word(job: Job, like: Job) -> str:
+    """Return a training's command as one word, on the data of another."""
+    command = list(job.command)
+    if job.needs:
+        command[1 : 1 + len(job.needs)] = map(_dataset_of, like.needs)
+    at = command.index("--out")
+    return shlex.join(command[:at] + command[at + 2 :])
+
+
+# --- experiments in downstream scores -------------------------------------------------------------------------------
+
+
+def _scores(
     request: Request,
-    method: str,
+    group: str,
     task: str,
-    encoders: Mapping[int, Job | None],
+    system: str,
     *,
     label: str = "",
     colors: str = "normal",
-    **place: Any,
+    place: Settings = NONE,
+    **how: Any,
 ) -> list[Cell]:
-    """Return the runs of a system on a task: every downstream seed on the encoder of every encoder seed.
+    """Return the runs of a system on a task of, or after, a group: every downstream seed on every encoder.
 
     Where there is no encoder to share (DrQ), the encoder seeds count as further seeds of the run, so that every
     system has as many runs.
     """
-    config = dict(request.scale.run)
-    config |= {} if request.scale.quality == "exact" else {"quality": request.scale.quality}
-    config |= {"intrinsic_reward_coef": 0} if method == NO_BONUS else {}
-    if method == DRQ:
-        config.pop("queue_size", None)  # it has no bonus
-    if colors != "normal":
-        config["colors"] = place["colors"] = colors
     found = []
-    for encoder_seed, on in encoders.items():
+    where = {"group": group, "task": task, **({} if colors == "normal" else {"colors": colors}), **place}
+    for encoder_seed in request.encoder_seeds:
+        base = encoder_for_task(request.scale, system, GROUPS[group], task, encoder_seed, **how)
         for seed in request.downstream_seeds:
-            own = seed if on is not None else seed + SEEDS * encoder_seed
-            job = downstream_job(task, on, own, config=config, name=NO_BONUS if method == NO_BONUS else "")
-            where = {"task": task, "encoder_seed": encoder_seed, "seed": seed, **place}
-            found.append(Cell(label or method, job, where))
+            own = seed if base is not None else seed + SEEDS * encoder_seed
+            job = run(request.scale, system, task, base, own, colors=colors)
+            found.append(Cell(label or system, job, {**where, "encoder_seed": encoder_seed, "seed": seed}))
     return found
-
-
-def _of_group(
-    request: Request, method: str, group: str, task: str, *, place: Settings = NONE, **settings: Any
-) -> list[Cell]:
-    """The runs of a system on a task of, or after, a group."""
-    how = {name: settings.pop(name) for name in ("loss", "explore", "transitions") if name in settings}
-    encoders = {
-        seed: encoder_for_task(request.scale, method, GROUPS[group], task, seed, **how)
-        for seed in request.encoder_seeds
-    }
-    return runs(request, method, task, encoders, group=group, **settings, **place)
-
-
-def _domain_sets(request: Request, group: str, method: str) -> list[tuple[str, ...]]:
-    """The domains of each encoder of a method: the group's, or, of an (S) method, one for each of those asked for."""
-    if not is_single_domain(method):
-        return [GROUPS[group]]
-    asked = dict.fromkeys(get_domain(task).name for task in request.tasks)
-    return [(domain,) for domain in asked if domain in GROUPS[group]] or [(SINGLE_DOMAIN[group],)]
-
-
-def _measured(label: str, job: Job, group: str, seed: int, domains: Sequence[str]) -> Cell:
-    return Cell(label, job, {"group": group, "domains": "+".join(domains), "encoder_seed": seed})
-
-
-# --- experiments in downstream scores -------------------------------------------------------------------------------
 
 
 def _seen(request: Request) -> list[Cell]:
@@ -456,8 +487,8 @@ def _seen(request: Request) -> list[Cell]:
         cell
         for group in request.groups or GROUPS
         for task in request.tasks_of(GROUPS[group])
-        for method in request.chosen(METHODS)
-        for cell in _of_group(request, method, group, task)
+        for system in request.chosen(METHODS)
+        for cell in _scores(request, group, task, system)
     ]
 
 
@@ -471,9 +502,9 @@ def _elsewhere(
         if group in (request.groups or rows)
         for task in tasks
         if task in (request.tasks or tasks)
-        for method in request.chosen(CROSS_DOMAIN)
-        if method != FINETUNE and (has_single or not is_single_domain(method))
-        for cell in _of_group(request, method, group, task, colors=colors)
+        for system in request.chosen(CROSS_DOMAIN)
+        if system != FINETUNE and (has_single or not is_single_domain(system))
+        for cell in _scores(request, group, task, system, colors=colors)
     ]
 
 
@@ -490,8 +521,8 @@ def _finetune(request: Request) -> list[Cell]:
         cell
         for group in request.groups or ("A",)
         for task in request.tasks_of(FINETUNE_UPDATES)
-        for method in request.chosen(("crptpro", FAST, FINETUNE, "proto-rl-s", "apt-s", DRQ))
-        for cell in _of_group(request, method, group, task)
+        for system in request.chosen(("crptpro", FAST, FINETUNE, "proto-rl-s", "apt-s", DRQ))
+        for cell in _scores(request, group, task, system)
     ]
 
 
@@ -500,16 +531,16 @@ def _ablation(request: Request) -> list[Cell]:
     found: list[Cell] = []
     for group in request.groups or ("A", "C"):
         for task in request.tasks_of(GROUPS[group]):
-            for method in request.chosen(VARIANTS):
+            for system in request.chosen(VARIANTS):
                 explore, weight = NONE, DISPERSION["intr_loss_coef"]
-                if is_single_domain(method):
+                if is_single_domain(system):
                     domain = get_domain(task).name
                     if domain not in SINGLE_DISPERSION and not request.tasks:
                         continue  # the paper has two domains
                     explore, weight = request.scale.single_ablation, SINGLE_DISPERSION.get(domain, weight)
-                for label, loss in VARIANTS.get(method, ((method, NONE),)):
+                for label, loss in VARIANTS.get(system, ((system, NONE),)):
                     own = {"intr_loss_coef": weight} if loss == DISPERSION else loss
-                    found += _of_group(request, method, group, task, label=label, loss=own, explore=explore)
+                    found += _scores(request, group, task, system, label=label, loss=own, explore=explore)
     return found
 
 
@@ -518,17 +549,17 @@ def _sensitivity(request: Request) -> list[Cell]:
     scale, found = request.scale, list[Cell]()
     for group in request.groups or ("A",):
         for task in request.tasks_of(GROUPS[group]):
-            for method in request.chosen(("crptpro", "proto-rl-c")):
-                for weight in sorted({0.0, 5e-3, *scale.alphas}) if disperses(method) else ():
-                    found += _of_group(
-                        request, method, group, task, label=f"{method}, alpha {weight:g}",
+            for system in request.chosen(("crptpro", "proto-rl-c")):
+                has_weight = "intr_loss_coef" in _loss_defaults(pretraining_of(system))
+                for weight in sorted({0.0, 5e-3, *scale.alphas}) if has_weight else ():
+                    found += _scores(
+                        request, group, task, system, label=f"{system}, alpha {weight:g}",
                         loss={"intr_loss_coef": weight}, place={"varied": "alpha", "value": f"{weight:g}"},
                     )  # fmt: skip
-            for size in (
-                sorted({*scale.capacities, scale.transitions}) if "crptpro" in request.chosen(METHODS) else ()
-            ):
-                found += _of_group(
-                    request, "crptpro", group, task, label=f"crptpro, b {size:,}", transitions=size,
+            sizes = sorted({*scale.capacities, scale.transitions})
+            for size in sizes if "crptpro" in request.chosen(("crptpro",)) else ():
+                found += _scores(
+                    request, group, task, "crptpro", label=f"crptpro, b {size:,}", transitions=size,
                     place={"varied": "b", "value": str(size)},
                 )  # fmt: skip
     return found
@@ -537,25 +568,28 @@ def _sensitivity(request: Request) -> list[Cell]:
 # --- experiments that measure encoders ------------------------------------------------------------------------------
 
 
+def _domain_sets(request: Request, group: str, system: str) -> list[tuple[str, ...]]:
+    """The domains of each encoder of a system: the group's, or, of an (S) method, one for each of those asked for."""
+    if not is_single_domain(system):
+        return [GROUPS[group]]
+    asked = dict.fromkeys(get_domain(task).name for task in request.tasks)
+    return [(domain,) for domain in asked if domain in GROUPS[group]] or [(SINGLE_DOMAIN[group],)]
+
+
+def _measured(label: str, job: Job, group: str, seed: int, domains: Sequence[str]) -> Cell:
+    return Cell(label, job, {"group": group, "domains": "+".join(domains), "encoder_seed": seed})
+
+
 def _efficiency(request: Request) -> list[Cell]:
-    scale, found = request.scale, []
+    found = []
     for group, seed in request.groups_and_seeds("A"):
-        for method in (name for name in request.chosen(PRETRAINED) if name in PRETRAINED):
+        for system in (name for name in request.chosen(PRETRAINED) if name in PRETRAINED):
             for count in range(1, len(GROUPS[group]) + 1):
                 domains = GROUPS[group][:count]
-                sets = [(domain,) for domain in domains] if is_single_domain(method) else [domains]
-                job = timing_job(
-                    [encoder(scale, method, each, seed) for each in sets],
-                    [encoder(PAPER, method, each, seed) for each in sets],
-                    updates=scale.timing_updates,
-                    paper_updates=scale.paper_timing_updates,
-                    device=request.device,
-                    threads=request.threads,
-                )
+                sets = [(domain,) for domain in domains] if is_single_domain(system) else [domains]
                 place = {"group": group, "domains": count, "encoder_seed": seed}
-                found.append(
-                    Cell(method, job, {**place, "device": request.device, "threads": request.threads})
-                )
+                place |= {"device": request.device, "threads": request.threads}
+                found.append(Cell(system, timing(request, system, sets, seed), place))
     return found
 
 
@@ -565,18 +599,17 @@ def _trained(
     """Encoders of methods with prototypes, or what is measured of them."""
     return [
         _measured(
-            label, measure(encoder(request.scale, method, domains, seed, loss=loss)), group, seed, domains
+            label, measure(encoder(request.scale, system, domains, seed, loss=loss)), group, seed, domains
         )
         for group, seed in request.groups_and_seeds("A")
-        for method in request.chosen(variants)
-        if method in VARIANTS
-        for domains in _domain_sets(request, group, method)
-        for label, loss in variants.get(method, ((method, NONE),))
+        for system in request.chosen(variants)
+        for domains in _domain_sets(request, group, system)
+        for label, loss in variants.get(system, ())
     ]
 
 
 def _prototypes(request: Request) -> list[Cell]:
-    return _trained(request, VARIANTS, prototypes_job)
+    return _trained(request, VARIANTS, spread)
 
 
 def _stability(request: Request) -> list[Cell]:
@@ -585,23 +618,16 @@ def _stability(request: Request) -> list[Cell]:
     return _trained(request, variants, lambda trained: trained)
 
 
-def _compared(request: Request, kind: str, groups: tuple[str, ...], method: str, samples: int) -> list[Cell]:
+def _compared(request: Request, kind: str, groups: tuple[str, ...], system: str, samples: int) -> list[Cell]:
     """Random data beside an explorer's, as CRPTpro's encoder sees both: it was trained on all domains."""
     scale, found = request.scale, []
     for group, seed in request.groups_and_seeds(*groups):
-        for explorer in filter(explores, request.chosen((method,))):
+        base = encoder(scale, "crptpro", GROUPS[group], seed)
+        for explorer in filter(explores, request.chosen((system,))):
             for domains in _domain_sets(request, group, explorer):
-                job = comparison_job(
-                    kind,
-                    encoder(scale, "crptpro", GROUPS[group], seed),
-                    encoder(scale, explorer, domains, seed),
-                    [
-                        dataset(scale, name, seed)
-                        for name in (domains if kind == "coverage" else GROUPS[group])
-                    ],
-                    samples=samples,
-                    seed=seed,
-                )
+                data = [dataset(scale, d, seed) for d in (domains if kind == "coverage" else GROUPS[group])]
+                exploring = encoder(scale, explorer, domains, seed)
+                job = comparison(kind, base, exploring, data, samples=samples, seed=seed)
                 found.append(_measured(explorer, job, group, seed, domains))
     return found
 
@@ -619,146 +645,15 @@ def _probe(request: Request) -> list[Cell]:
     scale, found = request.scale, []
     for group, seed in request.groups_and_seeds("A"):
         asked = tuple(dict.fromkeys(get_domain(task).name for task in request.tasks))
-        for method in request.chosen((*PRETRAINED, RANDOM_ENCODER)):
+        for system in request.chosen((*PRETRAINED, RANDOM)):
             for domain in asked or (*GROUPS[group], *PROBED_UNSEEN[group]):
-                home = domain if method == FINETUNE else SINGLE_DOMAIN[group]
-                trained = encoder_for_task(scale, method, GROUPS[group], get_domain(home).task, seed)
-                if trained is None or method == NO_BONUS:
+                home = domain if system == FINETUNE else SINGLE_DOMAIN[group]
+                trained = encoder_for_task(scale, system, GROUPS[group], get_domain(home).task, seed)
+                if trained is None or system == NO_BONUS:
                     continue  # no encoder of its own
-                data = dataset(scale, domain, seed, scale.probe_transitions)
-                for colors in ("normal", request.colors):
-                    job = probe_job(trained, data, colors=colors, samples=scale.probe_samples)
-                    place = {"group": group, "domain": domain, "colors": colors, "encoder_seed": seed}
-                    found.append(Cell(method, job, place))
-    return found
-
-
-# --- the study of CRPTpro's pre-training ----------------------------------------------------------------------------
-
-SNAPSHOTS, FACTOR_SNAPSHOTS = (500, 1_000, 2_000, 3_000, 5_000, 10_000, 20_000), (1_000,)
-"""Updates after which the encoders of full-length trials, and those of the factors, are probed besides at their end."""
-_SHARP, _LARGE_RATE = {"loss": {"assignment_temperature": 0.05}}, {"training": {"learning_rate": 3e-4}}
-TRIALS: dict[str, dict[str, dict[str, Any]]] = {
-    "assignment_temperature": {"0.1": {}, "0.05": _SHARP},
-    "learning_rate_and_temperature": {
-        "1e-4 and 0.1": {},
-        "1e-4 and 0.05": _SHARP,
-        "3e-4 and 0.05": {**_LARGE_RATE, **_SHARP},
-        "3e-4 and 0.1": _LARGE_RATE,
-    },
-}
-"""Trials of full length, on two groups and two encoder seeds, the usual setting first."""
-
-
-def factors_of(scale: Scale) -> list[tuple[str, str, float, tuple[float, ...]]]:
-    """Return what is varied alone: name, the setting of an encoder that holds it, the usual value, and all values."""
-    loss, usual = _study_loss(scale), get_method("crptpro")
-    prototypes, width = loss.get("num_prototypes", 512), loss.get("hidden_dim", 1_024)
-    batch = scale.batch_size or usual.batch_size
-    return [
-        (
-            "num_prototypes",
-            "loss",
-            prototypes,
-            (prototypes // 4, prototypes // 2, prototypes, 2 * prototypes),
-        ),
-        ("batch_size", "training", batch, (batch // 2, batch, 2 * batch)),
-        ("hidden_dim", "loss", width, (width // 2, width, 2 * width)),
-        ("pixel_offset", "encoder", 0.0, (0.0, 0.5)),
-        ("encoder_tau", "training", 0.05, (0.01, 0.05, 0.2)),
-        ("learning_rate", "training", usual.learning_rate, (5e-5, 1e-4, 3e-4)),
-        ("warmup_updates", "training", 0, (0, min(500, max(1, scale.updates // 6)))),
-        # The largest makes up for the mean over all pairs, whose gradient is about 10,000 times weaker than the
-        # comparison's.
-        ("intr_loss_coef", "loss", 5e-3, (0.0, 5e-3, 0.5, 50.0)),
-    ]
-
-
-def _study_loss(scale: Scale) -> dict[str, Any]:
-    own = {} if scale.study_prototypes is None else {"num_prototypes": scale.study_prototypes}
-    return {**scale.loss.get("ProtoLoss", {}), **own}
-
-
-def _study(request: Request) -> list[Cell]:
-    """Every encoder is judged by the state probe, along its training and at its end; full-length ones by a run, too."""
-    if "crptpro" not in request.chosen(("crptpro",)):
-        return []
-    scale, (first, *more), found = request.scale, request.encoder_seeds, list[Cell]()
-    full = scale.study_updates or scale.updates
-    seeds = (first, *(more or (first + 1,)))  # one run tells nothing of a difference
-    for factor, variants in TRIALS.items():
-        for group in request.groups or ("A", "C"):
-            for seed in seeds:
-                for value, changed in variants.items():
-                    place: dict[str, Any] = {
-                        "factor": factor,
-                        "value": value,
-                        "usual": next(iter(variants)),
-                        "group": group,
-                    }
-                    found += _trial(request, place, seed, full, SNAPSHOTS, changed, has_run=True)
-                found += _control(request, group, seed)
-    group = (request.groups or ("A",))[0]
-    for name, where, usual, values in factors_of(scale):
-        for number in values:
-            changed = {} if number == usual else {where: {name: number}}
-            place = {"factor": name, "value": f"{number:g}", "usual": f"{usual:g}", "group": group}
-            found += _trial(request, place, first, scale.updates, FACTOR_SNAPSHOTS, changed)
-    found += _control(request, group, first)
-    return list({(cell.label, cell.job, tuple(cell.place.items())): cell for cell in found}.values())
-
-
-def _trial(
-    request: Request,
-    place: dict[str, Any],
-    seed: int,
-    updates: int,
-    snapshots: tuple[int, ...],
-    changed: Mapping[str, Any],
-    *,
-    has_run: bool = False,
-) -> list[Cell]:
-    scale, group = request.scale, place["group"]
-    # At least one snapshot, half-way, where the scale has fewer updates than the first.
-    kept = tuple(done for done in snapshots if done < updates) or (max(1, updates // 2),)
-    loss = {**_study_loss(scale), **changed.get("loss", {})}
-    settings = {name: changed[name] for name in ("training", "encoder") if name in changed}
-    trained = encoder(
-        scale, "crptpro", GROUPS[group], seed, loss=loss, updates=updates, snapshots=kept, **settings
-    )
-    label, where = f"crptpro, {place['factor']} {place['value']}", {**place, "encoder_seed": seed}
-    found = [Cell(label, trained, where)]
-    for at_updates in (*kept, None):
-        found += _probes(scale, label, trained, {**where, "updates": at_updates or updates}, at_updates)
-    task = get_domain(SINGLE_DOMAIN[group]).task
-    if has_run and task in (request.tasks or (task,)):
-        found += runs(
-            replace(request, seeds=request.seeds or (0,)),
-            "crptpro",
-            task,
-            {seed: trained},
-            label=label,
-            **place,
-        )
-    return found
-
-
-def _control(request: Request, group: str, seed: int) -> list[Cell]:
-    if RANDOM_ENCODER not in request.chosen(("crptpro", RANDOM_ENCODER)):
-        return []
-    where = {"factor": "control", "value": "untrained", "group": group, "encoder_seed": seed, "updates": 0}
-    return _probes(request.scale, RANDOM_ENCODER, untrained_job(seed), where)
-
-
-def _probes(
-    scale: Scale, label: str, trained: Job, where: dict[str, Any], at_updates: int | None = None
-) -> list[Cell]:
-    """Probes on the group's domains and one more, on the data of the encoder's seed."""
-    found = []
-    for domain in (*GROUPS[where["group"]], PROBED_UNSEEN[where["group"]][0]):
-        data = dataset(scale, domain, where["encoder_seed"], scale.probe_transitions)
-        job = probe_job(trained, data, samples=scale.probe_samples, at_updates=at_updates)
-        found.append(Cell(label, job, {**where, "domain": get_domain(domain).name}))
+                job = probe(scale, trained, dataset(scale, domain, seed, scale.probe_transitions))
+                place = {"group": group, "domain": domain, "colors": "normal", "encoder_seed": seed}
+                found.append(Cell(system, job, place))
     return found
 
 
@@ -838,16 +733,9 @@ EXPERIMENTS: dict[str, Experiment] = {
     ),
     "probe": Experiment(
         "State probe",
-        "What a linear model reads of the simulator's state from frozen features: seen and unseen domains, normal and "
-        "other colours. Not in the paper.",
+        "What a linear model reads of the simulator's state from frozen features, on seen and unseen domains. Not in "
+        "the paper.",
         _probe,
-    ),
-    "study": Experiment(
-        "One-factor study of pre-training",
-        "The temperature of the targets, and one factor at a time, judged by the state probe along pre-training and by "
-        "reinforcement learning. At scale small its encoders have the paper's 512 prototypes, and those of full length "
-        "10,000 updates. Not in the paper.",
-        _study,
     ),
 }
 """In the order of the paper; what it does not have comes last."""

@@ -1,27 +1,24 @@
-"""``crptpro measure``: what experiments measure of encoders and their data, each a CSV file in a directory."""
+"""What experiments measure of encoders and their data; ``crptpro measure`` writes it as CSV files for jobs."""
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
 import shlex
 import shutil
 import statistics
-import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
-from tyro.conf import OmitSubcommandPrefixes, Positional, UseAppendAction, arg, subcommand
+import tyro
+from tyro.conf import Positional, UseAppendAction
 
 from crptpro.artifact import read_json, write_json, write_whole
 from crptpro.errors import RecordError
-from crptpro.values import Colors
 
 PROTOTYPE_METRICS = {
     "kne_3": "prototype_kne_3", "kne_half": "prototype_kne_half", "ane": "prototype_ane",
@@ -34,7 +31,6 @@ RANDOM_AGENT_STEPS = 24
 """Random decisions per domain before a timed exploration, instead of the method's own."""
 COVERAGE_WINDOWS = 10
 """Windows of the training, fewer where one would have less decisions of a domain than samples."""
-_PRESENT = arg(help_behavior_hint="(required)")
 
 
 def write_rows(
@@ -47,9 +43,8 @@ def write_rows(
     """
     import pandas as pd
 
-    write_whole(
-        path, pd.DataFrame(list(rows), columns=columns, dtype=object).to_csv(index=False, lineterminator="\n")
-    )
+    table = pd.DataFrame(list(rows), columns=columns, dtype=object)
+    write_whole(path, table.to_csv(index=False, lineterminator="\n"))
 
 
 def read_rows(path: str | Path) -> list[dict[str, str]]:
@@ -66,6 +61,8 @@ def read_rows(path: str | Path) -> list[dict[str, str]]:
         raise RecordError(f"{path} cannot be read: {reason}.") from None
 
 
+# --- state probes ---------------------------------------------------------------------------------------------------
+
 PROBE_COLUMNS = (
     "encoder", "method", "domain", "seen", "colors", "embedding", "measure", "coordinate", "value", "samples",
     "held_out_episodes", "seed",
@@ -74,26 +71,17 @@ PROBE_COLUMNS = (
 
 
 def probe_rows(
-    pretrained: Any,
-    dataset: Any,
-    *,
-    encoder: str,
-    colors: Colors = "normal",
-    samples: int = 2_000,
-    seed: int = 0,
-    drawn: Any = None,
+    pretrained: Any, dataset: Any, *, encoder: str, samples: int = 2_000, seed: int = 0
 ) -> tuple[list[dict[str, str]], list[dict[str, Any]]]:
-    """Probe an encoder on a dataset in some colours.
+    """Probe an encoder on a dataset.
 
     Args:
         pretrained: a :class:`~crptpro.pretrained.Pretrained` whose features, and projections if it has a projector, are
             read. The untrained control is given an untrained projector, so that z has one too.
         dataset: a :class:`~crptpro.data.FrameDataset` with physical state.
         encoder: what the encoder is called in the rows.
-        colors: in which the observations are drawn, whatever the dataset's own.
         samples: drawn from the dataset.
         seed: of the draw.
-        drawn: frames of the dataset in these colours that were drawn before.
 
     Returns:
         A row per embedding for people, and every number by :data:`PROBE_COLUMNS`.
@@ -104,37 +92,26 @@ def probe_rows(
     from crptpro.analysis.coordinates import joints_of
     from crptpro.analysis.probe import probe, probe_samples
 
-    observed = probe_samples(
-        dataset,
-        samples=samples,
-        seed=seed,
-        colors=colors,
-        joints=joints_of(dataset.card["task"]),
-        frame_stack=pretrained.encoder.in_channels // 3,
-        drawn=drawn,
-    )
-    seen = "yes" if dataset.domain in domains_seen(pretrained.card) else "no"
-    about = {"method": pretrained.label, "domain": dataset.domain, "seen": seen, "colors": colors}
+    joints, frame_stack = joints_of(dataset.card["task"]), pretrained.encoder.in_channels // 3
+    observed = probe_samples(dataset, samples=samples, seed=seed, joints=joints, frame_stack=frame_stack)
+    is_control = pretrained.method.startswith("random-encoder")
+    projector = _untrained_projector(pretrained) if is_control else pretrained.projector
+    about = {"method": pretrained.label, "domain": dataset.domain}
+    about |= {"seen": "yes" if dataset.domain in domains_seen(pretrained.card) else "no"}
+    about |= {"colors": dataset.card.get("colors", "normal")}
     counts = {"samples": len(observed.pixels), "held_out_episodes": observed.held_out_episodes, "seed": seed}
-    projector = (
-        _untrained_projector(pretrained) if pretrained.method == "random-encoder" else pretrained.projector
-    )
     table, measures = [], []
     for embedding, result in probe(observed, pretrained.encoder, projector).items():
-        means = {
-            "r2_position": result.position_r2, "r2_velocity": result.velocity_r2,
-            "effective_rank": result.effective_rank, "mean_cosine": result.mean_cosine,
-        }  # fmt: skip
-        shown = {"R2 positions": f"{result.position_r2:.3f}", "R2 velocities": f"{result.velocity_r2:.3f}"}
-        shown |= {
-            "effective rank": f"{result.effective_rank:.1f}",
+        table.append({
+            **about, "embedding": embedding, "R2 positions": f"{result.position_r2:.3f}",
+            "R2 velocities": f"{result.velocity_r2:.3f}", "effective rank": f"{result.effective_rank:.1f}",
             "mean cosine": f"{result.mean_cosine:.4f}",
-        }
-        table.append({**about, "embedding": embedding, **shown})
+        })  # fmt: skip
         found: list[tuple[str, str, Any]] = [("r2_position", *each) for each in result.positions.items()]
         found += [("r2_velocity", *each) for each in result.velocities.items()]
         found += [(f"r2_{kind}", name, "") for kind, name in (each.split(" ", 1) for each in result.left_out)]
-        found += [(name, "", value) for name, value in means.items()]
+        found += [("r2_position", "", result.position_r2), ("r2_velocity", "", result.velocity_r2)]
+        found += [(name, "", getattr(result, name)) for name in ("effective_rank", "mean_cosine")]
         named = {"encoder": encoder, **about, "embedding": embedding}
         measures += [{**named, "measure": m, "coordinate": c, "value": v, **counts} for m, c, v in found]
     return table, measures
@@ -162,79 +139,47 @@ def domains_seen(card: Mapping[str, Any]) -> set[str]:
     return seen
 
 
-@dataclass(frozen=True)
-class Redrawn:
-    """Draw the observations that probes of a dataset read in other colours, once for all encoders: OUT/frames."""
-
-    dataset: Positional[Path]
-    """with physical state"""
-    out: Path
-    """directory to write to"""
-    colors: Colors = "reversed_background"
-    """in which they are drawn"""
-    samples: int = 2_000
-    """observations of the probes"""
-    seed: int = 0
-    """of their draw"""
-
-    def run(self) -> None:
-        """Draw them."""
-        from crptpro.analysis.probe import probe_frame_rows
-        from crptpro.data import FrameDataset
-        from crptpro.data.redraw import DrawnFrames, redraw
-
-        dataset = FrameDataset.open(self.dataset)
-        rows = probe_frame_rows(
-            dataset, samples=self.samples, seed=self.seed, frame_stack=dataset.frame_stack
-        )
-        frames = redraw(dataset, rows, colors=self.colors)
-        DrawnFrames(dataset.domain, self.colors, rows, frames).save(self.out / "frames")
+# --- prototypes and data --------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class PrototypeSpread:
-    """How far prototypes have spread along a training and at its end: OUT/prototypes.csv."""
+def prototypes(encoder: Positional[Path], *, out: Path) -> None:
+    """Write how far prototypes have spread, along their training and at its end: OUT/prototypes.csv.
 
-    encoder: Positional[Path]
-    """directory of the pretrained encoder, in its run directory"""
-    out: Path
-    """directory to write to"""
+    Args:
+        encoder: in its run directory, whose record says how it came there.
+        out: directory to write to.
+    """
+    from crptpro.objectives.functional import prototype_metrics
+    from crptpro.pretrained import load_pretrained
 
-    def run(self) -> None:
-        """Read the record, and measure the weights."""
-        from crptpro.objectives.functional import prototype_metrics
-        from crptpro.pretrained import load_pretrained
-
-        pretrained = load_pretrained(self.encoder)
-        if pretrained.prototypes is None:
-            raise RecordError(f"{self.encoder} has no prototypes; its method is {pretrained.method}.")
-        options, updates = pretrained.card["loss"]["config"], pretrained.card["training"]["updates"]
-        about = {"method": pretrained.method, "has_dispersion": options["intr_loss_coef"] > 0}
-        # The record's own last row, if it is of the last update, is of weights that had not been normalised yet.
-        rows = [
-            {
-                **about,
-                "updates": row["updates"],
-                **{name: row[key] for name, key in PROTOTYPE_METRICS.items()},
-            }
-            for row in read_rows(self.encoder.parent / "pretrain.csv")
-            if int(row["updates"]) < updates
-        ]
-        found = prototype_metrics(pretrained.prototypes.weight, offset=options["offset"])  # type: ignore[arg-type]
-        end = {name: float(found[key]) for name, key in PROTOTYPE_METRICS.items()}
-        write_rows(self.out / "prototypes.csv", [*rows, {**about, "updates": updates, **end}])
+    pretrained: Any = load_pretrained(encoder)
+    if pretrained.prototypes is None:
+        raise RecordError(f"{encoder} has no prototypes; its method is {pretrained.method}.")
+    config, updates = pretrained.card["loss"]["config"], pretrained.card["training"]["updates"]
+    about = {"method": pretrained.method, "has_dispersion": config["intr_loss_coef"] > 0}
+    # The record's own last row, if it is of the last update, is of weights that had not been normalised yet.
+    record = [row for row in read_rows(encoder.parent / "pretrain.csv") if int(row["updates"]) < updates]
+    metrics = prototype_metrics(pretrained.prototypes.weight, offset=config["offset"])
+    end = {"updates": updates, **{name: float(value) for name, value in metrics.items()}}
+    rows = [
+        {**about, "updates": row["updates"], **{name: row[key] for name, key in PROTOTYPE_METRICS.items()}}
+        for row in [*record, end]
+    ]
+    write_rows(out / "prototypes.csv", rows)
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Comparison:
+class Comparison:
+    """Random data beside an explorer's, as an encoder sees both."""
+
     encoder: Path
     """which embeds all observations"""
     explorer: Path
-    """encoder of the explorer, in its run directory"""
-    replays: Annotated[tuple[Path, ...], _PRESENT]
+    """its encoder, in its run directory"""
+    replays: tuple[Path, ...]
     """what the explorer saw, a directory for each domain"""
-    datasets: Annotated[tuple[Path, ...], _PRESENT]
-    """random transitions, one for each domain"""
+    datasets: tuple[Path, ...]
+    """random transitions of each domain"""
     out: Path
     """directory to write to"""
     samples: int = 1_024
@@ -245,6 +190,7 @@ class _Comparison:
     """where the encoder runs"""
 
     def load(self) -> Any:
+        """Return the artifact of the encoder, on its device."""
         from crptpro.pretrained import load_pretrained
 
         pretrained = load_pretrained(self.encoder)
@@ -253,272 +199,186 @@ class _Comparison:
                 network.to(self.device)
         return pretrained
 
-    def replay(self, path: Path, frame_stack: int) -> Any:
-        from crptpro.data import StoredReplay
 
-        return StoredReplay(path, frame_stack=frame_stack)
-
-
-@dataclass(frozen=True, kw_only=True)
-class CoverageOfData(_Comparison):
-    """How widely an explorer's observations are spread along its training, beside random data: OUT/coverage.csv.
+def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
+    """Write how widely an explorer's observations are spread along its training, beside random data: OUT/coverage.csv.
 
     A window has the same decisions of both sources. Where one does not have enough of them, it has no row.
     """
+    from crptpro.analysis import coverage as estimate
+    from crptpro.analysis.embeddings import embed_pixels
+    from crptpro.data import FrameDataset, StoredReplay
+    from crptpro.pretrained import load_pretrained
+    from crptpro.seeding import derive_seed
 
-    def run(self) -> None:
-        """Estimate every window."""
-        from crptpro.analysis.coverage import coverage
-        from crptpro.analysis.embeddings import embed_pixels
-        from crptpro.data import FrameDataset
-        from crptpro.pretrained import load_pretrained
-        from crptpro.seeding import derive_seed
-
-        pretrained = self.load()
-        explorer = load_pretrained(self.explorer)
-        training: Any = explorer.card["training"]
-        decisions = {entry["domain"]: int(entry["agent_steps"]) for entry in training["datasets"]}
-        least = min(decisions.values())
-        windows = max(1, min(COVERAGE_WINDOWS, least // self.samples))
-        samples = min(self.samples, least // windows)
-        rows = []
-        for path, replay_path in zip(self.datasets, self.replays, strict=True):
-            frame_stack = pretrained.encoder.in_channels // 3
-            random, replay = FrameDataset.open(path), self.replay(replay_path, frame_stack)
-            total = decisions[random.domain]
-            lost = total - len(replay)  # the oldest decisions, of a ring that went round
-            for window in range(windows):
-                start, end = window * total // windows, (window + 1) * total // windows
-                for source, first, last in (
-                    ("random", start, min(end, len(random))),
-                    ("explorer", max(start, lost), end),
-                ):
-                    if last - first < samples:
-                        continue  # estimates of fewer observations cannot be compared
-                    seed = derive_seed(self.seed, "coverage", source, random.domain, window)
-                    order = torch.randperm(last - first, generator=torch.Generator().manual_seed(seed))
-                    chosen = first + order[:samples].sort().values
-                    if source == "random":
-                        pixels = _observations(random, chosen, frame_stack)
-                    else:
-                        pixels = replay.observations(chosen - lost)
-                    points = embed_pixels(pretrained.encoder, pixels, projector=pretrained.projector)
-                    rows.append(
-                        {
-                            "source": source,
-                            "method": explorer.method if source == "explorer" else "",
-                            "domain": random.domain,
-                            "env_steps": training["env_steps"] * end // total,
-                            "coverage": coverage(F.normalize(points, dim=-1)),
-                            "samples": samples,
-                        }
-                    )
-        columns = ("source", "method", "domain", "env_steps", "coverage", "samples")
-        write_rows(self.out / "coverage.csv", rows, columns)
+    pretrained, explored = of.load(), load_pretrained(of.explorer)
+    frame_stack, training = pretrained.encoder.in_channels // 3, explored.card["training"]
+    decisions = {entry["domain"]: int(entry["agent_steps"]) for entry in training["datasets"]}
+    least = min(decisions.values())
+    windows = max(1, min(COVERAGE_WINDOWS, least // of.samples))
+    samples = min(of.samples, least // windows)
+    rows = []
+    for path, replay_path in zip(of.datasets, of.replays, strict=True):
+        random = FrameDataset.open(path, frame_stack=frame_stack)
+        replay = StoredReplay(replay_path, frame_stack=frame_stack)
+        total = decisions[random.domain]
+        lost = total - len(replay)  # the oldest decisions, of a ring that went round
+        for window in range(windows):
+            start, end = window * total // windows, (window + 1) * total // windows
+            spans = {"random": (start, min(end, len(random))), "explorer": (max(start, lost), end)}
+            for source, (first, last) in spans.items():
+                if last - first < samples:
+                    continue  # estimates of fewer observations cannot be compared
+                draw = derive_seed(of.seed, "coverage", source, random.domain, window)
+                order = torch.randperm(last - first, generator=torch.Generator().manual_seed(draw))
+                chosen = first + order[:samples].sort().values
+                is_random = source == "random"
+                pixels = random[chosen]["pixels"] if is_random else replay.observations(chosen - lost)
+                points = embed_pixels(pretrained.encoder, pixels, projector=pretrained.projector)
+                rows.append({
+                    "source": source, "method": "" if is_random else explored.method, "domain": random.domain,
+                    "env_steps": training["env_steps"] * end // total,
+                    "coverage": estimate.coverage(F.normalize(points, dim=-1)), "samples": samples,
+                })  # fmt: skip
+    columns = ("source", "method", "domain", "env_steps", "coverage", "samples")
+    write_rows(of.out / "coverage.csv", rows, columns)
 
 
-def _observations(dataset: Any, index: Tensor, frame_stack: int) -> Tensor:
-    """Observations before transitions of a dataset."""
-    from crptpro.data.storage import stack_rows
+def embeddings(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
+    """Write principal components of random data and of an explorer's last quarter: OUT/embeddings.csv."""
+    from crptpro.analysis.embeddings import embed_pixels, principal_components, sample_pixels
+    from crptpro.data import FrameDataset, StoredReplay
+    from crptpro.seeding import derive_seed
 
-    row, step = (dataset.transitions.get(name)[index] for name in ("row", "step"))
-    return dataset.frames_at(stack_rows(row, step, frame_stack)).flatten(1, 2)
-
-
-@dataclass(frozen=True, kw_only=True)
-class PrincipalComponents(_Comparison):
-    """Principal components of random data of several domains and of an explorer's last quarter: OUT/embeddings.csv."""
-
-    def run(self) -> None:
-        """Embed all observations together."""
-        from crptpro.analysis.embeddings import embed_pixels, principal_components, sample_pixels
-        from crptpro.data import FrameDataset
-        from crptpro.seeding import derive_seed
-
-        pretrained = self.load()
-        frame_stack, pixels = pretrained.encoder.in_channels // 3, {}
-        for path in self.datasets:
-            random = FrameDataset.open(path, frame_stack=frame_stack)
-            pixels[f"{random.domain} random"] = sample_pixels(random, self.samples, seed=self.seed)
-        for path in self.replays:
-            replay = self.replay(path, frame_stack)
-            late = len(replay) - int(0.75 * len(replay))
-            seed = derive_seed(self.seed, "embeddings", path.name)
-            chosen = torch.randperm(late, generator=torch.Generator().manual_seed(seed))[: self.samples]
-            pixels[f"{path.name} explorer"] = replay.observations(len(replay) - late + chosen.sort().values)
-        points = torch.cat([embed_pixels(pretrained.encoder, images) for images in pixels.values()]).cpu()
-        coordinates, explained = principal_components(points)
-        sources = [source for source, images in pixels.items() for _ in images]
-        ratios = {"explained_variance_ratio": [float(part) for part in explained]}
-        write_json(self.out / "explained.json", ratios)
-        write_rows(
-            self.out / "embeddings.csv",
-            (
-                {"source": source, **{f"pc{number}": value for number, value in enumerate(point, 1)}}
-                for source, point in zip(sources, coordinates.tolist())
-            ),
-        )
+    pretrained = of.load()
+    frame_stack, pixels = pretrained.encoder.in_channels // 3, {}
+    for path in of.datasets:
+        random = FrameDataset.open(path, frame_stack=frame_stack)
+        pixels[f"{random.domain} random"] = sample_pixels(random, of.samples, seed=of.seed)
+    for path in of.replays:
+        replay = StoredReplay(path, frame_stack=frame_stack)
+        late = len(replay) - int(0.75 * len(replay))
+        draw = torch.Generator().manual_seed(derive_seed(of.seed, "embeddings", path.name))
+        chosen = torch.randperm(late, generator=draw)[: of.samples].sort().values
+        pixels[f"{path.name} explorer"] = replay.observations(len(replay) - late + chosen)
+    points = torch.cat([embed_pixels(pretrained.encoder, images) for images in pixels.values()]).cpu()
+    coordinates, explained = principal_components(points)
+    write_json(of.out / "explained.json", {"explained_variance_ratio": explained.tolist()})
+    sources = [source for source, images in pixels.items() for _ in images]
+    rows = [
+        {"source": source, **{f"pc{number}": value for number, value in enumerate(point, 1)}}
+        for source, point in zip(sources, coordinates.tolist())
+    ]
+    write_rows(of.out / "embeddings.csv", rows)
 
 
-@dataclass(frozen=True)
-class Timing:
-    """What training encoders takes, from a timed part of it: OUT/timing.csv."""
+# --- cost of pre-training -------------------------------------------------------------------------------------------
 
-    out: Path
-    """directory to write to"""
-    training: Annotated[UseAppendAction[tuple[str, ...]], _PRESENT] = ()
-    """a `pretrain ...` command without --out and --device; of several the costs add up"""
-    paper_training: UseAppendAction[tuple[str, ...]] = ()
-    """the same as the paper trains"""
-    updates: int = 100
-    """encoder updates that are timed, after as many to warm up"""
-    paper_updates: int = 0
-    """likewise of the paper's trainings; 0 leaves their hours open unless both are the same"""
-    device: str = "cpu"
-    """of networks"""
-    threads: int = 1
-    """of torch"""
 
-    def run(self) -> None:
-        """Time every training, and add up."""
-        rows = [self._row(*pair) for pair in zip(self.training, self.paper_training, strict=True)]
-        write_rows(self.out / "timing.csv", [{**_sum(rows), "threads": self.threads, "device": self.device}])
+def timing(
+    *,
+    out: Path,
+    training: UseAppendAction[tuple[str, ...]] = (),
+    paper_training: UseAppendAction[tuple[str, ...]] = (),
+    updates: int = 100,
+    paper_updates: int = 0,
+    device: str = "cpu",
+    threads: int = 1,
+) -> None:
+    """Write what training encoders takes, from a timed part of it: OUT/timing.csv.
 
-    def _row(self, training: str, paper: str) -> dict[str, Any]:
-        usual, whole = Training(training), Training(paper)
-        updates, decisions, seconds, each = self._time(usual, self.updates)
-        paper_each: float | None = each if training == paper else None
-        if training != paper and self.paper_updates:
-            paper_each = self._time(whole, self.paper_updates)[-1]
-        collected = [
-            read_json(path, error=RecordError)["seconds"]
-            for source in usual.sources
-            if (path := Path(source).parent / "done.json").exists()
-        ]
-        return {
-            "method": usual.method, "domains": len(usual.sources), "encoder_updates": updates, "decisions": decisions,
-            "seconds": seconds, "budget_updates": usual.updates, "budget_decisions": usual.decisions,
-            "projected_hours": each * usual.updates / 3600, "paper_updates": whole.updates,
-            "paper_decisions": whole.decisions,
-            "paper_projected_hours": None if paper_each is None else paper_each * whole.updates / 3600,
+    Args:
+        out: directory to write to.
+        training: a `pretrain ...` command without --out and --device; of several the costs add up.
+        paper_training: the same as the paper trains.
+        updates: encoder updates that are timed, after as many to warm up.
+        paper_updates: likewise of the paper's trainings; 0 leaves their hours open unless both are the same.
+        device: of networks.
+        threads: of torch.
+    """
+    torch.set_num_threads(threads)
+    rows = []
+    for here, paper in zip(training, paper_training, strict=True):
+        stage, whole = _stage(here, out / "timed", device), _stage(paper, out / "timed", device)
+        timed, seconds, each = _time(stage, updates)
+        paper_each: float | None = each if here == paper else None
+        if here != paper and paper_updates:
+            paper_each = _time(whole, paper_updates)[-1]
+        plan, paper_plan = _plan(stage), _plan(whole)
+        decisions = timed * plan.encoder_update_interval // plan.encoder_updates_each if plan else 0
+        sources = [Path(source).parent / "done.json" for source in stage.sources]
+        collected = [read_json(path, error=RecordError)["seconds"] for path in sources if path.exists()]
+        budget, paper_budget = _updates(stage), _updates(whole)
+        rows.append({
+            "domains": len(stage.sources), "encoder_updates": timed, "decisions": decisions, "seconds": seconds,
+            "budget_updates": budget, "budget_decisions": plan.decisions if plan else 0,
+            "projected_hours": each * budget / 3600, "paper_updates": paper_budget,
+            "paper_decisions": paper_plan.decisions if paper_plan else 0,
+            "paper_projected_hours": None if paper_each is None else paper_each * paper_budget / 3600,
             "collection_seconds": sum(collected) if collected else None,
-        }  # fmt: skip
-
-    def _time(self, training: Training, updates: int) -> tuple[int, int, float, float]:
-        """Return timed updates, their decisions, their seconds, and seconds per update by the median over windows."""
-        from crptpro.cli import main
-
-        window = training.period * math.ceil(updates / (WINDOWS * training.period))
-        words = [*training.words, *training.shortened(2 * WINDOWS * window), "--log-interval", str(window)]
-        directory = self.out / "timed"
-        shutil.rmtree(directory, ignore_errors=True)
-        torch.set_num_threads(self.threads)
-        before = sys.argv
-        try:
-            sys.argv = ["crptpro", *words, "--out", str(directory), "--device", self.device]
-            main()
-            rows = read_rows(directory / "pretrain.csv")
-        finally:
-            sys.argv = before
-            shutil.rmtree(directory, ignore_errors=True)
-        at = {int(row["updates"]): float(row["unix_time_s"]) for row in rows}
-        times = [at[count * window] for count in range(WINDOWS, 2 * WINDOWS + 1)]
-        each = statistics.median(after - before for before, after in itertools.pairwise(times)) / window
-        timed = WINDOWS * window
-        return timed, timed * training.interval // training.updates_each, times[-1] - times[0], each
-
-
-@dataclass
-class Training:
-    """A ``pretrain`` command, and what it amounts to."""
-
-    text: str
-    words: list[str] = field(init=False)
-    sources: list[str] = field(init=False)
-    method: str = field(init=False)
-    updates: int = field(init=False)
-    """of the encoder"""
-    decisions: int = field(default=0, init=False)
-    """of exploring agents"""
-    interval: int = field(default=0, init=False)
-    """decisions of a domain from one encoder update on it to the next"""
-    updates_each: int = field(default=1, init=False)
-
-    def __post_init__(self) -> None:
-        """Read the command."""
-        from crptpro.experiments.jobs import exploration_plan
-        from crptpro.objectives import get_method
-        from crptpro.training import ExploreConfig
-
-        self.words = shlex.split(self.text)
-        self.sources = list(itertools.takewhile(lambda word: not word.startswith("--"), self.words[1:]))
-        given = dict(itertools.pairwise(self.words))
-        self.method = given["--method"]
-        method = get_method(self.method)
-        self._plan = None
-        if method.exploration is None:
-            self.updates = int(given["--updates"])
-            return
-        known = {f"--{each.name.replace('_', '-')}": each.name for each in dataclasses.fields(ExploreConfig)}
-        explore = {
-            known[name]: int(value) if value.isdecimal() else value
-            for name, value in given.items()
-            if name in known and name != "--learning-rate"
-        }
-        self._plan = exploration_plan(method, self.sources, explore)
-        self.updates, self.decisions = self._plan.encoder_updates, self._plan.decisions
-        self.interval, self.updates_each = self._plan.encoder_update_interval, self._plan.encoder_updates_each
-
-    @property
-    def period(self) -> int:
-        """Updates after which all domains have had their turn."""
-        return len(self.sources) * self.updates_each
-
-    def shortened(self, updates: int) -> list[str]:
-        """Return options for so many updates."""
-        if self._plan is None:
-            return ["--updates", str(updates)]
-        first = min(self._plan.first_update, RANDOM_AGENT_STEPS)
-        # The first update comes with the first multiple of the interval that is not random.
-        rounds = self.interval * (math.ceil(first / self.interval) + math.ceil(updates / self.period) - 1) + 1
-        env_steps = rounds * sum(self._plan.repeats)
-        options = {
-            "env-steps": env_steps,
-            "random-agent-steps": first,
-            "checkpoint-interval-env-steps": env_steps,
-        }
-        return [word for name, value in options.items() for word in (f"--{name}", str(value))]
-
-
-def _sum(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Add the costs of several encoders up; per update, what the whole takes."""
-    total: dict[str, Any] = {"method": rows[0]["method"]}
+        })  # fmt: skip
+    total: dict[str, Any] = {"method": stage.method}
     for name in rows[0]:
-        if name != "method":
-            values = [row[name] for row in rows]
-            total[name] = None if None in values else sum(values)
+        values = [row[name] for row in rows]
+        total[name] = None if None in values else sum(values)
     hours, paper_hours = total["projected_hours"], total["paper_projected_hours"]
     total["seconds_per_update"] = 3600 * hours / total["budget_updates"]
     per_decision = total["seconds_per_update"] * total["encoder_updates"]
     total["seconds_per_decision"] = per_decision / total["decisions"] if total["decisions"] else None
-    total["paper_seconds_per_update"] = (
-        None if paper_hours is None else 3600 * paper_hours / total["paper_updates"]
-    )
-    return total
+    total["paper_seconds_per_update"] = paper_hours and 3600 * paper_hours / total["paper_updates"]
+    write_rows(out / "timing.csv", [{**total, "threads": threads, "device": device}])
 
 
-@dataclass(frozen=True)
-class Measure:
-    """Measure encoders and their data, as `crptpro reproduce` does in its experiments."""
+def _stage(text: str, out: Path, device: str) -> Any:
+    """Read a training's command as the command line does."""
+    from crptpro.cli import pretrain_command
 
-    what: OmitSubcommandPrefixes[
-        Annotated[PrototypeSpread, subcommand("prototypes")]
-        | Annotated[CoverageOfData, subcommand("coverage")]
-        | Annotated[PrincipalComponents, subcommand("embeddings")]
-        | Annotated[Timing, subcommand("timing")]
-        | Annotated[Redrawn, subcommand("redrawn")]
-    ]
+    words = shlex.split(text)
+    return tyro.cli(pretrain_command(words), args=[*words[1:], "--out", str(out), "--device", device])
 
-    def run(self) -> None:
-        """Measure."""
-        self.what.run()
+
+def _plan(stage: Any) -> Any | None:
+    """Return how often an exploring method decides and updates; nothing of one that learns from datasets."""
+    from crptpro.objectives import get_method
+    from crptpro.training.explore import plan_exploration
+
+    method = get_method(stage.method)
+    return None if method.exploration is None else plan_exploration(method, stage.sources, stage.config)
+
+
+def _updates(stage: Any) -> int:
+    plan = _plan(stage)
+    return stage.config.updates if plan is None else plan.encoder_updates
+
+
+def _time(stage: Any, updates: int) -> tuple[int, float, float]:
+    """Return timed updates, their seconds, and seconds per update by the median over windows."""
+    plan = _plan(stage)
+    # Updates after which all domains have had their turn.
+    period = len(stage.sources) * (plan.encoder_updates_each if plan else 1)
+    window = period * math.ceil(updates / (WINDOWS * period))
+    needed = 2 * WINDOWS * window
+    if plan is None:
+        settings = {"updates": needed}
+    else:
+        first, interval = min(plan.first_update, RANDOM_AGENT_STEPS), plan.encoder_update_interval
+        # The first update comes with the first multiple of the interval that is not random.
+        rounds = interval * (math.ceil(first / interval) + math.ceil(needed / period) - 1) + 1
+        env_steps = rounds * sum(plan.repeats)
+        settings = {"env_steps": env_steps, "random_agent_steps": first}
+        settings |= {"checkpoint_interval_env_steps": env_steps}
+    shutil.rmtree(stage.out, ignore_errors=True)
+    try:
+        replace(stage, config=replace(stage.config, log_interval=window, **settings)).run()
+        at = {int(row["updates"]): float(row["unix_time_s"]) for row in read_rows(stage.out / "pretrain.csv")}
+    finally:
+        shutil.rmtree(stage.out, ignore_errors=True)
+    times = [at[count * window] for count in range(WINDOWS, 2 * WINDOWS + 1)]
+    each = statistics.median(after - before for before, after in itertools.pairwise(times)) / window
+    return WINDOWS * window, times[-1] - times[0], each
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Run ``crptpro measure``."""
+    commands = {each.__name__: each for each in (prototypes, coverage, embeddings, timing)}
+    tyro.extras.subcommand_cli_from_dict(commands, prog="crptpro measure", args=arguments)

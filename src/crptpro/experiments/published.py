@@ -1,6 +1,6 @@
-"""Every number that the paper prints, and two public records beside it, to stand next to one's own.
+"""Every number that the paper prints, to stand next to one's own.
 
-Source, unless another is named: CRPTpro, arXiv 2302.05614, the tables of its section IV. Scores are returns of whole
+Source: CRPTpro, arXiv 2302.05614, the tables of its section IV. Scores are returns of whole
 episodes; "±" is printed without saying over what (results are "over at least 6 different evaluations (60 episodes)").
 Figures of the paper carry no numbers and are missing here for that reason.
 """
@@ -179,24 +179,3 @@ PROTOTYPE_METRICS: Mapping[tuple[str, bool], PrototypeMetrics] = {
     ("proto-rl-s", False): PrototypeMetrics(-44.036, 48.774, -80.839),
 }
 """Table "... facilitates the diffusion of prototypes ...", in units of 1e-4: method, and whether with L_intr."""
-
-RELEASED_RUN: Mapping[int, int] = dict(zip(range(0, 500_001, 10_000), (
-    1, 0, 2, 163, 182, 286, 297, 230, 282, 259, 278, 364, 441, 418, 325, 366, 324, 357, 473, 430, 172, 317, 377, 395,
-    378, 282, 382, 499, 441, 406, 540, 539, 504, 440, 573, 577, 587, 613, 596, 566, 626, 610, 637, 665, 606, 587, 558,
-    613, 533, 522, 654,
-), strict=True))  # fmt: skip
-"""Env steps to mean return over 10 episodes of the one run whose log the authors published: CRPTpro on group A, then
-cheetah_run, seed 1 (liuxin0824/CRPTpro, revision c15caed). The table says 611±44; neighbouring evaluations differ by
-about 50."""
-
-DRQ_BENCH: Mapping[str, tuple[Score, Score]] = {
-    "cheetah_run": (Score(702, 66), Score(794, 194)),
-    "walker_run": (Score(465, 82), Score(565, 120)),
-    "hopper_hop": (Score(208, 35), Score(267, 40)),
-    "finger_spin": (Score(906, 129), Score(946, 103)),
-    "pendulum_swingup": (Score(584, 343), Score(619, 331)),
-    "cartpole_swingup_sparse": (Score(520, 342), Score(646, 324)),
-}
-"""What DrQ's authors measured after 500,000 and after 1,000,000 env steps, on the tasks both papers share: mean and
-population standard deviation over 7 to 10 seeds (denisyarats/drq, revision dd040f1, ``data/dmc_dreamer_bench.csv``).
-Close to the paper's DrQ column, except on cartpole_swingup_sparse."""

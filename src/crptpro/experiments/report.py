@@ -7,7 +7,6 @@ that those of a plugin have their section, too. Nothing stands in for what is mi
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import io
 import logging
@@ -24,7 +23,7 @@ import pandas as pd
 from crptpro.artifact import read_json, write_whole
 from crptpro.errors import CRPTproError, RecordError
 from crptpro.experiments import published
-from crptpro.experiments.figures import curves, dots, in_order, scatter, stacks
+from crptpro.experiments.figures import curves, dots, in_order, scatter
 from crptpro.experiments.jobs import load_results
 from crptpro.experiments.launch import duration
 from crptpro.experiments.matrix import EXPERIMENTS
@@ -78,7 +77,6 @@ def build_report(root: str | Path, *, out: str | Path | None = None) -> Path:
         order = {label: place for place, label in enumerate(in_order(own["label"]))}
         own = own.sort_values("label", key=lambda labels, order=order: labels.map(order), kind="stable")
         _experiment(page, experiment, scale, own.dropna(axis=1, how="all").reset_index(drop=True), jobs)
-    _observations(page, jobs)
     _provenance(page, jobs)
     scales = " and ".join(dict.fromkeys(filter(None, cells["scale"])))
     now = f"{datetime.datetime.now(datetime.UTC):%Y-%m-%d at %H:%M} UTC"
@@ -128,13 +126,11 @@ class Page:
             ]
             self._add(kind="table", caption=caption, columns=[*map(str, frame)], rows=shown, fold=fold)
 
-    def figure(self, name: str, caption: str, figure: Any | None) -> None:
-        """Write a figure and show it; ``None`` shows one that is there. The same numbers give the same file."""
-        file = f"figures/{_plain(name)}.png"
-        if figure is not None:
-            pixels = io.BytesIO()
-            figure.savefig(pixels, format="png", dpi=110, metadata={"Software": None})
-            write_whole(self.folder / file, pixels.getvalue())
+    def figure(self, name: str, caption: str, figure: Any) -> None:
+        """Write a figure and show it; the same numbers give the same file."""
+        file, pixels = f"figures/{_plain(name)}.png", io.BytesIO()
+        figure.savefig(pixels, format="png", dpi=110, metadata={"Software": None})
+        write_whole(self.folder / file, pixels.getvalue())
         self._add(kind="figure", file=file, caption=caption)
 
     def write(self, title: str, summary: str) -> Path:
@@ -361,30 +357,6 @@ def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     page.bullets(SHORTCOMINGS)
 
 
-def _observations(page: Page, jobs: pd.DataFrame) -> None:
-    """Show observations of the first dataset of every domain and colours that still has its frames."""
-    from crptpro.data import FrameDataset
-
-    page.section("What the data looks like", "observations")
-    opened: dict[str, FrameDataset] = {}
-    gone: dict[str, None] = {}
-    for path in jobs.loc[(jobs["kind"] == "dataset") & jobs["done"].astype(bool), "path"]:
-        for card in sorted(path.glob("*/card.json")):
-            told = _json(card)
-            name = f"{told.get('domain')}, {told.get('colors', 'normal')}".removesuffix(", normal")
-            try:
-                opened[name] = opened.get(name) or FrameDataset.open(card.parent)
-            except (CRPTproError, OSError):
-                gone[name] = None
-    caption = "4 observations of each domain as a random policy collected them, each of several pictures, oldest first."
-    if opened:
-        page.figure("observations", caption, stacks(opened))
-    elif (page.folder / "figures" / "observations.png").exists():
-        page.figure("observations", f"{caption} Drawn when the datasets were here.", None)
-    if gone:
-        page.text(f"Datasets without their frames: {', '.join(gone)}.", "note")
-
-
 def _provenance(page: Page, jobs: pd.DataFrame) -> None:
     page.section("Versions and hardware", "provenance")
     done = jobs[jobs["done"].astype(bool)].copy()
@@ -507,7 +479,7 @@ def _experiment(page: Page, experiment: str, scale: str, cells: pd.DataFrame, jo
     else:
         page.text(f"Complete: {len(cells)} of {len(cells)} numbers are there.")
     cells = cells.assign(group=_words(cells.get("group")), encoder_seed=_words(cells.get("encoder_seed")))
-    for measure in (_study if "factor" in cells else _measurements, _efficiency, _scores):
+    for measure in (_measurements, _efficiency, _scores):
         measure(page, name, cells, jobs)
 
 
@@ -518,9 +490,7 @@ LAST = 10
 
 
 def _scores(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
-    episodes = _records(
-        page, cells, jobs, ["run"], "eval", "env_steps", "episode_return", "updates", "unix_time_s"
-    )
+    episodes = _records(page, cells, jobs, ["run"], "eval", "env_steps", "episode_return", "updates")
     if episodes.empty:
         return
     runs, points = _runs(episodes, jobs)
@@ -538,13 +508,13 @@ def _scores(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> N
         _score_table(page, long, "last_score", f"Episode return over the last {LAST} evaluations{of}")
         if varied:
             _sensitivity(page, f"{name}-{varied}", part, str(varied))
-    _aggregates(page, name, runs)
+    _aggregates(page, runs)
     _learning_curves(page, name, runs, points)
     _spending(page, runs, jobs)
 
 
 def _runs(episodes: pd.DataFrame, jobs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return a row per run with its place and scores, and one per evaluation with env steps, hours and mean return."""
+    """Return a row per run with its place and scores, and one per evaluation with env steps and mean return."""
     runs, points = [], []
     for _, own in episodes.groupby(["at_label", "at_job", "at_group"], sort=False):
         cell = own.iloc[0]
@@ -566,9 +536,7 @@ def _runs(episodes: pd.DataFrame, jobs: pd.DataFrame) -> tuple[pd.DataFrame, pd.
             "expert": published.EXPERT_SCORES.get(cell["at_task"], math.nan),
         })  # fmt: skip
         about = {name: runs[-1][name] for name in ("label", "task", "run", "encoder")}
-        points.append(
-            pd.DataFrame({"score": curve, "hours": hours_at_work(path, own)}).reset_index().assign(**about)
-        )
+        points.append(curve.reset_index(name="score").assign(**about))
     runs = pd.DataFrame(runs).sort_values("group", kind="stable").reset_index(drop=True)
     return runs, pd.concat(points, ignore_index=True)
 
@@ -579,23 +547,6 @@ def _json(path: Path) -> dict[str, Any]:
         return dict(read_json(path, error=RecordError))
     except (RecordError, OSError, TypeError, ValueError):
         return {}
-
-
-def hours_at_work(path: Path, episodes: pd.DataFrame) -> pd.Series:
-    """Return how long a run had been at work at each evaluation, from its first record; pauses count as one usual gap.
-
-    A pause is a gap between records that is longer than ten minutes and than twenty times their median.
-    """
-    times = [episodes["unix_time_s"]]
-    for stream in ("train", "episodes"):
-        with contextlib.suppress(RecordError):  # a run without training rows has its evaluations
-            times.append(_read(path / f"{stream}.csv", "unix_time_s")["unix_time_s"])
-    marks = np.unique(np.concatenate(times))
-    gaps = np.diff(marks)
-    usual = np.median(gaps[gaps > 1]) if (gaps > 1).any() else 0.0
-    worked = np.cumsum([0.0, *np.where(gaps > max(600.0, 20 * usual), usual, gaps)]) / 3600
-    ends = episodes.groupby("env_steps")["unix_time_s"].last()
-    return pd.Series(worked[np.searchsorted(marks, ends)], index=ends.index)
 
 
 def _score_table(page: Page, runs: pd.DataFrame, score: str, caption: str) -> None:
@@ -615,7 +566,7 @@ def _score_table(page: Page, runs: pd.DataFrame, score: str, caption: str) -> No
         page.table(caption, [{"task": t} | {label: cells[label, t] for label in labels} for t in tasks])
 
 
-def _aggregates(page: Page, name: str, runs: pd.DataFrame) -> None:
+def _aggregates(page: Page, runs: pd.DataFrame) -> None:
     """Aggregate over the tasks on which every method has runs."""
     labels = in_order(runs["label"])
     has_run = runs.groupby(["task", "label"], sort=False).size().unstack().reindex(columns=labels).notna()
@@ -679,9 +630,7 @@ def _aggregates(page: Page, name: str, runs: pd.DataFrame) -> None:
     if missing := sorted(kept.loc[kept["expert"].isna(), "task_name"].unique()):
         page.text(f"The paper has no DrQ score for {', '.join(missing)}: in the mean score only.", "note")
     if len(normal):
-        _improvement(page, name, normal)
-        if not kept["varied"].any():  # a dozen values of one setting would hide each other
-            _profiles(page, name, normal)
+        _improvement(page, normal)
 
 
 def _paper_mean(label: str, places: Sequence[Sequence[str]], normalized: bool = False) -> str:
@@ -699,7 +648,7 @@ def _paper_mean(label: str, places: Sequence[Sequence[str]], normalized: bool = 
     return f"{np.mean(values):.{digits}f}" if values and len(values) == len(found) else ""
 
 
-def _improvement(page: Page, name: str, runs: pd.DataFrame) -> None:
+def _improvement(page: Page, runs: pd.DataFrame) -> None:
     ours = runs[runs["label"] == "crptpro"]
     found = {
         label: estimate(probability_of_improvement, ours, runs[runs["label"] == label])
@@ -714,35 +663,12 @@ def _improvement(page: Page, name: str, runs: pd.DataFrame) -> None:
     page.table(
         caption, [{"other method": m, "runs of both": e.runs, title: f"{e:.2f}"} for m, e in found.items()]
     )
-    if any(e.low is not None for e in found.values()):
-        points = [
-            {"panel": title, "row": m, "label": m, "x": e.value[0], **_ends(e)} for m, e in found.items()
-        ]
-        page.figure(f"{name}-improvement", caption, dots(pd.DataFrame(points), mark=0.5))
 
 
 def _ends(found: Any) -> dict[str, Any]:
     """Return an interval as columns of points; NaN where there is none."""
     ends = {end: getattr(found, end) for end in ("low", "high")}
     return {end: math.nan if at is None else at if len(at) > 1 else at[0] for end, at in ends.items()}
-
-
-def _profiles(page: Page, name: str, runs: pd.DataFrame) -> None:
-    thresholds = np.linspace(0, max(min(runs["score"].max() * 1.05, 4.0), 0.05), 61)
-    columns = [f"above {place}" for place in range(len(thresholds))]
-    above = pd.DataFrame(runs["score"].to_numpy()[:, None] > thresholds, runs.index, columns, dtype=float)
-    points = []
-    for label, own in runs.join(above).groupby("label", sort=False):
-        found = estimate(mean, own, columns=columns)
-        points.append(
-            pd.DataFrame({"label": label, "x": thresholds, "y": found.value, "n": found.runs, **_ends(found)})
-        )
-    page.figure(
-        f"{name}-profiles",
-        f"Performance profiles: the fraction of runs above a score (n counts runs of all tasks), with {CONFIDENCE:.0%} "
-        f"intervals where every task has {MIN_RUNS} runs.",
-        curves(pd.concat(points), "score / the paper's DrQ", "fraction of runs above it"),
-    )
 
 
 def _learning_curves(page: Page, name: str, runs: pd.DataFrame, points: pd.DataFrame) -> None:
@@ -755,9 +681,8 @@ def _learning_curves(page: Page, name: str, runs: pd.DataFrame, points: pd.DataF
         if numbers.empty:  # no evaluation that all runs have
             continue
         found = estimate(mean, numbers.reset_index(), columns=list(numbers))
-        hours = own.groupby("env_steps")["hours"].mean()[numbers.columns]
         about = {"panel": task, "label": label}
-        columns = {"x": numbers.columns, "y": found.value, "hours": hours.to_numpy(), "n": len(numbers)}
+        columns = {"x": numbers.columns, "y": found.value, "n": len(numbers)}
         means.append(pd.DataFrame({**about, **columns, **_ends(found)}))
         if found.low is None and len(numbers) > 1:  # too few for an interval: the runs themselves
             own = own.rename(columns={"env_steps": "x", "score": "y", "run": "line"})
@@ -768,13 +693,6 @@ def _learning_curves(page: Page, name: str, runs: pd.DataFrame, points: pd.DataF
         f"Episode return along training: mean over runs, with {CONFIDENCE:.0%} bootstrap intervals from {MIN_RUNS} "
         "runs up, below that with a thin line per run.",
         curves(pd.concat([drawn, *thin], ignore_index=True), "env steps", "episode return"),
-    )
-    page.figure(
-        f"{name}-curves-time",
-        "The same against the time since a run's first record, mean over runs. Pauses of a run that was continued do "
-        "not count: what is longer than ten minutes and than twenty usual distances between records counts as one of "
-        "these. Times compare only within one machine, and runs that shared it slowed each other down.",
-        curves(drawn.assign(x=drawn["hours"], low=math.nan), "hours", "episode return"),
     )
 
 
@@ -974,9 +892,8 @@ def _prototypes(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -
     )
     page.figure(
         f"{name}-spread",
-        "Spread of the prototypes along training, a line per encoder. Where some lie more than ten times as far from 0 "
-        "as most, heights are to scale near 0 only.",
-        curves(points, "encoder updates", columns=2, compresses=True),
+        "Spread of the prototypes along training, a line per encoder.",
+        curves(points, "encoder updates", columns=2),
     )
 
 
@@ -1082,11 +999,10 @@ def diagnostic_curves(records: pd.DataFrame) -> Any:
     return curves(points, "encoder updates", marks=marks)
 
 
-def _diagnostics(page: Page, name: str, records: pd.DataFrame, of: str = "") -> None:
+def _diagnostics(page: Page, name: str, records: pd.DataFrame) -> None:
     """Show where encoders ended and how they came there, group by group."""
     for group, own in records.groupby("at_group") if len(records) else ():
-        what = ", ".join(filter(None, [of, f"group {group}" if group else ""]))
-        what = f"{what[:1].upper()}{what[1:]}: diagnostics" if what else "Diagnostics"
+        what = f"Group {group}: diagnostics" if group else "Diagnostics"
         caption = f"{what} along pre-training, a line per encoder (n in the legend)."
         page.figure(f"{name}-{group}", caption, diagnostic_curves(own))
         finals = [
@@ -1189,172 +1105,3 @@ def _means(page: Page, rows: pd.DataFrame) -> pd.DataFrame:
         means["is_redrawn"], ""
     )
     return means
-
-
-# --- a study of pre-training ----------------------------------------------------------------------------------------
-
-ENCODER = ["factor", "value", "group", "seed"]
-"""What distinguishes the encoders of a study."""
-CONTROL = "untrained"
-"""The factor of an untrained encoder, which stands beside those of every other."""
-
-
-def _study(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
-    """Report what each value of a factor changed against the usual one, by probes along training.
-
-    A cell's place names its ``factor``, ``value`` and ``usual`` value, ``group`` and ``encoder_seed``; ``updates`` if
-    an encoder was probed along its training.
-    """
-    places = {place: _words(cells.get(place)) for place in ("factor", "value", "usual")}
-    cells = cells.assign(**places, seed=cells["encoder_seed"])
-    cells["value"] = cells["value"].where(cells["value"] != "", cells["label"])
-    cells["factor"] = cells["factor"].str.replace("_", " ").replace("control", CONTROL)
-    rows = _records(page, cells, jobs, ["probe"], "probe")
-    records = _records(page, cells.assign(label=cells["value"]), jobs, ENCODERS, "pretrain", "updates")
-    if len(rows):
-        rows = _means(page, rows[rows["measure"].isin(["r2_position", "r2_velocity"])]).drop(columns="seed")
-        rows["at_updates"] = rows["at_updates"].fillna(0).astype(int) if "at_updates" in rows else 0
-        places = {f"at_{place}": place for place in (*ENCODER, "usual", "updates")}
-        rows = rows.rename(columns={"value": "r2"}).rename(columns=places)
-        found = compared(rows)
-        _changes(page, name, found)
-        _each_encoder(page, found, records)
-    factors = list(dict.fromkeys(factor for factor in cells["factor"] if factor != CONTROL))
-    for place, factor in enumerate(factors, 1):
-        if len(records):
-            _diagnostics(page, f"{name}-{place}", records[records["at_factor"] == factor], factor)
-        if len(rows):
-            _along(page, f"{name}-{place}", rows, factor)
-
-
-def compared(rows: pd.DataFrame) -> pd.DataFrame:
-    """Average probes over the domains of a group, and set the usual value's encoder of the same seed beside each.
-
-    What has not been probed on all domains of its group yet is left out: a mean over others would not compare.
-
-    Args:
-        rows: columns ``factor``, ``value``, ``usual``, ``group``, ``seed``, ``updates``, ``measure``, ``embedding``,
-            ``where`` and ``r2``.
-
-    Returns:
-        A row per encoder, updates, measure and embedding (``what``): ``r2``, its ``change`` against the usual value
-        after as many updates (NaN if it is the usual one, or there is none), and ``is_end`` of an encoder's last.
-    """
-    on = ["factor", "group", "seed", "updates", "measure", "embedding"]
-    found = rows.groupby(["value", "usual", *on], sort=False)["r2"].agg(["mean", "count"]).reset_index()
-    whole = rows.groupby("group")["where"].nunique()
-    found = found[found["count"] == found["group"].map(whole)].rename(columns={"mean": "r2"})
-    usual = found.loc[found["value"] == found["usual"], [*on, "r2"]].rename(columns={"r2": "of_usual"})
-    found = found.merge(usual, on=on, how="left")
-    found["change"] = (found["r2"] - found["of_usual"]).where(found["value"] != found["usual"])
-    found["is_end"] = found["updates"] == found.groupby(ENCODER)["updates"].transform("max")
-    found["what"] = (
-        found["measure"].map({"r2_velocity": "velocities, ", "r2_position": "positions, "})
-        + found["embedding"]
-    )
-    return found
-
-
-def _changes(page: Page, name: str, found: pd.DataFrame) -> None:
-    """Show all values beside each other at the end, then their changes along training, and draw them."""
-    table = []
-    for (factor, value, group), own in found[found["is_end"]].groupby(ENCODER[:3], sort=False):
-        usual = " (usual)" if (own["usual"] == value).all() else ""
-        line = {
-            "factor": factor,
-            "value": f"{value}{usual}",
-            "group": group,
-            "encoders": own["seed"].nunique(),
-        }
-        line["updates"] = _or(own["updates"])
-        for what, mine in own.groupby("what"):
-            change = _known(mine["change"].mean(), "+.3f")
-            line[str(what)] = "\n".join(filter(None, [f"{mine['r2'].mean():.3f}", change]))
-        table.append(line)
-    page.table(
-        "All values at a glance: R2 at the end on held-out episodes, mean over coordinates, domains and encoders. "
-        "Below it the mean change against the usual value's encoders of the same seeds.",
-        table,
-    )
-    changed = found.dropna(subset="change")
-    for what in ("velocities, features", "velocities, z"):
-        table = []
-        for (factor, value), own in changed[changed["what"] == what].groupby(ENCODER[:2], sort=False):
-            parts = {f"{at:,}": part["change"] for at, part in own.groupby("updates")}
-            line = {"factor": factor, "value": value, "pairs": max(map(len, parts.values()))}
-            for at, part in parts.items():
-                spread = f"\n{part.min():+.3f} to {part.max():+.3f}" if len(part) > 1 else ""
-                line[at] = f"{part.mean():+.3f}{spread}"
-            table.append(line)
-        page.table(
-            f"Change of the R2 of {what} against the usual value, by encoder updates: mean over pairs of encoders of "
-            "one group and seed (least to largest), each a mean over domains. A single pair has no range: what another "
-            "seed alone would change is to be seen where a value has several.",
-            table,
-        )
-    if changed.empty:
-        return
-    shared = sorted(set.intersection(*changed.groupby(ENCODER[:2])["updates"].agg(set)))
-    along = [changed[changed["updates"] == at].assign(label=f"after {at:,} updates") for at in shared]
-    points = pd.concat([*along, changed[changed["is_end"]].assign(label="at the end")])
-    pairs = changed.drop_duplicates(ENCODER).groupby(ENCODER[:2]).size()
-    points["row"] = [
-        f"{f} {v} ({_count(pairs[f, v], 'pair')})" for f, v in zip(points["factor"], points["value"])
-    ]
-    points["panel"] = "change of R2: " + points["what"]
-    points = points.groupby(["panel", "row", "label"], sort=False)["change"].mean().reset_index(name="x")
-    caption = (
-        "What each value changed against the usual one: mean over pairs of encoders of one group and seed."
-    )
-    page.figure(f"{name}-changes", caption, dots(points, mark=0.0))
-
-
-def _each_encoder(page: Page, found: pd.DataFrame, records: pd.DataFrame) -> None:
-    """Show every encoder along its training; an untrained one stands beside every number of updates."""
-    left = {}
-    for place, own in records.groupby([f"at_{name}" for name in ENCODER]) if len(records) else ():
-        left[place] = _plateau(own)
-    updates = sorted(found.loc[found["factor"] != CONTROL, "updates"].unique())
-    for what, part in found[found["measure"] == "r2_velocity"].groupby("what"):
-        table = []
-        for place, own in part.groupby(ENCODER, sort=False):
-            read = own.set_index("updates")["r2"]
-            if place[0] == CONTROL:
-                read = pd.Series(read.iloc[0], index=updates)
-            line = {**dict(zip(ENCODER, place)), "left the plateau at": left.get(place, "")}
-            table.append(line | {f"{at:,}": _known(read.get(at, math.nan), ".3f") for at in updates})
-        caption = f"R2 of {what} of each encoder after so many updates, mean over coordinates and domains."
-        page.table(caption, table, fold=True)
-
-
-def _along(page: Page, name: str, rows: pd.DataFrame, factor: str) -> None:
-    """Show what is read of every value on each domain at its end, and draw it along training."""
-    for group, here in rows[rows["factor"].isin([factor, CONTROL])].groupby("group"):
-        ends = here[here["updates"] == here.groupby(ENCODER)["updates"].transform("max")]
-        table = []
-        for (value, embedding), own in ends.groupby(["value", "embedding"], sort=False):
-            line = {"value": value, "from": embedding, "n": own["seed"].nunique()}
-            for where, at in own.groupby("where", sort=False):
-                both = [at.loc[at["measure"] == name, "r2"] for name in ("r2_position", "r2_velocity")]
-                line[str(where)] = " / ".join(
-                    _spread(part, 3, n=False) if len(part) else "-" for part in both
-                )
-            table.append(line)
-        of = f"{factor[:1].upper()}{factor[1:]}, group {group}"
-        page.table(
-            f"{of}: positions / velocities at the end, held-out R2, mean over encoders.", table, fold=True
-        )
-        read = here[(here["measure"] == "r2_velocity") & (here["embedding"] == "features")]
-        own = read[read["factor"] == factor]
-        if own["updates"].nunique() < 3:
-            continue  # the tables have these
-        points = own.groupby(["where", "value", "updates"], sort=False)["r2"].mean().reset_index()
-        points["n"] = points["value"].map(own.groupby("value")["seed"].nunique())
-        points = points.rename(columns={"where": "panel", "value": "label", "updates": "x", "r2": "y"})
-        control = read[read["factor"] == CONTROL].groupby("where")["r2"].mean()
-        marks = {where: {CONTROL: value} for where, value in control.items()}
-        caption = f"{of}: R2 of velocities read from the features along training, mean over encoders."
-        figure = curves(
-            points.sort_values("x", kind="stable"), "encoder updates", "R2", marks=marks, columns=4
-        )
-        page.figure(f"{name}{group}-probe", caption, figure)

@@ -60,14 +60,9 @@ def probability_of_improvement(scores: Sequence[Array], others: Sequence[Array])
 
     ``P(X > Y) + P(X = Y) / 2`` over all pairs of runs: the Mann-Whitney U statistic over their number. Half means no
     difference. It says nothing about by how much.
-
-    Args:
-        scores: one ``[..., R_t]`` per task, method X.
-        others: one ``[..., S_t]`` per task, method Y, in the same order of tasks.
     """
-    with np.errstate(
-        all="ignore"
-    ):  # its p-value, which nobody reads here, divides by zero where all runs are alike
+    # The p-value, which nobody reads here, divides by zero where all runs are alike.
+    with np.errstate(all="ignore"):
         wins = [
             mannwhitneyu(x, y, axis=-1, method="asymptotic").statistic / (x.shape[-1] * y.shape[-1])
             for x, y in zip(scores, others, strict=True)
@@ -116,10 +111,9 @@ def estimate(
 
     A replicate redraws the encoders, once for all tasks that share them, and then, for each run's place, a downstream
     run of the encoder drawn; tasks are kept (Davison & Hinkley, Bootstrap Methods and their Application, 1997, section
-    3.8). Runs that share an encoder are no independent draws of the method that made it, so that these intervals are
-    wider than those over runs alone wherever encoders differ. Where all runs stand on one encoder they are over its
-    runs, and speak of that encoder only; where each run has its own encoder they are over runs. Percentile intervals of
-    few draws are too narrow (:data:`COVERAGE`), and with few encoders even these are.
+    3.8): runs that share an encoder are no independent draws of the method that made it. Where all runs stand on one
+    encoder intervals are over its runs, and speak of that encoder only. Percentile intervals of few draws are too
+    narrow (:data:`COVERAGE`).
 
     Args:
         statistic: an aggregate of this module; of two methods one that takes both.
@@ -184,12 +178,6 @@ def resample(
 
     Returns:
         One ``[B, R_t]`` of indices into its runs per task.
-
-    Examples:
-        >>> rng = np.random.default_rng(0)
-        >>> first, second = resample([["a", "b"], ["a", "b"]], [["r1", "r2"], ["r3", "r4"]], replicates=100, rng=rng)
-        >>> bool((first == second).all())  # one run of each encoder: drawing encoders draws both tasks' runs
-        True
     """
     names = [np.unique(labels) for labels in encoders]
     strata = _strata(names)

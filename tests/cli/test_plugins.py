@@ -1,4 +1,4 @@
-"""Every method from the command line, the user's own included."""
+"""What a plugin registers, methods and worlds, has names in every command and every process."""
 
 from __future__ import annotations
 
@@ -6,10 +6,14 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import gymnasium
 import pytest
 from command import SIZE, SMALL, TASK, Call, refused, rows
 
 import crptpro.objectives.methods as registry
+from crptpro import doctor, plugins
+from crptpro.data import FrameDataset
+from crptpro.experiments import matrix
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import get_method, method_names
 from crptpro.pretrained import load_pretrained
@@ -82,3 +86,59 @@ def test_a_plugin_that_cannot_be_imported_says_so(
     assert "it cannot be imported" in refused(call("--plugin", tmp_path / "needs_more.py", "doctor"))
     assert "'json' is the name of another module" in refused(call("--plugin", tmp_path / "json.py", "doctor"))
     assert "needs a module or a Python file" in refused(call("doctor", "--plugin"))
+
+
+# --- a world of the user's own --------------------------------------------------------------------------------------
+
+WORLD = "SlowWorld-v0"
+
+
+@pytest.fixture
+def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A file that registers a world of Gymnasium's; it is forgotten afterwards."""
+    monkeypatch.setattr(plugins, "_loaded", [])
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    monkeypatch.setattr(matrix, "EXPERIMENTS", dict(matrix.EXPERIMENTS))
+    path = tmp_path / "plugin_of_a_world.py"
+    path.write_text((Path(__file__).parents[1] / "experiments" / "slow_world.py").read_text())
+    yield path
+    sys.modules.pop(path.stem, None)
+    gymnasium.registry.pop(WORLD, None)
+
+
+def test_a_plugins_world_is_collected_and_learned_with_evaluating_processes(
+    call: Call, tmp_path: Path, world: Path
+) -> None:
+    task = f"gymnasium:{WORLD}"
+    collect = ("collect", task, "--transitions", 15, "--workers", 1, "--out", tmp_path / "data")
+    status, _, err = call("--plugin", world, *collect)
+    assert status == 0, err
+    (path,) = (tmp_path / "data").iterdir()
+    assert len(FrameDataset.open(path)) == 15
+
+    learn = (
+        "downstream",
+        task,
+        "--pretrained",
+        "random-encoder",
+        "--out",
+        tmp_path / "run",
+        "--env-steps",
+        24,
+    )
+    few = (
+        "--random-agent-steps", 4, "--batch-size", 4, "--replay-capacity", 20, "--eval-episodes", 1,
+        "--eval-interval-env-steps", 24, "--hidden-dim", 8, "--queue-size", 16, "--eval-workers", 1,
+    )  # fmt: skip
+    status, _, err = call("--plugin", world, *learn, *few)
+    assert status == 0, err
+    assert "MUJOCO" not in err
+
+
+def test_the_doctor_looks_at_a_plugins_world(
+    call: Call, world: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plugins.load_plugin(str(world))
+    (entry,) = doctor.render_domains((f"gymnasium:{WORLD}",), "egl", 100.0)
+    assert entry["error"] == ""
+    assert entry["agent_step_ms"] > 0
