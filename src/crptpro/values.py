@@ -164,11 +164,6 @@ def check_switch(name: str, value: str) -> None:
         raise ValueError(f"`{name}` must be 'auto', 'on' or 'off', got {value!r}.")
 
 
-def is_drawn(stored: Colors, wanted: Colors) -> bool:
-    """Whether a picture in the wanted colours must be drawn: it cannot be made of the stored one."""
-    return stored != wanted and {stored, wanted} != {"normal", "reversed_image"}
-
-
 def _require_range(
     number: float, value: Any, name: str, minimum: float | None, maximum: float | None
 ) -> None:

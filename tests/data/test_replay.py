@@ -451,7 +451,6 @@ def test_a_stored_replay_shows_every_observation_that_was_decided_on_in_order(
     tmp_path: Path, transitions: int, length: int
 ) -> None:
     driver = Driver(small(path=tmp_path, slack=5), length).write(transitions)
-    driver.replay.flush()
     before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
     stored = StoredReplay(tmp_path)
     assert min(transitions, 20) <= len(stored) <= transitions
@@ -462,16 +461,13 @@ def test_a_stored_replay_shows_every_observation_that_was_decided_on_in_order(
 
 
 def test_what_is_no_stored_replay_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"absent holds no replay: number.memmap"):
+    with pytest.raises(DatasetError, match=r"absent/number.memmap is missing"):
         StoredReplay(tmp_path / "absent")
     driver = Driver(small(path=tmp_path / "new"))
     with pytest.raises(DatasetError, match="no transition"):
         StoredReplay(tmp_path / "new")
     driver.write(5)
-    driver.replay._storage.number[2] = 0
-    with pytest.raises(DatasetError, match="lost rows"):
-        StoredReplay(tmp_path / "new")
     with open(tmp_path / "new" / "pixels.memmap", "ab") as file:
         file.write(b"x")
-    with pytest.raises(DatasetError, match="square RGB"):
+    with pytest.raises(DatasetError, match=r"pixels.memmap is longer"):
         StoredReplay(tmp_path / "new")

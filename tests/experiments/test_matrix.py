@@ -159,16 +159,11 @@ def test_the_ablation_has_the_papers_weights_and_budgets() -> None:
     assert of(found, "proto-rl-c with dispersion")[0].needs[0].facts["loss"] == {"intr_loss_coef": 5e-3}
 
 
-def test_other_colours_are_drawn_downstream_and_for_probes_once_for_all_encoders() -> None:
+def test_other_colours_are_drawn_downstream() -> None:
     for colors in ("reversed_background", "reversed_image"):
         found = cells("colors", SMALL, colors=colors)
         assert {option(cell.job, "--colors") for cell in found} == {colors}
         assert {cell.place["colors"] for cell in found} == {colors}
-    probes = [c.job for c in cells("probe", SMALL, groups=("A",), tasks=("finger",))]
-    drawn = [needed for job in probes for needed in job.needs if needed.kind == "redrawn"]
-    assert len(drawn) == len(probes) / 2
-    assert len(set(drawn)) == 1
-    assert "--redrawn" in probes[1].command
 
 
 def test_timings_count_every_encoder_of_a_single_domain_method_and_need_only_data() -> None:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 from crptpro.cli.request import image_format, require_writable
-from crptpro.values import Colors
 
 if TYPE_CHECKING:
     from crptpro.pretrained import Pretrained
@@ -25,12 +24,8 @@ class Probe:
     """datasets, e.g. data/walker data/finger; each is probed alone, seen in pre-training or not"""
     samples: int = 2_000
     """observations per dataset; time and memory grow with their square"""
-    colors: tuple[Colors, ...] = ("normal",)
-    """colours; what a dataset was not collected in is drawn again from its physical state"""
     seed: int = 0
     """which observations, which episodes are held out, and the random encoder's initialisation"""
-    redrawn: Path | None = None
-    """observations of the one dataset that `crptpro measure redrawn` has drawn in other colours, which are probed"""
     csv: Path | None = None
     """write every number here, each coordinate's R2 among them"""
     device: str = "cpu"
@@ -39,7 +34,6 @@ class Probe:
     def run(self) -> None:
         """Print a table, and write what was asked for."""
         from crptpro.data import FrameDataset
-        from crptpro.data.redraw import DrawnFrames
         from crptpro.errors import CRPTproError
         from crptpro.experiments.measure import PROBE_COLUMNS, probe_rows, write_rows
         from crptpro.modules import usable_device
@@ -55,25 +49,16 @@ class Probe:
         if pretrained.projector is not None:
             pretrained.projector.to(self.device)
         datasets = [FrameDataset.open(path) for path in self.datasets]
-        drawn = None if self.redrawn is None else DrawnFrames.load(self.redrawn)
-        every = self.colors if drawn is None else (drawn.colors,)
         table, measures = [], []
         try:
             for dataset in datasets:
-                for colors in dict.fromkeys(every):
-                    rows, numbers = probe_rows(
-                        pretrained,
-                        dataset,
-                        encoder=self.encoder,
-                        colors=colors,
-                        samples=self.samples,
-                        seed=self.seed,
-                        drawn=drawn,
-                    )
-                    table += rows
-                    measures += numbers
-                    if self.csv is not None:
-                        write_rows(self.csv, measures, PROBE_COLUMNS)
+                rows, numbers = probe_rows(
+                    pretrained, dataset, encoder=self.encoder, samples=self.samples, seed=self.seed
+                )
+                table += rows
+                measures += numbers
+                if self.csv is not None:
+                    write_rows(self.csv, measures, PROBE_COLUMNS)
         finally:  # a later dataset may be refused, and writing may fail
             if table:
                 lines = [list(table[0]), ["---"] * len(table[0]), *(list(row.values()) for row in table)]

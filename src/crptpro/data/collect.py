@@ -23,16 +23,14 @@ from multiprocessing.connection import wait as wait_for_process
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.modules import RandomPolicy
 from tqdm import tqdm
 
 from crptpro.artifact import require_disk
 from crptpro.data.dataset import FrameDataset
-from crptpro.data.storage import estimate_bytes
 from crptpro.domains import LONGEST_EPISODE_AGENT_STEPS, Domain, expand_groups, get_domain
 from crptpro.errors import CRPTproError, DatasetError, RenderingError, WorkerLostError
 from crptpro.plugins import load_again, loaded_plugins
@@ -196,7 +194,7 @@ def collect_episode(
 
 
 class _Collection:
-    """One dataset, its episodes that run or wait for an earlier one, and its progress line.
+    """One dataset, and its episodes that run or wait for an earlier one.
 
     Episodes may finish in any order and are appended in order, so that the dataset depends on the request alone.
     """
@@ -213,8 +211,12 @@ class _Collection:
         self.usual_length = usual_length
         self.longest = max(LONGEST_EPISODE_AGENT_STEPS, usual_length or 0)
         self.running: set[int] = set()
-        self.waiting: dict[int, TensorDict] = {}
-        self.has_begun = False
+        self.waiting: dict[int, TensorDictBase] = {}
+
+    @property
+    def missing(self) -> int:
+        """Transitions that are not durable yet."""
+        return self.dataset.target - len(self.dataset)
 
     def next_plan(self, ahead: int) -> dict[str, Any] | None:
         """Return the next episode worth starting, ``None`` while those under way are expected to suffice.
@@ -222,20 +224,15 @@ class _Collection:
         Args:
             ahead: how many episodes may be under way beyond those that are durable.
         """
-        if self.dataset.is_complete:
-            return None
         first = index = self.dataset.episodes
-        missing = limit = self.dataset.target - len(self.dataset)
+        wanted = limit = self.missing
         while index in self.running or index in self.waiting:
             known = len(self.waiting[index]) if index in self.waiting else None
-            missing -= known or self.usual_length or 1
+            wanted -= known or self.usual_length or 1
             limit -= known or 1  # a running one has at least one transition
             index += 1
-        if missing <= 0 or index - first >= ahead:
+        if wanted <= 0 or index - first >= ahead:
             return None
-        if not self.has_begun:
-            self.has_begun = True
-            self.dataset.begin()
         self.running.add(index)
         name = self.domain.name
         return {
@@ -246,35 +243,36 @@ class _Collection:
             "limit": min(limit, self.longest),
         }
 
-    def accept(self, index: int, card: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+    def accept(self, index: int, card: Mapping[str, Any], rollout: TensorDictBase) -> None:
         """Take a finished episode; it and those that waited for it are durable when this returns."""
         self.running.discard(index)
         if self.dataset.is_complete:
             return
         self.dataset.note_environment(card)
-        self.waiting[index] = _rollout_of(arrays)
+        self.waiting[index] = rollout
         while (episode := self.waiting.pop(self.dataset.episodes, None)) is not None:
             self.usual_length = self.usual_length or len(episode)
             self.dataset.extend(episode)
             self.dataset.end_episode()
             if self.dataset.is_complete:
                 self.waiting.clear()
-                return
 
 
 def _announce(jobs: list[_Collection], root: Path, image_size: int) -> None:
-    missing = {job.domain.name: job.dataset.target - len(job.dataset) for job in jobs}
-    sizes = {
-        job.domain.name: estimate_bytes(missing[job.domain.name], image_size, job.usual_length)
-        for job in jobs
-    }
+    """Say how much will be written, and refuse what the disk cannot hold."""
+    sizes = {}
+    for job in jobs:
+        frames = job.missing + -(-job.missing // (job.usual_length or 100))  # one more per episode
+        sizes[job.domain.name] = (
+            frames * 3 * image_size**2 + job.missing * 1000
+        )  # action and state: at most 1 kB
     require_disk(root, sum(sizes.values()), f"Collecting {', '.join(sizes)}")
-    free = shutil.disk_usage(jobs[0].dataset.path or root).free
+    free = shutil.disk_usage(jobs[0].dataset.path).free
     for job in jobs:
         name = job.domain.name
         logger.info(
             "%s: %.2g GB for %s transitions into %s, %.1f GB free",
-            name, sizes[name] / 1e9, f"{missing[name]:,}", job.dataset.path, free / 1e9,
+            name, sizes[name] / 1e9, f"{job.missing:,}", job.dataset.path, free / 1e9,
         )  # fmt: skip
 
 
@@ -284,7 +282,7 @@ def _usable_workers(jobs: list[_Collection], workers: int) -> int:
     for job in jobs if workers > 1 else ():
         try:
             is_lost = b"__main__" in pickle.dumps(job.make) and not (main_file and Path(main_file).exists())
-        except Exception:
+        except Exception:  # objects may refuse in ways of their own
             is_lost = True
         if is_lost:
             logger.warning(
@@ -298,7 +296,7 @@ def _usable_workers(jobs: list[_Collection], workers: int) -> int:
 def _collect(jobs: list[_Collection], workers: int, progress: bool) -> None:
     factories = {job.domain.name: job.make for job in jobs}
     with ExitStack() as stack:
-        lines = [stack.enter_context(_ProgressLine(job, progress)) for job in jobs]
+        bars = [stack.enter_context(_Progress(job, progress)) for job in jobs]
         pool: Any = _Pool(factories, workers) if workers > 1 else _ThisProcess(factories)
         stack.enter_context(pool)
         running: dict[Future, tuple[_Collection, int, int]] = {}
@@ -309,9 +307,10 @@ def _collect(jobs: list[_Collection], workers: int, progress: bool) -> None:
                     running[pool.submit(plan, slot)] = (job, plan["episode"], slot)
             for future in pool.finished(running):
                 job, episode, _ = running.pop(future)
-                job.accept(episode, *future.result())
-            for line in lines:
-                line.show(sum(pool.steps[slot] for job, _, slot in running.values() if job is line.job))
+                result = future.result()
+                job.accept(episode, *(pickle.loads(result) if isinstance(result, bytes) else result))
+            for bar in bars:
+                bar.show(sum(pool.steps[slot] for job, _, slot in running.values() if job is bar.job))
 
 
 class _ThisProcess:
@@ -341,22 +340,35 @@ class _Pool:
     """Collects in spawned processes, never forked ones: a fork would share a GL context."""
 
     def __init__(self, factories: Mapping[str, Callable[[], EnvBase]], workers: int):
-        context = multiprocessing.get_context("spawn")
-        self.workers, self.steps = workers, context.RawArray("q", workers)
-        self._processes: set[Any] = set()
+        self._context = multiprocessing.get_context("spawn")
+        self.workers, self.steps = workers, self._context.RawArray("q", workers)
+        self._arguments = (factories, loaded_plugins(), self.steps)
+        self._executor: ProcessPoolExecutor | None = None
+        self._processes: dict[int, Any] = {}
         self._sign: tuple[list[int], float] = ([], time.monotonic())
-        arguments = (factories, loaded_plugins(), self.steps)
-        with self._explained():
-            self._executor = ProcessPoolExecutor(workers, context, _start_worker, arguments)
 
     def submit(self, plan: dict[str, Any], slot: int) -> Future:
-        others = set(multiprocessing.active_children()) - self._processes
-        with self._explained():
-            try:
-                with _interrupts_ignored():
-                    return self._executor.submit(_work, plan, slot)
-            finally:
-                self._processes |= set(multiprocessing.active_children()) - others
+        try:
+            if self._executor is None:
+                self._executor = ProcessPoolExecutor(
+                    self.workers, self._context, _start_worker, self._arguments
+                )
+            with _interrupts_ignored():
+                return self._executor.submit(_work, plan, slot)
+        except BrokenProcessPool:
+            raise self._lost(f"episode {plan['episode']} of {plan['domain']}") from None
+        except OSError as reason:
+            hint = "Use fewer workers."
+            if reason.errno == errno.EMFILE:
+                import resource
+
+                limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+                hint = f"This shell allows {limit} open files: raise that (`ulimit -n 4096`), or use fewer workers."
+            raise CRPTproError(
+                f"{self.workers} collecting processes cannot be started: {reason}. {hint}"
+            ) from reason
+        finally:
+            self._processes |= getattr(self._executor, "_processes", None) or {}
 
     def finished(self, running: Mapping[Future, tuple[_Collection, int, int]]) -> list[Future]:
         """Wait a second for episodes.
@@ -383,9 +395,9 @@ class _Pool:
         return done
 
     def _lost(self, episodes: str) -> WorkerLostError:
-        for process in self._processes:
+        for process in self._processes.values():
             process.join(2.0)
-        codes = [process.exitcode for process in self._processes]
+        codes = [process.exitcode for process in self._processes.values()]
         # Those that the executor ended after the first have been terminated.
         code = next((code for code in codes if code not in (None, 0, -signal.SIGTERM)), -signal.SIGTERM)
         how = f"was killed by signal {-code}" if code < 0 else f"exited with status {code}"
@@ -399,35 +411,19 @@ class _Pool:
             )
         return WorkerLostError(f"A process that collected ({episodes}) {how}. {hint} {_AGAIN}.")
 
-    @contextlib.contextmanager
-    def _explained(self) -> Iterator[None]:
-        try:
-            yield
-        except BrokenProcessPool:
-            raise self._lost("its first episode") from None
-        except OSError as reason:
-            hint = "Use fewer workers."
-            if reason.errno == errno.EMFILE:
-                import resource
-
-                limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-                hint = f"This shell allows {limit} open files: raise that (`ulimit -n 4096`), or use fewer workers."
-            raise CRPTproError(
-                f"{self.workers} collecting processes cannot be started: {reason}. {hint}"
-            ) from reason
-
     def __enter__(self) -> _Pool:
         return self
 
     def __exit__(self, *_: object) -> None:
         # What still runs is no longer wanted, or has lost its parent's interest by an error or Ctrl-C.
-        for process in self._processes:
+        for process in self._processes.values():
             process.terminate()
-        for process in self._processes:
+        for process in self._processes.values():
             process.join(5.0)
             if process.is_alive():
                 process.kill()
-        self._executor.shutdown(cancel_futures=True)
+        if self._executor is not None:
+            self._executor.shutdown(cancel_futures=True)
 
 
 @contextlib.contextmanager
@@ -443,24 +439,24 @@ def _interrupts_ignored() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-class _ProgressLine:
+class _Progress:
     """Transitions of one dataset: a bar on a terminal, a log line per tenth elsewhere."""
 
     def __init__(self, job: _Collection, is_shown: bool):
         self.job, self._is_shown = job, is_shown
-        self._total, self._shown = job.dataset.target, len(job.dataset)
+        self._total, self._count = job.dataset.target, len(job.dataset)
         self._begun: tuple[float, int] | None = None
         self._bar = tqdm(
-            total=self._total, initial=self._shown, desc=job.domain.name, unit=" transitions", dynamic_ncols=True,
+            total=self._total, initial=self._count, desc=job.domain.name, unit=" transitions", dynamic_ncols=True,
             disable=None if is_shown else True, smoothing=0.05,
         )  # fmt: skip
 
     def show(self, running: int) -> None:
         waiting = sum(map(len, self.job.waiting.values()))
-        count, before = min(self._total, len(self.job.dataset) + waiting + running), self._shown
+        count, before = min(self._total, len(self.job.dataset) + waiting + running), self._count
         if count <= before:
             return
-        self._shown = count
+        self._count = count
         self._bar.update(count - before)
         begun_s, first = self._begun = self._begun or (time.monotonic(), before)
         if self._is_shown and self._bar.disable and 10 * count // self._total > 10 * before // self._total:
@@ -470,7 +466,7 @@ class _ProgressLine:
                 self.job.domain.name, f"{count:,}", f"{self._total:,}", rate, (self._total - count) / rate,
             )  # fmt: skip
 
-    def __enter__(self) -> _ProgressLine:
+    def __enter__(self) -> _Progress:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -492,17 +488,19 @@ class _Roller:
         self._factories, self._steps = factories, steps
         self._domain, self._env = "", None
 
-    def roll(self, plan: Mapping[str, Any], slot: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Return the environment's card and the episode's arrays."""
+    def roll(self, plan: Mapping[str, Any], slot: int) -> tuple[dict[str, Any], TensorDictBase]:
+        """Return the environment's card and the episode."""
         self._steps[slot] = 0
 
         def count(*_: Any) -> None:
             self._steps[slot] += 1
 
         try:
-            env = self._env_of(plan["domain"])
+            if self._env is None or plan["domain"] != self._domain:
+                self.close()
+                self._env, self._domain = self._factories[plan["domain"]](), plan["domain"]
             seeds = {name: plan[name] for name in ("env_seed", "action_seed", "limit")}
-            rollout = collect_episode(env, callback=count, **seeds)
+            rollout = collect_episode(self._env, callback=count, **seeds)
         except CRPTproError:
             raise
         except Exception as reason:
@@ -510,7 +508,7 @@ class _Roller:
                 f"Episode {plan['episode']} of {plan['domain']} failed: {str(reason).strip() or repr(reason)}. "
                 f"{_AGAIN} once the cause is removed."
             ) from reason
-        return (env.card() if hasattr(env, "card") else {}), _arrays_of(rollout)
+        return (self._env.card() if hasattr(self._env, "card") else {}), rollout
 
     def close(self) -> None:
         """Close the environment and free its render context."""
@@ -518,41 +516,9 @@ class _Roller:
             self._env.close()
         self._env = None
 
-    def _env_of(self, domain: str) -> EnvBase:
-        if self._env is None or domain != self._domain:
-            self.close()
-            self._env, self._domain = self._factories[domain](), domain
-        return self._env
 
-
-def _arrays_of(rollout: TensorDictBase) -> dict[str, np.ndarray]:
-    """Return an episode as plain arrays that any process can send: T + 1 rows per frame, T per transition."""
-    following = rollout.get("next")
-    per_frame = [name for name in ("pixels", "qpos", "qvel") if name in following]
-    flags = [name for name in ("reward", "done", "terminated", "truncated") if name in following]
-    arrays = {name: torch.cat([rollout.get(name)[:1], following.get(name)]).numpy() for name in per_frame}
-    return (
-        arrays
-        | {name: following.get(name).numpy() for name in flags}
-        | {"action": rollout.get("action").numpy()}
-    )
-
-
-def _rollout_of(arrays: Mapping[str, np.ndarray]) -> TensorDict:
-    """Return the rollout ``[T]`` of an episode's arrays."""
-    root: dict[str, Any] = {"action": torch.from_numpy(arrays["action"])}
-    following: dict[str, Any] = {}
-    for name in arrays.keys() - {"action"}:
-        values = torch.from_numpy(arrays[name])
-        if name in ("pixels", "qpos", "qvel"):
-            root[name], values = values[:-1], values[1:]
-        following[name] = values
-    length = [len(arrays["action"])]
-    return TensorDict({**root, "next": TensorDict(following, length)}, length)
-
-
-_HERE: dict[str, Any] = {}
-"""What a collecting process works with."""
+_roller: _Roller
+_plugins: tuple[str, ...]
 
 
 def _start_worker(
@@ -566,17 +532,19 @@ def _start_worker(
             name in this process yet.
         steps: see :class:`_Roller`.
     """
+    global _roller, _plugins
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
     # One software-rendering thread per process is faster than several; it must be set before GL loads.
     os.environ.setdefault("LP_NUM_THREADS", "1")
     torch.set_num_threads(1)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    _HERE.update(roller=_Roller(factories, steps), plugins=plugins)
+    _roller, _plugins = _Roller(factories, steps), plugins
 
 
-def _work(plan: Mapping[str, Any], slot: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    load_again(_HERE.pop("plugins", ()))
-    return _HERE["roller"].roll(plan, slot)
+def _work(plan: Mapping[str, Any], slot: int) -> bytes:
+    load_again(_plugins)
+    # As bytes: torch would send tensors as open files, which are gone with the process.
+    return pickle.dumps(_roller.roll(plan, slot))
 
 
 def _exit_with_parent() -> None:

@@ -14,7 +14,7 @@ from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
 from torchrl.envs.transforms import Transform
 
 from crptpro.artifact import require_disk
-from crptpro.data.storage import Column, RingStorage, gather_stacks, map_column, read_rows, stack_rows
+from crptpro.data.storage import RingStorage, gather_stacks, map_rows, read_rows, stack_rows
 from crptpro.errors import DatasetError
 from crptpro.values import as_float, as_int, as_path
 
@@ -160,19 +160,9 @@ class FrameReplay(ReplayBuffer):
         )
 
     @property
-    def capacity(self) -> int:
-        """Most transitions that can be sampled."""
-        return self._storage.max_size
-
-    @property
     def window(self) -> int:
         """Frames that the observations of samples, and the newest one, lie among; their numbers differ modulo this."""
         return self._storage.window
-
-    @property
-    def slack(self) -> int:
-        """Frames that may be written after a checkpoint before it is worthless."""
-        return self._storage.slack
 
     @property
     def frames_written(self) -> int:
@@ -199,10 +189,6 @@ class FrameReplay(ReplayBuffer):
         """
         with self._replay_lock:
             return self._storage.observations(numbers)
-
-    def flush(self) -> None:
-        """Write a ring on disk through to it; only a crash of the machine makes a difference."""
-        self._storage.flush()
 
     def state_dict(self) -> dict[str, Any]:
         """Return a few counters (ring on disk) or the whole content (ring in RAM); the generator is the caller's."""
@@ -280,28 +266,21 @@ class StoredReplay:
     """
 
     def __init__(self, path: str | Path, *, frame_stack: int = 3) -> None:
-        self.path, self.frame_stack = Path(path), frame_stack
-        self.rows = self._size("number") // 8
-        size = math.isqrt(self._size("pixels") // (3 * max(self.rows, 1)))
-        if not self.rows or 3 * size * size * self.rows != self._size("pixels"):
-            raise DatasetError(f"{self.path} holds no square RGB frames; it is damaged, or no replay.")
-        self._frames = self._map("pixels", "uint8", (3, size, size))
-        number, row_of = self._map("number", "int64", ()), self._map("row_of", "int64", ())
-        self._step = self._map("step", "int32", ())
-        # A row's number is one more than the frames written before it, 0 where none was; frames follow one another.
-        written = (number[number > 0] - 1).sort().values
-        if len(written) and int(written[-1] - written[0]) + 1 != len(written):
-            raise DatasetError(f"{self.path} has lost rows in the middle; explore again.")
-        # Transitions that the ring has forgotten, and rows of the file that none was written to, point elsewhere.
-        starts = row_of.unique()
-        starts = starts[(starts > 0) | (row_of[0] == 0)]
-        starts = starts[torch.isin(starts, written) & torch.isin(starts + 1, written)]
-        step = self._step[starts % self.rows].long()
-        goes_on = self._step[(starts + 1) % self.rows] == step + 1
-        is_whole = starts - torch.clamp(step, max=frame_stack - 1) >= written[:1]
-        self._starts = starts[goes_on & is_whole]
+        path = as_path(path)
+        number, row_of = (map_rows(path / f"{name}.memmap", torch.int64, ()) for name in ("number", "row_of"))
+        self._step = map_rows(path / "step.memmap", torch.int32, ())
+        self._rows, self._frame_stack = len(number), frame_stack
+        size = math.isqrt((path / "pixels.memmap").stat().st_size // (3 * self._rows))
+        self._frames = map_rows(path / "pixels.memmap", torch.uint8, (3, size, size), self._rows)
+        # `number` counts from 1. Transitions that were overwritten, and rows never written (0), point elsewhere.
+        end = int(number.max())
+        oldest = max(0, end - self._rows)
+        starts = torch.cat([row_of[:1], row_of[row_of > 0]]).unique()
+        starts = starts[(starts >= oldest) & (starts + 1 < end)]
+        age = self._step[starts % self._rows].clamp(max=frame_stack - 1)
+        self._starts = starts[starts - age >= oldest]
         if not len(self._starts):
-            raise DatasetError(f"The replay in {self.path} has no transition.")
+            raise DatasetError(f"The replay in {path} has no transition.")
 
     def __len__(self) -> int:
         """Return how many transitions it holds."""
@@ -310,20 +289,8 @@ class StoredReplay:
     def observations(self, index: Tensor) -> Tensor:
         """Return the observations of transitions ``[B]``, 0 being the oldest, uint8 ``[B, k * 3, H, W]``."""
         numbers = self._starts[index]
-        rows = stack_rows(numbers, self._step[numbers % self.rows], self.frame_stack)
-        return gather_stacks(self._frames, rows % self.rows)
-
-    def _size(self, name: str) -> int:
-        try:
-            return (self.path / f"{name}.memmap").stat().st_size
-        except OSError:
-            raise DatasetError(
-                f"{self.path} holds no replay: {name}.memmap is missing. It is what an exploring run leaves behind; "
-                "explore again if it was removed."
-            ) from None
-
-    def _map(self, name: str, dtype: str, shape: tuple[int, ...]) -> Tensor:
-        return map_column(self.path / f"{name}.memmap", Column("frames", (name,), dtype, shape), self.rows)
+        rows = stack_rows(numbers, self._step[numbers % self._rows], self._frame_stack)
+        return gather_stacks(self._frames, rows % self._rows)
 
 
 def as_it_is(sample: TensorDictBase) -> TensorDictBase:

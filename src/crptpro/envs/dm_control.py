@@ -303,16 +303,6 @@ class DMControlPixelEnv(CheckedWorld, DMControlWrapper):
     the camera (:class:`AgentSteps`), actions and rewards are float32, and a seed does not reset the world.
     """
 
-    def draw_state(self, qpos: np.ndarray, qvel: np.ndarray) -> Tensor:
-        """Return the frame of a state, uint8 ``[3, H, W]``; the episode continues from there.
-
-        What a task draws at its reset and keeps in the model (targets, terrain, colours) stays as it is.
-        """
-        physics = self._env.physics
-        physics.data.qpos[:], physics.data.qvel[:] = qpos, qvel
-        physics.forward()
-        return self._env.draw()
-
     def _check_kwargs(self, kwargs: dict[str, Any]) -> None:
         if not isinstance(kwargs["env"], dm_env.Environment):
             raise TypeError(f"env must be a dm_env.Environment, got {type(kwargs['env']).__name__}.")

@@ -44,7 +44,6 @@ KINDS = {
     "explored": "encoders trained while exploring",
     "finetuned": "fine-tuned encoders",
     "run": "downstream runs",
-    "redrawn": "observations in other colours",
     "probe": "state probes",
     "timing": "timings, alone on the machine",
     "prototypes": "prototype measurements",
@@ -223,38 +222,18 @@ def downstream_job(
     return Job("run", title, tuple(command), about, needs, domain_definition(task))
 
 
-def redraw_job(dataset: Job, colors: str, samples: int, seed: int = 0) -> Job:
-    """Return the observations that probes of a dataset read, drawn in other colours, in ``<job>/frames``."""
-    command = ["measure", "redrawn", dataset_of(dataset), "--out", OWN]
-    command += options(colors=colors, samples=samples, seed=seed)
-    facts = {"domain": dataset.facts["domain"], "colors": colors, "samples": samples, "seed": seed}
-    title = f"{facts['domain']} {colors} seed {dataset.facts['seed']}"
-    return Job("redrawn", title, tuple(command), facts, (dataset,))
-
-
 def probe_job(
-    encoder: Job,
-    dataset: Job,
-    *,
-    colors: str = "normal",
-    samples: int = 2_000,
-    seed: int = 0,
-    at_updates: int | None = None,
+    encoder: Job, dataset: Job, *, samples: int = 2_000, seed: int = 0, at_updates: int | None = None
 ) -> Job:
     """Return the state probe of an encoder on a domain, ``<job>/probe.csv``; of a snapshot if `at_updates` says so."""
     command = ["probe", encoder_of(encoder, at_updates), dataset_of(dataset), "--csv", f"{OWN}/probe.csv"]
     command += options(samples=samples, seed=seed)
-    needs = [encoder, dataset]
-    if colors != "normal":
-        needs.append(redraw_job(dataset, colors, samples, seed))
-        command += ["--redrawn", f"{{{needs[-1].key}}}/frames"]
     domain, method = dataset.facts["domain"], encoder.facts["method"]
-    facts = {"method": method, "encoder_seed": encoder.facts["seed"], "domain": domain, "colors": colors}
+    facts = {"method": method, "encoder_seed": encoder.facts["seed"], "domain": domain, "colors": "normal"}
     facts |= {"samples": samples, "seed": seed, "at_updates": at_updates}
     when = "" if at_updates is None else f" at {at_updates}"
     title = f"{method} seed {encoder.facts['seed']}{when} on {domain}"
-    title += "" if colors == "normal" else f" {colors}"
-    return Job("probe", title, tuple(command), facts, tuple(needs))
+    return Job("probe", title, tuple(command), facts, (encoder, dataset))
 
 
 def prototypes_job(encoder: Job) -> Job:
@@ -519,8 +498,6 @@ def bytes_of(job: Job) -> tuple[int, int]:
     facts = job.facts
     if job.kind == "dataset":
         return facts["transitions"] * FRAME_BYTES, 0
-    if job.kind == "redrawn":
-        return 3 * facts["samples"] * FRAME_BYTES, 0
     if job.kind in ("encoder", "finetuned"):
         return ENCODER_BYTES * (1 + len(facts.get("snapshots", ()))), CHECKPOINT_BYTES
     if job.kind == "explored":

@@ -626,10 +626,9 @@ def _probe(request: Request) -> list[Cell]:
                 if trained is None or method == NO_BONUS:
                     continue  # no encoder of its own
                 data = dataset(scale, domain, seed, scale.probe_transitions)
-                for colors in ("normal", request.colors):
-                    job = probe_job(trained, data, colors=colors, samples=scale.probe_samples)
-                    place = {"group": group, "domain": domain, "colors": colors, "encoder_seed": seed}
-                    found.append(Cell(method, job, place))
+                job = probe_job(trained, data, samples=scale.probe_samples)
+                place = {"group": group, "domain": domain, "colors": "normal", "encoder_seed": seed}
+                found.append(Cell(method, job, place))
     return found
 
 

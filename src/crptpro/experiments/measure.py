@@ -16,12 +16,10 @@ from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 from tyro.conf import OmitSubcommandPrefixes, Positional, UseAppendAction, arg, subcommand
 
 from crptpro.artifact import read_json, write_json, write_whole
 from crptpro.errors import RecordError
-from crptpro.values import Colors
 
 PROTOTYPE_METRICS = {
     "kne_3": "prototype_kne_3", "kne_half": "prototype_kne_half", "ane": "prototype_ane",
@@ -78,22 +76,18 @@ def probe_rows(
     dataset: Any,
     *,
     encoder: str,
-    colors: Colors = "normal",
     samples: int = 2_000,
     seed: int = 0,
-    drawn: Any = None,
 ) -> tuple[list[dict[str, str]], list[dict[str, Any]]]:
-    """Probe an encoder on a dataset in some colours.
+    """Probe an encoder on a dataset.
 
     Args:
         pretrained: a :class:`~crptpro.pretrained.Pretrained` whose features, and projections if it has a projector, are
             read. The untrained control is given an untrained projector, so that z has one too.
         dataset: a :class:`~crptpro.data.FrameDataset` with physical state.
         encoder: what the encoder is called in the rows.
-        colors: in which the observations are drawn, whatever the dataset's own.
         samples: drawn from the dataset.
         seed: of the draw.
-        drawn: frames of the dataset in these colours that were drawn before.
 
     Returns:
         A row per embedding for people, and every number by :data:`PROBE_COLUMNS`.
@@ -108,13 +102,12 @@ def probe_rows(
         dataset,
         samples=samples,
         seed=seed,
-        colors=colors,
         joints=joints_of(dataset.card["task"]),
         frame_stack=pretrained.encoder.in_channels // 3,
-        drawn=drawn,
     )
     seen = "yes" if dataset.domain in domains_seen(pretrained.card) else "no"
-    about = {"method": pretrained.label, "domain": dataset.domain, "seen": seen, "colors": colors}
+    about = {"method": pretrained.label, "domain": dataset.domain, "seen": seen}
+    about["colors"] = dataset.card["colors"]
     counts = {"samples": len(observed.pixels), "held_out_episodes": observed.held_out_episodes, "seed": seed}
     projector = (
         _untrained_projector(pretrained) if pretrained.method == "random-encoder" else pretrained.projector
@@ -160,35 +153,6 @@ def domains_seen(card: Mapping[str, Any]) -> set[str]:
         seen |= {str(dataset.get("domain")) for dataset in training.get("datasets") or ()}
         training = training.get("previous_training")
     return seen
-
-
-@dataclass(frozen=True)
-class Redrawn:
-    """Draw the observations that probes of a dataset read in other colours, once for all encoders: OUT/frames."""
-
-    dataset: Positional[Path]
-    """with physical state"""
-    out: Path
-    """directory to write to"""
-    colors: Colors = "reversed_background"
-    """in which they are drawn"""
-    samples: int = 2_000
-    """observations of the probes"""
-    seed: int = 0
-    """of their draw"""
-
-    def run(self) -> None:
-        """Draw them."""
-        from crptpro.analysis.probe import probe_frame_rows
-        from crptpro.data import FrameDataset
-        from crptpro.data.redraw import DrawnFrames, redraw
-
-        dataset = FrameDataset.open(self.dataset)
-        rows = probe_frame_rows(
-            dataset, samples=self.samples, seed=self.seed, frame_stack=dataset.frame_stack
-        )
-        frames = redraw(dataset, rows, colors=self.colors)
-        DrawnFrames(dataset.domain, self.colors, rows, frames).save(self.out / "frames")
 
 
 @dataclass(frozen=True)
@@ -284,7 +248,8 @@ class CoverageOfData(_Comparison):
         rows = []
         for path, replay_path in zip(self.datasets, self.replays, strict=True):
             frame_stack = pretrained.encoder.in_channels // 3
-            random, replay = FrameDataset.open(path), self.replay(replay_path, frame_stack)
+            random = FrameDataset.open(path, frame_stack=frame_stack)
+            replay = self.replay(replay_path, frame_stack)
             total = decisions[random.domain]
             lost = total - len(replay)  # the oldest decisions, of a ring that went round
             for window in range(windows):
@@ -298,10 +263,8 @@ class CoverageOfData(_Comparison):
                     seed = derive_seed(self.seed, "coverage", source, random.domain, window)
                     order = torch.randperm(last - first, generator=torch.Generator().manual_seed(seed))
                     chosen = first + order[:samples].sort().values
-                    if source == "random":
-                        pixels = _observations(random, chosen, frame_stack)
-                    else:
-                        pixels = replay.observations(chosen - lost)
+                    is_random = source == "random"
+                    pixels = random[chosen]["pixels"] if is_random else replay.observations(chosen - lost)
                     points = embed_pixels(pretrained.encoder, pixels, projector=pretrained.projector)
                     rows.append(
                         {
@@ -315,14 +278,6 @@ class CoverageOfData(_Comparison):
                     )
         columns = ("source", "method", "domain", "env_steps", "coverage", "samples")
         write_rows(self.out / "coverage.csv", rows, columns)
-
-
-def _observations(dataset: Any, index: Tensor, frame_stack: int) -> Tensor:
-    """Observations before transitions of a dataset."""
-    from crptpro.data.storage import stack_rows
-
-    row, step = (dataset.transitions.get(name)[index] for name in ("row", "step"))
-    return dataset.frames_at(stack_rows(row, step, frame_stack)).flatten(1, 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -516,7 +471,6 @@ class Measure:
         | Annotated[CoverageOfData, subcommand("coverage")]
         | Annotated[PrincipalComponents, subcommand("embeddings")]
         | Annotated[Timing, subcommand("timing")]
-        | Annotated[Redrawn, subcommand("redrawn")]
     ]
 
     def run(self) -> None:
