@@ -115,13 +115,13 @@ def compare(domain: str, settings: Settings, work: Path) -> Iterator[tuple[str, 
         calls: dict[str, Callable[[], Any]] = {TORCHRL: lambda: next(stock)}
         ours = stack.enter_context(collector(own(physics_state=True), block))
         mixed = FrameDataset.create(work / "mixed", domain=domain, transitions=2**31)
-        stack.callback(mixed.close)
+        stack.callback(mixed.writer.close)
         calls[MIXED] = lambda: mixed.extend(next(ours))
         for name, quality in QUALITIES.items():
             env = own(quality=quality, physics_state=True)
             dataset = FrameDataset.create(work / quality, domain=domain, transitions=2**31)
             stack.callback(env.close)
-            stack.callback(dataset.close)
+            stack.callback(dataset.writer.close)
             calls[name] = functools.partial(collect_block, env, dataset, block)
         yield "collecting", timed(calls)
 
@@ -175,9 +175,9 @@ def collector(env: EnvBase, block: int, **options: Any) -> Iterator[Iterator[Any
 
 def collect_block(env: EnvBase, dataset: FrameDataset, transitions: int) -> None:
     """Collect one episode as ``collect_random`` does."""
-    seed = dataset.episodes
+    seed = dataset.writer.episodes
     dataset.extend(collect_episode(env, env_seed=seed, action_seed=seed, limit=transitions))
-    dataset.end_episode()
+    dataset.writer.end_episode()
 
 
 def time_workers(settings: Settings) -> dict[int, dict[str, Timing]]:

@@ -46,14 +46,7 @@ _AGAIN = "What was collected is kept: run the same command again"
 
 
 def collect_random(domain: str | Domain, root: str | Path, **options: Any) -> Path:
-    """Collect one domain's dataset with a uniform random policy, or continue an interrupted collection.
-
-    The paper (section "Decoupled random collection") takes b = 100,000 transitions per domain.
-
-    Args:
-        domain: as of :func:`collect_group`.
-        root: likewise.
-        **options: likewise.
+    """Collect one domain's dataset as :func:`collect_group` does.
 
     Returns:
         The dataset's directory, ``root/<domain name>``, ready for :meth:`crptpro.data.FrameDataset.open`.
@@ -75,22 +68,19 @@ def collect_group(
     camera: int | str | None = None,
     progress: bool = True,
 ) -> dict[str, Path]:
-    """Collect the datasets of several domains, one after the other, with one pool of processes.
+    """Collect the datasets of several domains with a uniform random policy, or continue interrupted collections.
 
-    Every episode has its own seeds, derived from ``seed``, the domain and the episode's index, so the same
-    seed gives the same actions and, on one machine and backend, the same pixels, whatever the number of
-    workers and however often the collection was interrupted. The dataset is episodes 0, 1, 2, ... until they
-    hold ``transitions`` transitions; the last one is cut to fit, and an endless one after 1000. A complete
-    dataset is returned at once.
+    The paper (section "Decoupled random collection") takes b = 100,000 transitions per domain. Every episode has its
+    own seeds, derived from ``seed``, the domain and the episode's index, so the same seed gives the same actions and,
+    on one machine and backend, the same pixels, whatever the number of workers and however often the collection was
+    interrupted. The last episode is cut to fit, and an endless one after 1000 transitions.
 
     With several workers the environments live in spawned processes, so a script needs the usual
     ``if __name__ == "__main__":``. A domain whose ``make`` no other process can import, because it was defined in a
     notebook for example, is collected in this one.
 
-    An episode is a rollout of ``RandomPolicy``, not a batch of a TorchRL ``Collector``: that one resets as soon as an
-    episode ends, before the next one's seeds are known, and steps on until its batch is full. With an environment
-    around it that answers both with zeros it took 2.1 times the CPU time per transition of a world that costs nothing,
-    and 8 % more with walker (84 x 84, software GL).
+    An episode is a rollout of ``RandomPolicy``, not a batch of a TorchRL ``Collector``, which resets before the next
+    episode's seeds are known; made to do this, it took 8 % more CPU time with walker (84 x 84, software GL).
 
     Args:
         domains: domain names, task names, letters of the paper's groups, ``gymnasium:<id>``, or
@@ -149,7 +139,7 @@ def collect_group(
             if dataset.is_complete:
                 logger.info("%s: %s is complete", domain.name, path)
                 continue
-            stack.callback(dataset.close)
+            stack.callback(dataset.writer.close)
             make = functools.partial(make_env, domain, seed=0, frame_stack=1, physics_state=True, **settings)
             length = episode_length(domain, action_repeat=settings["action_repeat"])
             jobs.append(_Collection(domain, dataset, make, seed, length))
@@ -178,10 +168,7 @@ def collect_episode(
         env_seed: of the simulator.
         action_seed: of the policy, which draws from torch's global generator.
         limit: transitions after which the episode is cut.
-        callback: as of TorchRL's ``rollout``: called at every step.
-
-    Returns:
-        The rollout ``[T]``.
+        callback: as of TorchRL's ``rollout``.
     """
     env.set_seed(env_seed)
     first = env.reset()
@@ -208,6 +195,7 @@ class _Collection:
         usual_length: int | None,
     ):
         self.domain, self.dataset, self.make, self.seed = domain, dataset, make, seed
+        self.writer: Any = dataset.writer
         self.usual_length = usual_length
         self.longest = max(LONGEST_EPISODE_AGENT_STEPS, usual_length or 0)
         self.running: set[int] = set()
@@ -216,15 +204,11 @@ class _Collection:
     @property
     def missing(self) -> int:
         """Transitions that are not durable yet."""
-        return self.dataset.target - len(self.dataset)
+        return self.writer.target - self.writer.transitions
 
     def next_plan(self, ahead: int) -> dict[str, Any] | None:
-        """Return the next episode worth starting, ``None`` while those under way are expected to suffice.
-
-        Args:
-            ahead: how many episodes may be under way beyond those that are durable.
-        """
-        first = index = self.dataset.episodes
+        """Return the next episode worth starting, at most ``ahead`` under way; ``None`` if those should suffice."""
+        first = index = self.writer.episodes
         wanted = limit = self.missing
         while index in self.running or index in self.waiting:
             known = len(self.waiting[index]) if index in self.waiting else None
@@ -248,14 +232,13 @@ class _Collection:
         self.running.discard(index)
         if self.dataset.is_complete:
             return
-        self.dataset.note_environment(card)
+        self.writer.note_environment(card)
         self.waiting[index] = rollout
-        while (episode := self.waiting.pop(self.dataset.episodes, None)) is not None:
+        while not self.dataset.is_complete and self.writer.episodes in self.waiting:
+            episode = self.waiting.pop(self.writer.episodes)
             self.usual_length = self.usual_length or len(episode)
             self.dataset.extend(episode)
-            self.dataset.end_episode()
-            if self.dataset.is_complete:
-                self.waiting.clear()
+            self.writer.end_episode()
 
 
 def _announce(jobs: list[_Collection], root: Path, image_size: int) -> None:
@@ -371,12 +354,7 @@ class _Pool:
             self._processes |= getattr(self._executor, "_processes", None) or {}
 
     def finished(self, running: Mapping[Future, tuple[_Collection, int, int]]) -> list[Future]:
-        """Wait a second for episodes.
-
-        Raises:
-            WorkerLostError: if a process died.
-            RenderingError: if all hang.
-        """
+        """Wait a second for episodes, and make sure that somebody works."""
         done = list(wait(running, 1.0, FIRST_COMPLETED).done)
         episodes = ", ".join(
             f"episode {episode} of {job.domain.name}" for job, episode, _ in running.values()
@@ -444,7 +422,7 @@ class _Progress:
 
     def __init__(self, job: _Collection, is_shown: bool):
         self.job, self._is_shown = job, is_shown
-        self._total, self._count = job.dataset.target, len(job.dataset)
+        self._total, self._count = job.writer.target, job.writer.transitions
         self._begun: tuple[float, int] | None = None
         self._bar = tqdm(
             total=self._total, initial=self._count, desc=job.domain.name, unit=" transitions", dynamic_ncols=True,
@@ -452,8 +430,8 @@ class _Progress:
         )  # fmt: skip
 
     def show(self, running: int) -> None:
-        waiting = sum(map(len, self.job.waiting.values()))
-        count, before = min(self._total, len(self.job.dataset) + waiting + running), self._count
+        running += self.job.writer.transitions + sum(map(len, self.job.waiting.values()))
+        count, before = min(self._total, running), self._count
         if count <= before:
             return
         self._count = count
@@ -477,12 +455,7 @@ class _Progress:
 
 
 class _Roller:
-    """Rolls out planned episodes, in the environment of one domain at a time.
-
-    Args:
-        factories: of environments, by domain.
-        steps: counts the transitions of the running episode, in the slot of its plan.
-    """
+    """Rolls out planned episodes, in the environment of one domain at a time; ``steps`` counts them in their slots."""
 
     def __init__(self, factories: Mapping[str, Callable[[], EnvBase]], steps: Any):
         self._factories, self._steps = factories, steps
@@ -524,14 +497,6 @@ _plugins: tuple[str, ...]
 def _start_worker(
     factories: Mapping[str, Callable[[], EnvBase]], plugins: tuple[str, ...], steps: Any
 ) -> None:
-    """Prepare a collecting process.
-
-    Args:
-        factories: of environments, by domain.
-        plugins: that the parent has loaded: what they register in other libraries, a world of Gymnasium's say, has no
-            name in this process yet.
-        steps: see :class:`_Roller`.
-    """
     global _roller, _plugins
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
     # One software-rendering thread per process is faster than several; it must be set before GL loads.
@@ -542,7 +507,7 @@ def _start_worker(
 
 
 def _work(plan: Mapping[str, Any], slot: int) -> bytes:
-    load_again(_plugins)
+    load_again(_plugins)  # a world that they register in Gymnasium has no name in this process yet
     # As bytes: torch would send tensors as open files, which are gone with the process.
     return pickle.dumps(_roller.roll(plan, slot))
 

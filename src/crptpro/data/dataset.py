@@ -42,17 +42,16 @@ class FrameDataset(ReplayBuffer):
     (``step``), and ``number``, ``("next", "number")``: the rows of the observations' newest frames, which
     :meth:`observations` reads. A pair never crosses an episode.
 
-    Frames are mapped from disk without write access, so several processes can open one dataset at once, and threads may
-    sample one object.
-
-    :meth:`open` reads a finished dataset; :meth:`create` begins one, or continues it, and :meth:`extend` fills it with
-    what a random policy, or any other, does::
+    Frames are mapped from disk without write access: several processes can open one dataset, threads may sample one
+    object. :meth:`open` reads a finished dataset; :meth:`create` begins or continues one, and ``extend`` fills it::
 
         dataset = FrameDataset.create("data/mine", domain="mine", transitions=10_000)
         for rollout in Collector(env, RandomPolicy(env.full_action_spec), frames_per_batch=100, total_frames=-1):
             dataset.extend(rollout)
             if dataset.is_complete:
                 break
+
+    ``extend`` takes what :class:`~crptpro.data.FrameReplay` takes, but each episode must begin at its reset.
 
     Args:
         storage: what to read.
@@ -72,10 +71,11 @@ class FrameDataset(ReplayBuffer):
         transform: Transform | None = None,
         **kwargs: Any,
     ):
+        batch_size = None if batch_size is None else as_int(batch_size, "batch_size", minimum=1)
         parts = {"sampler": RandomSampler(), "writer": ImmutableDatasetWriter(), "collate_fn": as_it_is}
         super().__init__(
             storage=storage,
-            batch_size=None if batch_size is None else as_int(batch_size, "batch_size", minimum=1),
+            batch_size=batch_size,
             generator=generator,
             transform=transform,
             **parts | kwargs,
@@ -109,9 +109,9 @@ class FrameDataset(ReplayBuffer):
             path: its directory.
             domain: the domain's name.
             transitions: after which it is complete, and can be sampled; the last episode is cut to fit.
-            frame_stack: k, frames per stack, of this object's samples.
-            **about: further facts of the card that two attempts must agree in, such as ``task``, ``seed``,
-                ``action_repeat``, ``quality``.
+            frame_stack: k, frames per stack.
+            **about: further facts of the card that two attempts must agree in: ``task``, ``seed``, ``action_repeat``,
+                ``quality``, ...
 
         Raises:
             DatasetError: if the directory holds something else, or another process is writing there.
@@ -121,13 +121,11 @@ class FrameDataset(ReplayBuffer):
         for name in request.keys() & {"transitions", "seed", "action_repeat", "image_size"}:
             request[name] = as_int(request[name], name, minimum=0 if name == "seed" else 1)
         if not (path / CARD_FILE).exists():
-            writer = _EpisodeWriter(path, request)
-            if not writer.is_complete:
+            writer = EpisodeWriter(path, request)
+            if not (path / CARD_FILE).exists():
                 return cls(FrameStorage(path, frame_stack), writer=writer)
         _require_request(path, read_card(path)["request"], request, "holds a dataset")
         return cls.open(path, frame_stack=frame_stack)
-
-    # --- reading
 
     def observations(self, numbers: Tensor) -> Tensor:
         """Return observations by the number of their newest frame, uint8 ``[B, k * C, H, W]``."""
@@ -137,6 +135,11 @@ class FrameDataset(ReplayBuffer):
     def card(self) -> dict[str, Any]:
         """The dataset's card; empty while it is being collected."""
         return self._storage.card
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all transitions that were asked for are there."""
+        return bool(self.card)
 
     @property
     def path(self) -> Path:
@@ -168,77 +171,12 @@ class FrameDataset(ReplayBuffer):
         """All transition rows without pixels, TensorDict ``[N]``."""
         return self._storage.transitions
 
-    # --- writing
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether all transitions that were asked for are there."""
-        return bool(self.card)
-
-    @property
-    def target(self) -> int:
-        """Transitions that make it complete."""
-        return len(self) if self.is_complete else self._writer.target
-
-    @property
-    def episodes(self) -> int:
-        """Whole episodes, all of them durable."""
-        return self.card["episodes"] if self.is_complete else self._writer.episodes
-
-    def extend(self, data: TensorDictBase, **kwargs: Any) -> Tensor:
-        """Append transitions in temporal order; an episode is durable once it has ended.
-
-        What makes an episode is as in :class:`~crptpro.data.FrameReplay`, but each must begin at a reset. Transitions
-        beyond those that were asked for are left out.
-
-        Args:
-            data: TensorDict ``[T]`` or ``[]`` of one environment.
-            **kwargs: as of TorchRL.
-
-        Returns:
-            The indices of the transitions that became durable, int64.
-
-        Raises:
-            DatasetError: if the dataset is finished, an episode has other shapes, or the files cannot be written.
-            DiskSpaceError: if the disk is full; whole episodes are kept.
-            ValueError: for entries that are missing or of another shape.
-            NonFiniteError: for a reward or an action that is NaN or infinite.
-        """
-        if self.is_complete:
-            raise DatasetError(f"{self.path} is complete and read-only; collect another one.")
-        return super().extend(data, **kwargs)
-
-    def add(self, data: TensorDictBase) -> Tensor:
-        """Append one transition; see :meth:`extend`."""
-        return self.extend(data)
-
-    def end_episode(self) -> None:
-        """End the running episode, which the environment has not ended: its last transition is truncated."""
-        if not self.is_complete:
-            with self._replay_lock:
-                self._writer.end_episode()
-
-    def note_environment(self, card: Mapping[str, Any]) -> None:
-        """Note what renders the frames (``backend``, ``gl_renderer``, ...); the card lists it.
-
-        Raises:
-            DatasetError: if earlier episodes were rendered by another backend or renderer.
-        """
-        if not self.is_complete:
-            self._writer.note_environment(dict(card))
-
-    def close(self) -> None:
-        """Release an unfinished dataset, which can be continued later."""
-        if not self.is_complete:
-            self._writer.close()
-
 
 class FrameStorage(StackStorage):
     """The rows of a dataset, read-only; copies and other processes map the files anew.
 
-    The stack of transition i is made of rows ``row[i] - min(j, step[i])``, j = k-1 .. 0, and that of its
-    successor ends at ``row[i] + 1``; both lie inside the episode, because an episode of T transitions has T +
-    1 frames.
+    An episode of T transitions has T + 1 frames, so the frames of a transition and its successor are rows up to
+    ``row`` and ``row + 1`` of the same episode.
     """
 
     def __init__(self, path: Path, frame_stack: int, device: str | torch.device = "cpu"):
@@ -250,18 +188,12 @@ class FrameStorage(StackStorage):
     def load(self) -> FrameStorage:
         """Map the files of a complete dataset."""
         card = read_card(self.path)
-        rows = {
-            "frames": TensorDict({}, [card["frames"]]),
-            "transitions": TensorDict({}, [card["transitions"]]),
-        }
+        parts = {name: TensorDict({}, [card[name]]) for name in ("frames", "transitions")}
         for name, (dtype, shape) in card["columns"].items():
             part, *key = name.split("/")
-            values = map_rows(self.path / f"{name}.memmap", getattr(torch, dtype), shape, len(rows[part]))
-            rows[part].set(tuple(key), values)
-        self.frames, self.transitions = (
-            rows["frames"],
-            rows["transitions"].clone(),
-        )  # the latter: a few MB, in RAM
+            values = map_rows(self.path / f"{name}.memmap", getattr(torch, dtype), shape, len(parts[part]))
+            parts[part].set(tuple(key), values)
+        self.frames, self.transitions = parts["frames"], parts["transitions"].clone()  # a few MB, in RAM
         if self.device.type != "cpu":
             self.frames, self.transitions = self.frames.to(self.device), self.transitions.to(self.device)
         self.max_size, self.card, self.pixels = len(self.transitions), card, self.frames["pixels"]
@@ -273,20 +205,16 @@ class FrameStorage(StackStorage):
         return self.max_size
 
     def get(self, index: Any, **how: Any) -> TensorDict:
-        """See the base class."""
+        """Return transitions by index; see the base class."""
         if not self.card:
             raise DatasetError(f"{self.path} is being collected: it can be read once it is complete.")
         return super().get(index, **how)
 
     def columns_at(self, index: Tensor, **how: Any) -> TensorDict:
-        """See the base class."""
+        """Return everything but pixels; see the base class."""
         columns = self.transitions.apply(lambda column: column.index_select(0, index), batch_size=index.shape)
         number = columns.pop("row")
         return columns.set("number", number).set(("next", "number"), number + 1)
-
-    def held(self) -> range:
-        """See the base class."""
-        return range(len(self.pixels))
 
     def _empty(self) -> None:
         self.set()
@@ -319,100 +247,110 @@ def _load(path: Path, frame_stack: int, device: str) -> FrameStorage:
     return FrameStorage(path, frame_stack, device).load()
 
 
-class _EpisodeWriter(ImmutableDatasetWriter):
+class EpisodeWriter(ImmutableDatasetWriter):
     """Appends episodes 0, 1, 2, ... to a directory until they hold the transitions asked for.
 
-    The rows of an episode are on the disk before ``collection.json`` counts them. What a kill left behind them is cut
-    off when the next episode is written. As long as no episode is durable, another request takes this one's place: one
-    that was refused or failed never blocks the corrected one.
+    The rows of an episode are on the disk before ``collection.json`` counts them; what a kill left behind them is cut
+    off when the next episode is written. As long as no episode is durable, another request takes this one's place.
+
+    Args:
+        path: the directory, which is locked until the dataset is complete or :meth:`close` is called.
+        request: facts of the card; ``transitions`` is the number to reach.
     """
 
     def __init__(self, path: Path, request: dict[str, Any]):
         super().__init__()
         self.path, self.request, self.target = path, request, request["transitions"]
-        self.state: dict[str, Any] = {
-            "format": FORMAT,
-            "version": VERSION,
-            "request": request,
-            "columns": {},
-            "transitions": 0,
-            "episodes": 0,
-            "sessions": [],
-        }
-        self.pending: list[Rows] = []
+        self.state: dict[str, Any] = {"format": FORMAT, "version": VERSION, "request": request, "columns": {}}
+        self.state |= {"transitions": 0, "episodes": 0, "sessions": []}
+        self._pending: list[Rows] = []
         self._has_noted = False
-        if path.exists() and not (path / COLLECTION_FILE).exists():
-            # The lock, and half a collection.json, are what a kill at the very start leaves.
-            ours = (".lock", f".{COLLECTION_FILE}.")
-            if any(not item.name.startswith(ours) for item in path.iterdir()):
-                raise DatasetError(
-                    f"{path} is not empty and not a collection. Choose another directory or empty it."
-                )
+        # The lock, and half a collection.json, are what a kill at the very start leaves.
+        found = [each for each in path.glob("*") if each.name != ".lock" and each.suffix != ".partial"]
+        if found and path / COLLECTION_FILE not in found:
+            raise DatasetError(
+                f"{path} is not empty and not a collection. Choose another directory or empty it."
+            )
         self._lock = DirectoryLock(path, error=DatasetError)
         try:
             if not (path / CARD_FILE).exists():  # another process may have finished it just now
                 self._resume()
-            self.is_complete = (path / CARD_FILE).exists()
         except BaseException:
             self.close()
             raise
-        if self.is_complete:
+        if (path / CARD_FILE).exists():
             self.close()
 
     @property
     def transitions(self) -> int:
+        """Durable transitions."""
         return self.state["transitions"]
 
     @property
     def episodes(self) -> int:
+        """Durable episodes."""
         return self.state["episodes"]
 
     @property
-    def taken(self) -> int:
-        """Transitions that are durable or wait for their episode's end."""
-        return self.transitions + sum(len(part.following) for part in self.pending)
+    def _taken(self) -> int:
+        return self.transitions + sum(len(part.following) for part in self._pending)
 
     def extend(self, data: TensorDictBase) -> Tensor:
-        """Take transitions; see :meth:`FrameDataset.extend`."""
+        """Take transitions of one environment in temporal order, as :class:`~crptpro.data.FrameReplay` does.
+
+        Those beyond the ones asked for are left out.
+
+        Returns:
+            The indices of the transitions that became durable, int64.
+
+        Raises:
+            DatasetError: if the dataset is complete, an episode has other shapes, or the files cannot be written.
+            DiskSpaceError: if the disk is full; whole episodes are kept.
+            ValueError: for entries that are missing or of another shape.
+            NonFiniteError: for a reward or an action that is NaN or infinite.
+        """
         before, storage = self.transitions, self._storage
+        if before >= self.target:
+            raise DatasetError(f"{self.path} is complete and read-only; collect another one.")
         channels = self.state["columns"]["frames/pixels"][1][0] if before else 3
         state: list[Any] = [name for name in ("qpos", "qvel") if name in data and data.get(name).shape[-1]]
         state += [("next", name) for name in state]
         rows = read_rows(
             data, channels=channels, frame_stack=storage.frame_stack, extra=state, what="A dataset"
         )
-        rows = rows.part(0, self.target - self.taken)
-        last = self.pending[-1].following[-1] if self.pending else None
-        for begins, part in rows.pieces(last):
+        last = self._pending[-1].following[-1] if self._pending else None
+        for begins, part in rows.part(0, self.target - self._taken).pieces(last):
             if begins:
                 self.end_episode()
                 if len(part.first_frames()) > 1:
                     raise ValueError(
                         "An episode of a dataset begins at its reset, with a stack of one frame."
                     )
-            self.pending.append(part)
-            if part.columns["done"][-1] or self.taken == self.target:
+            self._pending.append(part)
+            if part.columns["done"][-1] or self._taken == self.target:
                 self.end_episode()
         return torch.arange(before, self.transitions, device="cpu")
 
+    add = extend
+
     def end_episode(self) -> None:
-        """Write the episode that has been taken; it is durable when this returns."""
-        if not self.pending:
+        """Write the running episode; if the environment has not ended it, its last transition is truncated."""
+        if not self._pending:
             return
         columns = self._pending_columns()
-        self.pending = []
+        self._pending = []
         described = {name: [str(values.dtype), list(values.shape[1:])] for name, values in columns.items()}
         if self.episodes and described != self.state["columns"]:
             raise DatasetError(
                 f"{self.path} holds rows of {self.state['columns']}, but episode {self.episodes} brings {described}. "
                 "Collect it into another directory."
             )
-        length = len(columns["transitions/row"])
+        total = self.transitions + len(columns["transitions/row"])
         try:
             for name, values in columns.items():
                 rows = self.transitions + (self.episodes if name.startswith("frames/") else 0)
                 _append(self.path / f"{name}.memmap", values, rows)
-            self._save(columns=described, transitions=self.transitions + length, episodes=self.episodes + 1)
+            self._save(columns=described, transitions=total, episodes=self.episodes + 1)
         except (OSError, DiskSpaceError) as reason:
             if not is_disk_full(reason):
                 raise DatasetError(f"{self.path} cannot be written: {reason}.") from reason
@@ -420,12 +358,17 @@ class _EpisodeWriter(ImmutableDatasetWriter):
                 f"The disk under {self.path} is full after {self.transitions} transitions ({self.episodes} whole "
                 "episodes), which are kept. Free space and run the same command again."
             ) from reason
-        self._storage.max_size = self.transitions
-        if self.transitions >= self.target:
+        self._storage.max_size = total
+        if total >= self.target:
             self._finish()
             self._storage.load()  # read back once before anybody is told that it is there
 
-    def note_environment(self, card: dict[str, Any]) -> None:
+    def note_environment(self, card: Mapping[str, Any]) -> None:
+        """Note what renders the frames (``backend``, ``gl_renderer``, ...) for the card.
+
+        Raises:
+            DatasetError: if earlier episodes were rendered by another backend or renderer.
+        """
         sessions = self.state["sessions"]
         for name, label in (("backend", "render backend"), ("gl_renderer", "GL renderer")):
             before = sessions[-1]["render"].get(name) if sessions else None
@@ -437,32 +380,32 @@ class _EpisodeWriter(ImmutableDatasetWriter):
                     f"{self.path} was begun with the {label} {before!r}, now it is {card[name]!r}: their pixels "
                     f"differ. {remedy}, or remove the directory to begin anew."
                 )
-        if self._has_noted:
-            return
-        self._has_noted = True
-        if sessions and sessions[-1]["versions"] != versions():
-            logger.warning("%s is continued with other package versions; its card lists both.", self.path)
-        self._save(sessions=[*sessions, {"versions": versions(), "render": card}])
+        if not self._has_noted:
+            self._has_noted = True
+            if sessions and sessions[-1]["versions"] != versions():
+                logger.warning("%s is continued with other package versions; its card lists both.", self.path)
+            self._save(sessions=[*sessions, {"versions": versions(), "render": dict(card)}])
 
     def close(self) -> None:
-        """Release the lock; calling it twice is harmless."""
+        """Free the directory; an unfinished dataset can be continued later."""
         self._lock.release()
 
     def _pending_columns(self) -> dict[str, np.ndarray]:
-        """Return the rows of the episode that has been taken, by file."""
-        parts = self.pending
+        """Return the rows of the running episode by file."""
+        parts = self._pending
 
         def whole(name: Any) -> np.ndarray:
             return torch.cat([part.columns[name] for part in parts]).numpy()
 
-        frames = torch.cat([parts[0].newest[:1], *(part.following for part in parts)])
-        columns = {"frames/pixels": frames.numpy()}
+        columns = {
+            "frames/pixels": torch.cat([parts[0].newest[:1], *(part.following for part in parts)]).numpy()
+        }
         for name in ("qpos", "qvel"):
             if name in parts[0].columns:
                 values = np.concatenate([whole(name), whole(("next", name))[-1:]])
                 columns[f"frames/{name}"] = values.astype(np.float64)
         flags = {name: whole(name).copy() for name in ("done", "terminated", "truncated")}
-        if not flags["done"][-1, 0]:  # the environment did not end it
+        if not flags["done"][-1, 0]:
             flags["done"][-1] = flags["truncated"][-1] = True
         step = np.arange(len(flags["done"]))
         return columns | {
@@ -475,7 +418,7 @@ class _EpisodeWriter(ImmutableDatasetWriter):
         }
 
     def _resume(self) -> None:
-        for stale in self.path.glob(f".{COLLECTION_FILE}.*"):  # of a process that was killed: it had the lock
+        for stale in self.path.glob(".*.partial"):  # of a process that was killed: it had the lock
             stale.unlink(missing_ok=True)
         file = self.path / COLLECTION_FILE
         state = read_json(file, error=DatasetError) if file.exists() else self.state
@@ -487,9 +430,9 @@ class _EpisodeWriter(ImmutableDatasetWriter):
             self._save()
             return
         _require_request(self.path, state["request"], self.request, "was begun")
-        self.state = state
         for path, expected in _sizes(self.path, state).items():
             require_size(path, min(expected, path.stat().st_size if path.exists() else 0), expected)
+        self.state = state | {"request": self.request}
         logger.info(
             "%s: continuing after %d of %d transitions", self.path.name, self.transitions, self.target
         )
@@ -497,21 +440,15 @@ class _EpisodeWriter(ImmutableDatasetWriter):
             self._finish()
 
     def _save(self, **changes: Any) -> None:
-        state = self.state | changes
-        write_json(self.path / COLLECTION_FILE, state)
-        self.state = state
+        write_json(self.path / COLLECTION_FILE, self.state | changes)
+        self.state |= changes
 
     def _finish(self) -> None:
         """Write the card, which is the mark of a complete dataset, and release everything."""
         sessions = self.state["sessions"]
-        card = {
-            "image_size": self.state["columns"]["frames/pixels"][1][-1],
-            **self.request,
-            **self.state,
-            "frames": self.transitions + self.episodes,
-            "render": sessions[-1]["render"] if sessions else {},
-            **provenance(),
-        }
+        card = {"image_size": self.state["columns"]["frames/pixels"][1][-1], **self.request, **self.state}
+        card |= {"frames": self.transitions + self.episodes, **provenance()}
+        card["render"] = sessions[-1]["render"] if sessions else {}
         write_json(self.path / CARD_FILE, card)
         self.close()
 
@@ -550,30 +487,22 @@ def _require_request(path: Path, found: dict[str, Any], request: dict[str, Any],
         )
 
 
-# --- cards -----------------------------------------------------------------------------------------------------------
-
-
-def read_card(path: str | Path) -> dict[str, Any]:
+def read_card(path: Path) -> dict[str, Any]:
     """Read and check a dataset's card against its files, without reading the frames.
 
     Raises:
         DatasetError: naming what is missing, unfinished, truncated or foreign.
     """
-    path = Path(path)
-    if not path.is_dir():
-        raise DatasetError(
-            f"{path} is not a directory. A dataset is made by collect_random or `crptpro collect`."
-        )
     file = path / CARD_FILE
     if not file.exists():
         raise DatasetError(_why_no_card(path))
     card = read_json(file, error=DatasetError)
-    for name, expected, what in (("format", FORMAT, "format"), ("version", VERSION, "format version")):
-        if card.get(name) != expected:
-            raise DatasetError(
-                f"{file}: its {what} is {card.get(name)!r}, this release reads {expected!r}. It is foreign, or of "
-                "another release: collect the dataset again."
-            )
+    found = (card.get("format"), card.get("version"))
+    if found != (FORMAT, VERSION):
+        raise DatasetError(
+            f"{file} has format {found[0]!r}, version {found[1]!r}; this release reads {FORMAT!r}, {VERSION}. "
+            "Collect the dataset again."
+        )
     try:
         sizes = _sizes(path, card)
         if card["frames"] != card["transitions"] + card["episodes"] or card["transitions"] < 1:
@@ -588,13 +517,14 @@ def read_card(path: str | Path) -> dict[str, Any]:
 
 
 def _why_no_card(path: Path) -> str:
-    collection = path / COLLECTION_FILE
-    if not collection.exists():
-        kinds = sorted(child.parent.name for child in path.glob(f"*/{CARD_FILE}"))
-        hint = f" Did you mean one of its datasets: {', '.join(kinds)}?" if kinds else ""
-        return f"{path} has no {CARD_FILE}: it is not a dataset.{hint}"
-    state = read_json(collection, error=DatasetError)
-    return (
-        f"{path} is unfinished: {state.get('transitions', 0)} of {state.get('request', {}).get('transitions')} "
-        "transitions are collected. Run the same collect command again to complete it."
-    )
+    if not path.is_dir():
+        return f"{path} is not a directory. A dataset is made by collect_random or `crptpro collect`."
+    if (path / COLLECTION_FILE).exists():
+        state = read_json(path / COLLECTION_FILE, error=DatasetError)
+        return (
+            f"{path} is unfinished: {state.get('transitions', 0)} of {state.get('request', {}).get('transitions')} "
+            "transitions are collected. Run the same collect command again to complete it."
+        )
+    kinds = sorted(child.parent.name for child in path.glob(f"*/{CARD_FILE}"))
+    hint = f" Did you mean one of its datasets: {', '.join(kinds)}?" if kinds else ""
+    return f"{path} has no {CARD_FILE}: it is not a dataset.{hint}"

@@ -301,8 +301,7 @@ def as_it_is(sample: TensorDictBase) -> TensorDictBase:
 class _RingWriter(ImmutableDatasetWriter):
     """Hands what a buffer is extended by to the ring, checked.
 
-    Reading and checking a TensorDict of one transition costs about 0.25 ms more than writing its tensors by hand did;
-    an agent step of walker takes 50 ms. A rollout costs 0.05 ms per transition.
+    Reading and checking a TensorDict of one transition costs about 0.25 ms; an agent step of walker takes 50 ms.
     """
 
     def __init__(self, extra: Mapping[str, tuple[tuple[int, ...], torch.dtype]]):
@@ -320,9 +319,7 @@ class _RingWriter(ImmutableDatasetWriter):
                 raise ValueError(f"This replay holds {name} of shape {expected}, got {got}.")
         return ring.write(rows)
 
-    def add(self, data: TensorDictBase) -> Tensor:
-        """Store one transition."""
-        return self.extend(data)
+    add = extend
 
     def _empty(self, empty_write_count: bool = True) -> None:
         pass
@@ -336,30 +333,28 @@ class _WindowSampler(RandomSampler):
     """
 
     def sample(self, storage: RingStorage, batch_size: int) -> tuple[Tensor, dict]:
-        n_step, length = storage.n_step, len(storage)
-        count = length - n_step + 1
-        if n_step == 1 or length == 0:
+        length = len(storage)
+        if storage.n_step == 1 or length == 0:
             return super().sample(storage, batch_size)
-        nothing = DatasetError(
-            f"None of the replay's {length} transitions is followed by enough of its own episode for n_step={n_step}: "
-            "use a smaller n_step, or let more be stored before the first update (random_agent_steps)."
-        )
-        if count < 1:
-            raise nothing
 
         def draw(among: int, number: int) -> Tensor:
             return torch.randint(among, (number,), generator=self._rng, device="cpu")
 
-        index = draw(count, batch_size)
-        for _ in range(_REDRAWS):
+        count = max(0, length - storage.n_step + 1)
+        index = draw(max(1, count), batch_size)
+        for _ in range(_REDRAWS if count else 0):
             misfits = (~storage.has_window(index)).nonzero().squeeze(-1)
             if not len(misfits):
                 return index, {}
             index[misfits] = draw(count, len(misfits))
-        every = torch.arange(count, device="cpu")
-        admissible = every[storage.has_window(every)]
+        admissible = torch.arange(count, device="cpu")
+        admissible = admissible[storage.has_window(admissible)]
         if not len(admissible):
-            raise nothing
+            raise DatasetError(
+                f"None of the replay's {length} transitions is followed by enough of its own episode for "
+                f"n_step={storage.n_step}: use a smaller n_step, or let more be stored before the first update "
+                "(random_agent_steps)."
+            )
         misfits = (~storage.has_window(index)).nonzero().squeeze(-1)
         index[misfits] = admissible[draw(len(admissible), len(misfits))]
         return index, {}

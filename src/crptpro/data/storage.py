@@ -32,13 +32,7 @@ _MAP_NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)
 
 
 def map_rows(path: Path, dtype: torch.dtype, shape: Sequence[int], rows: int | None = None) -> Tensor:
-    """Map a raw file of rows without write access: writing to the tensor leaves the file alone.
-
-    Args:
-        path: of the file.
-        dtype: of its numbers.
-        shape: of a row.
-        rows: how many it must hold; ``None`` takes what is there.
+    """Map a raw file of rows (as many as there are by default): writing to the tensor leaves the file alone.
 
     Raises:
         DatasetError: if the file is missing, empty, or of another size.
@@ -55,11 +49,7 @@ def map_rows(path: Path, dtype: torch.dtype, shape: Sequence[int], rows: int | N
 
 
 def require_size(path: Path, size: int, expected: int | None) -> None:
-    """Refuse a file of ``size`` bytes where ``expected`` belong.
-
-    Raises:
-        DatasetError: naming the file and both sizes.
-    """
+    """Refuse a file of ``size`` bytes where ``expected`` belong, with a DatasetError."""
     if expected is not None and size != expected:
         kind = "truncated" if size < expected else "longer than it should be"
         raise DatasetError(
@@ -156,14 +146,9 @@ def read_rows(
     extra: Sequence[NestedKey] = (),
     what: str = "A replay",
 ) -> Rows:
-    """Read what a TorchRL environment, rollout or collector hands out.
+    """Read what a TorchRL environment, rollout or collector hands out, ``[T]`` in temporal order or ``[]``.
 
-    Args:
-        data: batch ``[T]`` in temporal order, or ``[]``.
-        channels: C of a single frame.
-        frame_stack: k; ``pixels`` are single frames or stacks of k.
-        extra: further entries to read.
-        what: is being written, for messages.
+    ``pixels`` are single frames of so many channels or stacks of them; ``what`` is being written, for messages.
 
     Raises:
         ValueError: for entries that are missing or of another shape.
@@ -239,18 +224,10 @@ class StackStorage(Storage):
 
     def held(self) -> range:
         """Return the numbers of the frames that can be read."""
-        raise NotImplementedError
+        return range(len(self.pixels))
 
     def get(self, index: Any, **how: Any) -> TensorDict:
-        """Return transitions; 0 is the oldest.
-
-        Args:
-            index: an int, a slice, a mask, or integers of any shape.
-            **how: of :meth:`columns_at`.
-
-        Raises:
-            IndexError: if an index is out of range.
-        """
+        """Return transitions by an int, a slice, a mask, or integers of any shape; 0 is the oldest."""
         positions = self._positions(index)
         flat = positions.reshape(-1)
         sample = self.columns_at(flat, **how).set("index", flat)
@@ -317,16 +294,8 @@ class RingStorage(StackStorage):
     is among the newest ``capacity`` and all its frames are among the newest ``window`` rows. So a state from
     a moment ago needs no row that was overwritten since, as long as at most ``slack`` rows were.
 
-    Args:
-        capacity: most transitions that are valid at once.
-        window: rows that valid transitions may use.
-        slack: further rows, which only restoring needs.
-        columns: name to (shape, dtype) of every per-row quantity, ``pixels`` among them.
-        frame_stack: k, frames per stack.
-        root_columns: names that belong to a transition's observation; the others are returned under ``"next"``.
-        n_step: n, agent steps from an observation to the next one of a sample.
-        discount: gamma of the n-step return.
-        path: directory of the memory-mapped files; RAM if ``None``.
+    ``columns`` maps every per-row quantity to its shape and dtype; ``root_columns`` belong to the observation, the
+    others are returned under ``"next"``.
     """
 
     COUNTERS = ("frames", "transitions", "oldest", "episode_step", "is_open")
@@ -553,44 +522,34 @@ def n_step_return(rewards: Tensor, terminated: Tensor, discount: float) -> tuple
 
 
 def map_file(path: Path, size: int) -> mmap.mmap:
-    """Map a file whose bytes are reserved, making it or keeping what is in it.
-
-    Args:
-        path: of the file, in an existing directory.
-        size: bytes.
+    """Map a file of ``size`` bytes, which are reserved if it is new.
 
     Raises:
         CheckpointError: there is a file of another size.
         DiskSpaceError: the disk cannot hold it; nothing is left of what was reserved.
         OSError: naming the file, for any other reason.
     """
-    found = path.stat().st_size if path.exists() else 0
-    if found not in (0, size):
-        raise CheckpointError(
-            f"{path} has {found:,} bytes, this replay needs {size:,}: it belongs to a replay of another size. Use "
-            "the capacity and slack it was written with, or another directory."
-        )
-    # A new one has its name once it is whole: a kill while it is reserved leaves nothing that looks like rows.
-    partial = path.with_name(f".{path.name}.partial")
-    # Not by open(path, "a+b"): a file system that cannot reserve has glibc write instead, which it refuses to do in a
-    # file that is appended to.
-    handle = os.open(path if found else partial, os.O_RDWR | os.O_CREAT, 0o666)
-    try:
-        os.ftruncate(handle, found)  # drops what such a kill left, of whatever size
+    if not path.exists():
+        # It has its name once it is whole: a kill while it is reserved leaves nothing that looks like rows.
+        partial = path.with_name(f".{path.name}.partial")
         try:
-            # Reserved, not sparse: a disk that fills up later would end the process by a bus error.
-            os.posix_fallocate(handle, 0, size)
+            with open(partial, "w+b") as file:
+                # Reserved, not sparse: a disk that fills up later would end the process by a bus error.
+                os.posix_fallocate(file.fileno(), 0, size)
+            os.replace(partial, path)
         except OSError as reason:
-            os.ftruncate(handle, found)  # what was reserved before the disk was full
             if is_disk_full(reason) or reason.errno == errno.EFBIG:
                 raise DiskSpaceError(
                     f"{path} needs {size / 1e9:.2f} GB: {reason}. Free space, or choose another directory or a smaller "
                     "capacity."
                 ) from reason
             raise writing_error(path, reason) from reason
-        if not found:
-            os.replace(partial, path)
-        return mmap.mmap(handle, size)
-    finally:
-        os.close(handle)
-        partial.unlink(missing_ok=True)
+        finally:
+            partial.unlink(missing_ok=True)
+    with open(path, "r+b") as file:
+        if (found := os.fstat(file.fileno()).st_size) != size:
+            raise CheckpointError(
+                f"{path} has {found:,} bytes, this replay needs {size:,}: it belongs to a replay of another size. Use "
+                "the capacity and slack it was written with, or another directory."
+            )
+        return mmap.mmap(file.fileno(), size)
