@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from multiprocessing.connection import wait as wait_for_process
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,9 @@ logger = logging.getLogger(__name__)
 
 STALL_S = 300.0
 """Seconds without a step of any worker after which they count as hung."""
+
+Factories = Mapping[str, Callable[[], EnvBase]]
+"""Functions that make an environment, by domain."""
 
 _AGAIN = "What was collected is kept: run the same command again"
 
@@ -279,9 +282,9 @@ def _usable_workers(jobs: list[_Collection], workers: int) -> int:
 def _collect(jobs: list[_Collection], workers: int, progress: bool) -> None:
     factories = {job.domain.name: job.make for job in jobs}
     with ExitStack() as stack:
-        bars = [stack.enter_context(_Progress(job, progress)) for job in jobs]
+        bars = [stack.enter_context(closing(_Progress(job, progress))) for job in jobs]
         pool: Any = _Pool(factories, workers) if workers > 1 else _ThisProcess(factories)
-        stack.enter_context(pool)
+        stack.enter_context(closing(pool))
         running: dict[Future, tuple[_Collection, int, int]] = {}
         while any(not job.dataset.is_complete for job in jobs):
             for job in jobs:  # all workers on the first that needs one: each makes each environment once
@@ -299,7 +302,7 @@ def _collect(jobs: list[_Collection], workers: int, progress: bool) -> None:
 class _ThisProcess:
     """Collects where it is called."""
 
-    def __init__(self, factories: Mapping[str, Callable[[], EnvBase]]):
+    def __init__(self, factories: Factories):
         self.steps = [0]
         self._roller = _Roller(factories, self.steps)
 
@@ -312,17 +315,14 @@ class _ThisProcess:
     def finished(self, running: Mapping[Future, Any]) -> list[Future]:
         return list(running)
 
-    def __enter__(self) -> _ThisProcess:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self._roller.close()
 
 
 class _Pool:
     """Collects in spawned processes, never forked ones: a fork would share a GL context."""
 
-    def __init__(self, factories: Mapping[str, Callable[[], EnvBase]], workers: int):
+    def __init__(self, factories: Factories, workers: int):
         self._context = multiprocessing.get_context("spawn")
         self.workers, self.steps = workers, self._context.RawArray("q", workers)
         self._arguments = (factories, loaded_plugins(), self.steps)
@@ -389,10 +389,7 @@ class _Pool:
             )
         return WorkerLostError(f"A process that collected ({episodes}) {how}. {hint} {_AGAIN}.")
 
-    def __enter__(self) -> _Pool:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         # What still runs is no longer wanted, or has lost its parent's interest by an error or Ctrl-C.
         for process in self._processes.values():
             process.terminate()
@@ -444,10 +441,7 @@ class _Progress:
                 self.job.domain.name, f"{count:,}", f"{self._total:,}", rate, (self._total - count) / rate,
             )  # fmt: skip
 
-    def __enter__(self) -> _Progress:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self._bar.close()
 
 
@@ -457,9 +451,10 @@ class _Progress:
 class _Roller:
     """Rolls out planned episodes, in the environment of one domain at a time; ``steps`` counts them in their slots."""
 
-    def __init__(self, factories: Mapping[str, Callable[[], EnvBase]], steps: Any):
+    def __init__(self, factories: Factories, steps: Any):
         self._factories, self._steps = factories, steps
-        self._domain, self._env = "", None
+        self._domain = ""
+        self._env: Any = None
 
     def roll(self, plan: Mapping[str, Any], slot: int) -> tuple[dict[str, Any], TensorDictBase]:
         """Return the environment's card and the episode."""
@@ -494,9 +489,7 @@ _roller: _Roller
 _plugins: tuple[str, ...]
 
 
-def _start_worker(
-    factories: Mapping[str, Callable[[], EnvBase]], plugins: tuple[str, ...], steps: Any
-) -> None:
+def _start_worker(factories: Factories, plugins: tuple[str, ...], steps: Any) -> None:
     global _roller, _plugins
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
     # One software-rendering thread per process is faster than several; it must be set before GL loads.

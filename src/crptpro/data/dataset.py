@@ -370,15 +370,13 @@ class EpisodeWriter(ImmutableDatasetWriter):
             DatasetError: if earlier episodes were rendered by another backend or renderer.
         """
         sessions = self.state["sessions"]
-        for name, label in (("backend", "render backend"), ("gl_renderer", "GL renderer")):
-            before = sessions[-1]["render"].get(name) if sessions else None
-            if before is not None and card.get(name, before) != before:
-                remedy = f"Continue with MUJOCO_GL={before}"
-                if name != "backend":
-                    remedy = f"Continue on a machine where {card.get('backend', 'GL')} is this renderer"
+        before = sessions[-1]["render"] if sessions else {}
+        for name in ("backend", "gl_renderer"):
+            if before.get(name) is not None and card.get(name, before[name]) != before[name]:
                 raise DatasetError(
-                    f"{self.path} was begun with the {label} {before!r}, now it is {card[name]!r}: their pixels "
-                    f"differ. {remedy}, or remove the directory to begin anew."
+                    f"{self.path} was begun with the {name} {before[name]!r}, now it is {card[name]!r}: their pixels "
+                    f"differ. Continue with MUJOCO_GL={before.get('backend')} where it is that renderer, or remove "
+                    "the directory to begin anew."
                 )
         if not self._has_noted:
             self._has_noted = True
@@ -456,7 +454,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
 def _append(path: Path, values: np.ndarray, rows: int) -> None:
     """Write rows behind the first ``rows`` of a file, through to the disk."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    content = memoryview(np.ascontiguousarray(values).reshape(-1).view(np.uint8))
+    content = np.ascontiguousarray(values).reshape(-1).view(np.uint8).data
     with open(path, "ab", buffering=0) as file:
         file.truncate(rows * (values.nbytes // len(values)))
         while content:

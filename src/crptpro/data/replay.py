@@ -179,10 +179,7 @@ class FrameReplay(ReplayBuffer):
         self._storage.returns_pixels = value
 
     def observations(self, numbers: Tensor) -> Tensor:
-        """Return observations by the number of their newest frame, uint8 ``[B, frame_stack * C, H, W]``.
-
-        Args:
-            numbers: int64 ``[B]``.
+        """Return observations by number, int64 ``[B]``, as uint8 ``[B, frame_stack * C, H, W]``.
 
         Raises:
             DatasetError: if one of them is not in the ring, or no longer.
@@ -205,14 +202,7 @@ class FrameReplay(ReplayBuffer):
             self._storage.load_state_dict(state_dict["ring"])
 
 
-def stack_frames(
-    buffer: ReplayBuffer,
-    *,
-    frame_stack: int = 3,
-    batch_size: int | None = None,
-    generator: torch.Generator | None = None,
-    transform: Transform | None = None,
-) -> FrameReplay:
+def stack_frames(buffer: ReplayBuffer, *, frame_stack: int = 3, **options: Any) -> FrameReplay:
     """Turn a buffer of single frames, as most public data sets are, into one whose samples are stacks.
 
     Args:
@@ -220,9 +210,7 @@ def stack_frames(
             episodes: ``pixels`` and ``("next", "pixels")`` uint8 ``[C, H, W]``, ``action`` and
             ``("next", "reward" | "done")``.
         frame_stack: k, frames per stack.
-        batch_size: default of ``sample``.
-        generator: source of randomness; torch's global generator if ``None``.
-        transform: of samples.
+        **options: ``batch_size``, ``generator`` and ``transform`` of :class:`FrameReplay`.
 
     Returns:
         A copy in RAM, each frame once, that :func:`crptpro.training.pretrain` takes as a dataset.
@@ -243,9 +231,7 @@ def stack_frames(
         frame_shape=tuple(first["pixels"].shape[1:]),
         action_dim=first["action"].shape[-1],
         frame_stack=frame_stack,
-        batch_size=batch_size,
-        generator=generator,
-        transform=transform,
+        **options,
     )
     for begin in range(0, length, 1000):
         replay.extend(buffer[begin : begin + 1000])
@@ -255,11 +241,7 @@ def stack_frames(
 class StoredReplay:
     """The observations in the files of a :class:`FrameReplay`, oldest first, without writing to them.
 
-    A ring that went round holds the newest part alone; the files do not tell how much came before.
-
-    Args:
-        path: directory that was the replay's ``path``; nobody may be writing to it.
-        frame_stack: k, frames per observation.
+    A ring that went round holds the newest part alone. Nobody may be writing to ``path``, which was the replay's.
 
     Raises:
         DatasetError: if there is no replay of square RGB frames, or not a single transition in it.

@@ -529,27 +529,26 @@ def map_file(path: Path, size: int) -> mmap.mmap:
         DiskSpaceError: the disk cannot hold it; nothing is left of what was reserved.
         OSError: naming the file, for any other reason.
     """
-    if not path.exists():
-        # It has its name once it is whole: a kill while it is reserved leaves nothing that looks like rows.
-        partial = path.with_name(f".{path.name}.partial")
-        try:
-            with open(partial, "w+b") as file:
+    # A new one has its name once it is whole: a kill while it is reserved leaves nothing that looks like rows.
+    is_new, partial = not path.exists(), path.with_name(f".{path.name}.partial")
+    try:
+        with open(partial if is_new else path, "w+b" if is_new else "r+b") as file:
+            if is_new:
                 # Reserved, not sparse: a disk that fills up later would end the process by a bus error.
                 os.posix_fallocate(file.fileno(), 0, size)
-            os.replace(partial, path)
-        except OSError as reason:
-            if is_disk_full(reason) or reason.errno == errno.EFBIG:
-                raise DiskSpaceError(
-                    f"{path} needs {size / 1e9:.2f} GB: {reason}. Free space, or choose another directory or a smaller "
-                    "capacity."
-                ) from reason
-            raise writing_error(path, reason) from reason
-        finally:
-            partial.unlink(missing_ok=True)
-    with open(path, "r+b") as file:
-        if (found := os.fstat(file.fileno()).st_size) != size:
-            raise CheckpointError(
-                f"{path} has {found:,} bytes, this replay needs {size:,}: it belongs to a replay of another size. Use "
-                "the capacity and slack it was written with, or another directory."
-            )
-        return mmap.mmap(file.fileno(), size)
+                os.replace(partial, path)
+            if (found := os.fstat(file.fileno()).st_size) != size:
+                raise CheckpointError(
+                    f"{path} has {found:,} bytes, this replay needs {size:,}: it belongs to a replay of another size. "
+                    "Use the capacity and slack it was written with, or another directory."
+                )
+            return mmap.mmap(file.fileno(), size)
+    except OSError as reason:
+        if is_disk_full(reason) or reason.errno == errno.EFBIG:
+            raise DiskSpaceError(
+                f"{path} needs {size / 1e9:.2f} GB: {reason}. Free space, or choose another directory or a smaller "
+                "capacity."
+            ) from reason
+        raise writing_error(path, reason) from reason
+    finally:
+        partial.unlink(missing_ok=True)
