@@ -66,13 +66,6 @@ def test_the_same_seed_gives_the_data_that_earlier_revisions_collected(collected
     assert found == FIRST_REVISION
 
 
-@pytest.mark.slow
-def test_the_number_of_workers_does_not_change_the_data(collected: dict[str, Path], tmp_path: Path) -> None:
-    again = collect_group([VARIABLE, FIXED], tmp_path, workers=2, **ASKED)
-    for name, path in collected.items():
-        assert data_bytes(again[name]) == data_bytes(path)
-
-
 def test_an_episode_is_what_its_seeds_say_whatever_was_drawn_before(collected: dict[str, Path]) -> None:
     dataset = FrameDataset.open(collected["toy-variable"])
     env = ToyEnv(variable_length, seed=derive_seed(3, "collect", "toy-variable", 2))
@@ -135,7 +128,7 @@ def test_an_endless_episode_is_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not dataset.transitions["next", "terminated"].any()
 
 
-@pytest.mark.parametrize("order", range(4))
+@pytest.mark.parametrize("order", range(2))
 def test_the_order_in_which_episodes_finish_does_not_change_the_data(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, collected: dict[str, Path], order: int
 ) -> None:
@@ -274,7 +267,7 @@ def test_a_process_that_dies_gives_one_clear_error_and_one_that_fails_its_cause(
 
 @pytest.mark.slow
 def test_processes_that_hang_are_noticed_and_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collect, "STALL_S", 60.0)
+    monkeypatch.setattr(collect, "STALL_S", 20.0)
     with pytest.raises(RenderingError, match=r"episode 0 of toy-hanging.*no sign of life.*MUJOCO_GL"):
         collect_random(HANGING, tmp_path, transitions=50, workers=2, **SMALL)
 

@@ -4,7 +4,6 @@ import copy
 import errno
 import json
 import math
-import multiprocessing
 import os
 import pickle
 import shutil
@@ -169,22 +168,6 @@ def test_frames_have_their_physical_state_beside_them(
     assert torch.equal(dataset.frames["pixels"][5], episodes[1]["pixels"][0])
     assert torch.equal(dataset.frames["qvel"][5], episodes[1]["qvel"][0])
     assert dataset.frames["qpos"].dtype == torch.float64
-
-
-def _sample_in_another_process(path: Path, connection: Any) -> None:
-    dataset = FrameDataset.open(path, generator=torch.Generator().manual_seed(1))
-    connection.send(dataset.sample(8)["pixels"].numpy())
-
-
-def test_two_processes_open_it_at_once(path: Path) -> None:
-    dataset = FrameDataset.open(path, generator=torch.Generator().manual_seed(1))
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_sample_in_another_process, args=(path, theirs))
-    process.start()
-    mine = dataset.sample(8)["pixels"]
-    assert torch.equal(torch.from_numpy(ours.recv()), mine)
-    process.join()
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda dataset: pickle.loads(pickle.dumps(dataset))])

@@ -195,12 +195,12 @@ class _Collection:
         dataset: FrameDataset,
         make: Callable[[], EnvBase],
         seed: int,
-        usual_length: int | None,
+        length: int | None,
     ):
         self.domain, self.dataset, self.make, self.seed = domain, dataset, make, seed
         self.writer: Any = dataset.writer
-        self.usual_length = usual_length
-        self.longest = max(LONGEST_EPISODE_AGENT_STEPS, usual_length or 0)
+        self.usual_length = length
+        self.longest = max(LONGEST_EPISODE_AGENT_STEPS, length or 0)
         self.running: set[int] = set()
         self.waiting: dict[int, TensorDictBase] = {}
 
@@ -242,16 +242,16 @@ class _Collection:
             self.usual_length = self.usual_length or len(episode)
             self.dataset.extend(episode)
             self.writer.end_episode()
+        if self.dataset.is_complete:
+            self.waiting.clear()
 
 
 def _announce(jobs: list[_Collection], root: Path, image_size: int) -> None:
-    """Say how much will be written, and refuse what the disk cannot hold."""
+    """Say how much will be written (action and state: at most 1 kB each), and refuse what the disk cannot hold."""
     sizes = {}
     for job in jobs:
         frames = job.missing + -(-job.missing // (job.usual_length or 100))  # one more per episode
-        sizes[job.domain.name] = (
-            frames * 3 * image_size**2 + job.missing * 1000
-        )  # action and state: at most 1 kB
+        sizes[job.domain.name] = frames * 3 * image_size**2 + job.missing * 1000
     require_disk(root, sum(sizes.values()), f"Collecting {', '.join(sizes)}")
     free = shutil.disk_usage(jobs[0].dataset.path).free
     for job in jobs:

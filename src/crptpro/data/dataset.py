@@ -15,7 +15,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
-from torchrl.envs.transforms import Transform
 
 from crptpro.artifact import CARD_FILE, read_json, write_json
 from crptpro.data.replay import as_it_is
@@ -55,35 +54,18 @@ class FrameDataset(ReplayBuffer):
 
     Args:
         storage: what to read.
-        batch_size: default of ``sample()``.
-        generator: source of randomness; torch's global generator if ``None``.
-        transform: of samples, as in TorchRL.
-        **kwargs: further arguments of TorchRL's ``ReplayBuffer`` (``prefetch``, ``sampler``, ...). Prefetching threads
-            may hand out the batches of one generator in another order.
+        **options: of TorchRL's ``ReplayBuffer``: ``batch_size`` (default of ``sample()``), ``generator`` (torch's
+            global one by default), ``transform``, ``sampler``, ``prefetch`` (whose threads may hand out the batches of
+            one generator in another order).
     """
 
-    def __init__(
-        self,
-        storage: FrameStorage,
-        *,
-        batch_size: int | None = None,
-        generator: torch.Generator | None = None,
-        transform: Transform | None = None,
-        **kwargs: Any,
-    ):
-        batch_size = None if batch_size is None else as_int(batch_size, "batch_size", minimum=1)
+    def __init__(self, storage: FrameStorage, **options: Any):
         parts = {"sampler": RandomSampler(), "writer": ImmutableDatasetWriter(), "collate_fn": as_it_is}
-        super().__init__(
-            storage=storage,
-            batch_size=batch_size,
-            generator=generator,
-            transform=transform,
-            **parts | kwargs,
-        )
+        super().__init__(storage=storage, **parts | options)
 
     @classmethod
     def open(
-        cls, path: str | Path, *, frame_stack: int = 3, device: str | torch.device = "cpu", **kwargs: Any
+        cls, path: str | Path, *, frame_stack: int = 3, device: str | torch.device = "cpu", **options: Any
     ) -> FrameDataset:
         """Open a finished dataset.
 
@@ -92,12 +74,12 @@ class FrameDataset(ReplayBuffer):
             frame_stack: k, frames per stack.
             device: ``"cpu"`` maps the frames from disk; another device holds a copy of them and samples there. It needs
                 a generator of the same device.
-            **kwargs: see the class.
+            **options: see the class.
 
         Raises:
             DatasetError: naming the file that is missing, unfinished, truncated or foreign.
         """
-        return cls(FrameStorage(as_path(path), frame_stack, device).load(), **kwargs)
+        return cls(FrameStorage(as_path(path), frame_stack, device).load(), **options)
 
     @classmethod
     def create(
