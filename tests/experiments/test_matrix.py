@@ -57,7 +57,7 @@ def of(found: list[Cell], label: str, **place: Any) -> list[Job]:
     ("coverage", 1, {"coverage"}),
     ("stability", 2 + 1 + 1, {"encoder", "explored"}),
     ("visualize", 2, {"embeddings"}),
-    ("probe", 9 * 5 * 2, {"probe"}),
+    ("probe", 9 * 5, {"probe"}),
 ])  # fmt: skip
 def test_every_experiment_of_the_paper_has_its_cells(experiment: str, count: int, kinds: set[str]) -> None:
     found = cells(experiment, PAPER)

@@ -213,7 +213,9 @@ class Reproduce:
                     said.append(f"--{name} {value}")
         if self.seeds and not any("seed" in cell.place for cell in cells):
             said.append(f"--seeds {' '.join(map(str, self.seeds))}")
-        if self.colors_by == "image" and not any("colors" in cell.place for cell in cells):
+        if self.colors_by == "image" and all(
+            cell.place.get("colors", "normal") == "normal" for cell in cells
+        ):
             said.append("--colors-by image")
         return said
 
