@@ -6,7 +6,7 @@ one thread (``LP_NUM_THREADS=1``), domain by domain, blocks of transitions in tu
 * environments alone: single frames, nothing stored. TorchRL's render at every env step, so twice per agent step at an
   action repeat of 2, with a camera made anew for every image.
 * collecting: TorchRL's ``Collector`` fills a ``LazyMemmapStorage`` with single frames. Ours is what ``collect_random``
-  does, every block an episode: physical state, checksums, files synced to the disk. Between them, our environment and
+  does, every block an episode: physical state, files synced to the disk. Between them, our environment and
   ``FrameDataset.extend`` with TorchRL's ``Collector``.
 
 Then ``collect_random`` with several worker processes.
@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import json
 import logging
 import os
 import tempfile
@@ -116,13 +115,13 @@ def compare(domain: str, settings: Settings, work: Path) -> Iterator[tuple[str, 
         calls: dict[str, Callable[[], Any]] = {TORCHRL: lambda: next(stock)}
         ours = stack.enter_context(collector(own(physics_state=True), block))
         mixed = FrameDataset.create(work / "mixed", domain=domain, transitions=2**31)
-        stack.callback(mixed.close)
+        stack.callback(mixed.writer.close)
         calls[MIXED] = lambda: mixed.extend(next(ours))
         for name, quality in QUALITIES.items():
             env = own(quality=quality, physics_state=True)
             dataset = FrameDataset.create(work / quality, domain=domain, transitions=2**31)
             stack.callback(env.close)
-            stack.callback(dataset.close)
+            stack.callback(dataset.writer.close)
             calls[name] = functools.partial(collect_block, env, dataset, block)
         yield "collecting", timed(calls)
 
@@ -176,28 +175,31 @@ def collector(env: EnvBase, block: int, **options: Any) -> Iterator[Iterator[Any
 
 def collect_block(env: EnvBase, dataset: FrameDataset, transitions: int) -> None:
     """Collect one episode as ``collect_random`` does."""
-    seed = dataset.episodes
+    seed = dataset.writer.episodes
     dataset.extend(collect_episode(env, env_seed=seed, action_seed=seed, limit=transitions))
-    dataset.end_episode()
+    dataset.writer.end_episode()
 
 
 def time_workers(settings: Settings) -> dict[int, dict[str, Timing]]:
     """Collect with each number of workers, in turns, twice; print transitions/s whole and without the start."""
     found: dict[int, dict[str, list[float]]] = {n: {"whole": [], "running": []} for n in settings.workers}
+    total = settings.worker_transitions
+
+    def seconds_of(transitions: int, workers: int) -> float:
+        with tempfile.TemporaryDirectory(prefix="crptpro-collection-", dir=settings.scratch) as root:
+            start = time.perf_counter()
+            collect_random(
+                settings.domains[0], root, transitions=transitions, workers=workers, progress=False
+            )
+            return time.perf_counter() - start
+
     for _ in range(2 if settings.workers else 0):
         for count, seconds in found.items():
-            with tempfile.TemporaryDirectory(prefix="crptpro-collection-", dir=settings.scratch) as root:
-                total, start = settings.worker_transitions, time.perf_counter()
-                path = collect_random(
-                    settings.domains[0], root, transitions=total, workers=count, progress=False
-                )
-                seconds["whole"].append((time.perf_counter() - start) / total)
-                rest = [
-                    json.loads(line) for line in (path / "journal.jsonl").read_text().splitlines()[count:]
-                ]
-                transitions = sum(entry["transitions"] for entry in rest)
-                if transitions:  # after each worker's first episode
-                    seconds["running"].append(sum(entry["wall_s"] for entry in rest) / transitions)
+            whole = seconds_of(total, count)
+            seconds["whole"].append(whole / total)
+            first = 500 * count  # each worker's first episode
+            if first < total:
+                seconds["running"].append((whole - seconds_of(first, count)) / (total - first))
     timings = {n: {k: timing_of(v) for k, v in seconds.items() if v} for n, seconds in found.items()}
     if timings:
         print("\n| workers | transitions/s, running | with start |\n|---|---|---|")

@@ -161,7 +161,7 @@ def _episodes(dataset: FrameDataset) -> Iterator[tuple[TensorDict, Tensor]]:
     transitions = dataset.transitions
     for index in range(int(transitions["episode"].max()) + 1):
         rows = transitions[transitions["episode"] == index]
-        yield rows.exclude("row"), dataset.frames_at(rows["row"][0] + torch.arange(len(rows) + 1))
+        yield rows.exclude("row"), dataset.frames["pixels"][rows["row"][0] + torch.arange(len(rows) + 1)]
 
 
 def _frame_rows(dataset: FrameDataset, scratch: Path) -> LazyMemmapStorage:

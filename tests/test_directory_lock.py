@@ -48,26 +48,6 @@ def test_a_released_directory_may_be_taken_again(tmp_path: Path, monkeypatch: py
     DirectoryLock(tmp_path / "new").release()
 
 
-def test_who_can_wait_is_asked_to_until_the_directory_is_free_or_it_has_had_enough(tmp_path: Path) -> None:
-    lock, waited = DirectoryLock(tmp_path), []
-
-    def wait(seconds: float) -> None:
-        waited.append(seconds)
-        if len(waited) == 3:
-            lock.release()
-
-    DirectoryLock(tmp_path, wait=wait).release()
-    assert len(waited) == 3
-    assert waited == sorted(waited)
-
-    def no_longer(seconds: float) -> None:
-        raise TimeoutError
-
-    with DirectoryLock(tmp_path), pytest.raises(TimeoutError):
-        DirectoryLock(tmp_path, wait=no_longer)
-    DirectoryLock(tmp_path).release()
-
-
 @pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOTSUP])
 def test_a_file_system_without_locks_is_not_taken_for_another_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, number: int

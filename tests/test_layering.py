@@ -11,7 +11,7 @@ import crptpro
 
 PACKAGE = Path(crptpro.__file__).parent
 FOUNDATION = [
-    "errors", "values", "seeding", "provenance", "artifact", "directory_lock", "console", "logging", "host_memory",
+    "errors", "values", "seeding", "provenance", "artifact", "directory_lock", "console", "logging",
     "plugins",
 ]  # fmt: skip
 ORDER = [

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import errno
 import logging
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -27,44 +25,31 @@ class DirectoryLock:
         error: What is raised.
         is_reentrant: Several re-entrant holders in one process share the lock: the record of a run and its training
             loop.
-        wait: Called with the seconds since the first try while another process holds the directory, which is then tried
-            again; it sleeps, or raises. Without it that is an error.
 
     Raises:
         CRPTproError: (or ``error``) if another process holds the directory, or it cannot be written.
     """
 
     def __init__(
-        self,
-        directory: str | Path,
-        *,
-        error: type[CRPTproError] = CRPTproError,
-        is_reentrant: bool = False,
-        wait: Callable[[float], None] | None = None,
+        self, directory: str | Path, *, error: type[CRPTproError] = CRPTproError, is_reentrant: bool = False
     ):
         path = as_path(directory)
         self._lock: FileLock | None = None
-        began = time.monotonic()
-        while True:
-            try:
-                path.mkdir(parents=True, exist_ok=True)
-                lock = FileLock(path.resolve() / ".lock", is_singleton=is_reentrant, thread_local=False)
-                lock.acquire(blocking=False)
-                self._lock = lock
-                return
-            except Timeout:
-                if wait is None:
-                    raise error(
-                        f"Another process is writing to {path}. Wait for it, end it, or choose another directory."
-                    ) from None
-                wait(time.monotonic() - began)
-            except OSError as reason:
-                if reason.errno not in _NO_LOCKS:
-                    raise error(f"{path} cannot be written: {reason}.") from reason
-                _LOG.warning(
-                    "%s cannot be locked (%s): see to it that no two processes write to it.", path, reason
-                )
-                return
+        try:
+            path.mkdir(parents=True, exist_ok=True)
+            lock = FileLock(path.resolve() / ".lock", is_singleton=is_reentrant, thread_local=False)
+            lock.acquire(blocking=False)
+            self._lock = lock
+        except Timeout:
+            raise error(
+                f"Another process is writing to {path}. Wait for it, end it, or choose another directory."
+            ) from None
+        except OSError as reason:
+            if reason.errno not in _NO_LOCKS:
+                raise error(f"{path} cannot be written: {reason}.") from reason
+            _LOG.warning(
+                "%s cannot be locked (%s): see to it that no two processes write to it.", path, reason
+            )
 
     def release(self) -> None:
         """Free the directory, once its last holder does; calling it twice is harmless."""

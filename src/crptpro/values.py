@@ -164,11 +164,6 @@ def check_switch(name: str, value: str) -> None:
         raise ValueError(f"`{name}` must be 'auto', 'on' or 'off', got {value!r}.")
 
 
-def is_drawn(stored: Colors, wanted: Colors) -> bool:
-    """Whether the wanted colours need a new rendering: reversing whole images does not."""
-    return stored != wanted and {stored, wanted} != {"normal", "reversed_image"}
-
-
 def _require_range(
     number: float, value: Any, name: str, minimum: float | None, maximum: float | None
 ) -> None:

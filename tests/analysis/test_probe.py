@@ -20,7 +20,6 @@ from crptpro.analysis.probe import (
     ProbeSamples,
     probe,
     probe_embeddings,
-    probe_frame_rows,
     probe_samples,
 )
 from crptpro.data import FrameDataset
@@ -80,21 +79,13 @@ def test_samples_are_split_by_episode_and_states_belong_to_the_newest_frame(data
     assert len(episodes[2]) == 3
     newest = samples.pixels[:, -3:, 0, 0].double() / 255
     torch.testing.assert_close(newest, samples.targets[:, :3], atol=0.002, rtol=0)
-    rows = probe_frame_rows(dataset, samples=100)  # what a sample reads is known beforehand
-    assert (
-        dataset.frames_at(rows).unique(dim=0).equal(samples.pixels.reshape(-1, 3, SIZE, SIZE).unique(dim=0))
-    )
-    assert rows.diff().min() > 0
 
 
-def test_the_same_seed_draws_the_same_samples_in_every_colour(dataset: FrameDataset) -> None:
+def test_the_same_seed_draws_the_same_samples(dataset: FrameDataset) -> None:
     first, again, other = (probe_samples(dataset, samples=50, seed=seed) for seed in (0, 0, 1))
-    swapped = probe_samples(dataset, samples=50, colors="reversed_image")
     assert first.pixels.equal(again.pixels)
     assert not first.targets.equal(other.targets)
-    assert swapped.targets.equal(first.targets)
-    assert swapped.test.equal(first.test)
-    assert swapped.pixels[:, :3].equal(first.pixels[:, :3].flip(1))
+    assert first.test.equal(again.test)
 
 
 def test_projections_are_probed_beside_the_features(dataset: FrameDataset) -> None:

@@ -4,7 +4,6 @@ import copy
 import errno
 import json
 import math
-import multiprocessing
 import os
 import pickle
 import shutil
@@ -30,8 +29,9 @@ from toy_world import (
     write_dataset,
 )
 
+from crptpro.artifact import CARD_FILE
 from crptpro.data import FrameDataset
-from crptpro.data.storage import CARD_FILE, COLLECTION_FILE, JOURNAL_FILE
+from crptpro.data.dataset import COLLECTION_FILE
 from crptpro.errors import DatasetError, DiskSpaceError, NonFiniteError
 from crptpro.modules import PixelEncoder
 from crptpro.transforms import FrozenEncoder
@@ -106,16 +106,9 @@ def test_samples_are_uint8_and_alias_neither_each_other_nor_the_files(path: Path
 
 
 def test_numbers_read_the_observations_of_a_sample(dataset: FrameDataset) -> None:
-    dataset.set_rng(torch.Generator().manual_seed(3))
-    shown = dataset.sample(40)
-    dataset.set_rng(torch.Generator().manual_seed(3))
-    named = dataset.sample_transitions(40)
-    assert "pixels" not in named.keys()  # noqa: SIM118
-    for part, other in ((named, shown), (named["next"], shown["next"])):
-        assert torch.equal(part["number"], other["number"])
-        assert torch.equal(dataset.observations(part["number"]), other["pixels"])
-        rows = dataset.stack_rows_of(part["number"])
-        assert torch.equal(dataset.frames["pixels"][rows].flatten(1, 2), other["pixels"])
+    sample = dataset.sample(40)
+    for part in (sample, sample["next"]):
+        assert torch.equal(dataset.observations(part["number"]), part["pixels"])
     with pytest.raises(DatasetError, match="Observation 31 is not stored"):
         dataset.observations(torch.tensor([TOTAL + len(LENGTHS)]))
 
@@ -145,13 +138,8 @@ def test_threads_that_sample_one_dataset_each_get_what_they_ask_for(dataset: Fra
         batch = dataset.sample(16)
         return torch.equal(batch["pixels"], dataset.observations(batch["number"]))
 
-    def bare(_: int) -> bool:
-        return "pixels" not in dataset.sample_transitions(16).keys()  # noqa: SIM118
-
     with ThreadPoolExecutor(2) as threads:
-        one, two = threads.map(whole, range(200)), threads.map(bare, range(200))
-        assert all(one)
-        assert all(two)
+        assert all(threads.map(whole, range(200)))
 
 
 def test_it_is_sampled_under_a_default_device_that_is_not_the_cpu(path: Path) -> None:
@@ -174,37 +162,12 @@ def test_indexing_follows_tensors(dataset: FrameDataset, index: Any) -> None:
         dataset[26]
 
 
-def test_frames_and_physics_are_read_by_row(
-    dataset: FrameDataset, episodes: list[TensorDict], tmp_path: Path
+def test_frames_have_their_physical_state_beside_them(
+    dataset: FrameDataset, episodes: list[TensorDict]
 ) -> None:
-    rows = torch.tensor([[0, 4], [5, 7]])
-    assert torch.equal(dataset.frames_at(rows)[1, 0], episodes[1]["pixels"][0])
-    assert torch.equal(dataset.physics_at(rows)["qvel"][1, 0], episodes[1]["qvel"][0])
-    stateless = FrameDataset.open(write_dataset(tmp_path, [random_episode(3, state=False)]))
-    with pytest.raises(DatasetError, match="no physical state"):
-        stateless.physics_at(rows)
-
-
-def test_tensordict_opens_both_stores(path: Path, episodes: list[TensorDict]) -> None:
-    frames, transitions = (TensorDict.load_memmap(path / part) for part in ("frames", "transitions"))
-    assert frames["pixels"].shape == (TOTAL + len(LENGTHS), 3, 6, 6)
-    assert torch.equal(transitions["action"][4], episodes[1]["action"][0])
-
-
-def _sample_in_another_process(path: Path, connection: Any) -> None:
-    dataset = FrameDataset.open(path, generator=torch.Generator().manual_seed(1))
-    connection.send(dataset.sample(8)["pixels"].numpy())
-
-
-def test_two_processes_open_it_at_once(path: Path) -> None:
-    dataset = FrameDataset.open(path, generator=torch.Generator().manual_seed(1))
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_sample_in_another_process, args=(path, theirs))
-    process.start()
-    mine = dataset.sample(8)["pixels"]
-    assert torch.equal(torch.from_numpy(ours.recv()), mine)
-    process.join()
+    assert torch.equal(dataset.frames["pixels"][5], episodes[1]["pixels"][0])
+    assert torch.equal(dataset.frames["qvel"][5], episodes[1]["qvel"][0])
+    assert dataset.frames["qpos"].dtype == torch.float64
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda dataset: pickle.loads(pickle.dumps(dataset))])
@@ -245,13 +208,11 @@ def test_a_missing_or_truncated_file_is_named(duplicate: Path, file: str) -> Non
 
 
 @pytest.mark.parametrize(("changes", "message"), [
-    ({"format": "safetensors"}, "its format is 'safetensors'"),
-    ({"version": 99}, "format version is 99, this release reads 1"),
-    ({"pixels": "float32 0..1"}, r"pixels of .* are 'float32 0..1', this release reads 'uint8 0..255'"),
+    ({"format": "safetensors"}, "has format 'safetensors'"),
+    ({"version": 99}, "version 99; this release reads"),
     ({"frames": 5}, "damaged.*frames"),
-    ({"transitions": "many"}, "damaged.*transitions"),
-    ({"layout": {}}, "damaged.*layout"),
-    ({"layout": None}, "damaged.*layout"),
+    ({"transitions": "many"}, "damaged"),
+    ({"columns": None}, "damaged"),
 ])  # fmt: skip
 def test_a_card_that_cannot_be_is_refused(duplicate: Path, changes: dict[str, Any], message: str) -> None:
     card = json.loads((duplicate / CARD_FILE).read_text())
@@ -265,43 +226,34 @@ def test_what_is_no_dataset_is_named(duplicate: Path, tmp_path: Path) -> None:
         FrameDataset.open(tmp_path / "nowhere")
     with pytest.raises(DatasetError, match=r"not a dataset. Did you mean one of its datasets: copy\?"):
         FrameDataset.open(tmp_path)
-    with pytest.raises(DatasetError, match="frame_stack must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="`frame_stack` must be at least 1, got 0"):
         FrameDataset.open(duplicate, frame_stack=0)
     (duplicate / CARD_FILE).write_text("{")
     with pytest.raises(DatasetError, match="damaged or foreign"):
         FrameDataset.open(duplicate)
 
 
-def test_verify_finds_a_flipped_bit(duplicate: Path) -> None:
-    FrameDataset.open(duplicate).verify()
-    pixels = duplicate / "frames/pixels.memmap"
-    content = bytearray(pixels.read_bytes())
-    content[6 * 6 * 3 * 8] ^= 1  # frame row 8 belongs to episode 2
-    pixels.write_bytes(content)
-    with pytest.raises(DatasetError, match="Episode 2 of"):
-        FrameDataset.open(duplicate).verify()
-
-
 # --- writing
 
 
-def test_a_torchrl_collector_fills_a_dataset_that_can_be_sampled_meanwhile(tmp_path: Path) -> None:
+def test_a_torchrl_collector_fills_a_dataset(tmp_path: Path) -> None:
     env, seen = ToyEnv(variable_length, seed=4, physics_state=True), []
     dataset = FrameDataset.create(tmp_path, domain="mine", transitions=45)
     for rollout in Collector(env, frames_per_batch=10, total_frames=-1):
         seen.append(rollout.clone())
         dataset.extend(rollout)
-        if len(dataset):
-            assert dataset.sample(4)["pixels"].shape == (4, 9, 8, 8)
         if dataset.is_complete:
             break
+        for read in (lambda: dataset[:], lambda: pickle.dumps(dataset)):
+            with pytest.raises(DatasetError, match="is being collected"):
+                read()
     expected, again = torch.cat(seen)[:45], FrameDataset.open(tmp_path, frame_stack=1)
     assert len(again) == len(dataset) == 45
     for key in ("pixels", ("next", "pixels"), "action", ("next", "reward")):
         assert torch.equal(again[:][key], expected[key]), key
     assert again[44]["next", "done"].item()  # the last episode was cut to fit
-    assert torch.equal(again.physics_at(again[:]["number"])["qpos"], expected["qpos"])
-    again.verify()
+    assert torch.equal(again.frames["qpos"][again[:]["number"]], expected["qpos"])
+    assert (dataset.sample(4)["pixels"].shape, dataset.domain) == ((4, 9, 8, 8), "mine")
     with pytest.raises(DatasetError, match="complete and read-only"):
         dataset.extend(rollout)
     with pytest.raises(DatasetError, match="use extend"):
@@ -343,28 +295,23 @@ def test_rows_of_another_shape_or_without_a_reset_are_refused_and_leave_no_trace
         part["pixels"] = torch.randint(0, 256, (3, 9, 8, 8), dtype=torch.uint8)
     with pytest.raises(ValueError, match="begins at its reset"):
         dataset.extend(late)
-    dataset.close()
+    dataset.writer.close()
     resumed = FrameDataset.create(tmp_path, **collection_request())
     for _ in range(3):
         resumed.extend(random_episode(10, size=8))
-    FrameDataset.open(tmp_path).verify()
+    assert len(FrameDataset.open(tmp_path)) == 27
 
 
-@pytest.mark.parametrize(
-    "killed_at", ["nothing", "bytes", "half a line", "a damaged episode", "before the card"]
-)
+@pytest.mark.parametrize("killed_at", ["nothing", "bytes", "half a card", "before the card"])
 def test_killed_anywhere_the_same_request_continues_to_the_same_bytes(tmp_path: Path, killed_at: str) -> None:
     whole = collect_toy(tmp_path / "whole", variable_length, transitions=40)
     path = collect_toy(tmp_path / "killed", variable_length, transitions=40, episodes=3)
-    if killed_at == "bytes":  # of an episode whose journal line was not written
+    if killed_at == "bytes":  # of an episode that was not counted yet
         for file in path.rglob("*.memmap"):
             file.write_bytes(file.read_bytes() + b"some")
-    elif killed_at == "half a line":
-        with open(path / JOURNAL_FILE, "ab") as file:
-            file.write(b'{"episode": 3, "transi')
-    elif killed_at == "a damaged episode":
-        pixels = path / "frames/pixels.memmap"
-        pixels.write_bytes(pixels.read_bytes()[:-1] + b"\0")
+    elif killed_at == "half a card":
+        for name in (CARD_FILE, COLLECTION_FILE):
+            (path / f".{name}.12345.partial").write_text('{"episodes": 4, "transi')
     elif killed_at == "before the card":
         shutil.rmtree(path)
         shutil.copytree(whole, path)
@@ -373,15 +320,15 @@ def test_killed_anywhere_the_same_request_continues_to_the_same_bytes(tmp_path: 
         FrameDataset.open(path)
     collect_toy(path, variable_length, transitions=40)
     assert data_bytes(path) == data_bytes(whole)
-    assert FrameDataset.open(path).card["crc32"] == FrameDataset.open(whole).card["crc32"]
+    assert len(FrameDataset.open(path)) == 40
 
 
-def test_files_that_are_damaged_from_the_first_episode_on_are_left_alone(tmp_path: Path) -> None:
-    path = collect_toy(tmp_path, episodes=1)
+def test_files_that_lack_finished_episodes_are_named_and_left_alone(tmp_path: Path) -> None:
+    path = collect_toy(tmp_path, episodes=2)
     pixels = path / "frames/pixels.memmap"
-    pixels.write_bytes(b"\0" + pixels.read_bytes()[1:])
+    pixels.write_bytes(pixels.read_bytes()[:-1])
     before = data_bytes(path)
-    with pytest.raises(DatasetError, match="damaged from the first one on"):
+    with pytest.raises(DatasetError, match=r"pixels.memmap is truncated"):
         collect_toy(path)
     assert data_bytes(path) == before
 
@@ -400,15 +347,15 @@ def test_another_request_for_the_same_place_is_refused(
         FrameDataset.create(tmp_path, **collection_request(**asked))
 
 
-@pytest.mark.parametrize("left", [[], [".lock"], [".lock", ".collection.json.k2j3h4x_"], [COLLECTION_FILE]])
+@pytest.mark.parametrize("left", [[], [".lock"], [".lock", ".collection.json.77.partial"], [COLLECTION_FILE]])
 def test_what_holds_no_episode_yet_blocks_no_request(tmp_path: Path, left: list[str]) -> None:
     for name in left:
         (tmp_path / name).write_text('{"format"')
     if left == [COLLECTION_FILE]:
         (tmp_path / COLLECTION_FILE).unlink()
-        FrameDataset.create(tmp_path, **collection_request(seed=5)).close()
+        FrameDataset.create(tmp_path, **collection_request(seed=5)).writer.close()
     assert len(FrameDataset.open(collect_toy(tmp_path))) == 27
-    assert not list(tmp_path.glob(".collection.json.*"))
+    assert not list(tmp_path.glob(".*.partial"))
 
 
 def test_a_directory_with_something_else_or_another_writer_is_left_alone(tmp_path: Path) -> None:
@@ -420,8 +367,8 @@ def test_a_directory_with_something_else_or_another_writer_is_left_alone(tmp_pat
     first = FrameDataset.create(tmp_path / "toy", **collection_request())
     with pytest.raises(DatasetError, match="Another process is writing"):
         FrameDataset.create(tmp_path / "toy", **collection_request())
-    first.close()
-    FrameDataset.create(tmp_path / "toy", **collection_request()).close()
+    first.writer.close()
+    FrameDataset.create(tmp_path / "toy", **collection_request()).writer.close()
 
 
 def test_a_full_disk_is_named_and_what_was_kept_continues(
@@ -436,7 +383,7 @@ def test_a_full_disk_is_named_and_what_was_kept_continues(
         patched.setattr(os, "fsync", full)
         with pytest.raises(DiskSpaceError, match="is full after 10 transitions"):
             dataset.extend(random_episode(10, size=8, state=False))
-    dataset.close()
+    dataset.writer.close()
     collect_toy(tmp_path / "disk")
     assert data_bytes(tmp_path / "disk") == data_bytes(collect_toy(tmp_path / "whole"))
 
@@ -451,14 +398,14 @@ def test_another_backend_or_renderer_may_not_continue(
     rendered = {"backend": "egl", "gl_renderer": "llvmpipe"}
     for renderer in (now, rendered):  # before the first episode any may begin
         dataset = FrameDataset.create(tmp_path, **collection_request())
-        dataset.note_environment(renderer)
-        dataset.close() if renderer == now else dataset.extend(random_episode(10, size=8))
-    dataset.close()
+        dataset.writer.note_environment(renderer)
+        dataset.writer.close() if renderer == now else dataset.extend(random_episode(10, size=8))
+    dataset.writer.close()
     resumed = FrameDataset.create(tmp_path, **collection_request())
-    resumed.note_environment(rendered)
+    resumed.writer.note_environment(rendered)
     with pytest.raises(DatasetError, match=message):
-        resumed.note_environment(now)
-    resumed.close()
+        resumed.writer.note_environment(now)
+    resumed.writer.close()
 
 
 def test_a_dataset_takes_21_kb_per_transition(tmp_path: Path) -> None:

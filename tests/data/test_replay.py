@@ -223,14 +223,13 @@ def test_extra_columns_belong_to_the_transition_and_are_sampled_at_the_root(tmp_
         replay.extend(rollout_of(torch.stack([frame(1), frame(2)])))
 
 
-@pytest.mark.parametrize("n", [2, 3, 5])
-@pytest.mark.parametrize("length", [6, 9, 1000])
+@pytest.mark.parametrize(("n", "length"), [(2, 6), (3, 9), (5, 6), (5, 1000)])
 def test_windows_and_their_returns_are_those_of_the_published_loop(n: int, length: int) -> None:
     replay = small(40, n_step=n, discount=GAMMA, generator=torch.Generator().manual_seed(0))
     driver = Driver(replay, length)
     for transitions in (13, 20, 60):
         expected = driver.write(transitions).windows(n)
-        batch = replay.sample(600)
+        batch = replay.sample(400)
         assert {float(action) for action in batch["action"]} == set(expected)
         for row in batch:
             reward, discount = expected[float(row["action"])]
@@ -319,8 +318,7 @@ def test_it_works_under_a_default_device_that_is_not_the_cpu() -> None:
         torch.set_default_device(None)
 
 
-@pytest.mark.parametrize("before", [4, 33, 100])
-@pytest.mark.parametrize("length", [1, 6, 1000])
+@pytest.mark.parametrize(("before", "length"), [(4, 6), (33, 1), (33, 1000), (100, 6)])
 def test_an_old_state_restores_the_content_of_its_moment(tmp_path: Path, before: int, length: int) -> None:
     def build() -> FrameReplay:
         return small(path=tmp_path, slack=16, generator=torch.Generator().manual_seed(5))
@@ -451,7 +449,6 @@ def test_a_stored_replay_shows_every_observation_that_was_decided_on_in_order(
     tmp_path: Path, transitions: int, length: int
 ) -> None:
     driver = Driver(small(path=tmp_path, slack=5), length).write(transitions)
-    driver.replay.flush()
     before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
     stored = StoredReplay(tmp_path)
     assert min(transitions, 20) <= len(stored) <= transitions
@@ -462,16 +459,13 @@ def test_a_stored_replay_shows_every_observation_that_was_decided_on_in_order(
 
 
 def test_what_is_no_stored_replay_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match=r"absent holds no replay: number.memmap"):
+    with pytest.raises(DatasetError, match=r"absent/number.memmap is missing"):
         StoredReplay(tmp_path / "absent")
     driver = Driver(small(path=tmp_path / "new"))
     with pytest.raises(DatasetError, match="no transition"):
         StoredReplay(tmp_path / "new")
     driver.write(5)
-    driver.replay._storage.number[2] = 0
-    with pytest.raises(DatasetError, match="lost rows"):
-        StoredReplay(tmp_path / "new")
     with open(tmp_path / "new" / "pixels.memmap", "ab") as file:
         file.write(b"x")
-    with pytest.raises(DatasetError, match="square RGB"):
+    with pytest.raises(DatasetError, match=r"pixels.memmap is longer"):
         StoredReplay(tmp_path / "new")

@@ -190,8 +190,8 @@ def write_dataset(path: Path, episodes: Iterable[TensorDict], **request: Any) ->
     dataset = FrameDataset.create(path, **asked | request)
     for episode in episodes:
         dataset.extend(episode)
-        dataset.end_episode()
-    dataset.close()
+        dataset.writer.end_episode()
+    dataset.writer.close()
     return path
 
 
@@ -201,14 +201,17 @@ def collect_toy(
     """Collect a toy world as ``collect_random`` does, all of it, or only so many episodes."""
     asked = collection_request(**request)
     dataset = FrameDataset.create(path, **asked)
+    if dataset.is_complete:
+        return path
     env = ToyEnv(lengths, image_size=asked["image_size"])
-    while not dataset.is_complete and dataset.episodes != episodes:
+    writer: Any = dataset.writer
+    while not dataset.is_complete and writer.episodes != episodes:
         seeds = [
-            derive_seed(asked["seed"], kind, asked["domain"], dataset.episodes)
+            derive_seed(asked["seed"], kind, asked["domain"], writer.episodes)
             for kind in ("collect", "collect-actions")
         ]
-        missing = dataset.target - len(dataset)
+        missing = writer.target - writer.transitions
         dataset.extend(collect_episode(env, env_seed=seeds[0], action_seed=seeds[1], limit=missing))
-        dataset.end_episode()
-    dataset.close()
+        writer.end_episode()
+    writer.close()
     return path

@@ -120,18 +120,12 @@ def test_every_paper_domain_is_drawn_once_per_agent_step_by_torchrls_parts(playe
 
 
 @pytest.mark.gl
-def test_an_episode_depends_on_its_seed_and_a_state_is_drawn_as_it_was_seen(played: Played) -> None:
+def test_an_episode_depends_on_its_seed(played: Played) -> None:
     played.env.set_seed(0)
     again = play(played.env, 1)
     for key in ("pixels", ("next", "pixels"), ("next", "reward"), ("next", "qpos"), ("next", "qvel")):
         assert torch.equal(again[key], played.first[key]), key
     assert not torch.equal(again["pixels"][0], played.rollout["pixels"][0])
-    before, after = again["pixels"][0, -3:], again["next", "pixels"][0, -3:]
-    world: Any = played.env.base_env
-    for key, seen in (("next", after), ("root", before)):
-        td = again[0]["next"] if key == "next" else again[0]
-        difference = world.draw_state(td["qpos"].numpy(), td["qvel"].numpy()).float() - seen.float()
-        assert difference.abs().mean() < 0.5
 
 
 @pytest.mark.gl

@@ -11,11 +11,9 @@ from torch import Tensor, nn
 from crptpro.analysis.coordinates import Joint, joints_of, position_coordinates, velocity_coordinates
 from crptpro.analysis.embeddings import effective_rank, embed_pixels, gram_matrix, mean_cosine
 from crptpro.data import FrameDataset
-from crptpro.data.redraw import DrawnFrames, redraw
-from crptpro.data.storage import stack_rows
+from crptpro.data.storage import gather_stacks, stack_rows
 from crptpro.errors import DatasetError
 from crptpro.seeding import derive_seed
-from crptpro.values import Colors
 
 HELD_OUT = 0.25
 """Fraction of the episodes that is held out, and of the others by which the penalty is chosen."""
@@ -81,30 +79,30 @@ def probe_samples(
     *,
     samples: int = 2_000,
     seed: int = 0,
-    colors: Colors | None = None,
     frame_stack: int | None = None,
     joints: tuple[Joint, ...] | None = None,
-    drawn: DrawnFrames | None = None,
 ) -> ProbeSamples:
-    """Draw observations and states of a dataset, and split its episodes; the same for a seed in all colours.
+    """Draw observations and states of a dataset, and divide its episodes.
+
+    The same seed draws the same observations and splits, whatever the colours of the dataset.
 
     Args:
         dataset: with physical state.
         samples: N, drawn without replacement; all transitions if there are fewer.
         seed: which ones, and which episodes are held out.
-        colors: in which they are shown (default: the dataset's own), see :func:`~crptpro.data.redraw.redraw`.
         frame_stack: frames per observation; the dataset's if ``None``.
         joints: what ``qpos`` and ``qvel`` are; of :func:`~crptpro.analysis.coordinates.joints_of` if ``None``.
-        drawn: frames in other colours that were drawn before, see :func:`probe_frame_rows`.
 
     Raises:
         DatasetError: there is no physical state, or too few episodes or samples to split.
     """
     transitions = dataset.transitions
-    generator = _generator(dataset, seed)
-    chosen = _choose(dataset, samples, generator)
+    generator = torch.Generator().manual_seed(derive_seed(seed, "probe", dataset.domain))
+    chosen = torch.randperm(len(transitions), generator=generator)[:samples].sort().values
     row, step, episode = (transitions.get(name)[chosen] for name in ("row", "step", "episode"))
-    state = dataset.physics_at(row)
+    if "qpos" not in dataset.frames or "qvel" not in dataset.frames:
+        raise DatasetError(f"The dataset of {dataset.domain!r} stores no physical state (qpos, qvel).")
+    qpos, qvel = (dataset.frames[name][row] for name in ("qpos", "qvel"))
     episodes = episode.unique()
     episodes = episodes[torch.randperm(len(episodes), generator=generator)]
     held_out = max(1, round(HELD_OUT * len(episodes)))
@@ -113,40 +111,21 @@ def probe_samples(
     train, validation, test = [torch.isin(episode, part).nonzero().squeeze(-1) for part in split]
     if min(len(train), len(validation), len(test)) < 2:
         raise DatasetError(
-            f"A probe of {dataset.path or dataset.domain} has {len(chosen)} samples of {len(episodes)} episodes; it "
+            f"A probe of {dataset.path} has {len(chosen)} samples of {len(episodes)} episodes; it "
             "needs two in each of three parts that share no episode. Collect more episodes, or draw more samples."
         )
     if joints is None:
         joints = joints_of(dataset.card.get("task", dataset.domain))
-    position_names, positions = position_coordinates(state["qpos"], joints)
-    velocity_names, velocities = velocity_coordinates(state["qvel"], joints)
+    position_names, positions = position_coordinates(qpos, joints)
+    velocity_names, velocities = velocity_coordinates(qvel, joints)
     names = [
         *(("position", name) for name in position_names),
         *(("velocity", name) for name in velocity_names),
     ]
     rows = stack_rows(row, step, frame_stack or dataset.frame_stack)
-    wanted = colors or dataset.card.get("colors", "normal")
-    frames = redraw(dataset, rows.reshape(-1), colors=wanted, drawn=drawn)
-    pixels = frames.reshape(len(rows), -1, *frames.shape[-2:])
+    pixels = gather_stacks(dataset.frames["pixels"], rows)
     targets = torch.cat([positions, velocities], 1)
     return ProbeSamples(pixels, targets, names, train, validation, test, held_out)
-
-
-def probe_frame_rows(
-    dataset: FrameDataset, *, samples: int = 2_000, seed: int = 0, frame_stack: int | None = None
-) -> Tensor:
-    """Return the frame rows, int64 ``[N]`` and ascending, that :func:`probe_samples` reads with the same arguments."""
-    chosen = _choose(dataset, samples, _generator(dataset, seed))
-    row, step = (dataset.transitions.get(name)[chosen] for name in ("row", "step"))
-    return stack_rows(row, step, frame_stack or dataset.frame_stack).unique()
-
-
-def _generator(dataset: FrameDataset, seed: int) -> torch.Generator:
-    return torch.Generator().manual_seed(derive_seed(seed, "probe", dataset.domain))
-
-
-def _choose(dataset: FrameDataset, samples: int, generator: torch.Generator) -> Tensor:
-    return torch.randperm(len(dataset.transitions), generator=generator)[:samples].sort().values
 
 
 @torch.no_grad()

@@ -18,21 +18,19 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from multiprocessing.connection import wait as wait_for_process
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.modules import RandomPolicy
 from tqdm import tqdm
 
 from crptpro.artifact import require_disk
 from crptpro.data.dataset import FrameDataset
-from crptpro.data.storage import estimate_bytes
 from crptpro.domains import LONGEST_EPISODE_AGENT_STEPS, Domain, expand_groups, get_domain
 from crptpro.errors import CRPTproError, DatasetError, RenderingError, WorkerLostError
 from crptpro.plugins import load_again, loaded_plugins
@@ -44,18 +42,14 @@ logger = logging.getLogger(__name__)
 STALL_S = 300.0
 """Seconds without a step of any worker after which they count as hung."""
 
+Factories = Mapping[str, Callable[[], EnvBase]]
+"""Functions that make an environment, by domain."""
+
 _AGAIN = "What was collected is kept: run the same command again"
 
 
 def collect_random(domain: str | Domain, root: str | Path, **options: Any) -> Path:
-    """Collect one domain's dataset with a uniform random policy, or continue an interrupted collection.
-
-    The paper (section "Decoupled random collection") takes b = 100,000 transitions per domain.
-
-    Args:
-        domain: as of :func:`collect_group`.
-        root: likewise.
-        **options: likewise.
+    """Collect one domain's dataset as :func:`collect_group` does.
 
     Returns:
         The dataset's directory, ``root/<domain name>``, ready for :meth:`crptpro.data.FrameDataset.open`.
@@ -77,22 +71,19 @@ def collect_group(
     camera: int | str | None = None,
     progress: bool = True,
 ) -> dict[str, Path]:
-    """Collect the datasets of several domains, one after the other, with one pool of processes.
+    """Collect the datasets of several domains with a uniform random policy, or continue interrupted collections.
 
-    Every episode has its own seeds, derived from ``seed``, the domain and the episode's index, so the same
-    seed gives the same actions and, on one machine and backend, the same pixels, whatever the number of
-    workers and however often the collection was interrupted. The dataset is episodes 0, 1, 2, ... until they
-    hold ``transitions`` transitions; the last one is cut to fit, and an endless one after 1000. A complete
-    dataset is returned at once.
+    The paper (section "Decoupled random collection") takes b = 100,000 transitions per domain. Every episode has its
+    own seeds, derived from ``seed``, the domain and the episode's index, so the same seed gives the same actions and,
+    on one machine and backend, the same pixels, whatever the number of workers and however often the collection was
+    interrupted. The last episode is cut to fit, and an endless one after 1000 transitions.
 
     With several workers the environments live in spawned processes, so a script needs the usual
     ``if __name__ == "__main__":``. A domain whose ``make`` no other process can import, because it was defined in a
     notebook for example, is collected in this one.
 
-    An episode is a rollout of ``RandomPolicy``, not a batch of a TorchRL ``Collector``: that one resets as soon as an
-    episode ends, before the next one's seeds are known, and steps on until its batch is full. With an environment
-    around it that answers both with zeros it took 2.1 times the CPU time per transition of a world that costs nothing,
-    and 8 % more with walker (84 x 84, software GL).
+    An episode is a rollout of ``RandomPolicy``, not a batch of a TorchRL ``Collector``, which resets before the next
+    episode's seeds are known; made to do this, it took 8 % more CPU time with walker (84 x 84, software GL).
 
     Args:
         domains: domain names, task names, letters of the paper's groups, ``gymnasium:<id>``, or
@@ -151,7 +142,7 @@ def collect_group(
             if dataset.is_complete:
                 logger.info("%s: %s is complete", domain.name, path)
                 continue
-            stack.callback(dataset.close)
+            stack.callback(dataset.writer.close)
             make = functools.partial(make_env, domain, seed=0, frame_stack=1, physics_state=True, **settings)
             length = episode_length(domain, action_repeat=settings["action_repeat"])
             jobs.append(_Collection(domain, dataset, make, seed, length))
@@ -180,10 +171,7 @@ def collect_episode(
         env_seed: of the simulator.
         action_seed: of the policy, which draws from torch's global generator.
         limit: transitions after which the episode is cut.
-        callback: as of TorchRL's ``rollout``: called at every step.
-
-    Returns:
-        The rollout ``[T]``.
+        callback: as of TorchRL's ``rollout``.
     """
     env.set_seed(env_seed)
     first = env.reset()
@@ -196,7 +184,7 @@ def collect_episode(
 
 
 class _Collection:
-    """One dataset, its episodes that run or wait for an earlier one, and its progress line.
+    """One dataset, and its episodes that run or wait for an earlier one.
 
     Episodes may finish in any order and are appended in order, so that the dataset depends on the request alone.
     """
@@ -207,35 +195,31 @@ class _Collection:
         dataset: FrameDataset,
         make: Callable[[], EnvBase],
         seed: int,
-        usual_length: int | None,
+        length: int | None,
     ):
         self.domain, self.dataset, self.make, self.seed = domain, dataset, make, seed
-        self.usual_length = usual_length
-        self.longest = max(LONGEST_EPISODE_AGENT_STEPS, usual_length or 0)
+        self.writer: Any = dataset.writer
+        self.usual_length = length
+        self.longest = max(LONGEST_EPISODE_AGENT_STEPS, length or 0)
         self.running: set[int] = set()
-        self.waiting: dict[int, TensorDict] = {}
-        self.has_begun = False
+        self.waiting: dict[int, TensorDictBase] = {}
+
+    @property
+    def missing(self) -> int:
+        """Transitions that are not durable yet."""
+        return self.writer.target - self.writer.transitions
 
     def next_plan(self, ahead: int) -> dict[str, Any] | None:
-        """Return the next episode worth starting, ``None`` while those under way are expected to suffice.
-
-        Args:
-            ahead: how many episodes may be under way beyond those that are durable.
-        """
-        if self.dataset.is_complete:
-            return None
-        first = index = self.dataset.episodes
-        missing = limit = self.dataset.target - len(self.dataset)
+        """Return the next episode worth starting, at most ``ahead`` under way; ``None`` if those should suffice."""
+        first = index = self.writer.episodes
+        wanted = limit = self.missing
         while index in self.running or index in self.waiting:
             known = len(self.waiting[index]) if index in self.waiting else None
-            missing -= known or self.usual_length or 1
+            wanted -= known or self.usual_length or 1
             limit -= known or 1  # a running one has at least one transition
             index += 1
-        if missing <= 0 or index - first >= ahead:
+        if wanted <= 0 or index - first >= ahead:
             return None
-        if not self.has_begun:
-            self.has_begun = True
-            self.dataset.begin()
         self.running.add(index)
         name = self.domain.name
         return {
@@ -246,35 +230,35 @@ class _Collection:
             "limit": min(limit, self.longest),
         }
 
-    def accept(self, index: int, card: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+    def accept(self, index: int, card: Mapping[str, Any], rollout: TensorDictBase) -> None:
         """Take a finished episode; it and those that waited for it are durable when this returns."""
         self.running.discard(index)
         if self.dataset.is_complete:
             return
-        self.dataset.note_environment(card)
-        self.waiting[index] = _rollout_of(arrays)
-        while (episode := self.waiting.pop(self.dataset.episodes, None)) is not None:
+        self.writer.note_environment(card)
+        self.waiting[index] = rollout
+        while not self.dataset.is_complete and self.writer.episodes in self.waiting:
+            episode = self.waiting.pop(self.writer.episodes)
             self.usual_length = self.usual_length or len(episode)
             self.dataset.extend(episode)
-            self.dataset.end_episode()
-            if self.dataset.is_complete:
-                self.waiting.clear()
-                return
+            self.writer.end_episode()
+        if self.dataset.is_complete:
+            self.waiting.clear()
 
 
 def _announce(jobs: list[_Collection], root: Path, image_size: int) -> None:
-    missing = {job.domain.name: job.dataset.target - len(job.dataset) for job in jobs}
-    sizes = {
-        job.domain.name: estimate_bytes(missing[job.domain.name], image_size, job.usual_length)
-        for job in jobs
-    }
+    """Say how much will be written (action and state: at most 1 kB each), and refuse what the disk cannot hold."""
+    sizes = {}
+    for job in jobs:
+        frames = job.missing + -(-job.missing // (job.usual_length or 100))  # one more per episode
+        sizes[job.domain.name] = frames * 3 * image_size**2 + job.missing * 1000
     require_disk(root, sum(sizes.values()), f"Collecting {', '.join(sizes)}")
-    free = shutil.disk_usage(jobs[0].dataset.path or root).free
+    free = shutil.disk_usage(jobs[0].dataset.path).free
     for job in jobs:
         name = job.domain.name
         logger.info(
             "%s: %.2g GB for %s transitions into %s, %.1f GB free",
-            name, sizes[name] / 1e9, f"{missing[name]:,}", job.dataset.path, free / 1e9,
+            name, sizes[name] / 1e9, f"{job.missing:,}", job.dataset.path, free / 1e9,
         )  # fmt: skip
 
 
@@ -284,7 +268,7 @@ def _usable_workers(jobs: list[_Collection], workers: int) -> int:
     for job in jobs if workers > 1 else ():
         try:
             is_lost = b"__main__" in pickle.dumps(job.make) and not (main_file and Path(main_file).exists())
-        except Exception:
+        except Exception:  # objects may refuse in ways of their own
             is_lost = True
         if is_lost:
             logger.warning(
@@ -298,9 +282,9 @@ def _usable_workers(jobs: list[_Collection], workers: int) -> int:
 def _collect(jobs: list[_Collection], workers: int, progress: bool) -> None:
     factories = {job.domain.name: job.make for job in jobs}
     with ExitStack() as stack:
-        lines = [stack.enter_context(_ProgressLine(job, progress)) for job in jobs]
+        bars = [stack.enter_context(closing(_Progress(job, progress))) for job in jobs]
         pool: Any = _Pool(factories, workers) if workers > 1 else _ThisProcess(factories)
-        stack.enter_context(pool)
+        stack.enter_context(closing(pool))
         running: dict[Future, tuple[_Collection, int, int]] = {}
         while any(not job.dataset.is_complete for job in jobs):
             for job in jobs:  # all workers on the first that needs one: each makes each environment once
@@ -309,15 +293,16 @@ def _collect(jobs: list[_Collection], workers: int, progress: bool) -> None:
                     running[pool.submit(plan, slot)] = (job, plan["episode"], slot)
             for future in pool.finished(running):
                 job, episode, _ = running.pop(future)
-                job.accept(episode, *future.result())
-            for line in lines:
-                line.show(sum(pool.steps[slot] for job, _, slot in running.values() if job is line.job))
+                result = future.result()
+                job.accept(episode, *(pickle.loads(result) if isinstance(result, bytes) else result))
+            for bar in bars:
+                bar.show(sum(pool.steps[slot] for job, _, slot in running.values() if job is bar.job))
 
 
 class _ThisProcess:
     """Collects where it is called."""
 
-    def __init__(self, factories: Mapping[str, Callable[[], EnvBase]]):
+    def __init__(self, factories: Factories):
         self.steps = [0]
         self._roller = _Roller(factories, self.steps)
 
@@ -330,41 +315,46 @@ class _ThisProcess:
     def finished(self, running: Mapping[Future, Any]) -> list[Future]:
         return list(running)
 
-    def __enter__(self) -> _ThisProcess:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self._roller.close()
 
 
 class _Pool:
     """Collects in spawned processes, never forked ones: a fork would share a GL context."""
 
-    def __init__(self, factories: Mapping[str, Callable[[], EnvBase]], workers: int):
-        context = multiprocessing.get_context("spawn")
-        self.workers, self.steps = workers, context.RawArray("q", workers)
-        self._processes: set[Any] = set()
+    def __init__(self, factories: Factories, workers: int):
+        self._context = multiprocessing.get_context("spawn")
+        self.workers, self.steps = workers, self._context.RawArray("q", workers)
+        self._arguments = (factories, loaded_plugins(), self.steps)
+        self._executor: ProcessPoolExecutor | None = None
+        self._processes: dict[int, Any] = {}
         self._sign: tuple[list[int], float] = ([], time.monotonic())
-        arguments = (factories, loaded_plugins(), self.steps)
-        with self._explained():
-            self._executor = ProcessPoolExecutor(workers, context, _start_worker, arguments)
 
     def submit(self, plan: dict[str, Any], slot: int) -> Future:
-        others = set(multiprocessing.active_children()) - self._processes
-        with self._explained():
-            try:
-                with _interrupts_ignored():
-                    return self._executor.submit(_work, plan, slot)
-            finally:
-                self._processes |= set(multiprocessing.active_children()) - others
+        try:
+            if self._executor is None:
+                self._executor = ProcessPoolExecutor(
+                    self.workers, self._context, _start_worker, self._arguments
+                )
+            with _interrupts_ignored():
+                return self._executor.submit(_work, plan, slot)
+        except BrokenProcessPool:
+            raise self._lost(f"episode {plan['episode']} of {plan['domain']}") from None
+        except OSError as reason:
+            hint = "Use fewer workers."
+            if reason.errno == errno.EMFILE:
+                import resource
+
+                limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+                hint = f"This shell allows {limit} open files: raise that (`ulimit -n 4096`), or use fewer workers."
+            raise CRPTproError(
+                f"{self.workers} collecting processes cannot be started: {reason}. {hint}"
+            ) from reason
+        finally:
+            self._processes |= getattr(self._executor, "_processes", None) or {}
 
     def finished(self, running: Mapping[Future, tuple[_Collection, int, int]]) -> list[Future]:
-        """Wait a second for episodes.
-
-        Raises:
-            WorkerLostError: if a process died.
-            RenderingError: if all hang.
-        """
+        """Wait a second for episodes, and make sure that somebody works."""
         done = list(wait(running, 1.0, FIRST_COMPLETED).done)
         episodes = ", ".join(
             f"episode {episode} of {job.domain.name}" for job, episode, _ in running.values()
@@ -383,9 +373,9 @@ class _Pool:
         return done
 
     def _lost(self, episodes: str) -> WorkerLostError:
-        for process in self._processes:
+        for process in self._processes.values():
             process.join(2.0)
-        codes = [process.exitcode for process in self._processes]
+        codes = [process.exitcode for process in self._processes.values()]
         # Those that the executor ended after the first have been terminated.
         code = next((code for code in codes if code not in (None, 0, -signal.SIGTERM)), -signal.SIGTERM)
         how = f"was killed by signal {-code}" if code < 0 else f"exited with status {code}"
@@ -399,35 +389,16 @@ class _Pool:
             )
         return WorkerLostError(f"A process that collected ({episodes}) {how}. {hint} {_AGAIN}.")
 
-    @contextlib.contextmanager
-    def _explained(self) -> Iterator[None]:
-        try:
-            yield
-        except BrokenProcessPool:
-            raise self._lost("its first episode") from None
-        except OSError as reason:
-            hint = "Use fewer workers."
-            if reason.errno == errno.EMFILE:
-                import resource
-
-                limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-                hint = f"This shell allows {limit} open files: raise that (`ulimit -n 4096`), or use fewer workers."
-            raise CRPTproError(
-                f"{self.workers} collecting processes cannot be started: {reason}. {hint}"
-            ) from reason
-
-    def __enter__(self) -> _Pool:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         # What still runs is no longer wanted, or has lost its parent's interest by an error or Ctrl-C.
-        for process in self._processes:
+        for process in self._processes.values():
             process.terminate()
-        for process in self._processes:
+        for process in self._processes.values():
             process.join(5.0)
             if process.is_alive():
                 process.kill()
-        self._executor.shutdown(cancel_futures=True)
+        if self._executor is not None:
+            self._executor.shutdown(cancel_futures=True)
 
 
 @contextlib.contextmanager
@@ -443,24 +414,24 @@ def _interrupts_ignored() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
 
 
-class _ProgressLine:
+class _Progress:
     """Transitions of one dataset: a bar on a terminal, a log line per tenth elsewhere."""
 
     def __init__(self, job: _Collection, is_shown: bool):
         self.job, self._is_shown = job, is_shown
-        self._total, self._shown = job.dataset.target, len(job.dataset)
+        self._total, self._count = job.writer.target, job.writer.transitions
         self._begun: tuple[float, int] | None = None
         self._bar = tqdm(
-            total=self._total, initial=self._shown, desc=job.domain.name, unit=" transitions", dynamic_ncols=True,
+            total=self._total, initial=self._count, desc=job.domain.name, unit=" transitions", dynamic_ncols=True,
             disable=None if is_shown else True, smoothing=0.05,
         )  # fmt: skip
 
     def show(self, running: int) -> None:
-        waiting = sum(map(len, self.job.waiting.values()))
-        count, before = min(self._total, len(self.job.dataset) + waiting + running), self._shown
+        running += self.job.writer.transitions + sum(map(len, self.job.waiting.values()))
+        count, before = min(self._total, running), self._count
         if count <= before:
             return
-        self._shown = count
+        self._count = count
         self._bar.update(count - before)
         begun_s, first = self._begun = self._begun or (time.monotonic(), before)
         if self._is_shown and self._bar.disable and 10 * count // self._total > 10 * before // self._total:
@@ -470,10 +441,7 @@ class _ProgressLine:
                 self.job.domain.name, f"{count:,}", f"{self._total:,}", rate, (self._total - count) / rate,
             )  # fmt: skip
 
-    def __enter__(self) -> _ProgressLine:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self._bar.close()
 
 
@@ -481,28 +449,26 @@ class _ProgressLine:
 
 
 class _Roller:
-    """Rolls out planned episodes, in the environment of one domain at a time.
+    """Rolls out planned episodes, in the environment of one domain at a time; ``steps`` counts them in their slots."""
 
-    Args:
-        factories: of environments, by domain.
-        steps: counts the transitions of the running episode, in the slot of its plan.
-    """
-
-    def __init__(self, factories: Mapping[str, Callable[[], EnvBase]], steps: Any):
+    def __init__(self, factories: Factories, steps: Any):
         self._factories, self._steps = factories, steps
-        self._domain, self._env = "", None
+        self._domain = ""
+        self._env: Any = None
 
-    def roll(self, plan: Mapping[str, Any], slot: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-        """Return the environment's card and the episode's arrays."""
+    def roll(self, plan: Mapping[str, Any], slot: int) -> tuple[dict[str, Any], TensorDictBase]:
+        """Return the environment's card and the episode."""
         self._steps[slot] = 0
 
         def count(*_: Any) -> None:
             self._steps[slot] += 1
 
         try:
-            env = self._env_of(plan["domain"])
+            if self._env is None or plan["domain"] != self._domain:
+                self.close()
+                self._env, self._domain = self._factories[plan["domain"]](), plan["domain"]
             seeds = {name: plan[name] for name in ("env_seed", "action_seed", "limit")}
-            rollout = collect_episode(env, callback=count, **seeds)
+            rollout = collect_episode(self._env, callback=count, **seeds)
         except CRPTproError:
             raise
         except Exception as reason:
@@ -510,7 +476,7 @@ class _Roller:
                 f"Episode {plan['episode']} of {plan['domain']} failed: {str(reason).strip() or repr(reason)}. "
                 f"{_AGAIN} once the cause is removed."
             ) from reason
-        return (env.card() if hasattr(env, "card") else {}), _arrays_of(rollout)
+        return (self._env.card() if hasattr(self._env, "card") else {}), rollout
 
     def close(self) -> None:
         """Close the environment and free its render context."""
@@ -518,65 +484,25 @@ class _Roller:
             self._env.close()
         self._env = None
 
-    def _env_of(self, domain: str) -> EnvBase:
-        if self._env is None or domain != self._domain:
-            self.close()
-            self._env, self._domain = self._factories[domain](), domain
-        return self._env
+
+_roller: _Roller
+_plugins: tuple[str, ...]
 
 
-def _arrays_of(rollout: TensorDictBase) -> dict[str, np.ndarray]:
-    """Return an episode as plain arrays that any process can send: T + 1 rows per frame, T per transition."""
-    following = rollout.get("next")
-    per_frame = [name for name in ("pixels", "qpos", "qvel") if name in following]
-    flags = [name for name in ("reward", "done", "terminated", "truncated") if name in following]
-    arrays = {name: torch.cat([rollout.get(name)[:1], following.get(name)]).numpy() for name in per_frame}
-    return (
-        arrays
-        | {name: following.get(name).numpy() for name in flags}
-        | {"action": rollout.get("action").numpy()}
-    )
-
-
-def _rollout_of(arrays: Mapping[str, np.ndarray]) -> TensorDict:
-    """Return the rollout ``[T]`` of an episode's arrays."""
-    root: dict[str, Any] = {"action": torch.from_numpy(arrays["action"])}
-    following: dict[str, Any] = {}
-    for name in arrays.keys() - {"action"}:
-        values = torch.from_numpy(arrays[name])
-        if name in ("pixels", "qpos", "qvel"):
-            root[name], values = values[:-1], values[1:]
-        following[name] = values
-    length = [len(arrays["action"])]
-    return TensorDict({**root, "next": TensorDict(following, length)}, length)
-
-
-_HERE: dict[str, Any] = {}
-"""What a collecting process works with."""
-
-
-def _start_worker(
-    factories: Mapping[str, Callable[[], EnvBase]], plugins: tuple[str, ...], steps: Any
-) -> None:
-    """Prepare a collecting process.
-
-    Args:
-        factories: of environments, by domain.
-        plugins: that the parent has loaded: what they register in other libraries, a world of Gymnasium's say, has no
-            name in this process yet.
-        steps: see :class:`_Roller`.
-    """
+def _start_worker(factories: Factories, plugins: tuple[str, ...], steps: Any) -> None:
+    global _roller, _plugins
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what Ctrl-C ends
     # One software-rendering thread per process is faster than several; it must be set before GL loads.
     os.environ.setdefault("LP_NUM_THREADS", "1")
     torch.set_num_threads(1)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    _HERE.update(roller=_Roller(factories, steps), plugins=plugins)
+    _roller, _plugins = _Roller(factories, steps), plugins
 
 
-def _work(plan: Mapping[str, Any], slot: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    load_again(_HERE.pop("plugins", ()))
-    return _HERE["roller"].roll(plan, slot)
+def _work(plan: Mapping[str, Any], slot: int) -> bytes:
+    load_again(_plugins)  # a world that they register in Gymnasium has no name in this process yet
+    # As bytes: torch would send tensors as open files, which are gone with the process.
+    return pickle.dumps(_roller.roll(plan, slot))
 
 
 def _exit_with_parent() -> None:

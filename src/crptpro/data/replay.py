@@ -14,7 +14,7 @@ from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
 from torchrl.envs.transforms import Transform
 
 from crptpro.artifact import require_disk
-from crptpro.data.storage import Column, RingStorage, gather_stacks, map_column, read_rows, stack_rows
+from crptpro.data.storage import RingStorage, gather_stacks, map_rows, read_rows, stack_rows
 from crptpro.errors import DatasetError
 from crptpro.values import as_float, as_int, as_path
 
@@ -160,19 +160,9 @@ class FrameReplay(ReplayBuffer):
         )
 
     @property
-    def capacity(self) -> int:
-        """Most transitions that can be sampled."""
-        return self._storage.max_size
-
-    @property
     def window(self) -> int:
         """Frames that the observations of samples, and the newest one, lie among; their numbers differ modulo this."""
         return self._storage.window
-
-    @property
-    def slack(self) -> int:
-        """Frames that may be written after a checkpoint before it is worthless."""
-        return self._storage.slack
 
     @property
     def frames_written(self) -> int:
@@ -189,20 +179,13 @@ class FrameReplay(ReplayBuffer):
         self._storage.returns_pixels = value
 
     def observations(self, numbers: Tensor) -> Tensor:
-        """Return observations by the number of their newest frame, uint8 ``[B, frame_stack * C, H, W]``.
-
-        Args:
-            numbers: int64 ``[B]``.
+        """Return observations by number, int64 ``[B]``, as uint8 ``[B, frame_stack * C, H, W]``.
 
         Raises:
             DatasetError: if one of them is not in the ring, or no longer.
         """
         with self._replay_lock:
             return self._storage.observations(numbers)
-
-    def flush(self) -> None:
-        """Write a ring on disk through to it; only a crash of the machine makes a difference."""
-        self._storage.flush()
 
     def state_dict(self) -> dict[str, Any]:
         """Return a few counters (ring on disk) or the whole content (ring in RAM); the generator is the caller's."""
@@ -219,14 +202,7 @@ class FrameReplay(ReplayBuffer):
             self._storage.load_state_dict(state_dict["ring"])
 
 
-def stack_frames(
-    buffer: ReplayBuffer,
-    *,
-    frame_stack: int = 3,
-    batch_size: int | None = None,
-    generator: torch.Generator | None = None,
-    transform: Transform | None = None,
-) -> FrameReplay:
+def stack_frames(buffer: ReplayBuffer, *, frame_stack: int = 3, **options: Any) -> FrameReplay:
     """Turn a buffer of single frames, as most public data sets are, into one whose samples are stacks.
 
     Args:
@@ -234,9 +210,7 @@ def stack_frames(
             episodes: ``pixels`` and ``("next", "pixels")`` uint8 ``[C, H, W]``, ``action`` and
             ``("next", "reward" | "done")``.
         frame_stack: k, frames per stack.
-        batch_size: default of ``sample``.
-        generator: source of randomness; torch's global generator if ``None``.
-        transform: of samples.
+        **options: ``batch_size``, ``generator`` and ``transform`` of :class:`FrameReplay`.
 
     Returns:
         A copy in RAM, each frame once, that :func:`crptpro.training.pretrain` takes as a dataset.
@@ -257,9 +231,7 @@ def stack_frames(
         frame_shape=tuple(first["pixels"].shape[1:]),
         action_dim=first["action"].shape[-1],
         frame_stack=frame_stack,
-        batch_size=batch_size,
-        generator=generator,
-        transform=transform,
+        **options,
     )
     for begin in range(0, length, 1000):
         replay.extend(buffer[begin : begin + 1000])
@@ -269,39 +241,28 @@ def stack_frames(
 class StoredReplay:
     """The observations in the files of a :class:`FrameReplay`, oldest first, without writing to them.
 
-    A ring that went round holds the newest part alone; the files do not tell how much came before.
-
-    Args:
-        path: directory that was the replay's ``path``; nobody may be writing to it.
-        frame_stack: k, frames per observation.
+    A ring that went round holds the newest part alone. Nobody may be writing to ``path``, which was the replay's.
 
     Raises:
         DatasetError: if there is no replay of square RGB frames, or not a single transition in it.
     """
 
     def __init__(self, path: str | Path, *, frame_stack: int = 3) -> None:
-        self.path, self.frame_stack = Path(path), frame_stack
-        self.rows = self._size("number") // 8
-        size = math.isqrt(self._size("pixels") // (3 * max(self.rows, 1)))
-        if not self.rows or 3 * size * size * self.rows != self._size("pixels"):
-            raise DatasetError(f"{self.path} holds no square RGB frames; it is damaged, or no replay.")
-        self._frames = self._map("pixels", "uint8", (3, size, size))
-        number, row_of = self._map("number", "int64", ()), self._map("row_of", "int64", ())
-        self._step = self._map("step", "int32", ())
-        # A row's number is one more than the frames written before it, 0 where none was; frames follow one another.
-        written = (number[number > 0] - 1).sort().values
-        if len(written) and int(written[-1] - written[0]) + 1 != len(written):
-            raise DatasetError(f"{self.path} has lost rows in the middle; explore again.")
-        # Transitions that the ring has forgotten, and rows of the file that none was written to, point elsewhere.
-        starts = row_of.unique()
-        starts = starts[(starts > 0) | (row_of[0] == 0)]
-        starts = starts[torch.isin(starts, written) & torch.isin(starts + 1, written)]
-        step = self._step[starts % self.rows].long()
-        goes_on = self._step[(starts + 1) % self.rows] == step + 1
-        is_whole = starts - torch.clamp(step, max=frame_stack - 1) >= written[:1]
-        self._starts = starts[goes_on & is_whole]
+        path = as_path(path)
+        number, row_of = (map_rows(path / f"{name}.memmap", torch.int64, ()) for name in ("number", "row_of"))
+        self._step = map_rows(path / "step.memmap", torch.int32, ())
+        self._rows, self._frame_stack = len(number), frame_stack
+        size = math.isqrt((path / "pixels.memmap").stat().st_size // (3 * self._rows))
+        self._frames = map_rows(path / "pixels.memmap", torch.uint8, (3, size, size), self._rows)
+        # `number` counts from 1. Transitions that were overwritten, and rows never written (0), point elsewhere.
+        end = int(number.max())
+        oldest = max(0, end - self._rows)
+        starts = torch.cat([row_of[:1], row_of[row_of > 0]]).unique()
+        starts = starts[(starts >= oldest) & (starts + 1 < end)]
+        age = self._step[starts % self._rows].clamp(max=frame_stack - 1)
+        self._starts = starts[starts - age >= oldest]
         if not len(self._starts):
-            raise DatasetError(f"The replay in {self.path} has no transition.")
+            raise DatasetError(f"The replay in {path} has no transition.")
 
     def __len__(self) -> int:
         """Return how many transitions it holds."""
@@ -310,20 +271,8 @@ class StoredReplay:
     def observations(self, index: Tensor) -> Tensor:
         """Return the observations of transitions ``[B]``, 0 being the oldest, uint8 ``[B, k * 3, H, W]``."""
         numbers = self._starts[index]
-        rows = stack_rows(numbers, self._step[numbers % self.rows], self.frame_stack)
-        return gather_stacks(self._frames, rows % self.rows)
-
-    def _size(self, name: str) -> int:
-        try:
-            return (self.path / f"{name}.memmap").stat().st_size
-        except OSError:
-            raise DatasetError(
-                f"{self.path} holds no replay: {name}.memmap is missing. It is what an exploring run leaves behind; "
-                "explore again if it was removed."
-            ) from None
-
-    def _map(self, name: str, dtype: str, shape: tuple[int, ...]) -> Tensor:
-        return map_column(self.path / f"{name}.memmap", Column("frames", (name,), dtype, shape), self.rows)
+        rows = stack_rows(numbers, self._step[numbers % self._rows], self._frame_stack)
+        return gather_stacks(self._frames, rows % self._rows)
 
 
 def as_it_is(sample: TensorDictBase) -> TensorDictBase:
@@ -334,8 +283,7 @@ def as_it_is(sample: TensorDictBase) -> TensorDictBase:
 class _RingWriter(ImmutableDatasetWriter):
     """Hands what a buffer is extended by to the ring, checked.
 
-    Reading and checking a TensorDict of one transition costs about 0.25 ms more than writing its tensors by hand did;
-    an agent step of walker takes 50 ms. A rollout costs 0.05 ms per transition.
+    Reading and checking a TensorDict of one transition costs about 0.25 ms; an agent step of walker takes 50 ms.
     """
 
     def __init__(self, extra: Mapping[str, tuple[tuple[int, ...], torch.dtype]]):
@@ -353,9 +301,7 @@ class _RingWriter(ImmutableDatasetWriter):
                 raise ValueError(f"This replay holds {name} of shape {expected}, got {got}.")
         return ring.write(rows)
 
-    def add(self, data: TensorDictBase) -> Tensor:
-        """Store one transition."""
-        return self.extend(data)
+    add = extend
 
     def _empty(self, empty_write_count: bool = True) -> None:
         pass
@@ -369,30 +315,28 @@ class _WindowSampler(RandomSampler):
     """
 
     def sample(self, storage: RingStorage, batch_size: int) -> tuple[Tensor, dict]:
-        n_step, length = storage.n_step, len(storage)
-        count = length - n_step + 1
-        if n_step == 1 or length == 0:
+        length = len(storage)
+        if storage.n_step == 1 or length == 0:
             return super().sample(storage, batch_size)
-        nothing = DatasetError(
-            f"None of the replay's {length} transitions is followed by enough of its own episode for n_step={n_step}: "
-            "use a smaller n_step, or let more be stored before the first update (random_agent_steps)."
-        )
-        if count < 1:
-            raise nothing
 
         def draw(among: int, number: int) -> Tensor:
             return torch.randint(among, (number,), generator=self._rng, device="cpu")
 
-        index = draw(count, batch_size)
-        for _ in range(_REDRAWS):
+        count = max(0, length - storage.n_step + 1)
+        index = draw(max(1, count), batch_size)
+        for _ in range(_REDRAWS if count else 0):
             misfits = (~storage.has_window(index)).nonzero().squeeze(-1)
             if not len(misfits):
                 return index, {}
             index[misfits] = draw(count, len(misfits))
-        every = torch.arange(count, device="cpu")
-        admissible = every[storage.has_window(every)]
+        admissible = torch.arange(count, device="cpu")
+        admissible = admissible[storage.has_window(admissible)]
         if not len(admissible):
-            raise nothing
+            raise DatasetError(
+                f"None of the replay's {length} transitions is followed by enough of its own episode for "
+                f"n_step={storage.n_step}: use a smaller n_step, or let more be stored before the first update "
+                "(random_agent_steps)."
+            )
         misfits = (~storage.has_window(index)).nonzero().squeeze(-1)
         index[misfits] = admissible[draw(len(admissible), len(misfits))]
         return index, {}

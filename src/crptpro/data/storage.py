@@ -1,4 +1,4 @@
-"""Frames stored once, on disk or in RAM, and the stacks that are made of them when they are read."""
+"""Frames stored once, and the stacks that are made of them when they are read."""
 
 from __future__ import annotations
 
@@ -7,16 +7,13 @@ import itertools
 import math
 import mmap
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, is_tensor_collection
 from torch import Tensor
-from torchrl.data.replay_buffers.checkpointers import StorageCheckpointerBase
 from torchrl.data.replay_buffers.storages import Storage
 
 from crptpro.errors import (
@@ -27,159 +24,37 @@ from crptpro.errors import (
     is_disk_full,
     writing_error,
 )
-from crptpro.host_memory import empty_batch
 
-FORMAT, VERSION = "crptpro-frames", 1
-CARD_FILE, JOURNAL_FILE, COLLECTION_FILE = "card.json", "journal.jsonl", "collection.json"
-FRAMES, TRANSITIONS = "frames", "transitions"
-PIXELS_FILE = f"{FRAMES}/pixels.memmap"
-
-#: What a card says about its pixels: their type and range, unscaled.
-PIXELS = "uint8 0..255"
+PIXELS_FILE = "frames/pixels.memmap"
 
 # Not in the mmap module of every Python; without it a mapping larger than RAM could be refused.
 _MAP_NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)
 
 
-# --- the files of a dataset ------------------------------------------------------------------------------------------
-
-
-class Column(NamedTuple):
-    """One raw little-endian file: rows of ``shape``, under a TensorDict key."""
-
-    part: Literal["frames", "transitions"]
-    key: tuple[str, ...]
-    dtype: str
-    shape: tuple[int, ...]
-
-    @property
-    def file(self) -> str:
-        """The file's path inside the dataset, where ``TensorDict.load_memmap`` looks for it."""
-        return "/".join((self.part, *self.key)) + ".memmap"
-
-    @property
-    def row_bytes(self) -> int:
-        """Bytes per row."""
-        return math.prod(self.shape) * np.dtype(self.dtype).itemsize
-
-
-@dataclass(frozen=True)
-class Layout:
-    """The shapes that fix every file of a dataset.
-
-    Args:
-        image_size: H = W, pixels.
-        action_dim: length of an action vector.
-        channels: channels of one frame.
-        state: physical quantities stored per frame as float64, name to length (``qpos``, ``qvel``).
-    """
-
-    image_size: int
-    action_dim: int
-    channels: int = 3
-    state: Mapping[str, int] = field(default_factory=dict)
-
-    def columns(self) -> tuple[Column, ...]:
-        """Every file, frames first, in the order in which checksums read them."""
-        frame = (self.channels, self.image_size, self.image_size)
-        flags = [("next", name) for name in ("done", "terminated", "truncated")]
-        return (
-            Column("frames", ("pixels",), "uint8", frame),
-            *(Column("frames", (name,), "float64", (size,)) for name, size in sorted(self.state.items())),
-            Column("transitions", ("action",), "float32", (self.action_dim,)),
-            Column("transitions", ("next", "reward"), "float32", (1,)),
-            *(Column("transitions", key, "bool", (1,)) for key in flags),
-            Column("transitions", ("row",), "int64", ()),
-            Column("transitions", ("step",), "int32", ()),
-            Column("transitions", ("episode",), "int32", ()),
-        )
-
-    def sizes(self, transitions: int, frames: int) -> dict[str, int]:
-        """Return each file's size in bytes."""
-        rows = {FRAMES: frames, TRANSITIONS: transitions}
-        return {column.file: column.row_bytes * rows[column.part] for column in self.columns()}
-
-    def bytes(self, transitions: int, frames: int) -> int:
-        """Return the size of all files in bytes, card and journal excepted."""
-        return sum(self.sizes(transitions, frames).values())
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form that a card holds."""
-        state = dict(sorted(self.state.items()))
-        return {
-            "image_size": self.image_size, "action_dim": self.action_dim, "channels": self.channels, "state": state
-        }  # fmt: skip
-
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> Layout:
-        """Read what :meth:`to_dict` wrote."""
-        sizes = {name: int(content[name]) for name in ("image_size", "action_dim", "channels")}
-        return cls(**sizes, state={name: int(size) for name, size in content["state"].items()})
-
-
-def estimate_bytes(transitions: int, image_size: int, episode_agent_steps: int | None) -> int:
-    """Estimate a dataset's size before its action and state sizes are known (taken as 1 kB)."""
-    episodes = -(-transitions // (episode_agent_steps or 100))
-    return (transitions + episodes) * 3 * image_size**2 + transitions * 1000
-
-
-def map_parts(path: Path, layout: Layout, transitions: int, frames: int) -> tuple[TensorDict, TensorDict]:
-    """Map a dataset's frames without write access, and read its transitions, a few MB, into RAM."""
-    rows = {FRAMES: frames, TRANSITIONS: transitions}
-    parts = [
-        TensorDict(
-            {c.key: map_column(path / c.file, c, rows[part]) for c in layout.columns() if c.part == part},
-            batch_size=[rows[part]],
-        )
-        for part in (FRAMES, TRANSITIONS)
-    ]
-    return parts[0], parts[1].clone()
-
-
-def map_column(path: Path, column: Column, rows: int) -> Tensor:
-    """Map a column's file without write access: it costs no memory, and writing to it leaves the file alone.
+def map_rows(path: Path, dtype: torch.dtype, shape: Sequence[int], rows: int | None = None) -> Tensor:
+    """Map a raw file of rows (as many as there are by default): writing to the tensor leaves the file alone.
 
     Raises:
-        DatasetError: if the file is missing or does not have exactly the expected size.
+        DatasetError: if the file is missing, empty, or of another size.
     """
-    expected = rows * column.row_bytes
-    dtype = getattr(torch, column.dtype)
+    row_bytes = math.prod(shape) * dtype.itemsize
     try:
         with open(path, "rb") as file:
-            size = file.seek(0, 2)
-            if size != expected:
-                raise DatasetError(size_problem(path, size, expected))
-            if not expected:
-                return torch.empty(rows, *column.shape, dtype=dtype, device="cpu")
+            require_size(path, os.fstat(file.fileno()).st_size, rows and rows * row_bytes)
             flags = mmap.MAP_PRIVATE | _MAP_NORESERVE
-            mapped = mmap.mmap(file.fileno(), expected, flags=flags, prot=mmap.PROT_READ | mmap.PROT_WRITE)
-    except OSError as reason:
+            mapped = mmap.mmap(file.fileno(), 0, flags=flags, prot=mmap.PROT_READ | mmap.PROT_WRITE)
+    except (OSError, ValueError) as reason:  # an empty file cannot be mapped
+        raise DatasetError(f"{path} is missing or unreadable ({reason}).") from None
+    return torch.frombuffer(mapped, dtype=dtype).view(-1, *shape)
+
+
+def require_size(path: Path, size: int, expected: int | None) -> None:
+    """Refuse a file of ``size`` bytes where ``expected`` belong, with a DatasetError."""
+    if expected is not None and size != expected:
+        kind = "truncated" if size < expected else "longer than it should be"
         raise DatasetError(
-            f"{path} is missing or unreadable ({reason}). Collect the dataset again."
-        ) from None
-    return torch.frombuffer(mapped, dtype=dtype).view(rows, *column.shape)
-
-
-def size_problem(path: Path, size: int, expected: int) -> str:
-    """Say what is wrong with a file of ``size`` bytes where ``expected`` belong."""
-    kind = "truncated" if size < expected else "longer than it should be"
-    return f"{path} is {kind}: {size:,} bytes, the card promises {expected:,}. Collect the dataset again."
-
-
-def write_tensordict_metadata(root: Path, layout: Layout, transitions: int, frames: int) -> None:
-    """Turn the raw files under ``root`` into two memory-mapped TensorDicts by writing their metadata."""
-    from tensordict import MemoryMappedTensor
-
-    for part, rows in ((FRAMES, frames), (TRANSITIONS, transitions)):
-        leaves = {
-            column.key: MemoryMappedTensor.from_filename(
-                root / column.file, getattr(torch, column.dtype), torch.Size((rows, *column.shape))
-            )
-            for column in layout.columns()
-            if column.part == part
-        }
-        # memmap_ keeps a file that already lies where it would write it, so this adds the metadata only.
-        TensorDict(leaves, batch_size=[rows]).memmap_(root / part)
+            f"{path} is {kind}: {size:,} bytes, {expected:,} belong there. Collect the dataset again."
+        )
 
 
 # --- stacks ----------------------------------------------------------------------------------------------------------
@@ -202,17 +77,12 @@ def stack_rows(row: Tensor, step: Tensor, frame_stack: int) -> Tensor:
 def gather_stacks(frames: Tensor, rows: Tensor) -> Tensor:
     """Gather ``[B, k]`` frame rows into stacks ``[B, k * C, H, W]``; contiguous, the dtype of ``frames``.
 
-    Two separate gathers for an observation and its successor are faster than one of the k + 1 frames they
-    share: the shared block would have to be copied again to be contiguous, and handing out overlapping views
-    would let an in-place edit of one change the other.
+    Two gathers for an observation and its successor are faster than one of the k + 1 frames they share, which would
+    have to be copied again to be contiguous.
     """
-    batch, stack = rows.shape
     channels, *size = frames.shape[1:]
-    flat = frames.reshape(len(frames), -1)
-    shape = (batch * stack, flat.shape[1])
-    stacks = empty_batch(shape, flat.dtype) if flat.device.type == "cpu" else flat.new_empty(shape)
-    torch.index_select(flat, 0, rows.reshape(-1), out=stacks)
-    return stacks.view(batch, stack * channels, *size)
+    stacks = frames.reshape(len(frames), -1).index_select(0, rows.reshape(-1))
+    return stacks.view(len(rows), rows.shape[1] * channels, *size)
 
 
 # --- transitions as they come ----------------------------------------------------------------------------------------
@@ -236,26 +106,28 @@ class Rows(NamedTuple):
         """The newest frame of the observations, ``[T, C, H, W]``."""
         return self.stacks[:, -self.following.shape[1] :]
 
-    def starts(self, last: Tensor | None) -> list[int]:
-        """Return which rows begin an episode.
+    def part(self, first: int, end: int) -> Rows:
+        """Return rows ``first`` to ``end``, that one excluded."""
+        columns = {name: values[first:end] for name, values in self.columns.items()}
+        return Rows(self.stacks[first:end], self.following[first:end], columns)
+
+    def pieces(self, last: Tensor | None) -> Iterator[tuple[bool, Rows]]:
+        """Split where episodes begin; yields whether a piece begins one, and its rows.
 
         A row continues the one before if that one was not done and led to the frame that this one begins with.
 
         Args:
             last: the newest frame of what was stored before; ``None`` if no episode is running.
         """
-        newest, found = self.newest, []
-        if last is None or not torch.equal(newest[0], last):
-            found.append(0)
-        if len(newest) > 1:
-            continues = (newest[1:] == self.following[:-1]).flatten(1).all(1) & ~self.columns["done"][:-1, 0]
-            found += (1 + (~continues).nonzero().squeeze(-1)).tolist()
-        return found
-
-    def part(self, first: int, last: int) -> Rows:
-        """Return rows ``first`` to ``last``, that one excluded."""
-        columns = {name: values[first:last] for name, values in self.columns.items()}
-        return Rows(self.stacks[first:last], self.following[first:last], columns)
+        newest, length = self.newest, len(self.following)
+        if not length:
+            return
+        starts = [0] if last is None or not torch.equal(newest[0], last) else []
+        if length > 1:
+            begins = (newest[1:] != self.following[:-1]).flatten(1).any(1) | self.columns["done"][:-1, 0]
+            starts += (1 + begins.nonzero().squeeze(-1)).tolist()
+        for first, end in itertools.pairwise(sorted({0, *starts, length})):
+            yield first in starts, self if (first, end) == (0, length) else self.part(first, end)
 
     def first_frames(self) -> Tensor:
         """Return the first observation's frames without those that an episode's start repeats, ``[s, C, H, W]``."""
@@ -274,14 +146,9 @@ def read_rows(
     extra: Sequence[NestedKey] = (),
     what: str = "A replay",
 ) -> Rows:
-    """Read what a TorchRL environment, rollout or collector hands out.
+    """Read what a TorchRL environment, rollout or collector hands out, ``[T]`` in temporal order or ``[]``.
 
-    Args:
-        data: batch ``[T]`` in temporal order, or ``[]``.
-        channels: C of a single frame.
-        frame_stack: k; ``pixels`` are single frames or stacks of k.
-        extra: further entries to read.
-        what: is being written, for messages.
+    ``pixels`` are single frames of so many channels or stacks of them; ``what`` is being written, for messages.
 
     Raises:
         ValueError: for entries that are missing or of another shape.
@@ -348,8 +215,8 @@ class StackStorage(Storage):
     pixels: Tensor
     step: Tensor
     frame_stack: int
-    returns_pixels: bool = True
     device: torch.device
+    returns_pixels: bool = True
 
     def columns_at(self, index: Tensor, **how: Any) -> TensorDict:
         """Return everything but pixels of transitions ``[B]``, with both observations' numbers."""
@@ -357,38 +224,17 @@ class StackStorage(Storage):
 
     def held(self) -> range:
         """Return the numbers of the frames that can be read."""
-        raise NotImplementedError
-
-    def load(self) -> None:
-        """Read what has been written since."""
+        return range(len(self.pixels))
 
     def get(self, index: Any, **how: Any) -> TensorDict:
-        """Return transitions; 0 is the oldest.
-
-        Args:
-            index: an int, a slice, a mask, or integers of any shape.
-            **how: of :meth:`columns_at`.
-
-        Raises:
-            IndexError: if an index is out of range.
-        """
-        self.load()
+        """Return transitions by an int, a slice, a mask, or integers of any shape; 0 is the oldest."""
         positions = self._positions(index)
         flat = positions.reshape(-1)
         sample = self.columns_at(flat, **how).set("index", flat)
         if self.returns_pixels:
-            sample.set("pixels", self.stacks(sample.get("number")))
-            sample.set(("next", "pixels"), self.stacks(sample.get(("next", "number"))))
+            sample.set("pixels", self._stacks(sample.get("number")))
+            sample.set(("next", "pixels"), self._stacks(sample.get(("next", "number"))))
         return sample if positions.ndim == 1 else sample.reshape(positions.shape)
-
-    def stack_rows_of(self, numbers: Tensor) -> Tensor:
-        """Return the rows of :attr:`pixels` that make up observations, int64 ``[B, k]``, oldest to newest."""
-        rows = len(self.pixels)
-        return stack_rows(numbers, self.step[numbers % rows], self.frame_stack) % rows
-
-    def stacks(self, numbers: Tensor) -> Tensor:
-        """Return observations ``[B]`` by their numbers, uint8 ``[B, k * C, H, W]``."""
-        return gather_stacks(self.pixels, self.stack_rows_of(numbers))
 
     def observations(self, numbers: Tensor) -> Tensor:
         """Return observations by number, uint8 ``[B, k * C, H, W]``.
@@ -396,7 +242,6 @@ class StackStorage(Storage):
         Raises:
             DatasetError: if a frame of one of them is not there, or no longer.
         """
-        self.load()
         numbers, held = torch.as_tensor(numbers, dtype=torch.int64, device=self.device), self.held()
         first = numbers - torch.clamp(self.step[numbers % len(self.pixels)], max=self.frame_stack - 1)
         gone = (first < held.start) | (numbers >= held.stop)
@@ -404,7 +249,13 @@ class StackStorage(Storage):
             raise DatasetError(
                 f"Observation {int(numbers[gone][0])} is not stored; there are {held.start} to {held.stop - 1}."
             )
-        return self.stacks(numbers)
+        return self._stacks(numbers)
+
+    def _stacks(self, numbers: Tensor) -> Tensor:
+        rows = len(self.pixels)
+        return gather_stacks(
+            self.pixels, stack_rows(numbers, self.step[numbers % rows], self.frame_stack) % rows
+        )
 
     def _positions(self, index: Any) -> Tensor:
         if isinstance(index, tuple) and len(index) == 1:
@@ -422,113 +273,18 @@ class StackStorage(Storage):
             raise IndexError(f"index {index} is out of range for {length} transitions.")
         return torch.where(positions < 0, positions + length, positions)
 
-    def contains(self, item: Any) -> bool:
-        """Whether there is a transition at an index."""
-        return -len(self) <= int(item) < len(self)
-
     def set(self, *_: Any, **__: Any) -> None:
         """Refuse: rows depend on each other."""
         raise DatasetError("Frames are stored once, so that transitions depend on each other: use extend.")
 
-
-class FrameStorage(StackStorage):
-    """The rows of a dataset, read-only.
-
-    The stack of transition i is made of rows ``row[i] - min(j, step[i])``, j = k-1 .. 0, and that of its
-    successor ends at ``row[i] + 1``; both lie inside the episode, because an episode of T transitions has T +
-    1 frames.
-
-    Args:
-        frames: TensorDict ``[F]`` with ``pixels`` uint8 ``[F, C, H, W]`` and optional physical state.
-        transitions: TensorDict ``[N]`` with ``row`` int64, ``step``, and any per-transition columns.
-        frame_stack: k, frames per stack.
-        path: of the directory that they are mapped from.
-        card: of the dataset.
-
-    Raises:
-        DatasetError: for a ``frame_stack`` below 1.
-    """
-
-    def __init__(
-        self,
-        frames: TensorDictBase,
-        transitions: TensorDictBase,
-        *,
-        frame_stack: int = 3,
-        path: Path | None = None,
-        card: Mapping[str, Any] | None = None,
-    ):
-        if frame_stack < 1:
-            raise DatasetError(f"frame_stack must be at least 1, got {frame_stack}.")
-        super().__init__(len(transitions))
-        self.frame_stack, self.path, self.card = frame_stack, path, dict(card or {})
-        self._read: Callable[[], tuple[TensorDictBase, TensorDictBase]] | None
-        self.replace(len(transitions), lambda: (frames, transitions))
-        self.load()
-
-    def replace(self, length: int, read: Callable[[], tuple[TensorDictBase, TensorDictBase]]) -> None:
-        """Hold other rows from now on, which are read when they are needed."""
-        self.max_size, self._read = length, read
-
-    def load(self) -> None:
-        """See the base class."""
-        if self._read is None:
-            return
-        (self.frames, self.transitions), self._read = self._read(), None
-        frames, transitions = self.frames, self.transitions
-        self.pixels = frames.get("pixels")
-        self.device = self.pixels.device
-        row, step = transitions.get("row"), transitions.get("step").to(torch.int32)
-        self.step = torch.zeros(len(frames), dtype=torch.int32, device=self.device)
-        self.step[row + 1] = step + 1
-
-    def __len__(self) -> int:
-        return self.max_size
-
-    def columns_at(self, index: Tensor, **how: Any) -> TensorDict:
-        """See the base class."""
-        columns = self.transitions.apply(lambda column: column.index_select(0, index), batch_size=index.shape)
-        number = columns.pop("row")
-        return columns.set("number", number).set(("next", "number"), number + 1)
-
-    def held(self) -> range:
-        """See the base class."""
-        return range(len(self.pixels))
-
-    def _empty(self) -> None:
-        self.set()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what tells this dataset from another one of the same shape: a checkpoint does not copy it."""
-        names = ("domain", "task", "seed", "transitions", "frames", "quality", "action_repeat", "crc32")
-        return {name: self.card.get(name) for name in names} | {"frame_stack": self.frame_stack}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Check that a checkpoint belongs to this dataset.
-
-        Raises:
-            DatasetError: if it was written with another one.
-        """
-        for name, mine in self.state_dict().items():
-            if mine != state_dict.get(name):
-                raise DatasetError(
-                    f"The checkpoint was written with another dataset: {name} was {state_dict.get(name)}, "
-                    f"{self.path} has {mine}. Open the dataset it was written with."
-                )
-
-
-class _StateCheckpointer(StorageCheckpointerBase):
-    """Saves a storage's state dict: a reference to a dataset, the counters of a ring on disk, a ring in RAM."""
-
-    def dumps(self, storage: StackStorage, path: str | Path) -> None:
+    def dumps(self, path: str | Path) -> None:
+        """Save the state dict: a reference to a dataset, the counters of a ring on disk, or a ring in RAM."""
         Path(path).mkdir(parents=True, exist_ok=True)
-        torch.save(storage.state_dict(), Path(path) / "state.pt")
+        torch.save(self.state_dict(), Path(path) / "state.pt")
 
-    def loads(self, storage: StackStorage, path: str | Path) -> None:
-        storage.load_state_dict(torch.load(Path(path) / "state.pt", weights_only=True))
-
-
-StackStorage._default_checkpointer = _StateCheckpointer
+    def loads(self, path: str | Path) -> None:
+        """Load what :meth:`dumps` saved."""
+        self.load_state_dict(torch.load(Path(path) / "state.pt", weights_only=True))
 
 
 class RingStorage(StackStorage):
@@ -538,16 +294,8 @@ class RingStorage(StackStorage):
     is among the newest ``capacity`` and all its frames are among the newest ``window`` rows. So a state from
     a moment ago needs no row that was overwritten since, as long as at most ``slack`` rows were.
 
-    Args:
-        capacity: most transitions that are valid at once.
-        window: rows that valid transitions may use.
-        slack: further rows, which only restoring needs.
-        columns: name to (shape, dtype) of every per-row quantity, ``pixels`` among them.
-        frame_stack: k, frames per stack.
-        root_columns: names that belong to a transition's observation; the others are returned under ``"next"``.
-        n_step: n, agent steps from an observation to the next one of a sample.
-        discount: gamma of the n-step return.
-        path: directory of the memory-mapped files; RAM if ``None``.
+    ``columns`` maps every per-row quantity to its shape and dtype; ``root_columns`` belong to the observation, the
+    others are returned under ``"next"``.
     """
 
     COUNTERS = ("frames", "transitions", "oldest", "episode_step", "is_open")
@@ -567,13 +315,9 @@ class RingStorage(StackStorage):
     ):
         super().__init__(capacity)
         self.device = torch.device("cpu")
-        self.window, self.slack, self.frame_stack, self.path = window, slack, frame_stack, path
-        self.rows, self.root_columns, self.n_step, self.discount = (
-            window + slack,
-            root_columns,
-            n_step,
-            discount,
-        )
+        self.rows, self.window, self.slack, self.path = window + slack, window, slack, path
+        self.frame_stack, self.n_step, self.discount = frame_stack, n_step, discount
+        self.root_columns = root_columns
         # They only grow; a counter modulo the number of rows is a slot. `oldest` is the first valid transition.
         self.frames = self.transitions = self.oldest = self.episode_step = 0
         self.is_open = False
@@ -599,11 +343,7 @@ class RingStorage(StackStorage):
         for begin in range(0, total, self.max_size):
             part = rows if total <= self.max_size else rows.part(begin, begin + self.max_size)
             last = self.pixels[(self.frames - 1) % self.rows] if self.is_open else None
-            starts = part.starts(last)
-            edges = sorted({0, *starts, len(part.following)})
-            for first, end in itertools.pairwise(edges):
-                piece = part if (first, end) == (0, len(part.following)) else part.part(first, end)
-                numbers.append(self._write_piece(piece, begins=first in starts))
+            numbers += [self._write_piece(piece, begins=begins) for begins, piece in part.pieces(last)]
         return numbers[0] if len(numbers) == 1 else torch.cat(numbers)
 
     def _write_piece(self, rows: Rows, *, begins: bool) -> Tensor:
@@ -691,14 +431,10 @@ class RingStorage(StackStorage):
 
     # -- keeping
 
-    def flush(self) -> None:
-        """Write the memory-mapped rows to the disk; a kill of this process loses nothing even without it."""
-        for mapped in self._maps:
-            mapped.flush()
-
     def state_dict(self) -> dict[str, Any]:
         """Return the counters, and the rows themselves if they are in RAM."""
-        self.flush()
+        for mapped in self._maps:
+            mapped.flush()  # only a crash of the machine makes a difference
         counters = {name: getattr(self, name) for name in self.COUNTERS}
         state: dict[str, Any] = {"counters": counters, "rows": self.rows, "window": self.window}
         if self.path is None:
@@ -786,44 +522,33 @@ def n_step_return(rewards: Tensor, terminated: Tensor, discount: float) -> tuple
 
 
 def map_file(path: Path, size: int) -> mmap.mmap:
-    """Map a file whose bytes are reserved, making it or keeping what is in it.
-
-    Args:
-        path: of the file, in an existing directory.
-        size: bytes.
+    """Map a file of ``size`` bytes, which are reserved if it is new.
 
     Raises:
         CheckpointError: there is a file of another size.
         DiskSpaceError: the disk cannot hold it; nothing is left of what was reserved.
         OSError: naming the file, for any other reason.
     """
-    found = path.stat().st_size if path.exists() else 0
-    if found not in (0, size):
-        raise CheckpointError(
-            f"{path} has {found:,} bytes, this replay needs {size:,}: it belongs to a replay of another size. Use "
-            "the capacity and slack it was written with, or another directory."
-        )
     # A new one has its name once it is whole: a kill while it is reserved leaves nothing that looks like rows.
-    partial = path.with_name(f".{path.name}.partial")
-    # Not by open(path, "a+b"): a file system that cannot reserve has glibc write instead, which it refuses to do in a
-    # file that is appended to.
-    handle = os.open(path if found else partial, os.O_RDWR | os.O_CREAT, 0o666)
+    is_new, partial = not path.exists(), path.with_name(f".{path.name}.partial")
     try:
-        os.ftruncate(handle, found)  # drops what such a kill left, of whatever size
-        try:
-            # Reserved, not sparse: a disk that fills up later would end the process by a bus error.
-            os.posix_fallocate(handle, 0, size)
-        except OSError as reason:
-            os.ftruncate(handle, found)  # what was reserved before the disk was full
-            if is_disk_full(reason) or reason.errno == errno.EFBIG:
-                raise DiskSpaceError(
-                    f"{path} needs {size / 1e9:.2f} GB: {reason}. Free space, or choose another directory or a smaller "
-                    "capacity."
-                ) from reason
-            raise writing_error(path, reason) from reason
-        if not found:
-            os.replace(partial, path)
-        return mmap.mmap(handle, size)
+        with open(partial if is_new else path, "w+b" if is_new else "r+b") as file:
+            if is_new:
+                # Reserved, not sparse: a disk that fills up later would end the process by a bus error.
+                os.posix_fallocate(file.fileno(), 0, size)
+                os.replace(partial, path)
+            if (found := os.fstat(file.fileno()).st_size) != size:
+                raise CheckpointError(
+                    f"{path} has {found:,} bytes, this replay needs {size:,}: it belongs to a replay of another size. "
+                    "Use the capacity and slack it was written with, or another directory."
+                )
+            return mmap.mmap(file.fileno(), size)
+    except OSError as reason:
+        if is_disk_full(reason) or reason.errno == errno.EFBIG:
+            raise DiskSpaceError(
+                f"{path} needs {size / 1e9:.2f} GB: {reason}. Free space, or choose another directory or a smaller "
+                "capacity."
+            ) from reason
+        raise writing_error(path, reason) from reason
     finally:
-        os.close(handle)
         partial.unlink(missing_ok=True)

@@ -273,16 +273,6 @@ class DMControlPixelEnv(CheckedWorld, DMControlWrapper):
     and renders every env step of a repeated action, which doubles the time of an agent step.
     """
 
-    def draw_state(self, qpos: np.ndarray, qvel: np.ndarray) -> Tensor:
-        """Return the frame of a state, uint8 ``[3, H, W]``; the episode continues from there.
-
-        What a reset draws into the model (targets, terrain, colours) stays.
-        """
-        physics = self._env.physics
-        physics.data.qpos[:], physics.data.qvel[:] = qpos, qvel
-        physics.forward()
-        return self._env.draw()
-
     def _check_kwargs(self, kwargs: dict[str, Any]) -> None:
         pass  # TorchRL's refuses composer environments
 
