@@ -6,10 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from benchmarks.library import fresh_loss
-from benchmarks.plain_downstream import PlainDownstream
-from benchmarks.plain_pretrain import Batch, PlainPretraining, StackedStore, crop, dispersion, sinkhorn
-from benchmarks.synthetic import write_dataset
+from benchmarks.plain import Batch, PlainDownstream, PlainPretraining, crop, dispersion, sinkhorn
+from benchmarks.synthetic import drifting_dataset
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
@@ -57,7 +55,7 @@ def assert_all_close(ours: list[Tensor], plain: list[Tensor], **tolerance: float
 
 def test_plain_pretraining_has_the_loss_and_gradients_of_proto_loss_in_float32() -> None:
     loss = proto_loss(torch.float32)
-    plain = PlainPretraining.like(loss)
+    plain = PlainPretraining(loss)
     theirs = plain.loss(pixels(1), pixels(10))
     theirs.backward()
     loss.before_update()
@@ -74,12 +72,13 @@ def test_plain_pretraining_has_the_loss_and_gradients_of_proto_loss_in_float32()
 def test_after_three_plain_pretraining_updates_the_loss_is_that_after_three_of_ours() -> None:
     # In float64: Adam turns the rounding of a vanishing gradient into a whole step.
     loss = proto_loss(torch.float64)
-    plain = PlainPretraining.like(loss)
+    plain = PlainPretraining(loss)
     optimizer = torch.optim.Adam([p for p in loss.parameters() if p.requires_grad], lr=1e-4)
     targets = SoftUpdate(loss, tau=0.05)
     before = plain.loss(pixels(5), pixels(14)).item()
     for index in range(3):
-        theirs = plain.update(pixels(index), pixels(index + 9))
+        rest = (torch.zeros(B, 1),) * 2
+        theirs = plain.update(Batch(pixels(index), *rest, pixels(index + 9), rest[0]))
         loss.before_update()
         out = loss(batch_of(index))
         optimizer.zero_grad()
@@ -121,7 +120,7 @@ class Agents:
         sizes = {"bottleneck_dim": 10, "hidden_dim": 32}
         actor = SquashedGaussianActor(encoder.feature_dim, A, **sizes)
         critic = TwinCritic(encoder.feature_dim, A, **sizes)
-        self.plain = PlainDownstream.like(self.pretrained, actor, critic, torch.Generator().manual_seed(7))
+        self.plain = PlainDownstream(self.pretrained, actor, critic, torch.Generator().manual_seed(7))
         self.loss = RADSACLoss(actor, critic, generator=torch.Generator().manual_seed(7))
         self.bonus = PrototypeReward(
             self.pretrained.projector,
@@ -160,8 +159,7 @@ def test_the_plain_features_critic_actor_and_temperature_are_ours_in_losses_and_
         loss.backward()
     torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=0)
     assert_all_close(gradients(agents.loss.critic), gradients(agents.plain.critic), rtol=1e-3, atol=1e-5)
-    theirs, log_prob = agents.plain.actor_loss(agents.h)
-    their_alpha = agents.plain.alpha_loss(log_prob)
+    theirs, their_alpha = agents.plain.actor_loss(agents.h)
     out = agents.loss.actor_and_temperature_loss(td)
     for loss in (theirs, their_alpha, out["loss_actor"], out["loss_alpha"]):
         loss.backward()
@@ -203,10 +201,9 @@ def test_two_plain_downstream_updates_have_the_losses_of_the_learner() -> None:
 def test_the_plain_crop_and_store_are_the_librarys_shift_and_dataset(tmp_path: Path) -> None:
     offsets = torch.randint(0, 9, (B, 2), generator=torch.Generator().manual_seed(0))
     assert torch.equal(crop(pixels(0), offsets), random_shift(pixels(0), offsets))
-    dataset = FrameDataset.open(write_dataset(tmp_path / "toy", transitions=25, image_size=16))
-    store, rows = StackedStore.of(dataset, 20), dataset[torch.arange(20)]
+    dataset = FrameDataset.open(drifting_dataset(tmp_path, transitions=25, image_size=16))
+    store, rows = Batch.of(dataset, 20), dataset[torch.arange(20)]
     for name, key in (("obs", "pixels"), ("next_obs", ("next", "pixels")), ("action", "action")):
-        assert torch.equal(getattr(store.content, name), rows[key])
-    assert len(StackedStore.of(dataset, 1_000)) == 25
+        assert torch.equal(getattr(store, name), rows[key])
+    assert len(Batch.of(dataset, 1_000).obs) == 25
     assert store.sample(7).obs.shape == (7, 9, 16, 16)
-    assert fresh_loss(image_size=16).prototypes.weight.shape == (512, 128)
