@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import torch
 import tyro
-from benchmarks.loops import ITEMS, STORE, downstream, fill
+from benchmarks.loops import ITEMS, downstream
 from benchmarks.measure import Loop, side_by_side
 from benchmarks.synthetic import drifting_dataset, make_drifting_env
 from torch import nn
@@ -108,7 +108,7 @@ def test_candidates_take_turns_and_times_are_per_unit() -> None:
 
 @pytest.mark.parametrize("has_stages", [False, True])
 def test_a_loop_is_the_librarys_and_its_laps_are_all_of_its_time(has_stages: bool) -> None:
-    plain = FrameReplay.sample, getattr(FrameReplay, STORE)
+    plain = FrameReplay.sample, FrameReplay.extend
     found: list[dict[str, float]] = []
 
     def hold(laps: dict[str, float]) -> None:
@@ -121,13 +121,7 @@ def test_a_loop_is_the_librarys_and_its_laps_are_all_of_its_time(has_stages: boo
     split = {"sample", "learn", "wait for the image"} if has_stages else {"update"}
     assert all(laps.keys() == {*split, "store", "act"} for laps in found[1:])
     assert all(seconds > 0 for laps in found[1:] for seconds in laps.values())
-    assert (FrameReplay.sample, getattr(FrameReplay, STORE)) == plain
-
-
-def test_a_replay_is_filled_to_the_last_transition() -> None:
-    replay = FrameReplay(1_200, frame_shape=(3, 16, 16), action_dim=6)
-    fill(replay, 1_200, 16, encodes=False)
-    assert len(replay) == 1_200
+    assert (FrameReplay.sample, FrameReplay.extend) == plain
 
 
 def test_a_process_of_its_own_answers_and_is_watched(tmp_path: Path) -> None:
