@@ -111,18 +111,11 @@ def downstream(
     hold: Hold, *, image_size: int, prototypes: int, transitions: int, task: str = "", passes: int = 2,
     is_filled: bool = True, has_stages: bool = False, **settings: Any,
 ) -> None:  # fmt: skip
-    """Time ``train_downstream(...)``: laps ``update``, ``store`` and ``act``; the actor learns in every second pass.
+    """Time ``train_downstream(...)`` on the drifting world or a task: laps ``update``, ``store`` and ``act``.
 
-    Args:
-        hold: told the laps.
-        image_size: pixels.
-        prototypes: M.
-        transitions: capacity of the replay.
-        task: on the simulator; the drifting world by default.
-        passes: between two holds.
-        is_filled: store and encode drifting pictures before the first update; otherwise the loop fills its replay.
-        has_stages: split ``update`` into ``sample`` (features and bonus too), ``learn``, and ``wait for the image``.
-        **settings: of ``train_downstream``.
+    The actor learns in every second pass. ``is_filled``: drifting pictures are stored and encoded before the first update;
+    otherwise the loop fills its replay. ``has_stages``: ``update`` is split into ``sample`` (with features and bonus),
+    ``learn``, and ``wait for the image``.
     """
     laps = Laps(hold, passes)
     to_fill = iter([transitions] if is_filled else [])

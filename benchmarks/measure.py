@@ -55,13 +55,10 @@ class Loop:
 
     Args:
         item: name.
-        of: the laps that count; all by default.
+        of: the laps that count; all by default. ``laps`` holds all of the last call.
         source: checkout whose ``src`` is imported; this one by default.
         python: interpreter.
         **settings: of the item.
-
-    Attributes:
-        laps: seconds per unit by what they were spent on, of the last call.
     """
 
     def __init__(

@@ -30,11 +30,7 @@ _PATCHES = 12
 class DriftingWorld(EnvBase):
     """Single frames of a drifting picture. No two frames of an episode are equal (below ``image_size ** 2``).
 
-    Args:
-        seed: of the picture.
-        image_size: pixels.
-        clock: file to which every reset appends the time and how many steps came before it.
-        action_dim: A.
+    Every reset appends the time and how many steps came before it to the file ``clock``.
     """
 
     def __init__(
