@@ -113,9 +113,9 @@ def downstream(
 ) -> None:  # fmt: skip
     """Time ``train_downstream(...)`` on the drifting world or a task: laps ``update``, ``store`` and ``act``.
 
-    The actor learns in every second pass. ``is_filled``: drifting pictures are stored and encoded before the first update;
-    otherwise the loop fills its replay. ``has_stages``: ``update`` is split into ``sample`` (with features and bonus),
-    ``learn``, and ``wait for the image``.
+    The actor learns in every second pass. ``is_filled``: drifting pictures are stored and encoded before the first
+    update; otherwise the loop fills its replay. ``has_stages``: ``update`` is split into ``sample`` (with features and
+    bonus), ``learn``, and ``wait for the image``.
     """
     laps = Laps(hold, passes)
     to_fill = iter([transitions] if is_filled else [])
