@@ -3,9 +3,9 @@
 ``python -m benchmarks.gpu`` prints, on synthetic frames that the device holds:
 
 * ``parity``: the device's samples and shifts against the CPU's; compiled and recorded updates against plain ones.
-* ``pretrain``: one update, batches included: float32, TF32, bfloat16, compiled, recorded as a CUDA graph, both.
-* ``downstream``: one update from dense features: float32, TF32, bfloat16, compiled.
-* ``sustained``: ``pretrain(...)`` as it is, what 50,000 updates take, and its peak memory.
+* ``pretrain``: one update of ``pretrain(...)``: float32, TF32, bfloat16, compiled, recorded as a CUDA graph, both.
+* ``downstream``: one update of ``train_downstream(...)``, dense features: float32, TF32, bfloat16, compiled.
+* ``sustained``: ``pretrain(...)`` with its log, what 50,000 updates take, and its peak memory.
 
 ``--tiny`` runs all of it at a toy size, on the CPU where there is no GPU (nothing is recorded there).
 """
@@ -14,9 +14,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import statistics
 import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -25,21 +25,31 @@ import torch
 import tyro
 from torch import Tensor, nn
 
-from benchmarks.library import Downstream, PretrainUpdates, fresh_loss, fresh_pretrained
-from benchmarks.measure import report, save, side_by_side
-from benchmarks.synthetic import make_drifting_env, write_dataset
+from benchmarks import updates
+from benchmarks.loops import fresh_loss, fresh_pretrained
+from benchmarks.measure import Loop, save, side_by_side, table
+from benchmarks.synthetic import drifting_dataset, make_drifting_env
 from crptpro.console import run_main
 from crptpro.data import FrameDataset
 from crptpro.errors import CRPTproError
-from crptpro.modules.precision import Precision
-from crptpro.training import DownstreamConfig, pretrain
+from crptpro.training import pretrain, train_downstream
 from crptpro.transforms import draw_offsets, random_shift
 
 Section = Literal["parity", "pretrain", "downstream", "sustained"]
-PAPER_UPDATES = 50_000
+Switches = dict[str, Any]
+WAYS: dict[str, Switches] = {
+    "recorded": {"cuda_graph": True},
+    "compiled": {"compile": True},
+    "compiled and recorded": {"compile": True, "cuda_graph": True},
+}
+"""Switches of a pre-training that are not to change what is computed."""
 RECORDED_TOLERANCE, COMPILED_TOLERANCE = 1e-5, 1e-3
 """Largest difference allowed between float32 weights after some updates at learning rate 1e-4: Adam turns the rounding
 of a gradient near zero into a step of the learning rate."""
+TINY: dict[str, Any] = {
+    "rounds": 1, "updates_per_call": 2, "batch_size": 8, "prototypes": 16, "image_size": 16, "transitions": 40,
+    "parity_updates": 6, "sustained_updates": 8,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -71,13 +81,15 @@ class Settings:
     out: Path | None = None
     """directory of the JSON; benchmarks/results by default"""
 
-    def resolved(self) -> Settings:
-        """Return the settings with what `tiny` changes."""
-        sizes: dict[str, int] = {
-            "rounds": 1, "updates_per_call": 2, "batch_size": 8, "prototypes": 16, "image_size": 16, "transitions": 40,
-            "parity_updates": 6, "sustained_updates": 8,
-        }  # fmt: skip
-        return dataclasses.replace(self, **sizes) if self.tiny else self  # type: ignore[arg-type]
+    @property
+    def device(self) -> str:
+        """The GPU, if there is one."""
+        return "cuda" if torch.cuda.is_available() else "cpu"
+
+    @property
+    def sizes(self) -> dict[str, Any]:
+        """What every network and image is sized by."""
+        return {"image_size": self.image_size, "prototypes": self.prototypes}
 
 
 def main(settings: Settings) -> dict[str, Any]:
@@ -86,57 +98,43 @@ def main(settings: Settings) -> dict[str, Any]:
     Raises:
         CRPTproError: without a CUDA device, or if a check of the section `parity` fails.
     """
-    settings = settings.resolved()
-    if not (torch.cuda.is_available() or settings.tiny):
+    if settings.tiny:
+        settings = dataclasses.replace(settings, **TINY)
+    elif settings.device == "cpu":
         raise CRPTproError("No CUDA device here. `--tiny` runs through on the CPU.")
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     results: dict[str, Any] = {}
     with tempfile.TemporaryDirectory(prefix="crptpro-gpu-") as directory:
-        sizes = {"transitions": settings.transitions, "image_size": settings.image_size}
-        paths = [write_dataset(Path(directory) / f"drifting_{seed}", seed=seed, **sizes) for seed in range(3)]
+        sizes: dict[str, Any] = {"transitions": settings.transitions, "image_size": settings.image_size}
+        paths = [drifting_dataset(directory, seed=seed, **sizes) for seed in range(3)]
         sections: dict[Section, Callable[[], Any]] = {
-            "parity": lambda: check_parity(settings, paths, device),
-            "pretrain": lambda: time_pretraining(settings, paths, device),
-            "downstream": lambda: time_downstream(settings, device),
-            "sustained": lambda: time_sustained(settings, paths, device, Path(directory)),
+            "parity": lambda: check_parity(settings, paths),
+            "pretrain": lambda: time_pretraining(settings, paths),
+            "downstream": lambda: time_downstream(settings),
+            "sustained": lambda: time_sustained(settings, paths, Path(directory)),
         }
         for name in settings.only:
             print(f"\n## {name}\n", flush=True)
             results[name] = sections[name]()
-            if device.type == "cuda":
+            if settings.device == "cuda":
                 torch.cuda.empty_cache()
-            save("gpu", settings, results, out=settings.out)
-    failed = [check["check"] for check in results.get("parity", []) if not check["passed"]]
-    if failed:
+            save("gpu", settings, results, settings.out)
+    if failed := [check["check"] for check in results.get("parity", []) if not check["passed"]]:
         raise CRPTproError(f"Parity does not hold: {'; '.join(failed)}. Do not trust the times either.")
     return results
 
 
-def check_parity(settings: Settings, paths: list[Path], device: torch.device) -> list[dict[str, Any]]:
+def check_parity(settings: Settings, paths: list[Path]) -> list[dict[str, Any]]:
     """Run every check and print whether it passed."""
-    checks = [check_batches(paths[0], settings.batch_size, device)]
-    records = device.type == "cuda"
-    ways: list[tuple[str, float, dict[str, bool]]] = []
-    if records:
-        ways.append(("recorded", RECORDED_TOLERANCE, {"cuda_graph": True}))
+    pretrained = functools.partial(pretrained_weights, settings, paths)
+    learned = functools.partial(learned_weights, settings)
+    checks = [check_batches(settings, paths[0])]
+    for name, switches in ways(settings).items():
+        tolerance = COMPILED_TOLERANCE if "compile" in switches else RECORDED_TOLERANCE
+        fast = functools.partial(pretrained, **switches)
+        checks.append(check_weights(f"pre-training, {name}", pretrained, fast, tolerance))
     if settings.compile:
-        ways.append(("compiled", COMPILED_TOLERANCE, {"compile": True}))
-    if records and settings.compile:
-        ways.append(("compiled and recorded", COMPILED_TOLERANCE, {"compile": True, "cuda_graph": True}))
-    make_pretraining = functools.partial(pretraining, settings, paths, device, precision="fp32")
-    make_downstream = functools.partial(downstream, settings, device, precision="fp32")
-    for name, tolerance, switches in ways:
-        fast = functools.partial(make_pretraining, **switches)
-        checks.append(
-            check_updates(f"pre-training, {name}", make_pretraining, fast, settings.parity_updates, tolerance)
-        )
-    if settings.compile:
-        fast = functools.partial(make_downstream, compile=True)
-        checks.append(
-            check_updates(
-                "downstream, compiled", make_downstream, fast, settings.parity_updates, COMPILED_TOLERANCE
-            )
-        )
+        fast = functools.partial(learned, compile=True)
+        checks.append(check_weights("downstream, compiled", learned, fast, COMPILED_TOLERANCE))
     print("| check | largest difference | allowed | |\n|---|---|---|---|")
     for check in checks:
         verdict = "ok" if check["passed"] else "**FAILED**"
@@ -144,36 +142,28 @@ def check_parity(settings: Settings, paths: list[Path], device: torch.device) ->
     return checks
 
 
-def check_batches(path: Path, batch_size: int, device: torch.device) -> dict[str, Any]:
-    """Compare a batch of the device, shifted there, with what the CPU makes of the same draws; must be equal."""
-    generator = torch.Generator(device).manual_seed(0)
-    batch = FrameDataset.open(path, device=device, generator=generator).sample(batch_size)
-    expected = FrameDataset.open(path)[batch["index"].cpu()]
-    difference = 0.0
+def check_batches(settings: Settings, path: Path) -> dict[str, Any]:
+    """Compare stacks and shifts of frames on the device with those on the CPU."""
+    ours = FrameDataset.open(path, device=settings.device).sample(settings.batch_size)
+    expected = FrameDataset.open(path)[ours["index"].cpu()]
+    offsets = draw_offsets(settings.batch_size, 4)
+    difference = 0
     for key in ("pixels", ("next", "pixels")):
-        offsets = draw_offsets(batch_size, 4)
-        one, other = random_shift(batch[key], offsets).cpu(), random_shift(expected[key], offsets)
-        difference = max(difference, float((one.int() - other.int()).abs().max()))
+        one, other = random_shift(ours[key], offsets).cpu(), random_shift(expected[key], offsets)
+        difference = max(difference, int((one.int() - other.int()).abs().max()))
     name = "samples and shifts, against the CPU's"
-    return {"check": name, "difference": difference, "allowed": 0.0, "passed": difference == 0}
+    return {"check": name, "difference": difference, "allowed": 0, "passed": difference == 0}
 
 
-Updates = tuple[Callable[[], Any], nn.Module]
-
-
-def check_updates(
-    name: str, plain: Callable[[], Updates], fast: Callable[[], Updates], updates: int, tolerance: float
+def check_weights(
+    name: str, plain: Callable[[], nn.Module], fast: Callable[[], nn.Module], tolerance: float
 ) -> dict[str, Any]:
-    """Compare weights after some updates with switches and without, from the same start on the same batches.
+    """Compare the weights of a training with switches and of one without, from the same start on the same batches.
 
-    A GPU may add up gradients in another order each time, so the plain updates are done twice: what differs by no more
-    than three times as much as they do from themselves passes too.
+    A GPU may add up gradients in another order each time, so the plain training is done twice: what differs by no more
+    than three times as much as it does from itself passes too.
     """
-    made = [plain(), plain(), fast()]
-    for _ in range(updates):
-        for call, _loss in made:
-            call()
-    reference, again, other = (loss for _, loss in made)
+    reference, again, other = plain(), plain(), fast()
     allowed = max(tolerance, 3 * largest_difference(reference, again))
     difference = largest_difference(reference, other)
     return {"check": name, "difference": difference, "allowed": allowed, "passed": difference <= allowed}
@@ -189,103 +179,68 @@ def largest_difference(one: nn.Module, two: nn.Module) -> float:
     )
 
 
-def time_pretraining(settings: Settings, paths: list[Path], device: torch.device) -> dict[str, Any]:
+def pretrained_weights(settings: Settings, paths: list[Path], **switches: Any) -> nn.Module:
+    """Return the loss, with its networks and targets, after some updates in float32."""
+    return pretrain(
+        fresh_loss(**settings.sizes), paths, updates=settings.parity_updates, batch_size=settings.batch_size,
+        device=settings.device, precision="fp32", progress=False, **switches,
+    ).loss  # fmt: skip
+
+
+def learned_weights(settings: Settings, **switches: Any) -> nn.Module:
+    """Return the actor after some updates in float32; its losses are those of the critic."""
+    torch.manual_seed(0)
+    start = settings.batch_size
+    return train_downstream(
+        "drifting", fresh_pretrained(**settings.sizes), env_factory=make_drifting_env, precision="fp32",
+        env_steps=2 * (start + settings.parity_updates), random_agent_steps=start, batch_size=settings.batch_size,
+        replay_capacity=2 * start + settings.parity_updates, features="dense", eval_episodes=1, eval_workers=0,
+        eval_interval_env_steps=10**9, device=settings.device, progress=False, **switches,
+    ).agent.actor  # fmt: skip
+
+
+def time_pretraining(settings: Settings, paths: list[Path]) -> dict[str, Any]:
     """Time one pre-training update with every switch."""
-    make = functools.partial(pretraining, settings, paths, device)
-    candidates = {
-        "fp32": make(precision="fp32")[0],
-        "TF32": in_tf32(make(precision="fp32")[0]),
-        "bf16": make(precision="bf16")[0],
-    }
-    if device.type == "cuda":
-        candidates["bf16, recorded"] = make(precision="bf16", cuda_graph=True)[0]
-    if settings.compile:
-        candidates["bf16, compiled"] = make(precision="bf16", compile=True)[0]
-    if settings.compile and device.type == "cuda":
-        candidates["bf16, compiled and recorded"] = make(precision="bf16", compile=True, cuda_graph=True)[0]
-    return time_updates(settings, candidates, device, unit="pre-training update")
+    bf16 = {f"bf16, {name}": {"precision": "bf16", **switches} for name, switches in ways(settings).items()}
+    return time_updates(settings, "pretraining", bf16, datasets=paths)
 
 
-def time_downstream(settings: Settings, device: torch.device) -> dict[str, Any]:
+def time_downstream(settings: Settings) -> dict[str, Any]:
     """Time one downstream update from dense features with every switch."""
-    make = functools.partial(downstream, settings, device)
-    candidates = {
-        "fp32": make(precision="fp32")[0],
-        "TF32": in_tf32(make(precision="fp32")[0]),
-        "bf16": make(precision="bf16")[0],
-    }
-    if settings.compile:
-        candidates["bf16, compiled"] = make(precision="bf16", compile=True)[0]
-    return time_updates(settings, candidates, device, unit="downstream update")
+    compiled = {"bf16, compiled": {"precision": "bf16", "compile": True}} if settings.compile else {}
+    return time_updates(settings, "downstream", compiled, transitions=settings.transitions, features="dense")
 
 
-def time_updates(
-    settings: Settings, candidates: dict[str, Callable[[], Any]], device: torch.device, *, unit: str
-) -> dict[str, Any]:
-    """Time candidates in turns, many updates between two looks at the clock."""
-    count = settings.updates_per_call
-
-    def many(call: Callable[[], Any]) -> None:
-        for _ in range(count):
-            call()
-
-    calls = {name: functools.partial(many, call) for name, call in candidates.items()}
-    return report(side_by_side(calls, rounds=settings.rounds, per_call=count, device=device), unit=unit)
-
-
-def time_sustained(
-    settings: Settings, paths: list[Path], device: torch.device, scratch: Path
-) -> dict[str, Any]:
-    """Pre-train for a while as a user does and project the paper's number of updates."""
-    if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
-    loss = fresh_loss(image_size=settings.image_size, prototypes=settings.prototypes)
-    result = pretrain(
-        loss, paths, updates=settings.sustained_updates, batch_size=settings.batch_size, device=str(device),
-        run_dir=scratch / "sustained", log_interval=max(1, settings.sustained_updates // 10), compile=settings.compile,
-        cuda_graph=device.type == "cuda",
-    )  # fmt: skip
-    rate = statistics.median(row["updates_per_s"] for row in result.history if "updates_per_s" in row)
-    peak = torch.cuda.max_memory_allocated(device) if device.type == "cuda" else 0
-    print(
-        f"{rate:.1f} updates/s; {PAPER_UPDATES:,} take {PAPER_UPDATES / rate:.0f} s; peak {peak / 2**30:.2f} GiB."
-    )
-    return {"updates_per_s": rate, "projected_s": PAPER_UPDATES / rate, "peak_allocated_bytes": peak}
+def time_updates(settings: Settings, item: str, more: dict[str, Switches], **common: Any) -> dict[str, Any]:
+    """Time loops with switches in turns, many updates between two looks at the clock."""
+    fp32, bf16 = {"precision": "fp32"}, {"precision": "bf16"}
+    candidates: dict[str, Switches] = {"fp32": fp32, "TF32": {**fp32, "tf32": True}, "bf16": bf16, **more}
+    common |= {"device": settings.device, "batch_size": settings.batch_size, **settings.sizes}
+    common["passes"] = settings.updates_per_call
+    with ExitStack() as stack:
+        loops = {
+            name: stack.enter_context(Loop(item, of=("update",), **common, **switches))
+            for name, switches in candidates.items()
+        }
+        return table(side_by_side(loops, rounds=settings.rounds), unit=f"{item} update")
 
 
-def pretraining(settings: Settings, paths: list[Path], device: torch.device, **switches: Any) -> Updates:
-    """Return pre-training updates and what they train."""
-    loss = fresh_loss(image_size=settings.image_size, prototypes=settings.prototypes)
-    return PretrainUpdates(loss, paths, batch_size=settings.batch_size, device=device, **switches), loss
+def time_sustained(settings: Settings, paths: list[Path], scratch: Path) -> dict[str, Any]:
+    """Pre-train for a while as a user does, with every switch."""
+    is_gpu = settings.device == "cuda"
+    if is_gpu:
+        torch.cuda.reset_peak_memory_stats()
+    switches: Switches = {"device": settings.device, "compile": settings.compile, "cuda_graph": is_gpu}
+    found = updates.time_sustained(settings, paths, scratch, **switches)
+    peak = torch.cuda.max_memory_allocated() if is_gpu else 0
+    print(f"Peak {peak / 2**30:.2f} GiB on the device.")
+    return {**found, "peak_allocated_bytes": peak}
 
 
-def downstream(
-    settings: Settings, device: torch.device, *, precision: Precision, compile: bool = False
-) -> Updates:
-    """Return downstream updates and what they train."""
-    config = DownstreamConfig(
-        env_steps=500_000, replay_capacity=settings.transitions, random_agent_steps=1, device=str(device),
-        batch_size=settings.batch_size, features="dense", precision=precision, compile=compile,
-    )  # fmt: skip
-    pretrained = fresh_pretrained(image_size=settings.image_size, prototypes=settings.prototypes)
-    run = Downstream(pretrained, config, env_factory=make_drifting_env)
-    run.fill(settings.transitions)
-    return run.update, run.learner.loss
-
-
-def in_tf32(call: Callable[[], Any]) -> Callable[[], None]:
-    """Let float32 factors be rounded to TF32 during a call."""
-
-    def rounded() -> None:
-        cudnn, matmul = torch.backends.cudnn, torch.backends.cuda.matmul
-        before = cudnn.allow_tf32, matmul.allow_tf32
-        cudnn.allow_tf32 = matmul.allow_tf32 = True
-        try:
-            call()
-        finally:
-            cudnn.allow_tf32, matmul.allow_tf32 = before
-
-    return rounded
+def ways(settings: Settings) -> dict[str, Switches]:
+    """Return the ways that this machine has and the user wants."""
+    missing = {"cuda_graph": settings.device == "cpu", "compile": not settings.compile}
+    return {name: way for name, way in WAYS.items() if not any(missing[switch] for switch in way)}
 
 
 if __name__ == "__main__":

@@ -1,120 +1,96 @@
-"""Image-like episodes, datasets and a world, without a simulator.
+"""A world without a simulator: one smooth picture that drifts, whose steps cost next to nothing, and its datasets.
 
-``benchmarks.revisions`` imports this file in checkouts of other revisions too.
+Public names of the library only: ``benchmarks.revisions`` runs this with other revisions too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+import time
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import CatFrames, EnvBase, TransformedEnv
 
+from crptpro.data import collect_random
+from crptpro.domains import Domain
+
 ACTION_DIM = 6
 """Of the cheetah."""
+LENGTH = 500
+"""Transitions of an episode."""
 _PATCHES = 12
 """Side of the noise that is blown up to an image: patches of a few pixels, as rendered scenes have."""
 
 
-def drifting_episode(
-    transitions: int, *, seed: int, image_size: int = 84, action_dim: int = ACTION_DIM
-) -> TensorDict:
-    """Return a rollout ``[T]`` of single frames: one smooth picture that drifts by a pixel or two per transition.
-
-    No two of its frames are equal while there are fewer than ``image_size ** 2``. It is truncated at its end.
-    """
-    rng = np.random.default_rng(seed)
-    scene = _picture(rng, image_size)
-    pixels = torch.from_numpy(np.stack([_drifted(scene, t) for t in range(transitions + 1)]))
-    action = torch.from_numpy(rng.uniform(-1, 1, (transitions, action_dim)).astype(np.float32))
-    reward = torch.from_numpy(rng.uniform(0, 1, (transitions, 1)).astype(np.float32))
-    truncated = torch.zeros(transitions, 1, dtype=torch.bool)
-    truncated[-1] = True
-    flags = {"done": truncated, "terminated": torch.zeros_like(truncated), "truncated": truncated}
-    following = TensorDict({"pixels": pixels[1:], "reward": reward, **flags}, [transitions])
-    return TensorDict({"pixels": pixels[:-1], "action": action, "next": following}, [transitions])
-
-
-def episodes(transitions: int, *, seed: int = 0, length: int = 500, **sizes: int) -> Iterator[TensorDict]:
-    """Yield whole episodes and one with the rest; ``sizes`` are those of :func:`drifting_episode`."""
-    for number, first in enumerate(range(0, transitions, length)):
-        yield drifting_episode(min(length, transitions - first), seed=1_000 * seed + number, **sizes)
-
-
-def write_dataset(
-    path: Path, *, transitions: int, seed: int = 0, image_size: int = 84, length: int = 500
-) -> Path:
-    """Write a dataset of drifting pictures that :meth:`crptpro.data.FrameDataset.open` reads; returns ``path``."""
-    from crptpro.data import FrameDataset
-
-    about: dict[str, Any] = {"task": "drifting_picture", "seed": seed, "action_repeat": 2}
-    dataset = FrameDataset.create(path, domain=path.name, transitions=transitions, **about)
-    for episode in episodes(transitions, seed=seed, image_size=image_size, length=length):
-        dataset.extend(episode)
-    return path
-
-
 class DriftingWorld(EnvBase):
-    """Single frames of a drifting picture, in episodes of a fixed length; its steps cost next to nothing."""
+    """Single frames of a drifting picture. No two frames of an episode are equal (below ``image_size ** 2``).
 
-    def __init__(self, *, seed: int = 0, image_size: int = 84, length: int = 500) -> None:
+    Every reset appends the time and how many steps came before it to the file ``clock``.
+    """
+
+    def __init__(
+        self, *, seed: int = 0, image_size: int = 84, clock: Path | None = None, action_dim: int = ACTION_DIM
+    ) -> None:
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
-        self.length, self.image_size = length, image_size
+        self.image_size, self.clock, self.count = image_size, clock, 0
         self._set_seed(seed)
         shape = (3, image_size, image_size)
         self.observation_spec = Composite(pixels=Bounded(0, 255, shape=shape, dtype=torch.uint8))
-        self.action_spec = Bounded(-1.0, 1.0, shape=(ACTION_DIM,), dtype=torch.float32)
+        self.action_spec = Bounded(-1.0, 1.0, shape=(action_dim,), dtype=torch.float32)
         self.reward_spec = Unbounded(shape=(1,), dtype=torch.float32)
         flag = Categorical(2, shape=(1,), dtype=torch.bool)
         self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone())
 
-    def _look(self, is_last: bool = False) -> dict[str, Tensor]:
-        end = torch.tensor([is_last])
+    def _look(self) -> dict[str, Tensor]:
+        end, t = torch.tensor([self.count >= LENGTH]), self.count
+        frame = self.scene.roll((t, 2 * t + t // self.image_size), (1, 2))
         flags = {"done": end, "terminated": torch.zeros_like(end), "truncated": end.clone()}
-        return {"pixels": torch.from_numpy(_drifted(self.scene, self.count)), **flags}
+        return {"pixels": frame, **flags}
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
+        if self.clock is not None:
+            with self.clock.open("a") as file:
+                file.write(f"{time.time()} {self.count}\n")
         self.count = 0
         return TensorDict(self._look(), [])
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
         self.count += 1
         reward = tensordict["action"].mean().reshape(1).abs()
-        return TensorDict({**self._look(self.count >= self.length), "reward": reward}, [])
+        return TensorDict({**self._look(), "reward": reward}, [])
 
     def _set_seed(self, seed: int | None) -> None:
-        self.scene = _picture(np.random.default_rng(seed or 0), self.image_size)
+        rng = torch.Generator().manual_seed(seed or 0)
+        coarse = 20 + 215 * torch.rand(1, 3, _PATCHES, _PATCHES, generator=rng)
+        smooth = F.interpolate(coarse, self.image_size, mode="bilinear")[0]
+        grain = 3 * torch.randn(smooth.shape, generator=rng)
+        self.scene = (smooth + grain).clamp(0, 255).to(torch.uint8)
 
 
-def make_drifting(*, seed: int, image_size: int) -> EnvBase:
+def make_drifting(*, seed: int, image_size: int, clock: Path | None = None) -> EnvBase:
     """Build the world of a :class:`crptpro.domains.Domain`."""
-    return DriftingWorld(seed=seed, image_size=image_size)
+    return DriftingWorld(seed=seed, image_size=image_size, clock=clock)
 
 
 def make_drifting_env(
-    task: object, *, seed: int, image_size: int = 84, frame_stack: int = 3, length: int = 500, **ignored: object
+    task: object, *, seed: int, image_size: int = 84, frame_stack: int = 3, action_dim: int = ACTION_DIM,
+    **ignored: object,
 ) -> EnvBase:  # fmt: skip
     """Build the world with stacks of frames, called as :func:`crptpro.envs.make_env` is."""
-    world = DriftingWorld(seed=seed, image_size=image_size, length=length)
+    world = DriftingWorld(seed=seed, image_size=image_size, action_dim=action_dim)
     return TransformedEnv(world, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
 
 
-def _drifted(scene: np.ndarray, t: int) -> np.ndarray:
-    return np.roll(scene, (t, 2 * t + t // scene.shape[1]), axis=(1, 2))
-
-
-def _picture(rng: np.random.Generator, size: int) -> np.ndarray:
-    """Return noise of a few large patches, interpolated, with a little grain: uint8 ``[3, size, size]``."""
-    coarse = rng.uniform(20, 235, (3, _PATCHES, _PATCHES))
-    at = np.linspace(0, _PATCHES - 1, size)
-    low = np.minimum(at.astype(int), _PATCHES - 2)
-    share = at - low
-    rows = coarse[:, low] * (1 - share)[:, None] + coarse[:, low + 1] * share[:, None]
-    smooth = rows[:, :, low] * (1 - share) + rows[:, :, low + 1] * share
-    return (smooth + rng.normal(0, 3, smooth.shape)).clip(0, 255).astype(np.uint8)
+def drifting_dataset(
+    root: Path | str, *, transitions: int, image_size: int = 84, seed: int = 0, clock: Path | None = None
+) -> Path:
+    """Collect a dataset of the world in one process, or return it at once where it is complete."""
+    make = functools.partial(make_drifting, clock=clock)
+    domain = Domain(f"drifting_{seed}", "drifting_go", make=make, episode_env_steps=LENGTH)
+    sizes = {"transitions": transitions, "image_size": image_size}
+    return collect_random(domain, root, seed=seed, progress=False, **sizes)

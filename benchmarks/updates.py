@@ -1,14 +1,13 @@
 """Updates of both stages beside their plain implementation, a whole decision on the simulator, and a sustained run.
 
-``python -m benchmarks.updates`` times, in one process and taking turns, medians:
+``python -m benchmarks.updates`` times, taking turns, medians:
 
-* ``pretrain``: sampling, random shift and one whole update. Plain float32 (:mod:`benchmarks.plain_pretrain`), ours in
-  float32, and ours in bfloat16 where ``precision=auto`` picks it.
-* ``downstream``: sampling, features, bonus and one whole update, the mean of two because the actor learns in every
-  second. Plain float32 that encodes anew (:mod:`benchmarks.plain_downstream`), ours that encodes anew, ours from dense
-  features.
+* ``pretrain``: one update of ``pretrain(...)``, sampling and random shift included. Plain float32
+  (:mod:`benchmarks.plain`), ours in float32, and ours in bfloat16 where ``precision=auto`` picks it.
+* ``downstream``: sampling, features, bonus and one whole update of ``train_downstream(...)``, the mean of two because
+  the actor learns in every second. Plain float32 that encodes anew, ours that encodes anew, ours from dense features.
 * ``decision``: act, step, update and store on the real simulator, with a full replay of dense features.
-* ``sustained``: ``pretrain(...)`` as it is, records and checkpoints included.
+* ``sustained``: ``pretrain(...)``, records and checkpoints included.
 * ``parity``: bfloat16 against float32 over whole pre-trainings, beside what another seed changes.
 
 With ``--peer DIR`` a released agent is timed in the same turns (:mod:`benchmarks.peer`).
@@ -20,6 +19,7 @@ import itertools
 import statistics
 import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -27,20 +27,18 @@ from typing import Any, Literal
 import torch
 import tyro
 
-from benchmarks.library import Downstream, PretrainUpdates, fresh_loss, fresh_pretrained, precisions
-from benchmarks.measure import report, save, side_by_side
-from benchmarks.peer import Peer
-from benchmarks.plain_downstream import PlainDownstream
-from benchmarks.plain_pretrain import PlainPretraining, StackedStore
-from benchmarks.synthetic import ACTION_DIM, make_drifting_env, write_dataset
+from benchmarks.loops import fresh_loss, fresh_pretrained
+from benchmarks.measure import PAPER_ENV_STEPS, PAPER_UPDATES, Loop, save, side_by_side, table
+from benchmarks.peer import peer_update
+from benchmarks.plain import Batch, PlainDownstream, PlainPretraining
+from benchmarks.synthetic import ACTION_DIM, drifting_dataset
 from crptpro.console import run_main
 from crptpro.data import FrameDataset
-from crptpro.modules import SquashedGaussianActor, TwinCritic
+from crptpro.modules import SquashedGaussianActor, TwinCritic, resolve_precision
 from crptpro.provenance import cpu_cores
-from crptpro.training import DownstreamConfig, pretrain
+from crptpro.training import pretrain
 
 Section = Literal["pretrain", "downstream", "decision", "sustained", "parity"]
-PAPER_UPDATES, PAPER_ENV_STEPS = 50_000, 500_000
 CURVES = ("loss_comp", "embedding_cosine")
 
 
@@ -81,23 +79,28 @@ class Settings:
     out: Path | None = None
     """directory of the JSON; benchmarks/results by default"""
 
+    @property
+    def sizes(self) -> dict[str, Any]:
+        """What every network and image is sized by."""
+        return {"image_size": self.image_size, "prototypes": self.prototypes}
+
 
 def main(settings: Settings) -> dict[str, Any]:
     """Run the chosen sections, print a table for each and write the JSON; returns what it holds."""
     torch.set_num_threads(settings.threads)
-    peer = None
-    if settings.peer is not None:
-        peer = Peer(settings.peer, batch_size=settings.batch_size, prototypes=settings.prototypes)
     results: dict[str, Any] = {}
     with tempfile.TemporaryDirectory(prefix="crptpro-updates-") as directory:
         scratch = Path(directory)
-        datasets = list(settings.dataset)
-        if not datasets and {"pretrain", "sustained", "parity"} & {*settings.only}:
-            sizes = {"transitions": settings.dataset_transitions, "image_size": settings.image_size}
-            datasets = [write_dataset(scratch / f"drifting_{seed}", seed=seed, **sizes) for seed in range(3)]
+        sizes: dict[str, Any] = {
+            "transitions": settings.dataset_transitions,
+            "image_size": settings.image_size,
+        }
+        datasets = [path.resolve() for path in settings.dataset] or [
+            drifting_dataset(scratch, seed=seed, **sizes) for seed in range(3)
+        ]
         sections: dict[Section, Callable[[], dict[str, Any]]] = {
-            "pretrain": lambda: time_pretraining(settings, datasets, peer),
-            "downstream": lambda: time_downstream(settings, scratch, peer),
+            "pretrain": lambda: time_pretraining(settings, datasets),
+            "downstream": lambda: time_downstream(settings, datasets[0]),
             "decision": lambda: time_decisions(settings, scratch),
             "sustained": lambda: time_sustained(settings, datasets, scratch),
             "parity": lambda: compare_curves(settings, datasets),
@@ -106,147 +109,128 @@ def main(settings: Settings) -> dict[str, Any]:
             print(f"\n## {name}\n", flush=True)
             results[name] = sections[name]()
             # At once: what has been measured must not be lost with a section for which memory is too small.
-            save("updates", settings, results, out=settings.out)
+            save("updates", settings, results, settings.out)
     return results
 
 
-def time_pretraining(settings: Settings, datasets: list[Path], peer: Peer | None) -> dict[str, Any]:
+def time_pretraining(settings: Settings, datasets: list[Path]) -> dict[str, Any]:
     """Time one pre-training update of every implementation."""
-    batch, sizes = settings.batch_size, {"image_size": settings.image_size, "prototypes": settings.prototypes}
-    store = StackedStore.of(FrameDataset.open(datasets[0]), settings.dataset_transitions)
-    plain = PlainPretraining.like(fresh_loss(**sizes))
-    candidates: dict[str, Callable[[], Any]] = {"plain fp32": lambda: plain.sample_and_update(store, batch)}
-    if peer is not None:
-        candidates["released agent"] = peer.pretrain_update(store)
-    for precision in precisions():
-        loss = fresh_loss(**sizes)
-        candidates[f"ours {precision}"] = PretrainUpdates(
-            loss, datasets, batch_size=batch, precision=precision
-        )
-    return report(side_by_side(candidates, rounds=settings.rounds), unit="pre-training update")
+    batch_size, common = settings.batch_size, common_of(settings)
+    store = Batch.of(FrameDataset.open(datasets[0]), settings.dataset_transitions)
+    plain = PlainPretraining(fresh_loss(**settings.sizes))
+    candidates: dict[str, Callable[[], Any]] = {"plain fp32": lambda: plain.update(store.sample(batch_size))}
+    if settings.peer is not None:
+        theirs = released(settings, store, task_agnostic=True)
+        candidates["released agent"] = lambda: theirs(
+            2
+        )  # an even number: every gate of the schedules is open
+    with ExitStack() as stack:
+        for precision in precisions():
+            candidates[f"ours {precision}"] = stack.enter_context(
+                Loop("pretraining", datasets=datasets, precision=precision, **common)
+            )
+        return table(side_by_side(candidates, rounds=settings.rounds), unit="pre-training update")
 
 
-def time_downstream(settings: Settings, scratch: Path, peer: Peer | None) -> dict[str, Any]:
+def time_downstream(settings: Settings, dataset: Path) -> dict[str, Any]:
     """Time one downstream update, the mean of two, of every implementation."""
-    batch, transitions = settings.batch_size, settings.update_transitions
-    pretrained = fresh_pretrained(image_size=settings.image_size, prototypes=settings.prototypes)
-    path = write_dataset(scratch / "plain", transitions=transitions, image_size=settings.image_size)
-    store = StackedStore.of(FrameDataset.open(path), transitions)
-    dim = pretrained.encoder.feature_dim
-    plain = PlainDownstream.like(
-        pretrained, SquashedGaussianActor(dim, ACTION_DIM), TwinCritic(dim, ACTION_DIM)
-    )
-    steps = itertools.count()
-    candidates: dict[str, Callable[[], Any]] = {
-        "plain fp32": lambda: plain.sample_and_update(store, batch, next(steps))
+    batch_size, common = settings.batch_size, common_of(settings)
+    pretrained = fresh_pretrained(**settings.sizes)
+    store = Batch.of(FrameDataset.open(dataset), settings.update_transitions)
+    sizes = pretrained.encoder.feature_dim, ACTION_DIM
+    plain = PlainDownstream(pretrained, SquashedGaussianActor(*sizes), TwinCritic(*sizes))
+    ways: dict[str, Callable[[int], Any]] = {
+        "plain fp32": lambda step: plain.update(store.sample(batch_size), step)
     }
-    if peer is not None:
-        candidates["released agent"] = peer.downstream_update(store)
-    cases = [("reencode", "encoding anew", precision) for precision in precisions()]
-    if len(cases) == 1:
-        cases.append(("dense-bf16", "dense features in bf16", "fp32"))
-    cases += [("dense", "dense features", precision) for precision in precisions()]
-    for features, words, precision in cases:
-        config = downstream_config(settings, transitions, features=features, precision=precision)
-        ours = Downstream(pretrained, config, env_factory=make_drifting_env)
-        ours.fill(transitions)
-        candidates[f"ours {precision}, {words}"] = ours.update
-    pairs = {name: _twice(call) for name, call in candidates.items()}
-    return report(side_by_side(pairs, rounds=settings.rounds, per_call=2), unit="downstream update")
+    if settings.peer is not None:
+        ways["released agent"] = released(settings, store, task_agnostic=False)
+    candidates: dict[str, Callable[[], Any]] = {name: twice(update) for name, update in ways.items()}
+    with ExitStack() as stack:
+        for features, words in (("reencode", "encoding anew"), ("dense", "dense features")):
+            for precision in precisions():
+                candidates[f"ours {precision}, {words}"] = stack.enter_context(
+                    Loop(
+                        "downstream", of=("update",), transitions=settings.update_transitions, features=features,
+                        precision=precision, **common,
+                    )
+                )  # fmt: skip
+        timings = side_by_side(candidates, rounds=settings.rounds, per_call=2)
+    return table(timings, unit="downstream update")
 
 
 def time_decisions(settings: Settings, scratch: Path) -> dict[str, Any]:
-    """Time decisions on the real simulator: the next image drawn after the update, then during it."""
-    pretrained = fresh_pretrained(image_size=settings.image_size, prototypes=settings.prototypes)
-    config = downstream_config(settings, settings.replay_transitions, features="auto")
-    found: dict[str, dict[str, Any]] = {}
-    for runs_ahead in (False, True):
-        run = Downstream(
-            pretrained, config, task=settings.task, run_dir=scratch / "decision", runs_ahead=runs_ahead
-        )
-        try:
-            run.fill(settings.replay_transitions)
-            for _ in range(20):
-                run.decide()
-            run.seconds.clear()
-            pairs = settings.decisions // 2
-            timed = side_by_side({"": _twice(run.decide)}, rounds=pairs, warmup=0, per_call=2)
-        finally:
-            run.close()
-        hours = timed[""].median_s * PAPER_ENV_STEPS / (run.config.action_repeat or 1) / 3600
-        found[f"drawn {'during' if runs_ahead else 'after'} the update"] = {
-            "timing": timed[""],
-            "mean_s_by_stage": {stage: seconds / (2 * pairs) for stage, seconds in run.seconds.items()},
-            "projected_hours": hours,
-        }
-        del run  # its maps are dropped before the next ones are made
-    print(f"One decision on {settings.task}, ms.\n\n| | {' | '.join(found)} |\n|---|---|---|")
-    for stage in found["drawn after the update"]["mean_s_by_stage"]:
-        print(_line(stage, [1e3 * way["mean_s_by_stage"].get(stage, 0.0) for way in found.values()]))
-    print(_line("**whole**, median", [1e3 * way["timing"].median_s for way in found.values()]))
-    print(_line("500,000 env steps, hours", [way["projected_hours"] for way in found.values()]))
-    return found
+    """Time decisions on the real simulator, stage by stage: medians over pairs of decisions."""
+    with Loop(
+        "downstream", transitions=settings.replay_transitions, task=settings.task, has_stages=True, features="dense",
+        run_dir=scratch / "decision", **common_of(settings),
+    ) as loop:  # fmt: skip
+        pairs = [(loop(), loop.laps) for _ in range(10 + settings.decisions // 2)][10:]
+    stages = {stage: statistics.median(laps[stage] for _, laps in pairs) for stage in pairs[0][1]}
+    whole = statistics.median(seconds for seconds, _ in pairs)
+    hours = whole * PAPER_ENV_STEPS / 2 / 3600
+    print(f"| one decision on {settings.task} | median ms |\n|---|---|")
+    for stage, seconds in {**stages, "**whole**": whole}.items():
+        print(f"| {stage} | {1e3 * seconds:.1f} |")
+    print(f"\n{PAPER_ENV_STEPS:,} env steps take {hours:.1f} h, evaluations left out.")
+    return {"median_s_by_stage": stages, "median_s": whole, "projected_hours": hours}
 
 
-def time_sustained(settings: Settings, datasets: list[Path], scratch: Path) -> dict[str, Any]:
+def time_sustained(settings: Any, datasets: list[Path], scratch: Path, **options: Any) -> dict[str, Any]:
     """Pre-train for a while as a user does and project the paper's number of updates."""
-    loss = fresh_loss(image_size=settings.image_size, prototypes=settings.prototypes)
     result = pretrain(
-        loss, datasets, updates=settings.sustained_updates, batch_size=settings.batch_size,
-        run_dir=scratch / "sustained", log_interval=max(1, settings.sustained_updates // 10),
+        fresh_loss(**settings.sizes), datasets, updates=settings.sustained_updates, batch_size=settings.batch_size,
+        run_dir=scratch / "sustained", log_interval=max(1, settings.sustained_updates // 10), **options,
     )  # fmt: skip
     rates = [row["updates_per_s"] for row in result.history if "updates_per_s" in row]
-    rate = statistics.median(rates)
+    rate, precision = statistics.median(rates), result.training["settings"]["precision"]
     hours = PAPER_UPDATES / rate / 3600
-    print("| updates | precision | updates/s, median tenth | slowest to fastest | hours for 50,000 |")
-    print("|---|---|---|---|---|")
-    precision = result.training["settings"]["precision"]
-    spread = f"{min(rates):.2f} to {max(rates):.2f}"
-    print(f"| {result.updates} | {precision} | {rate:.2f} | {spread} | {hours:.2f} |")
-    return {
-        "precision": precision, "updates_per_s": rate, "updates_per_s_of_tenths": rates, "projected_hours": hours,
-    }  # fmt: skip
+    print(
+        f"{rate:.2f} updates/s in {precision}, tenths from {min(rates):.2f} to {max(rates):.2f}; "
+        f"{PAPER_UPDATES:,} take {hours:.2f} h."
+    )
+    return {"precision": precision, "updates_per_s_of_tenths": rates, "projected_hours": hours}
 
 
 def compare_curves(settings: Settings, datasets: list[Path]) -> dict[str, Any]:
     """Pre-train in float32, in bfloat16 from the same seed, and in float32 from another; compare the curves."""
-    curves: dict[str, dict[str, torch.Tensor]] = {}
+    curves: dict[str, dict[str, list[float]]] = {}
     for name, precision, seed in (("fp32", "fp32", 0), ("bf16", "bf16", 0), ("other seed", "fp32", 1)):
-        loss = fresh_loss(image_size=settings.image_size, prototypes=settings.prototypes, seed=seed)
         result = pretrain(
-            loss, datasets, updates=settings.parity_updates, batch_size=settings.batch_size, seed=seed,
-            precision=precision, log_interval=max(1, settings.parity_updates // 20),
+            fresh_loss(seed=seed, **settings.sizes), datasets, updates=settings.parity_updates, seed=seed,
+            batch_size=settings.batch_size, precision=precision, log_interval=max(1, settings.parity_updates // 20),
         )  # fmt: skip
-        curves[name] = {curve: torch.tensor([row[curve] for row in result.history]) for curve in CURVES}
-    found: dict[str, Any] = {
-        name: {c: v.tolist() for c, v in curve.items()} for name, curve in curves.items()
-    }
-    print("Mean absolute difference of two curves.\n")
-    print("| curve | bf16 against fp32, same seed | fp32, two seeds |\n|---|---|---|")
+        curves[name] = {curve: [row[curve] for row in result.history] for curve in CURVES}
+    print("| mean absolute difference | bf16 against fp32, same seed | fp32, two seeds |\n|---|---|---|")
     for curve in CURVES:
-        near, far = ((curves[name][curve] - curves["fp32"][curve]).abs().mean() for name in list(curves)[1:])
-        print(f"| {curve} | {near:.5f} | {far:.5f} |")
-    return found
+        fp32, bf16, other = (torch.tensor(found[curve]) for found in curves.values())
+        print(f"| {curve} | {(bf16 - fp32).abs().mean():.5f} | {(other - fp32).abs().mean():.5f} |")
+    return curves
 
 
-def downstream_config(settings: Settings, transitions: int, **options: Any) -> DownstreamConfig:
-    """Return the paper's settings at this benchmark's batch and replay."""
-    return DownstreamConfig(
-        env_steps=PAPER_ENV_STEPS, batch_size=settings.batch_size, replay_capacity=transitions,
-        random_agent_steps=1, **options,
-    )  # fmt: skip
+def common_of(settings: Settings) -> dict[str, Any]:
+    """Return what every loop in a process of its own is given."""
+    return {**settings.sizes, "batch_size": settings.batch_size, "threads": settings.threads}
 
 
-def _twice(call: Callable[[], Any]) -> Callable[[], None]:
+def precisions() -> list[str]:
+    """Return fp32, the reference, and bf16 if that is what ``"auto"`` picks here."""
+    return ["fp32"] if resolve_precision("auto", "cpu") == torch.float32 else ["fp32", "bf16"]
+
+
+def released(settings: Settings, store: Batch, *, task_agnostic: bool) -> Callable[[int], Any]:
+    assert settings.peer is not None
+    sizes = {"batch_size": settings.batch_size, "prototypes": settings.prototypes}
+    return peer_update(settings.peer, store, task_agnostic=task_agnostic, **sizes)
+
+
+def twice(update: Callable[[int], Any]) -> Callable[[], None]:
+    steps = itertools.count()
+
     def both() -> None:
-        call()
-        call()
+        update(next(steps))
+        update(next(steps))
 
     return both
-
-
-def _line(name: str, values: list[float]) -> str:
-    return f"| {name} | {' | '.join(f'{value:.1f}' for value in values)} |"
 
 
 if __name__ == "__main__":

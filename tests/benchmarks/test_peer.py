@@ -7,11 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from benchmarks.peer import Peer, RandomCrop, load
-from benchmarks.plain_pretrain import StackedStore
-from benchmarks.synthetic import write_dataset
+from benchmarks.peer import RandomCrop, load, peer_update
+from benchmarks.plain import Batch
 
-from crptpro.data import FrameDataset
 from crptpro.errors import CRPTproError
 
 #: A checkout in the shape of the released ones, with an agent that learns nothing.
@@ -45,7 +43,7 @@ class ProtoAgent:
         self.encoder = hydra.utils.instantiate(encoder_cfg)
         actor_cfg.params.repr_dim = self.encoder.repr_dim
         self.actor = hydra.utils.instantiate(actor_cfg)
-        self.batch_size, self.task_agnostic, self.updates = batch_size, task_agnostic, []
+        self.batch_size, self.updates = batch_size, [task_agnostic]
         self.aug = nn.Sequential(nn.ReplicationPad2d(4), kornia.augmentation.RandomCrop((84, 84)))
 
     def update(self, replay_buffer, step):
@@ -60,48 +58,45 @@ class ProtoAgent:
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    path = tmp_path / "peer"
-    path.mkdir()
     for name, content in PEER_FILES.items():
-        (path / name).write_text(content)
-    return path
+        (tmp_path / name).write_text(content)
+    return tmp_path
 
 
-def store(tmp_path: Path, image_size: int) -> StackedStore:
-    path = write_dataset(tmp_path / f"toy_{image_size}", transitions=6, image_size=image_size)
-    return StackedStore.of(FrameDataset.open(path), 6)
+def store(image_size: int) -> Batch:
+    images = torch.zeros(6, 9, image_size, image_size, dtype=torch.uint8)
+    return Batch(images, torch.zeros(6, 2), torch.zeros(6, 1), images, torch.ones(6, 1))
 
 
-def test_a_peer_updates_from_the_arrays_of_the_plain_store(checkout: Path, tmp_path: Path) -> None:
-    peer = Peer(checkout, batch_size=4, prototypes=16)
-    large = store(tmp_path, 84)
-    pretraining, downstream = peer.pretrain_update(large), peer.downstream_update(large)
-    assert [pretraining() for _ in range(2)][-1] == [2, 2]
-    assert [downstream() for _ in range(3)][-1] == [0, 1, 2]
+def test_a_peer_updates_from_the_arrays_of_the_plain_store(checkout: Path) -> None:
+    update = peer_update(checkout, store(84), batch_size=4, prototypes=16, task_agnostic=True)
+    assert [update(step) for step in (2, 3)][-1] == [True, 2, 3]
     with pytest.raises(CRPTproError, match="takes images of 84 px, not 16"):
-        peer.pretrain_update(store(tmp_path, 16))
+        peer_update(checkout, store(16), batch_size=4, prototypes=16, task_agnostic=True)
 
 
 def test_a_peer_imports_without_its_packages_and_leaves_no_trace(checkout: Path) -> None:
     before, path = set(sys.modules), list(sys.path)
     assert load(checkout).keys() == {"utils", "proto", "replay_buffer"}
-    assert not {"utils", "proto", "replay_buffer"} & (set(sys.modules) - before)
+    assert not {"utils", "proto", "replay_buffer", "hydra", "kornia", "gym"} & (set(sys.modules) - before)
     assert sys.path == path
-    assert all(name in before for name in ("hydra", "kornia", "gym") if name in sys.modules)
 
 
-def test_what_is_no_released_agent_is_one_clear_error(checkout: Path, tmp_path: Path) -> None:
-    with pytest.raises(CRPTproError) as error:
-        load(tmp_path)
-    assert str(error.value) == (
-        f"{tmp_path} has no proto.py, utils.py, replay_buffer.py: --peer wants a checkout of liuxin0824/CRPTpro or "
-        "denisyarats/proto."
-    )
-    (checkout / "proto.py").write_text("import hydra\n")
-    with pytest.raises(CRPTproError, match="defines no ProtoAgent"):
-        load(checkout)
-    (checkout / "proto.py").write_text("import a_package_nobody_has\n")
-    with pytest.raises(CRPTproError, match=r"ModuleNotFoundError: .*a_package_nobody_has"):
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "has no proto.py: --peer wants a checkout of liuxin0824/CRPTpro or denisyarats/proto."),
+        ("import hydra\n", "defines no ProtoAgent"),
+        ("import a_package_nobody_has\n", r"ModuleNotFoundError: .*a_package_nobody_has"),
+    ],
+)
+def test_what_is_no_released_agent_is_one_clear_error(
+    checkout: Path, content: str | None, message: str
+) -> None:
+    (checkout / "proto.py").unlink()
+    if content is not None:
+        (checkout / "proto.py").write_text(content)
+    with pytest.raises(CRPTproError, match=message):
         load(checkout)
 
 

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from benchmarks.library import fresh_loss
-from benchmarks.plain_downstream import PlainDownstream
-from benchmarks.plain_pretrain import Batch, PlainPretraining, StackedStore, crop, dispersion, sinkhorn
-from benchmarks.synthetic import write_dataset
+import torch.nn.functional as F
+from benchmarks.plain import Batch, PlainDownstream, PlainPretraining, crop, dispersion, sinkhorn
+from benchmarks.synthetic import drifting_dataset
 from tensordict import TensorDict
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.objectives import SoftUpdate
 
 from crptpro.data import FrameDataset
@@ -27,27 +26,12 @@ B, SIZE, A = 24, 32, 3
 ENCODER = {"channels": (8, 8, 8, 8), "image_size": SIZE}
 
 
+def seeded(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
 def pixels(seed: int) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randint(0, 256, (B, 9, SIZE, SIZE), dtype=torch.uint8, generator=generator)
-
-
-def proto_loss(dtype: torch.dtype) -> ProtoLoss:
-    torch.manual_seed(0)
-    loss = ProtoLoss(PixelEncoder(**ENCODER), num_prototypes=48, latent_dim=16, hidden_dim=32)
-    return loss.to(dtype)
-
-
-def batch_of(seed: int) -> TensorDict:
-    return TensorDict({"pixels": pixels(seed), "next": {"pixels": pixels(seed + 9)}}, [B])
-
-
-def parameters_of(loss: ProtoLoss) -> list[Tensor]:
-    return [
-        p
-        for name in ("encoder", "projector", "predictor", "prototypes")
-        for p in getattr(loss, name).parameters()
-    ]
+    return torch.randint(0, 256, (B, 9, SIZE, SIZE), dtype=torch.uint8, generator=seeded(seed))
 
 
 def assert_all_close(ours: list[Tensor], plain: list[Tensor], **tolerance: float) -> None:
@@ -55,49 +39,36 @@ def assert_all_close(ours: list[Tensor], plain: list[Tensor], **tolerance: float
         torch.testing.assert_close(one, other, **tolerance)
 
 
-def test_plain_pretraining_has_the_loss_and_gradients_of_proto_loss_in_float32() -> None:
-    loss = proto_loss(torch.float32)
-    plain = PlainPretraining.like(loss)
-    theirs = plain.loss(pixels(1), pixels(10))
-    theirs.backward()
-    loss.before_update()
-    out = loss(batch_of(1))
-    ours = out["loss_comp"] + out["loss_intr"]
-    ours.backward()
-    torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=0)
-    gradients = [p.grad for p in plain.parameters]
-    scale = max(float(g.abs().max()) for g in gradients)
-    assert scale > 1e-4
-    assert_all_close([p.grad for p in parameters_of(loss)], gradients, rtol=1e-3, atol=1e-5 * scale)
-
-
-def test_after_three_plain_pretraining_updates_the_loss_is_that_after_three_of_ours() -> None:
+def test_plain_pretraining_has_the_losses_gradients_and_updates_of_proto_loss() -> None:
     # In float64: Adam turns the rounding of a vanishing gradient into a whole step.
-    loss = proto_loss(torch.float64)
-    plain = PlainPretraining.like(loss)
-    optimizer = torch.optim.Adam([p for p in loss.parameters() if p.requires_grad], lr=1e-4)
-    targets = SoftUpdate(loss, tau=0.05)
-    before = plain.loss(pixels(5), pixels(14)).item()
-    for index in range(3):
-        theirs = plain.update(pixels(index), pixels(index + 9))
+    torch.manual_seed(0)
+    loss = ProtoLoss(PixelEncoder(**ENCODER), num_prototypes=48, latent_dim=16, hidden_dim=32).double()
+    plain = PlainPretraining(loss)
+    trained = [p for p in loss.parameters() if p.requires_grad]
+    optimizer, targets = torch.optim.Adam(trained, lr=1e-4), SoftUpdate(loss, tau=0.05)
+    losses = []
+    for seed in range(4):
+        obs, next_obs, unread = pixels(seed), pixels(seed + 9), torch.zeros(B, 1)
+        theirs = plain.update(Batch(obs, unread, unread, next_obs, unread))
         loss.before_update()
-        out = loss(batch_of(index))
+        out = loss(TensorDict({"pixels": obs, "next": {"pixels": next_obs}}, [B]))
         optimizer.zero_grad()
         ours = out["loss_comp"] + out["loss_intr"]
         ours.backward()
-        assert ours.item() == pytest.approx(theirs.item(), rel=1e-9)
+        losses.append(ours.item())
+        assert losses[-1] == pytest.approx(theirs.item(), rel=1e-9)
+        names = ("encoder", "projector", "predictor", "prototypes")
+        gradients = [p.grad for name in names for p in getattr(loss, name).parameters()]
+        assert max(float(g.abs().max()) for g in gradients) > 1e-4
+        assert_all_close(gradients, [p.grad for p in plain.parameters], rtol=1e-5, atol=1e-9)
         optimizer.step()
         targets.step()
-    loss.before_update()
-    with torch.no_grad():
-        plain.prototypes.copy_(nn.functional.normalize(plain.prototypes, dim=1))
-    out, after = loss(batch_of(5)), plain.loss(pixels(5), pixels(14)).item()
-    assert abs((out["loss_comp"] + out["loss_intr"]).item() - after) < 1e-5 * abs(after - before)
+    assert len(set(losses)) == 4
 
 
 def test_plain_dispersion_and_assignments_are_the_librarys() -> None:
     # Beside the comparative loss the dispersion is too small for the comparison of totals to notice it.
-    unit = nn.functional.normalize(torch.randn(48, 16, generator=torch.Generator().manual_seed(0)), dim=1)
+    unit = F.normalize(torch.randn(48, 16, generator=seeded(0)), dim=1)
     ours, theirs = (unit.clone().requires_grad_() for _ in range(2))
     values = prototype_dispersion(ours), dispersion(theirs)
     for value in values:
@@ -115,21 +86,15 @@ class Agents:
     def __init__(self) -> None:
         torch.manual_seed(0)
         encoder = PixelEncoder(**ENCODER).requires_grad_(False)
-        self.pretrained = Pretrained(
-            encoder, Projector(encoder.feature_dim, 16), prototypes=Prototypes(64, 16)
-        )
+        heads = Projector(encoder.feature_dim, 16), Prototypes(64, 16)
+        self.pretrained = Pretrained(encoder, heads[0], prototypes=heads[1])
         sizes = {"bottleneck_dim": 10, "hidden_dim": 32}
         actor = SquashedGaussianActor(encoder.feature_dim, A, **sizes)
         critic = TwinCritic(encoder.feature_dim, A, **sizes)
-        self.plain = PlainDownstream.like(self.pretrained, actor, critic, torch.Generator().manual_seed(7))
-        self.loss = RADSACLoss(actor, critic, generator=torch.Generator().manual_seed(7))
-        self.bonus = PrototypeReward(
-            self.pretrained.projector,
-            self.pretrained.prototypes,
-            coef=0.2,
-            generator=torch.Generator().manual_seed(8),
-        )
-        same_stream = torch.Generator().manual_seed(8)
+        self.plain = PlainDownstream(self.pretrained, actor, critic, seeded(7))
+        self.loss = RADSACLoss(actor, critic, generator=seeded(7))
+        self.bonus = PrototypeReward(*heads, coef=0.2, generator=seeded(8))
+        same_stream = seeded(8)
         self.plain.draw_candidates = lambda scores: draw_candidates(scores, same_stream)
         self.batch = Batch(pixels(1), torch.rand(B, A) * 2 - 1, torch.rand(B, 1), pixels(2), torch.ones(B, 1))
         self.batch.not_terminated[::3] = 0
@@ -143,32 +108,30 @@ class Agents:
         following = {"features": next_h, "reward": self.batch.reward, "done": end, "terminated": end}
         return TensorDict({"features": h, "action": self.batch.action, "next": following}, [B])
 
-
-def gradients(network: nn.Module) -> list[Tensor]:
-    return [p.grad for p in network.parameters()]
+    def critic_losses(self) -> tuple[Tensor, Tensor]:
+        batch = self.batch
+        theirs = self.plain.critic_loss(self.h, batch.action, batch.reward, self.next_h, batch.not_terminated)
+        return self.loss.critic_loss(self.td())["loss_qvalue"], theirs
 
 
 def test_the_plain_features_critic_actor_and_temperature_are_ours_in_losses_and_gradients() -> None:
     agents = Agents()
-    td, batch = agents.td(), agents.batch
+    td, ours, plain = agents.td(), agents.loss, agents.plain
     assert_all_close([td["features"], td["next", "features"]], [agents.h, agents.next_h])
-    theirs = agents.plain.critic_loss(
-        agents.h, batch.action, batch.reward, agents.next_h, batch.not_terminated
-    )
-    ours = agents.loss.critic_loss(td)["loss_qvalue"]
-    for loss in (theirs, ours):
-        loss.backward()
-    torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=0)
-    assert_all_close(gradients(agents.loss.critic), gradients(agents.plain.critic), rtol=1e-3, atol=1e-5)
-    theirs, log_prob = agents.plain.actor_loss(agents.h)
-    their_alpha = agents.plain.alpha_loss(log_prob)
-    out = agents.loss.actor_and_temperature_loss(td)
-    for loss in (theirs, their_alpha, out["loss_actor"], out["loss_alpha"]):
-        loss.backward()
-    torch.testing.assert_close(out["loss_actor"], theirs, rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(out["loss_alpha"], their_alpha, rtol=1e-5, atol=1e-6)
-    assert_all_close(gradients(agents.loss.actor), gradients(agents.plain.actor), rtol=1e-3, atol=1e-5)
-    torch.testing.assert_close(agents.loss.log_alpha.grad, agents.plain.log_alpha.grad, rtol=1e-5, atol=1e-6)
+    qvalue_losses = agents.critic_losses()
+    out = ours.actor_and_temperature_loss(td)
+    pairs = [
+        qvalue_losses,
+        *zip((out["loss_actor"], out["loss_alpha"]), plain.actor_loss(agents.h), strict=True),
+    ]
+    networks = [(ours.critic, plain.critic), (ours.actor, plain.actor)]
+    for (one, other), compared in zip(pairs, [networks[0], networks[1], None], strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
+        for loss in (one, other):
+            loss.backward()
+        if compared is not None:
+            assert_all_close(*([p.grad for p in net.parameters()] for net in compared), rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(ours.log_alpha.grad, plain.log_alpha.grad, rtol=1e-5, atol=1e-6)
 
 
 def test_the_plain_bonus_is_ours_over_a_queue_that_wraps_around() -> None:
@@ -191,22 +154,17 @@ def test_two_plain_downstream_updates_have_the_losses_of_the_learner() -> None:
     for agent_step in range(2):
         agents.plain.update(agents.batch, agent_step)
         learner.update(agents.bonus(agents.td()), agent_step=agent_step)
-    batch = agents.batch
     agents.plain.generator.set_state(agents.loss.generator.get_state())
-    theirs = agents.plain.critic_loss(
-        agents.h, batch.action, batch.reward, agents.next_h, batch.not_terminated
-    )
-    torch.testing.assert_close(agents.loss.critic_loss(agents.td())["loss_qvalue"], theirs, rtol=1e-3, atol=0)
+    torch.testing.assert_close(*agents.critic_losses(), rtol=1e-3, atol=0)
     torch.testing.assert_close(agents.loss.log_alpha.detach(), agents.plain.log_alpha.detach())
 
 
 def test_the_plain_crop_and_store_are_the_librarys_shift_and_dataset(tmp_path: Path) -> None:
-    offsets = torch.randint(0, 9, (B, 2), generator=torch.Generator().manual_seed(0))
+    offsets = torch.randint(0, 9, (B, 2), generator=seeded(0))
     assert torch.equal(crop(pixels(0), offsets), random_shift(pixels(0), offsets))
-    dataset = FrameDataset.open(write_dataset(tmp_path / "toy", transitions=25, image_size=16))
-    store, rows = StackedStore.of(dataset, 20), dataset[torch.arange(20)]
+    dataset = FrameDataset.open(drifting_dataset(tmp_path, transitions=25, image_size=16))
+    store, rows = Batch.of(dataset, 20), dataset[torch.arange(20)]
     for name, key in (("obs", "pixels"), ("next_obs", ("next", "pixels")), ("action", "action")):
-        assert torch.equal(getattr(store.content, name), rows[key])
-    assert len(StackedStore.of(dataset, 1_000)) == 25
+        assert torch.equal(getattr(store, name), rows[key])
+    assert len(Batch.of(dataset, 1_000).obs) == 25
     assert store.sample(7).obs.shape == (7, 9, 16, 16)
-    assert fresh_loss(image_size=16).prototypes.weight.shape == (512, 128)

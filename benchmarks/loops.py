@@ -1,0 +1,227 @@
+"""The library's loops as users call them, held at every pass: what :class:`benchmarks.measure.Loop` runs.
+
+``python -m benchmarks.loops ITEM SETTINGS`` prints, whenever it is held, a JSON object of seconds per pass by what they
+were spent on, and goes on when it reads a line. Nothing of a loop is copied here: clocks are put around public methods
+that it calls. Public names of the library only: ``benchmarks.revisions`` runs this with other revisions too.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+import statistics
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import torch
+from torch.optim.optimizer import register_optimizer_step_post_hook
+
+from benchmarks import synthetic
+from benchmarks.synthetic import drifting_dataset, make_drifting_env
+from crptpro.data import FrameDataset, FrameReplay, collect_random
+from crptpro.envs import make_env
+from crptpro.modules import PixelEncoder, Projector, Prototypes
+from crptpro.objectives import ProtoLoss
+from crptpro.pretrained import Pretrained
+from crptpro.training import pretrain, train_downstream
+
+Hold = Callable[[dict[str, float]], None]
+STORE = "append" if hasattr(FrameReplay, "begin_episode") else "extend"  # the former in revision 40d9ae0
+
+
+def fresh_loss(*, image_size: int, prototypes: int, seed: int = 0) -> ProtoLoss:
+    """Return the pre-training loss with the paper's sizes; the same seed gives the same weights."""
+    torch.manual_seed(seed)
+    return ProtoLoss(PixelEncoder(image_size=image_size), num_prototypes=prototypes)
+
+
+def fresh_pretrained(*, image_size: int, prototypes: int) -> Pretrained:
+    """Return encoder, projector and prototypes at initialisation: their values do not change what they cost."""
+    torch.manual_seed(0)
+    encoder = PixelEncoder(image_size=image_size).requires_grad_(False).eval()
+    projector, heads = Projector(encoder.feature_dim), Prototypes(prototypes)
+    return Pretrained(encoder, projector, prototypes=heads, card={"method": "crptpro"})
+
+
+class Laps:
+    """Seconds of a loop by what they were spent on; ``hold`` is told their means every ``passes`` passes."""
+
+    def __init__(self, hold: Hold, passes: int) -> None:
+        self.hold, self.passes, self.done = hold, passes, 0
+        self.seconds: dict[str, float] = defaultdict(float)
+        self.since = time.perf_counter()
+
+    def lap(self, name: str, *, waits: bool = False) -> None:
+        """Say what the time since the last lap was spent on."""
+        if waits and torch.cuda.is_initialized():
+            torch.cuda.synchronize()
+        now = time.perf_counter()
+        self.seconds[name] += now - self.since
+        self.since = now
+
+    def begin(self, name: str) -> None:
+        """End the last lap of a pass."""
+        self.done += 1
+        is_due = self.done % self.passes == 0
+        self.lap(name, waits=is_due)
+        if is_due:
+            self.hold({lap: seconds / self.passes for lap, seconds in self.seconds.items()})
+            self.seconds.clear()
+            self.since = time.perf_counter()
+
+    def clock(self, owner: type, name: str, before: Callable[..., None], after: str = "") -> Any:
+        """Call ``before`` when a method begins; what it takes is the lap ``after``, if that is named."""
+        method = getattr(owner, name)
+
+        @functools.wraps(method)
+        def clocked(this: Any, *args: Any, **kwargs: Any) -> Any:
+            before(this, *args)
+            found = method(this, *args, **kwargs)
+            if after:
+                self.lap(after)
+            return found
+
+        return mock.patch.object(owner, name, clocked)
+
+
+def pretraining(
+    hold: Hold, *, image_size: int, prototypes: int, datasets: Sequence[str], batch_size: int, passes: int = 1,
+    **settings: Any,
+) -> None:  # fmt: skip
+    """Time ``pretrain(...)``: one lap, ``update``."""
+    laps = Laps(hold, passes)
+
+    def begin(_: FrameDataset, count: int) -> None:
+        if count == batch_size:  # otherwise it only has a look at what the dataset holds
+            laps.begin("update")
+
+    with laps.clock(FrameDataset, "sample", begin):
+        loss = fresh_loss(image_size=image_size, prototypes=prototypes)
+        pretrain(loss, datasets, batch_size=batch_size, progress=False, **settings)
+
+
+def downstream(
+    hold: Hold, *, image_size: int, prototypes: int, transitions: int, task: str = "", passes: int = 2,
+    is_filled: bool = True, has_stages: bool = False, **settings: Any,
+) -> None:  # fmt: skip
+    """Time ``train_downstream(...)`` on the drifting world or a task: laps ``update``, ``store`` and ``act``.
+
+    The actor learns in every second pass. ``is_filled``: drifting pictures are stored and encoded before the first
+    update; otherwise the loop fills its replay. ``has_stages``: ``update`` is split into ``sample`` (with features and
+    bonus), ``learn``, and ``wait for the image``.
+    """
+    laps = Laps(hold, passes)
+    to_fill = iter([transitions] if is_filled else [])
+
+    def begin(replay: FrameReplay, *_: int) -> None:
+        for count in to_fill:
+            fill(replay, count, image_size, encodes=settings.get("features") != "reencode")
+        laps.begin("act")
+
+    last = "wait for the image" if has_stages else "update"
+    with ExitStack() as stack:
+        stack.enter_context(laps.clock(FrameReplay, "sample", begin, "sample" if has_stages else ""))
+        stack.enter_context(
+            laps.clock(FrameReplay, STORE, lambda *_: laps.lap(last, waits=True), after="store")
+        )
+        if has_stages:
+            stack.callback(register_optimizer_step_post_hook(lambda *_: laps.lap("learn")).remove)
+        train_downstream(
+            task or "drifting", fresh_pretrained(image_size=image_size, prototypes=prototypes), progress=False,
+            env_factory=make_env if task else make_drifting_env, env_steps=500_000, replay_capacity=transitions,
+            random_agent_steps=1 if is_filled else transitions, eval_episodes=1, eval_workers=0,
+            eval_interval_env_steps=500_000, **settings,
+        )  # fmt: skip
+
+
+def fill(replay: FrameReplay, transitions: int, image_size: int, *, encodes: bool) -> None:
+    """Store episodes of the drifting world, and encode them where the replay's transforms keep features."""
+    action_dim = replay[:1]["action"].shape[-1] if len(replay) else synthetic.ACTION_DIM
+    env = make_drifting_env("drifting", seed=1, image_size=image_size, action_dim=action_dim)
+    while len(replay) < transitions:
+        replay.extend(env.rollout(transitions - len(replay)))
+    for first in range(0, transitions if encodes else 0, 500):
+        replay[first : first + 500]
+
+
+def datasets(hold: Hold, *, root: str, image_size: int, transitions: int) -> None:
+    """Collect three datasets of the drifting world."""
+    for seed in range(3):
+        drifting_dataset(root, seed=seed, transitions=transitions, image_size=image_size)
+    hold({})
+
+
+def sampling(hold: Hold, *, path: str, batch_size: int) -> None:
+    """Time ``FrameDataset.sample``."""
+    dataset = FrameDataset.open(path)
+    while True:
+        hold({"sample": mean_s(lambda: dataset.sample(batch_size), 20)})
+
+
+def opening(hold: Hold, *, path: str) -> None:
+    """Time ``FrameDataset.open``."""
+    while True:
+        hold({"open": mean_s(lambda: FrameDataset.open(path), 5)})
+
+
+def collecting(hold: Hold, *, root: str, image_size: int, transitions: int) -> None:
+    """Time collecting the drifting world in one process, at least two episodes, from one reset to the next."""
+    for number in itertools.count():
+        place = Path(root) / str(number)
+        place.mkdir(parents=True)
+        clock = place / "clock"
+        drifting_dataset(place, clock=clock, transitions=transitions, image_size=image_size)
+        resets = [tuple(map(float, line.split())) for line in clock.read_text().splitlines()]
+        pairs = itertools.pairwise(resets)
+        episodes = [end - start for (start, _), (end, length) in pairs if length == synthetic.LENGTH]
+        hold({"collect": statistics.median(episodes) / synthetic.LENGTH})
+
+
+def rendering(hold: Hold, *, root: str, task: str, image_size: int, transitions: int) -> None:
+    """Collect a task once."""
+    collect_random(task, root, transitions=transitions, image_size=image_size, progress=False)
+    hold({})
+
+
+def nothing(hold: Hold) -> None:
+    """Import what the others import."""
+    hold({})
+
+
+ITEMS: dict[str, Callable[..., None]] = {
+    item.__name__: item
+    for item in (pretraining, downstream, datasets, sampling, opening, collecting, rendering, nothing)
+}
+
+
+def mean_s(call: Callable[[], Any], count: int) -> float:
+    start = time.perf_counter()
+    for _ in range(count):
+        call()
+    return (time.perf_counter() - start) / count
+
+
+def main(item: str, settings: dict[str, Any]) -> None:
+    """Run an item until standard input ends."""
+    answers, sys.stdout = sys.stdout, sys.stderr  # TorchRL announces storages on standard output
+
+    def hold(laps: dict[str, float]) -> None:
+        print(json.dumps(laps), file=answers, flush=True)
+        if not sys.stdin.readline():
+            raise SystemExit(0)
+
+    torch.set_num_threads(settings.pop("threads", torch.get_num_threads()))
+    if settings.pop("tf32", False):
+        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
+    ITEMS[item](hold, **settings)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], json.loads(sys.argv[2]))
