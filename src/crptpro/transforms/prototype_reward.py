@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
@@ -13,7 +12,7 @@ from torch import Tensor, nn
 
 from crptpro.modules.heads import latent_dim_of
 from crptpro.objectives.functional import knn_distance
-from crptpro.transforms.base import IntrinsicReward
+from crptpro.transforms.base import IntrinsicReward, Keys
 from crptpro.values import as_int
 
 logger = logging.getLogger(__name__)
@@ -36,10 +35,8 @@ class PrototypeReward(IntrinsicReward):
     512 prototypes and k = 3), and rows of the queue not yet filled are zero vectors at distance 1. A row that is not
     finite is never drawn.
 
-    Works on replay batches (``forward``, keys under ``"next"``) and on environments. The candidates come
-    from the batch at hand: on a single environment that is one sample, which fills the queue with itself
-    and earns 0; use replay batches or many environments. Never put it on evaluation environments. Nothing depends on
-    training mode.
+    The candidates come from the batch at hand: one sample alone fills the queue with itself and earns 0. Never put it
+    on evaluation environments.
 
     Deviation: the released pre-training fills Q on the way and hands it over; here Q starts from zeros unless
     ``queue`` is given.
@@ -57,8 +54,6 @@ class PrototypeReward(IntrinsicReward):
             zeros when None.
         generator: source of the draws; the global generator of the device when None. Not part of the state
             dict.
-
-    In an environment's step the entries are those without the leading ``"next"``.
 
     Raises:
         ValueError: a queue size that is no multiple of M, a queue of another shape, more than one key, a ``knn_k``
@@ -87,8 +82,8 @@ class PrototypeReward(IntrinsicReward):
         coef: float | None = 0.2,
         knn_k: int = 3,
         queue_size: int = 2048,
-        in_keys: NestedKey | Sequence[NestedKey] = ("next", "features"),
-        out_keys: NestedKey | Sequence[NestedKey] = ("next", "intrinsic_reward"),
+        in_keys: Keys = ("next", "features"),
+        out_keys: Keys = ("next", "intrinsic_reward"),
         reward_key: NestedKey = ("next", "reward"),
         queue: Tensor | None = None,
         generator: torch.Generator | None = None,
@@ -120,11 +115,6 @@ class PrototypeReward(IntrinsicReward):
         self.register_buffer("queue", start.detach().to(weight.device, torch.float32, copy=True))
         self.register_buffer("queue_pointer", torch.tensor(0, device=weight.device))
 
-    def reset_queue(self) -> None:
-        """Empty the queue: all rows zero, pointer at the first."""
-        self.queue.zero_()
-        self.queue_pointer.zero_()
-
     @torch.no_grad()
     def intrinsic_reward(self, features: Tensor) -> Tensor:
         r"""Insert this batch's candidates into the queue and return the bonus before :math:`\beta`.
@@ -149,7 +139,7 @@ class PrototypeReward(IntrinsicReward):
         self.queue_pointer.add_(count).remainder_(self.queue.shape[0])
         return knn_distance(latents, self.queue, k=self.knn_k)
 
-    def _intrinsic_reward(self, features: Tensor, root: TensorDictBase) -> Tensor:
+    def _intrinsic_reward(self, features: Tensor, tensordict: TensorDictBase) -> Tensor:
         return self.intrinsic_reward(features)
 
 
