@@ -62,7 +62,7 @@ def prototype_reward():
 
 def reward_to_a_new_key():
     encoder = small_encoder()
-    reward = prototype(encoder, in_keys=("next", "z"), out_keys="bonus")
+    reward = prototype(encoder, in_keys=("next", "z"), out_keys=("next", "bonus"))
     return Compose(FrozenEncoder(encoder, out_keys="z"), reward)
 
 
@@ -128,7 +128,7 @@ def offline(make):
     encoder, key = small_encoder(), "z" if make is reward_to_a_new_key else "features"
     encode = FrozenEncoder(encoder, in_keys=[("next", "pixels")], out_keys=[("next", key)])
     rewards = {particle_reward: particle, contrastive_reward: contrastive}
-    options = {"in_keys": ("next", "z"), "out_keys": "bonus"} if make is reward_to_a_new_key else {}
+    options = {"in_keys": ("next", "z"), "out_keys": ("next", "bonus")} if make is reward_to_a_new_key else {}
     reward = rewards.get(make, prototype)(encoder, **options)
     return Compose(*([RandomShift()] if make is everything else []), encode, reward)
 
