@@ -81,7 +81,7 @@ class Projector(nn.Module):
         super().__init__()
         sizes = plain_sizes(feature_dim=feature_dim, latent_dim=latent_dim)
         self.config: dict[str, Any] = {**sizes, "init": init}
-        self.linear = nn.Linear(*sizes.values())
+        self.linear = nn.Linear(sizes["feature_dim"], sizes["latent_dim"])
         self.init: WeightInit = init
         self.compute_dtype: torch.dtype = torch.float32
         self.reset_parameters()

@@ -129,7 +129,7 @@ class RADSACLoss(NetworkLoss, SACLoss):
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
 
     @property
-    def actor(self) -> SquashedGaussianActor:
+    def actor(self) -> Any:
         """The policy that is trained, on features."""
         return cast(Any, self.actor_network)[0].module
 

@@ -95,12 +95,12 @@ class SkillDDPGLoss(NetworkLoss):
         self.convert_to_functional(critic, "qvalue_network", create_target_params=True)
 
     @property
-    def actor(self) -> DeterministicActor:
+    def actor(self) -> Any:
         """The policy that is trained."""
         return self.actor_network
 
     @property
-    def critic(self) -> TwinCritic:
+    def critic(self) -> Any:
         """The critic that is trained."""
         return self.qvalue_network
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -15,8 +14,8 @@ from torchrl.envs.transforms import Transform
 if TYPE_CHECKING:
     from typing import Self
 
-KeyPair = tuple[NestedKey, NestedKey]
-Keys = NestedKey | Sequence[NestedKey]
+Keys = Any
+"""One key, or a sequence of them."""
 
 PIXEL_KEYS: list[NestedKey] = ["pixels", ("next", "pixels")]
 
@@ -88,7 +87,7 @@ class PixelTransform(Transform):
     def __init__(self, in_keys: Keys | None, out_keys: Keys | None) -> None:
         read, written = paired_keys(PIXEL_KEYS if in_keys is None else in_keys, out_keys)
         super().__init__(in_keys=read, out_keys=written)
-        self._pairs: list[KeyPair] = list(zip(read, written))
+        self._pairs = list(zip(read, written))
         self._root_pairs = [pair for pair in self._pairs if not is_next(pair[0])]
         self._optional = PIXEL_KEYS[1:] if in_keys is None else []
 
@@ -104,7 +103,9 @@ class PixelTransform(Transform):
         """
         return self._apply_to(tensordict, self._pairs)
 
-    def _apply_to(self, tensordict: TensorDictBase, pairs: list[KeyPair]) -> TensorDictBase:
+    def _apply_to(
+        self, tensordict: TensorDictBase, pairs: list[tuple[NestedKey, NestedKey]]
+    ) -> TensorDictBase:
         for in_key, out_key in pairs:
             if in_key in self._optional and in_key not in tensordict.keys(True):
                 continue
