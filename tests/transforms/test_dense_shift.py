@@ -96,15 +96,6 @@ def test_the_default_encoder_gives_all_81_shifts_bit_for_bit_in_float32_and_roun
     assert dense_maps_bytes(encoder, 1, torch.bfloat16) == 2 * 194_688
 
 
-@pytest.mark.parametrize("pad", [0, 1, 3])
-def test_other_paddings_hold_too(pad):
-    encoder = small_encoder(strides=(1, 1) if pad == 0 else (2, 1))
-    crops, direct = crops_and_features(
-        encoder, torch.randint(0, 256, (9, SIZE, SIZE), dtype=torch.uint8), pad
-    )
-    assert torch.equal(crops, direct)
-
-
 def test_indexing_as_on_a_gpu_gives_the_same_crops_as_slicing():
     maps, rows = torch.randn(7, 4, 3, 11, 12), torch.randint(0, 7, (81,))
     indexed = _crop_by_index(maps, rows, ALL_SHIFTS, 2, (5, 7, 8))

@@ -39,12 +39,6 @@ def test_a_shift_larger_than_the_image_repeats_its_border():
     assert torch.equal(random_shift(pixels, every_offset(4)), pad_then_slice(pixels, every_offset(4), 4))
 
 
-def test_all_channels_of_a_sample_share_one_shift():
-    ramp = torch.arange(12 * 12, dtype=torch.float32).view(1, 1, 12, 12).expand(5, 9, 12, 12)
-    shifted = random_shift(ramp, draw_offsets(5, 4, torch.Generator().manual_seed(1)))
-    assert torch.equal(shifted, shifted[:, :1].expand_as(shifted))
-
-
 def test_non_contiguous_and_empty_batches_are_shifted():
     pixels = torch.randint(0, 256, (10, 12, 12, 3), dtype=torch.uint8).permute(0, 3, 1, 2)[::2]
     offsets = draw_offsets(5, 4)

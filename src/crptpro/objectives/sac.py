@@ -146,41 +146,22 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not changed."""
-        loss, metadata = self.qvalue_v2_loss(tensordict)
-        out = {
-            "loss_qvalue": loss,
-            "q_mean": metadata["q"].mean(),
-            "target_q_mean": metadata["target_q"].mean(),
-            "td_error": metadata["td_error"].mean(),
-        }
-        return TensorDict(out, batch_size=[])
-
-    def actor_and_temperature_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """``loss_actor`` and ``loss_alpha`` of one action draw, with ``alpha`` and ``entropy``."""
-        loss_actor, metadata = self.actor_loss(tensordict)
-        log_prob = metadata["log_prob"]
-        out = {
-            "loss_actor": loss_actor,
-            "loss_alpha": self._alpha_loss(log_prob).mean(),
-            "alpha": self._alpha,
-            "entropy": -log_prob.mean(),
-        }
-        return TensorDict(out, batch_size=[])
-
-    def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Critic loss and detached per-row metadata (``td_error``, ``q``, ``target_q``)."""
         target = self._compute_target_v2(tensordict)  # (B,)
         action = tensordict.get(self.tensor_keys.action)
         with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
             values = torch.stack([self._q_values(view, action) for view in self._views(tensordict)], -2)
         errors = values - target[..., None, None]  # (B, views, 2)
-        # Sum over the views and the two heads of the mean over the batch.
-        loss = errors.square().sum((-2, -1)).mean()
-        largest = errors.detach().abs().amax(-1).mean(-1)
-        return loss, {"td_error": largest, "q": values.detach().mean(-2), "target_q": target}
+        out = {
+            # Sum over the views and the two heads of the mean over the batch.
+            "loss_qvalue": errors.square().sum((-2, -1)).mean(),
+            "q_mean": values.detach().mean(-2).mean(),
+            "target_q_mean": target.mean(),
+            "td_error": errors.detach().abs().amax(-1).mean(-1).mean(),
+        }
+        return TensorDict(out, batch_size=[])
 
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Actor loss and the detached log-probability of its actions."""
+    def actor_and_temperature_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """``loss_actor`` and ``loss_alpha`` of one action draw, with ``alpha`` and ``entropy``."""
         features = self._policy_features(self._views(tensordict)[0])
         noise = self._noise(features)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
@@ -188,7 +169,14 @@ class RADSACLoss(NetworkLoss, SACLoss):
         # Detached weights: the gradient passes through Q to the action and to nothing else.
         with self._cached_detached_qvalue_params.to_module(self.qvalue_network, preserve_module_state=False):
             value = self._q_values_on_features(features, action).amin(-1)
-        return (self._alpha * log_prob - value).mean(), {"log_prob": log_prob.detach()}
+        loss_actor, log_prob = (self._alpha * log_prob - value).mean(), log_prob.detach()
+        out = {
+            "loss_actor": loss_actor,
+            "loss_alpha": self._alpha_loss(log_prob).mean(),
+            "alpha": self._alpha,
+            "entropy": -log_prob.mean(),
+        }
+        return TensorDict(out, batch_size=[])
 
     def _alpha_loss(self, log_prob: Tensor) -> Tensor:
         # SACLoss uses log_alpha in place of alpha.

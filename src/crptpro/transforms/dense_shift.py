@@ -1,10 +1,9 @@
 """Features of all 81 random shifts of an image as crops of a few dense maps: the same numbers, encoded once.
 
-An un-padded convolutional encoder with total stride S sees a shifted image as a crop of what it would make
-of the larger, border-replicated image. Shifts that differ by a multiple of S share one map, so one map per
-remainder ("phase") holds them all: the shift (dy, dx) is the crop at (dy // S, dx // S) of the map of phase
-(dy % S, dx % S). The identity is the shift-and-stitch of OverFeat (Sermanet et al. 2013,
-https://arxiv.org/abs/1312.6229). For the default encoder (84x84, strides 2, 1, 1, 1) and 4 pixels of shift:
+An un-padded convolutional encoder with total stride S sees a shifted image as a crop of what it would make of the
+larger, border-replicated image. Shifts that differ by a multiple of S share one map ("phase"): the shift (dy, dx) is
+the crop at (dy // S, dx // S) of the map of phase (dy % S, dx % S), as in the shift-and-stitch of OverFeat (Sermanet et
+al. 2013, https://arxiv.org/abs/1312.6229). For the default encoder (84x84, strides 2, 1, 1, 1) and 4 pixels of shift:
 4 maps of 32x39x39, crops of 32x35x35.
 """
 
@@ -144,15 +143,12 @@ def crop_features(
     otherwise to the rounding of the convolution (about 1e-6 of the largest feature).
 
     Args:
-        maps: contiguous ``[N, phases**2, C, m, m]`` of :func:`dense_shift_maps`.
+        maps: contiguous ``[N, phases**2, C, m, m]`` of :func:`dense_shift_maps` with the same ``pad``.
         offsets: int64 ``[B, 2]``, (row, column) in ``{0, ..., 2 * pad}``.
-        pad: as given to :func:`dense_shift_maps`.
+        pad: largest shift in pixels.
         rows: int64 ``[B]``, of the maps; all in turn if None.
-        out: contiguous ``[B, feature_dim]`` of ``dtype`` to write into.
+        out: contiguous ``[B, feature_dim]`` of ``dtype`` to write into, and to return.
         dtype: of the crops: that of the maps when None, or float32 of bfloat16 maps.
-
-    Returns:
-        ``[B, feature_dim]``; ``out`` if given.
 
     Raises:
         ValueError: shapes or formats that do not fit, or an offset outside the range (read on the CPU only).

@@ -38,8 +38,8 @@ class PrototypeReward(IntrinsicReward):
     The candidates come from the batch at hand: one sample alone fills the queue with itself and earns 0. Never put it
     on evaluation environments.
 
-    Deviation: the released pre-training fills Q on the way and hands it over; here Q starts from zeros unless
-    ``queue`` is given.
+    Deviation: the released pre-training fills Q on the way and hands it over; here Q starts from zeros unless ``queue``
+    is given.
 
     Args:
         projector: maps features to the latent space, frozen; None if ``in_keys`` already names projections.
@@ -58,15 +58,6 @@ class PrototypeReward(IntrinsicReward):
     Raises:
         ValueError: a queue size that is no multiple of M, a queue of another shape, more than one key, a ``knn_k``
             that does not lie in 1 to ``queue_size``, or a projector whose outputs are not as long as the prototypes.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> from crptpro.modules import Prototypes
-        >>> bonus = PrototypeReward(None, Prototypes(4, 4), queue_size=8)  # features that are projections already
-        >>> after = {"features": torch.randn(5, 4), "reward": torch.zeros(5, 1)}
-        >>> batch = bonus(TensorDict({"next": after}, [5]))
-        >>> torch.equal(batch["next", "reward"], 0.2 * batch["next", "intrinsic_reward"])
-        True
     """
 
     projector: nn.Module | None
@@ -153,9 +144,8 @@ def _check_latents(length: int, expected: int) -> None:
 def warn_if_mostly_zero(num_prototypes: int, batch_size: int, knn_k: int) -> None:
     """Say so where most rows will earn nothing.
 
-    Every prototype draws a candidate from the batch: from a small one each row so often that the k nearest candidates
-    of most rows are the row itself. A row is drawn about Poisson(M / B) times, whose median is k from M / B = k - 1/3
-    on. With 512 prototypes, k = 3 and batches of 128 three quarters of the rows get 0.
+    Every prototype draws a candidate from the batch. A row is drawn about Poisson(M / B) times, whose median is k from
+    M / B = k - 1/3 on: with 512 prototypes, k = 3 and batches of 128 three quarters of the rows get 0.
 
     Args:
         num_prototypes: M.

@@ -115,14 +115,6 @@ class RandomShift(PixelTransform):
     Raises:
         ValueError: negative ``pad``, or ``in_keys`` and ``out_keys`` of unequal length.
 
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> pixels = torch.arange(9, dtype=torch.uint8).view(1, 1, 3, 3)
-        >>> shift = RandomShift(pad=1, generator=torch.Generator().manual_seed(0))
-        >>> shift(TensorDict({"pixels": pixels}, [1]))["pixels"]
-        tensor([[[[3, 3, 4],
-                  [6, 6, 7],
-                  [6, 6, 7]]]], dtype=torch.uint8)
     """
 
     def __init__(
