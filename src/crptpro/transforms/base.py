@@ -157,10 +157,10 @@ class IntrinsicReward(Transform):
         self,
         networks: dict[str, nn.Module | None],
         *,
-        coef: float | None,
-        in_keys: Keys,
-        out_keys: Keys,
-        reward_key: NestedKey,
+        coef: float | None = None,
+        in_keys: Keys = ("next", "features"),
+        out_keys: Keys = ("next", "intrinsic_reward"),
+        reward_key: NestedKey = ("next", "reward"),
     ) -> None:
         read, written = paired_keys(in_keys, out_keys)
         if len(read) != 1:

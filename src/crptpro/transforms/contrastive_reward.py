@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -9,7 +11,7 @@ from torch import Tensor, nn
 
 from crptpro.objectives.base import require_positive
 from crptpro.objectives.functional import becl_loss
-from crptpro.transforms.base import IntrinsicReward, Keys, read_entry
+from crptpro.transforms.base import IntrinsicReward, read_entry
 
 
 class ContrastiveReward(IntrinsicReward):
@@ -26,12 +28,10 @@ class ContrastiveReward(IntrinsicReward):
 
     Args:
         head: maps features to the embedding; None if ``in_keys`` already names embeddings.
-        coef: :math:`c` in :math:`r_\mathrm{ext} + c \hat r`; None writes :math:`\hat r` only.
         temperature: T.
-        in_keys: one key, features ``[*, feature_dim]`` (or embeddings) of the next observation.
-        out_keys: one key for :math:`\hat r`, of the reward's shape.
         skill_key: one-hot ``[*, K]``, the skill that acted, at the root.
-        reward_key: :math:`r_\mathrm{ext}`, ``[*, 1]``, which the sum replaces.
+        **options: ``coef``, ``in_keys``, ``out_keys`` and ``reward_key`` of
+            :class:`~crptpro.transforms.base.IntrinsicReward`.
 
     Raises:
         ValueError: a non-positive temperature, or more than one key.
@@ -43,15 +43,12 @@ class ContrastiveReward(IntrinsicReward):
         self,
         head: nn.Module | None,
         *,
-        coef: float | None = None,
         temperature: float = 0.5,
-        in_keys: Keys = ("next", "features"),
-        out_keys: Keys = ("next", "intrinsic_reward"),
         skill_key: NestedKey = "skill",
-        reward_key: NestedKey = ("next", "reward"),
+        **options: Any,
     ) -> None:
         require_positive(temperature=temperature)
-        super().__init__({"head": head}, coef=coef, in_keys=in_keys, out_keys=out_keys, reward_key=reward_key)
+        super().__init__({"head": head}, **options)
         self.temperature = float(temperature)
         self.skill_key = skill_key
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from crptpro.modules.precision import device_of
 from crptpro.objectives.functional import knn_distances, particle_entropy
-from crptpro.transforms.base import IntrinsicReward, Keys
+from crptpro.transforms.base import IntrinsicReward
 from crptpro.values import as_int
 
 # Below this a scale says that all particles coincide; their distances are 0 too, and so is the bonus.
@@ -35,11 +36,9 @@ class ParticleReward(IntrinsicReward):
 
     Args:
         projector: maps features to the latent space; None if ``in_keys`` already names projections.
-        coef: :math:`c` in :math:`r_\mathrm{ext} + c \hat r`; None writes :math:`\hat r` only.
         k: neighbours, the particle itself included.
-        in_keys: one key, features ``[*, feature_dim]`` (or projections ``[*, D]``) of the next observation.
-        out_keys: one key for :math:`\hat r`, of the reward's shape.
-        reward_key: :math:`r_\mathrm{ext}`, ``[*, 1]``, which the sum replaces.
+        **options: ``coef``, ``in_keys``, ``out_keys`` and ``reward_key`` of
+            :class:`~crptpro.transforms.base.IntrinsicReward`.
 
     Raises:
         ValueError: ``k`` below 2, or more than one key.
@@ -53,15 +52,10 @@ class ParticleReward(IntrinsicReward):
         self,
         projector: nn.Module | None,
         *,
-        coef: float | None = None,
         k: int = 12,
-        in_keys: Keys = ("next", "features"),
-        out_keys: Keys = ("next", "intrinsic_reward"),
-        reward_key: NestedKey = ("next", "reward"),
+        **options: Any,
     ) -> None:
-        super().__init__(
-            {"projector": projector}, coef=coef, in_keys=in_keys, out_keys=out_keys, reward_key=reward_key
-        )
+        super().__init__({"projector": projector}, **options)
         self.k = as_int(k, "k", minimum=2)
         where = None if projector is None else device_of(projector)
         # The published starting point: mean 0, as if seen a ten-thousandth of a time.

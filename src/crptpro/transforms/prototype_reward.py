@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from crptpro.modules.heads import latent_dim_of
 from crptpro.objectives.functional import knn_distance
-from crptpro.transforms.base import IntrinsicReward, Keys
+from crptpro.transforms.base import IntrinsicReward
 from crptpro.values import as_int
 
 logger = logging.getLogger(__name__)
@@ -47,13 +47,11 @@ class PrototypeReward(IntrinsicReward):
         coef: :math:`\beta`; None writes :math:`\hat r` only.
         knn_k: k, counted with copies of the sample itself.
         queue_size: length of Q, a multiple of M.
-        in_keys: one key, features ``[*, feature_dim]`` (or projections ``[*, D]``) of the next observation.
-        out_keys: one key for :math:`\hat r`, of the reward's shape.
-        reward_key: :math:`r_\mathrm{ext}`, ``[*, 1]``, which the sum replaces.
         queue: ``[queue_size, D]`` to start from, such as a checkpoint's, the row that is overwritten first in front;
             zeros when None.
         generator: source of the draws; the global generator of the device when None. Not part of the state
             dict.
+        **keys: ``in_keys``, ``out_keys`` and ``reward_key`` of :class:`~crptpro.transforms.base.IntrinsicReward`.
 
     Raises:
         ValueError: a queue size that is no multiple of M, a queue of another shape, more than one key, a ``knn_k``
@@ -73,11 +71,9 @@ class PrototypeReward(IntrinsicReward):
         coef: float | None = 0.2,
         knn_k: int = 3,
         queue_size: int = 2048,
-        in_keys: Keys = ("next", "features"),
-        out_keys: Keys = ("next", "intrinsic_reward"),
-        reward_key: NestedKey = ("next", "reward"),
         queue: Tensor | None = None,
         generator: torch.Generator | None = None,
+        **keys: Any,
     ) -> None:
         weight = prototypes.get_parameter("weight")
         num_prototypes, latent_dim = weight.shape
@@ -93,13 +89,7 @@ class PrototypeReward(IntrinsicReward):
         told = None if projector is None else latent_dim_of(projector)
         if told is not None:
             _check_latents(told, latent_dim)
-        super().__init__(
-            {"projector": projector, "prototypes": prototypes},
-            coef=coef,
-            in_keys=in_keys,
-            out_keys=out_keys,
-            reward_key=reward_key,
-        )
+        super().__init__({"projector": projector, "prototypes": prototypes}, coef=coef, **keys)
         self.knn_k = as_int(knn_k, "knn_k", minimum=1, maximum=queue_size)
         self.generator = generator
         start = torch.zeros(queue_size, latent_dim) if queue is None else queue
