@@ -97,7 +97,9 @@ def test_every_network_comes_back_bit_equal_and_reading_draws_nothing(trained: P
     assert all_equal(states(trained, *roles), states(loaded, *roles))
     for role, module in (("encoder", loaded.target_encoder), ("projector", loaded.target_projector)):
         assert module is not None
-        assert all_equal(trained.target_state()[role], module.state_dict())
+        assert all_equal(
+            getattr(trained, f"target_{role}_params").data.flatten_keys(".").to_dict(), module.state_dict()
+        )
         assert not all_equal(module.state_dict(), getattr(loaded, role).state_dict())
     assert torch.equal(trained.encoder(PIXELS), loaded.encoder(PIXELS))
     assert not any(p.requires_grad for p in loaded.encoder.parameters())
@@ -353,7 +355,7 @@ def test_finetuning_starts_from_the_artifact_with_its_targets_and_fresh_adam(kep
     assert loaded.target_encoder is not None
     target, online = loaded.target_encoder.convs[0].weight, loaded.encoder.convs[0].weight
     expected = target + 0.05 * (online - target)
-    assert torch.allclose(loss.target_state()["encoder"]["convs.0.weight"], expected, atol=1e-7)
+    assert torch.allclose(loss.target_encoder_params["convs", "0", "weight"], expected, atol=1e-7)
     assert torch.allclose(loss.encoder.convs[0].weight, online, atol=1e-7)
     assert not loaded.encoder.convs[0].weight.requires_grad
     assert result.updates == 1

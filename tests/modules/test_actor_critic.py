@@ -13,18 +13,16 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch.distributions import Normal, TanhTransform, TransformedDistribution
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import ProbabilisticActor
+from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from crptpro.modules import (
     DeterministicActor,
-    FixedSkillActor,
-    PixelCritic,
     PixelEncoder,
     SquashedGaussianActor,
     TwinCritic,
     set_compute_dtype,
 )
-from crptpro.modules.actor_critic import SquashedGaussian, squashed_gaussian
+from crptpro.modules.actor_critic import PixelCritic, squashed_gaussian
 
 
 def actor(**options) -> SquashedGaussianActor:
@@ -183,59 +181,15 @@ def test_the_skill_policy_clips_its_noise_and_lets_the_gradient_through_the_boun
     assert policy.mlp.last.weight.grad.any()
 
 
-def test_a_fixed_skill_acts_as_the_policy_with_that_skill() -> None:
-    policy, features = skilled(), torch.rand(5, 40)
-    fixed = FixedSkillActor(policy, 2)
-    code = torch.tensor([0.0, 0, 1, 0]).expand(5, 4)
-    assert torch.equal(fixed.mode(features), policy(torch.cat([features, code], -1)))
-    assert not torch.equal(fixed.explore(features), fixed.mode(features))
-    assert FixedSkillActor.from_config(**fixed.config).action_dim == 3
-    with pytest.raises(ValueError, match="There are 4 skills"):
-        FixedSkillActor(policy, 4)
-
-
-# The distribution in TorchRL's form ----------------------------------------------------------------------
-
-
-def test_own_samples_are_scored_before_the_tanh_and_others_inverted() -> None:
-    saturated = SquashedGaussian(torch.full((1, 1), 40.0), torch.ones(1, 1))
-    action = saturated.rsample()
-    assert action.item() == 1.0
-    assert saturated.log_prob(action).item() > 70
-    assert saturated.log_prob(action.clone()).item() < 0  # a stranger's action is inverted with a margin
-    policy = SquashedGaussian(torch.zeros(3, 2).double(), torch.ones(3, 2).double())
-    action = policy.rsample()
-    torch.testing.assert_close(policy.log_prob(action.clone()), policy.log_prob(action), rtol=1e-5, atol=1e-5)
-    assert policy.log_prob(policy.sample((4,))).shape == (4, 3)
-
-
-def test_gradients_of_own_samples_are_those_of_the_score_and_of_the_reparameterisation() -> None:
-    draws = torch.Generator().manual_seed(0)
-    loc, raw = torch.randn(2, 5, 3, generator=draws, dtype=torch.float64)
-    torch.manual_seed(0)
-    loc, scale = loc.requires_grad_(), (0.3 * raw).exp().requires_grad_()
-    policy = SquashedGaussian(loc, scale)
-    action = policy.sample()
-    own = torch.autograd.grad(policy.log_prob(action).sum(), (loc, scale))
-    given = torch.autograd.grad(policy.log_prob(action.clone()).sum(), (loc, scale))
-    torch.testing.assert_close(own, given, rtol=1e-4, atol=1e-6)
-    torch.manual_seed(0)
-    through = torch.autograd.grad(policy.log_prob(policy.rsample()).sum(), (loc, scale))
-    torch.manual_seed(0)
-    noise = torch.randn_like(loc)
-    expected = torch.autograd.grad(squashed_gaussian(loc, scale, noise)[1].sum(), (loc, scale))
-    torch.testing.assert_close(through, expected)
-
-
 def test_probabilistic_actor_follows_the_exploration_type() -> None:
     network = actor()
     policy = ProbabilisticActor(
         TensorDictModule(network, ["features"], ["loc", "scale"]),
         in_keys=["loc", "scale"],
-        distribution_class=SquashedGaussian,
+        distribution_class=TanhNormal,
     )
     td = TensorDict({"features": torch.randn(4, 40)}, [4])
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert torch.equal(policy(td.copy())["action"], network.mode(td["features"]))
+        torch.testing.assert_close(policy(td.copy())["action"], network.mode(td["features"]))
     with set_exploration_type(ExplorationType.RANDOM):
         assert not torch.equal(policy(td.copy())["action"], policy(td.copy())["action"])

@@ -265,19 +265,11 @@ def run(loss: LossModule, td: TensorDictBase, seed: int = 7) -> TensorDictBase:
     return loss(td)
 
 
-def as_images(rows: torch.Tensor) -> torch.Tensor:
-    """Vectors ``[B, D]`` as images of one pixel, which :func:`passing_through` hands on as they are."""
-    return rows.reshape(*rows.shape, 1, 1)
-
-
-def passing_through(dim: int = 2) -> tuple[torch.nn.Module, torch.nn.Module]:
-    """An encoder and a projector, in double precision, whose latents are their images' values."""
-    conv = torch.nn.Conv2d(dim, dim, 1, bias=False)
-    linear = torch.nn.Linear(dim, dim, bias=False)
-    with torch.no_grad():
-        conv.weight.copy_(as_images(torch.eye(dim)))
-        linear.weight.copy_(torch.eye(dim))
-    return torch.nn.Sequential(conv, torch.nn.Flatten()).double(), linear.double()
+def target_state(loss: LossModule, name: str) -> dict[str, torch.Tensor]:
+    """The live tensors of a target network, by the names of its own state dictionary."""
+    leaves = loss._modules[f"target_{name}_params"].items(True, True)
+    named = {key if isinstance(key, str) else ".".join(key): value.data for key, value in leaves}
+    return {key.removeprefix("module."): value for key, value in named.items()}
 
 
 def keep_targets(case: LossCase, loss: LossModule) -> Callable[[], None]:

@@ -20,7 +20,6 @@ from crptpro.objectives import (
     Exploration,
     ProtoLoss,
     SimCLRLoss,
-    exploration_of,
     get_method,
     method_names,
     method_of,
@@ -63,8 +62,7 @@ def test_passive_methods_have_their_papers_numbers() -> None:
     assert get_method("atc-native").build_encoder().config["init"] == "kaiming"
     assert get_method("crptpro").build_encoder().config == PixelEncoder().config
     tuned = get_method("crptpro-finetune")
-    assert tuned.starts_from == "crptpro"
-    assert sum(tuned.domain_updates.values()) == 2_000 + 2_000 + 3_000 + 1_000 + 500
+    assert (tuned.starts_from, tuned.updates) == ("crptpro", 2_000)
 
 
 def test_crptpro_fast_is_crptpro_but_for_its_learning_rate_and_the_temperature_of_its_targets() -> None:
@@ -157,7 +155,6 @@ def test_a_method_of_ones_own_is_found_by_name_and_class() -> None:
 
     assert method_of(Derived(small_encoder())).updates == 10
     assert method_of(Derived(small_encoder())).name == "Derived"
-    assert exploration_of(Derived) == Exploration() == exploration_of(proto())
     with pytest.raises(ValueError, match="'own' is already registered for OwnLoss"):
         register_method("own", ProtoLoss)
     with pytest.raises(ValueError, match="'drq' is already registered for no loss"):

@@ -5,23 +5,19 @@ from __future__ import annotations
 import copy
 import math
 
-import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 from loss_cases import (
     SKILLS,
-    as_images,
     atc,
     becl,
-    close,
-    double,
     image_batch,
-    passing_through,
     proto,
     simclr,
     skill_image_batch,
     small_encoder,
+    target_state,
     view_batch,
 )
 from tensordict import TensorDict
@@ -45,12 +41,12 @@ def require_gradients(loss, gradients: list, tolerance: float = 1e-6) -> None:
         torch.testing.assert_close(parameter.grad, expected, rtol=1e-3, atol=tolerance, msg=name)
 
 
-def released_proto(loss: ProtoLoss, td: TensorDict, targets: dict, *, alpha: float, w: float, tau: float):
+def released_proto(loss: ProtoLoss, td: TensorDict, *, alpha: float, w: float, tau: float):
     """liuxin0824/CRPTpro proto.py ``update_proto``, on copies of the same parameters; returns terms and gradients."""
     encoder, projector, predictor = (copy.deepcopy(m) for m in (loss.encoder, loss.projector, loss.predictor))
     target_encoder, target_projector = copy.deepcopy(encoder), copy.deepcopy(projector)
-    target_encoder.load_state_dict(targets["encoder"])
-    target_projector.load_state_dict(targets["projector"])
+    target_encoder.load_state_dict(target_state(loss, "encoder"))
+    target_projector.load_state_dict(target_state(loss, "projector"))
     protos = torch.nn.Linear(*reversed(loss.prototypes.weight.shape), bias=False)
     with torch.no_grad():
         protos.weight.copy_(F.normalize(loss.prototypes.weight, dim=1))
@@ -86,7 +82,6 @@ def test_proto_equals_the_released_update_in_value_and_gradients(options: dict) 
     comp, intr, gradients = released_proto(
         loss.before_update(),
         td,
-        loss.target_state(),
         alpha=settings["intr_loss_coef"],
         w=settings["offset"],
         tau=settings["temperature"],
@@ -136,12 +131,11 @@ def test_given_networks_are_trained_and_must_share_one_latent_length() -> None:
 def test_targets_start_as_copies_and_feed_only_the_assignments() -> None:
     loss, td = proto(), image_batch()
     for name, module in (("encoder", loss.encoder), ("projector", loss.projector)):
-        state = loss.target_state()[name]
+        state = target_state(loss, name)
         assert state.keys() == module.state_dict().keys()
         assert all(torch.equal(state[key], value) for key, value in module.state_dict().items())
-    assert set(loss.target_state()) == {"encoder", "projector"}
     before = loss(td)
-    for value in loss.target_state()["encoder"].values():
+    for value in target_state(loss, "encoder").values():
         value.mul_(-1.0)  # live tensors: the target changes
     after = loss(td)
     assert not torch.equal(after["loss_comp"], before["loss_comp"])
@@ -240,12 +234,6 @@ def test_impossible_options_are_refused_by_name(make, options: dict, message: st
         make(**options)
 
 
-def test_options_of_any_number_type_become_plain_numbers() -> None:
-    loss = proto(sinkhorn_iterations=np.int64(2), temperature=np.float32(0.5))
-    assert type(loss.sinkhorn_iterations) is int
-    assert loss.temperature.item() == 0.5
-
-
 def test_a_missing_entry_is_named() -> None:
     with pytest.raises(KeyError, match=r"\('next', 'pixels'\)"):
         proto()(TensorDict({"pixels": image_batch()["pixels"]}, [6]))
@@ -259,8 +247,8 @@ def released_atc(loss: ATCLoss, td: TensorDict):
     """rlpyt ``augmented_temporal_contrast.py`` and ``atc_models.py`` on copies of the parameters."""
     encoder, projector, head = (copy.deepcopy(m) for m in (loss.encoder, loss.projector, loss.anchor_head))
     target_encoder, target_projector = copy.deepcopy(encoder), copy.deepcopy(projector)
-    target_encoder.load_state_dict(loss.target_state()["encoder"])
-    target_projector.load_state_dict(loss.target_state()["projector"])
+    target_encoder.load_state_dict(target_state(loss, "encoder"))
+    target_projector.load_state_dict(target_state(loss, "projector"))
     anchor = projector(encoder(td["pixels"]))
     with torch.no_grad():
         positive = target_projector(target_encoder(td["next", "pixels"]))
@@ -330,36 +318,6 @@ def test_contrastive_losses_and_gradients_equal_the_released_updates(make, batch
     require_gradients(loss, gradients, 1e-5)
 
 
-def test_golden_values_pass_through_the_modules() -> None:
-    encoder, projector = passing_through()
-    head = AnchorHead(2, 4).double()
-    with torch.no_grad():
-        head.bilinear.weight.copy_(torch.eye(2))
-        head.output.weight.zero_()
-        head.output.bias.zero_()
-    anchors, positives = double([[1, 2], [0, 1], [2, 0]]), double([[1, 1], [0, 2], [1, 0]])
-    td = TensorDict({"pixels": as_images(anchors), "next": {"pixels": as_images(positives)}}, [3])
-    value = ATCLoss(encoder, projector=projector, anchor_head=head)(td)["loss_contrast"]
-    assert value.item() == pytest.approx(0.838414, abs=1e-6)
-
-    encoder, projector = passing_through()
-    views = double([[1, 0], [0, 1], [0.8, 0.6], [-0.6, 0.8]])
-    td = TensorDict({"pixels": as_images(views[:2]), "pixels_view": as_images(views[2:])}, [2])
-    loss = SimCLRLoss(encoder, projector=projector)
-    assert loss(td)["loss_contrast"].item() == pytest.approx(0.027933, abs=1e-6)
-    close(loss(td.apply(lambda images: 3 * images))["loss_contrast"], loss(td)["loss_contrast"], 1e-9)
-    swapped = TensorDict({"pixels": td["pixels_view"], "pixels_view": td["pixels"]}, [2])
-    close(loss(swapped)["loss_contrast"], loss(td)["loss_contrast"], 1e-9)
-
-    encoder, projector = passing_through()
-    features, skills = double([[1, 0], [0.6, 0.8], [0, 1], [-1, 0]]), torch.tensor([0, 0, 1, 1])
-    td = TensorDict(
-        {"next": {"pixels": as_images(features)}, "skill": F.one_hot(skills, SKILLS).double()}, [4]
-    )
-    rows = double([0.294128, 0.948772, 1.939172, 0.362229])
-    close(BeCLLoss(encoder, projector=projector)(td)["loss_contrast"], rows.mean())
-
-
 def test_the_gradient_reaches_the_anchors_of_atc_and_both_views_of_simclr() -> None:
     td = image_batch(6).apply(lambda pixels: (pixels / 255).requires_grad_())
     atc()(td)["loss_contrast"].backward()
@@ -378,11 +336,9 @@ def test_contrastive_losses_have_the_heads_and_entries_of_their_papers() -> None
     ]
     assert sizes == [30_368, 5_017_728, 148_096]
     assert loss.projector.linear.weight.std().item() == pytest.approx((2 / 39_200) ** 0.5, rel=0.01)
-    assert set(loss.target_state()) == {"encoder", "projector"}
     views = SimCLRLoss(PixelEncoder())
     assert views.projector.config["latent_dim"] == 128
     assert views.temperature.item() == 0.07
-    assert views.target_state() == {}
     assert views.views == {"pixels_view": "pixels"}
     views.set_keys(observation=("next", "pixels"), observation_view=("next", "pixels_view"))
     assert views.views == {("next", "pixels_view"): ("next", "pixels")}

@@ -17,20 +17,21 @@ from loss_cases import (
     rad_sac,
     skill_batch,
     skill_ddpg,
+    target_state,
     transition_batch,
     two_view_batch,
 )
 from torch import Tensor, nn
-from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
+from torchrl.objectives import SACLoss, ValueEstimators
 
 from crptpro.modules import (
     DeterministicActor,
-    PixelCritic,
     PixelEncoder,
     SquashedGaussianActor,
     TwinCritic,
     set_compute_dtype,
 )
+from crptpro.modules.actor_critic import PixelCritic
 from crptpro.objectives import DrQLoss, RADSACLoss, SkillDDPGLoss
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
@@ -80,9 +81,7 @@ def test_rad_sac_equals_the_released_update_in_value_and_gradients() -> None:
     td, loss = transition_batch(), rad_sac(generator=generator())
     disturb(loss.critic)
     target = TwinCritic(**loss.critic.config)
-    target.load_state_dict(
-        {".".join(key[1:]): value.data for key, value in loss.target_qvalue_network_params.items(True, True)}
-    )
+    target.load_state_dict(target_state(loss, "qvalue_network"))
     actor, critic, log_alpha = (
         copy.deepcopy(loss.actor),
         copy.deepcopy(loss.critic),
@@ -212,19 +211,6 @@ def test_n_step_transitions_are_discounted_by_gamma_to_the_n() -> None:
     torch.testing.assert_close(found, reward + 0.99**rows * value)
 
 
-def test_target_follows_the_whole_critic_trunk_included() -> None:
-    loss = rad_sac()
-    updater = SoftUpdate(loss, tau=0.01)
-    with torch.no_grad():
-        for parameter in loss.critic.parameters():
-            parameter.add_(1.0)
-    source = loss.qvalue_network_params["module", "trunk", "linear", "weight"]
-    target = loss.target_qvalue_network_params["module", "trunk", "linear", "weight"]
-    torch.testing.assert_close(source - target, torch.ones_like(source))
-    updater.step()
-    torch.testing.assert_close(source - target, torch.full_like(source, 0.99))
-
-
 def test_it_is_a_torchrl_sac_loss_whose_actor_acts() -> None:
     loss, td = rad_sac(), transition_batch()
     assert isinstance(loss, SACLoss)
@@ -244,13 +230,6 @@ def test_bfloat16_losses_and_features_are_close_to_float32() -> None:
     assert all(value.dtype == torch.float32 for value in out.values())
     for key in ("loss_qvalue", "loss_actor"):
         assert out[key].item() == pytest.approx(expected[key].item(), rel=0.05, abs=0.02)
-
-
-def test_observation_key_can_be_given_at_construction() -> None:
-    td = transition_batch()
-    expected = rad_sac(generator=generator())(td)["loss_qvalue"]
-    td.rename_key_("features", "latent").rename_key_(("next", "features"), ("next", "latent"))
-    assert torch.equal(rad_sac(generator=generator(), observation="latent")(td)["loss_qvalue"], expected)
 
 
 @pytest.mark.parametrize(
@@ -316,12 +295,8 @@ class Retyped:
     def __init__(self, loss: DrQLoss) -> None:
         self.critic = Critic(loss.critic)
         self.actor = Actor(loss, self.critic.convs)
-        names = {
-            ".".join(key[1:]): value.data
-            for key, value in loss.target_qvalue_network_params.items(True, True)
-        }
         fresh = PixelCritic(PixelEncoder(**loss.encoder.config), TwinCritic(**loss.critic.head.config))
-        fresh.load_state_dict(names)
+        fresh.load_state_dict(target_state(loss, "qvalue_network"))
         self.target = Critic(fresh)
         self.log_alpha = torch.tensor(math.log(0.1), requires_grad=True)
 
@@ -444,17 +419,6 @@ def test_the_actor_learns_from_the_first_view_only() -> None:
     assert torch.equal(loss.actor_and_temperature_loss(td)["loss_actor"], expected)
 
 
-def test_bf16_reaches_the_encoder_inside_the_critic_and_stays_close() -> None:
-    td = pixel_batch()
-    expected = drq(generator=generator())(td)
-    loss = set_compute_dtype(drq(generator=generator()), torch.bfloat16)
-    assert loss.encoder.compute_dtype == torch.bfloat16
-    out = loss(td)
-    torch.testing.assert_close(out["loss_qvalue"], expected["loss_qvalue"], rtol=0.1, atol=0.05)
-    out["loss_qvalue"].backward()
-    assert loss.encoder.convs[0].weight.grad.dtype == torch.float32
-
-
 def test_a_critic_for_another_encoder_is_refused_with_both_lengths() -> None:
     loss = drq()
     with pytest.raises(ValueError, match=r"7 features, the encoder gives \d+"):
@@ -486,10 +450,7 @@ def test_skill_ddpg_equals_the_released_update_in_value_and_gradients() -> None:
     loss, td = skill_ddpg(generator=generator()), skill_batch()
     disturb(loss.critic)
     plain = TwinCritic(**loss.critic.config)
-    plain.load_state_dict(
-        {".".join(key) if isinstance(key, tuple) else key: value.data
-         for key, value in loss.target_qvalue_network_params.items(True, True)}
-    )  # fmt: skip
+    plain.load_state_dict(target_state(loss, "qvalue_network"))
     target, _ = critic_of(plain)
     critic, critic_parameters = critic_of(loss.critic)
     actor = nn.Sequential(head_of(loss.actor.trunk), layers_of(loss.actor.mlp))

@@ -8,7 +8,7 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
 from crptpro.transforms import RandomShift, draw_offsets, random_shift
-from crptpro.transforms.random_shift import _shift_by_gather, shifted_stacks
+from crptpro.transforms.random_shift import _shift_by_gather
 
 
 def pad_then_slice(pixels, offsets, pad):
@@ -37,12 +37,6 @@ def test_every_shift_equals_replicate_padding_and_slicing(shift, dtype, pad):
 def test_a_shift_larger_than_the_image_repeats_its_border():
     pixels = torch.randint(0, 256, (81, 2, 3, 2), dtype=torch.uint8)
     assert torch.equal(random_shift(pixels, every_offset(4)), pad_then_slice(pixels, every_offset(4), 4))
-
-
-def test_all_channels_of_a_sample_share_one_shift():
-    ramp = torch.arange(12 * 12, dtype=torch.float32).view(1, 1, 12, 12).expand(5, 9, 12, 12)
-    shifted = random_shift(ramp, draw_offsets(5, 4, torch.Generator().manual_seed(1)))
-    assert torch.equal(shifted, shifted[:, :1].expand_as(shifted))
 
 
 def test_non_contiguous_and_empty_batches_are_shifted():
@@ -132,27 +126,3 @@ def test_an_environment_shifts_resets_and_steps():
         for original, shifted in zip(td["pixels"], td["shifted"]):
             candidates = random_shift(original.expand(81, *original.shape), every_offset(4))
             assert (candidates == shifted).flatten(1).all(1).any()
-
-
-@pytest.mark.parametrize("dtype", [torch.uint8, torch.bfloat16])
-@pytest.mark.parametrize("pad", [4, 0])
-def test_stacks_shifted_while_they_are_read_equal_stacks_shifted_afterwards(dtype, pad):
-    offsets = every_offset(pad)
-    frames = torch.randint(0, 256, (20, 3, 11, 14)).to(dtype)
-    newest = torch.randint(2, 20, (len(offsets),))
-    rows = newest.unsqueeze(-1) - torch.tensor([2, 1, 0])
-    rows[::3, 0] = rows[::3, 1]  # an episode's second observation
-    rows[::5] = rows[::5, -1:]  # and its first
-    stacks = frames[rows].flatten(1, 2)
-    before = frames.clone()
-    shifted = shifted_stacks(frames, rows, offsets, pad=pad)
-    assert torch.equal(shifted, random_shift(stacks, offsets, pad=pad))
-    assert torch.equal(frames, before)
-
-
-def test_stacks_of_shapes_that_do_not_fit_are_refused():
-    frames, rows = torch.zeros(5, 3, 4, 4), torch.zeros(2, 3, dtype=torch.int64)
-    with pytest.raises(ValueError, match=r"offsets \[B, 2\], got .*\(3, 2\)"):
-        shifted_stacks(frames, rows, torch.zeros(3, 2, dtype=torch.int64))
-    with pytest.raises(ValueError, match=r"must lie in 0\.\.8"):
-        shifted_stacks(frames, rows, torch.full((2, 2), 9))

@@ -1,29 +1,13 @@
 """Networks: the pixel encoder, its pre-training heads, and the downstream actor and critic."""
 
-from crptpro.modules.actor_critic import (
-    DeterministicActor,
-    FixedSkillActor,
-    PixelCritic,
-    SquashedGaussianActor,
-    TwinCritic,
-)
+from crptpro.modules.actor_critic import DeterministicActor, SquashedGaussianActor, TwinCritic
 from crptpro.modules.encoder import PixelEncoder
 from crptpro.modules.heads import AnchorHead, Predictor, Projector, Prototypes, SkillHead
-from crptpro.modules.precision import (
-    computing,
-    is_channels_last,
-    resolve_channels_last,
-    resolve_precision,
-    set_channels_last,
-    set_compute_dtype,
-    usable_device,
-)
+from crptpro.modules.precision import computing, resolve_precision, set_compute_dtype, usable_device
 
 __all__ = [
     "AnchorHead",
     "DeterministicActor",
-    "FixedSkillActor",
-    "PixelCritic",
     "PixelEncoder",
     "Predictor",
     "Projector",
@@ -32,10 +16,7 @@ __all__ = [
     "SquashedGaussianActor",
     "TwinCritic",
     "computing",
-    "is_channels_last",
-    "resolve_channels_last",
     "resolve_precision",
-    "set_channels_last",
     "set_compute_dtype",
     "usable_device",
 ]

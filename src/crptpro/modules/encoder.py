@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
-from crptpro.modules.convolutions import apply_to_chunks, conv_relu_stack
+from crptpro.modules.convolutions import apply_to_chunks
 from crptpro.modules.heads import WeightInit, init_weights_, plain_sizes
 from crptpro.values import as_float, as_int
 
@@ -26,10 +27,9 @@ class PixelEncoder(nn.Module):
     flattened kernel (gain sqrt 2, not delta-orthogonal), biases zero, as in the released implementation
     (liuxin0824/CRPTpro ``proto.py``) and denisyarats/proto.
 
-    Numerics. In float32 the network sees ``pixels * pixel_scale - pixel_offset``. In bfloat16 it sees the raw
-    0..255 values, which bfloat16 holds exactly, and the scale is folded into the first kernel; an offset of
-    0.5 (with scale 1/255) is exact too. Parameters stay float32 in both, and each chunk of the batch
-    accumulates its weight gradient in float32. Memory layout and chunking change rounding only.
+    In float32 the network sees ``pixels * pixel_scale - pixel_offset``. In bfloat16 it sees the raw 0..255 values,
+    which bfloat16 holds exactly, and the scale is folded into the first kernel; an offset of 0.5 (with scale 1/255) is
+    exact too. Parameters and their gradients stay float32 in both.
 
     Images are uint8, or floating in [0, 1], which are taken as divided by 255 already; a warning says so once per
     encoder. Everything else is refused.
@@ -50,10 +50,7 @@ class PixelEncoder(nn.Module):
         config: the constructor arguments, JSON-able.
         compute_dtype: ``torch.float32`` (the parameters' own dtype) or ``torch.bfloat16``; also the output
             dtype.
-        micro_batch: chunk length on CPU, where smaller chunks stay in cache and go to different cores; 0 and other
-            devices take the whole batch.
-        channels_last: whether convolutions compute with the channels of a pixel beside each other in memory, or in
-            PyTorch's usual layout.
+        micro_batch: chunk length on a CPU, where chunks stay in cache and go to different cores.
 
     Raises:
         ValueError: lists of unequal length, an image too small for the convolutions, an unknown ``init``, or a size
@@ -116,7 +113,6 @@ class PixelEncoder(nn.Module):
         self.init: WeightInit = init
         self.compute_dtype: torch.dtype = torch.float32
         self.micro_batch: int = 64
-        self.channels_last: bool = True
         self._has_warned = False
         if standardised:
             self.register_buffer("feature_mean", torch.zeros(self.feature_dim))
@@ -202,8 +198,7 @@ class PixelEncoder(nn.Module):
             pixels: ``[*, in_channels, H, W]``, uint8, or floating in [0, 1].
 
         Returns:
-            ``[*, C, h, w]`` in ``compute_dtype``; contiguous where the batch took several chunks, else in the layout of
-            the convolutions.
+            ``[*, C, h, w]`` in ``compute_dtype``.
 
         Raises:
             ValueError: values that are neither uint8 nor in [0, 1].
@@ -211,12 +206,9 @@ class PixelEncoder(nn.Module):
         self._require_pixels(pixels)
         lead = pixels.shape[:-3]
         images = pixels.reshape(-1, *pixels.shape[-3:])
-        # A compiler would take the chunks apart, which made an update 13 % slower; it gets the whole batch.
-        in_chunks = pixels.device.type == "cpu" and not torch.compiler.is_compiling()
-        chunk = self.micro_batch if in_chunks else 0
         parameters = [p for conv in self.conv_layers for p in (conv.weight, cast(Tensor, conv.bias))]
-        if chunk and images.shape[0] > chunk and not images.requires_grad:
-            maps = apply_to_chunks(self._convolve, images.split(chunk), parameters)
+        if len(images) > self.micro_batch and not images.requires_grad and _can_chunk(images.device):
+            maps = apply_to_chunks(self._convolve, images.split(self.micro_batch), parameters)
         else:
             maps = self._convolve(images, parameters)
         return maps.reshape(*lead, *maps.shape[1:])
@@ -257,15 +249,26 @@ class PixelEncoder(nn.Module):
             x = images.to(parameters[0].dtype) * scale
             if self.pixel_offset:
                 x = x - self.pixel_offset
-        x = x.contiguous(memory_format=torch.channels_last if self.channels_last else torch.contiguous_format)
         weights, biases = list(parameters[::2]), list(parameters[1::2])
         if low:
             weights[0] = weights[0] * scale
-            weights = [weight.to(self.compute_dtype) for weight in weights]
-            biases = [bias.to(self.compute_dtype) for bias in biases]
-        largest = max(255.0, self.pixel_offset / scale) if is_raw else None
-        return conv_relu_stack(x, weights, biases, self.strides, largest=largest)
+        # Forward and backward pass of 512 images in bfloat16 were 3 and 15 % faster than in PyTorch's usual layout on
+        # two CPUs with AVX512-BF16, and a third faster on one with AMX.
+        x = x.contiguous(memory_format=torch.channels_last)
+        for weight, bias, stride in zip(weights, biases, self.strides):
+            x = F.relu(F.conv2d(x, weight.to(x.dtype), bias.to(x.dtype), stride=stride), inplace=True)
+        return x.contiguous()
 
     def extra_repr(self) -> str:
         """Show the shapes that matter when reading a printed model."""
         return f"image_size={self.image_size}, feature_dim={self.feature_dim}"
+
+
+def _can_chunk(device: torch.device) -> bool:
+    """On a CPU, where nobody watches or changes the operations, which other threads would not see."""
+    return (
+        device.type == "cpu"
+        and not torch.compiler.is_compiling()
+        and not torch.is_autocast_enabled("cpu")
+        and not torch._C._are_functorch_transforms_active()
+    )

@@ -1,4 +1,7 @@
-"""What sits on the encoder during pre-training: the heads of CRPTpro and Proto-RL, of ATC, and of BeCL."""
+"""What sits on the encoder during pre-training: the heads of CRPTpro and Proto-RL, of ATC, and of BeCL.
+
+Every head raises ``ValueError`` for a size that is no positive whole number, and keeps its arguments in ``config``.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +25,8 @@ def init_weights_(layer: nn.Linear | nn.Conv2d, init: WeightInit = "orthogonal",
 
     Args:
         layer: linear or convolutional.
-        init: ``"orthogonal"`` on the flattened kernel, or ``"kaiming"``: normal with variance 2 / fan-in, for
-            layers that a ReLU follows (rlpyt, the framework of ATC).
+        init: ``"orthogonal"`` on the flattened kernel, or ``"kaiming"``: normal with variance 2 / fan-in (rlpyt, the
+            framework of ATC).
         gain: of the orthogonal matrix.
 
     Raises:
@@ -63,17 +66,13 @@ def plain_sizes(**sizes: Any) -> dict[str, int]:
 class Projector(nn.Module):
     r"""One linear layer from features to the latent space: :math:`g_\theta`.
 
-    Orthogonal weights (gain 1), zero bias. The product runs in ``compute_dtype``; the result has the
-    parameters' dtype, so normalisation, softmax and Sinkhorn stay float32. Source: denisyarats/proto and
-    liuxin0824/CRPTpro ``proto.py`` (a single layer there too).
+    The product runs in ``compute_dtype``; the result has the parameters' dtype, so normalisation, softmax and Sinkhorn
+    stay float32. Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
 
     Args:
         feature_dim: input length (39,200 for the default encoder).
         latent_dim: output length D.
         init: ``"orthogonal"``, or ``"kaiming"`` (normal, fan-in, for ReLU), as ATC draws its own.
-
-    Raises:
-        ValueError: unknown ``init``, or a size that is no positive whole number.
     """
 
     def __init__(
@@ -99,14 +98,11 @@ class Projector(nn.Module):
 class Predictor(OrthogonalNetwork):
     r"""Two-layer perceptron in the latent space, online branch only: :math:`v_\psi`.
 
-    Orthogonal weights (gain 1), zero biases. Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
+    Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
 
     Args:
         latent_dim: input and output length D.
         hidden_dim: hidden width. 1024 as in the paper's table; the released code has 512.
-
-    Raises:
-        ValueError: a size that is no positive whole number.
     """
 
     def __init__(self, latent_dim: int = 128, hidden_dim: int = 1024) -> None:
@@ -126,16 +122,12 @@ class Prototypes(nn.Module):
     """M trainable vectors; what matters of each is its direction.
 
     Orthogonal initialisation (a tight frame when M > D). Training keeps the rows at unit length by calling
-    :meth:`normalize_` before every update, as the released code does; every read goes through
-    :meth:`unit_weight`, so rows of any length give the same scores. Source: denisyarats/proto and
-    liuxin0824/CRPTpro ``proto.py``; the idea is SwaV's (arXiv 2006.09882).
+    :meth:`normalize_` before every update, as the released code does; every read goes through :meth:`unit_weight`.
+    Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``; the idea is SwaV's (arXiv 2006.09882).
 
     Args:
         num_prototypes: M.
         latent_dim: D.
-
-    Raises:
-        ValueError: a size that is no positive whole number.
     """
 
     def __init__(self, num_prototypes: int = 512, latent_dim: int = 128) -> None:
@@ -172,16 +164,12 @@ class Prototypes(nn.Module):
 class AnchorHead(nn.Module):
     r"""ATC's contrast model on the anchor's side: :math:`W(a + \mathrm{MLP}(a))`, online branch only.
 
-    Two-layer residual perceptron and a bilinear matrix without bias; the logits are the inner products of the
-    result with the positives' latents. PyTorch's default initialisation, as in the source: astooke/rlpyt
-    ``rlpyt/ul/models/ul/atc_models.py`` (ATC, arXiv 2009.08319).
+    The logits are the inner products of the result with the positives' latents. PyTorch's default initialisation, as
+    in the source: astooke/rlpyt ``rlpyt/ul/models/ul/atc_models.py`` (ATC, arXiv 2009.08319).
 
     Args:
         latent_dim: length D of the latents.
         hidden_dim: hidden width of the perceptron.
-
-    Raises:
-        ValueError: a size that is no positive whole number.
     """
 
     def __init__(self, latent_dim: int = 128, hidden_dim: int = 512) -> None:
@@ -192,11 +180,6 @@ class AnchorHead(nn.Module):
         self.output = nn.Linear(hidden_dim, latent_dim)
         self.bilinear = nn.Linear(latent_dim, latent_dim, bias=False)
 
-    def reset_parameters(self) -> None:
-        """Draw the weights and biases as PyTorch's linear layers do."""
-        for layer in (self.hidden, self.output, self.bilinear):
-            layer.reset_parameters()
-
     def forward(self, anchors: Tensor) -> Tensor:
         """Map latents ``[*, D]`` to ``[*, D]``, not normalised."""
         return self.bilinear(anchors + self.output(F.relu(self.hidden(anchors))))
@@ -205,17 +188,14 @@ class AnchorHead(nn.Module):
 class SkillHead(OrthogonalNetwork):
     """BeCL's head: embedding of the features, then projection, in one module.
 
-    features -> hidden ReLU -> hidden ReLU -> D (embedding) -> hidden ReLU -> D (projection). Orthogonal weights
-    (gain 1), zero biases. The product with the features runs in ``compute_dtype``; everything after it, and the
-    result, has the parameters' dtype. Source: Rooshy-yang/BeCL ``agent/becl.py`` (arXiv 2305.04477).
+    features -> hidden ReLU -> hidden ReLU -> D (embedding) -> hidden ReLU -> D (projection). The product with the
+    features runs in ``compute_dtype``; everything after it, and the result, has the parameters' dtype. Source:
+    Rooshy-yang/BeCL ``agent/becl.py`` (arXiv 2305.04477).
 
     Args:
         feature_dim: input length (39,200 for the default encoder).
         latent_dim: length D of the embedding and of the result; the number of skills in the source.
         hidden_dim: hidden width of both parts.
-
-    Raises:
-        ValueError: a size that is no positive whole number.
     """
 
     def __init__(self, feature_dim: int = 39_200, latent_dim: int = 16, hidden_dim: int = 1024) -> None:

@@ -1,4 +1,4 @@
-"""How networks compute: number format, memory layout, device."""
+"""How networks compute: number format and device."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from crptpro.errors import CRPTproError
-from crptpro.values import Switch, check_switch
 
 Precision = Literal["auto", "fp32", "bf16"]
 
@@ -26,18 +25,13 @@ _Module = TypeVar("_Module", bound=nn.Module)
 def resolve_precision(precision: Precision, device: torch.device | str) -> torch.dtype:
     """Turn a precision name into the compute dtype for a device.
 
-    PyTorch lets cuDNN convolutions round float32 factors to TF32's eleven significant bits by default. When
-    float32 is what comes out for a CUDA device, this switches TF32 off for convolutions and matrix products,
-    for the whole process, so that fp32 means the same on every device.
+    Where float32 is what comes out for a CUDA device, this switches TF32 off for the whole process, so that fp32
+    means the same on every device.
 
     Args:
         precision: ``"fp32"`` (the reference), ``"bf16"``, or ``"auto"``: bf16 where the hardware is faster in it (CUDA
-            compute capability 8 or newer; a CPU with AMX, or with AVX512-BF16 unless it is an Intel one whose AMX a
-            virtual machine hides: what is left there multiplies at half the rate of float32), otherwise fp32.
+            compute capability 8 or newer; a CPU with AMX or AVX512-BF16), otherwise fp32.
         device: the device that will compute.
-
-    Returns:
-        ``torch.float32`` or ``torch.bfloat16``.
 
     Raises:
         ValueError: unknown precision name.
@@ -52,91 +46,46 @@ def resolve_precision(precision: Precision, device: torch.device | str) -> torch
     if precision == "bf16" or (precision == "auto" and _is_faster_in_bf16(device)):
         return torch.bfloat16
     if device.type == "cuda":
-        # The older switches: every supported PyTorch has them, and reading them fails after the newer ones
-        # (fp32_precision) were set for one operation only.
+        # The older switches: reading them fails after the newer ones (fp32_precision) were set for one operation only.
         torch.backends.cudnn.allow_tf32 = False
         torch.backends.cuda.matmul.allow_tf32 = False
     return torch.float32
 
 
 def set_compute_dtype(module: _Module, dtype: torch.dtype) -> _Module:
-    """Set ``compute_dtype`` on every network inside ``module`` that has one.
+    """Set ``compute_dtype`` on every network inside ``module`` that has one; parameters keep their dtype.
 
-    Parameters keep their dtype (fp32 master weights); only the convolutions and the large matrix products
-    change. Networks that a TorchRL ``LossModule`` keeps outside its registered children are reached too.
+    Networks that a TorchRL ``LossModule`` keeps outside its registered children are reached too.
 
     Args:
         module: a network, or a loss that owns networks.
-        dtype: ``torch.float32`` or ``torch.bfloat16``. Float32 means "the dtype of the parameters".
-
-    Returns:
-        ``module``.
+        dtype: ``torch.bfloat16``, or ``torch.float32`` for "the dtype of the parameters".
 
     Raises:
         ValueError: any other dtype.
     """
     if dtype not in (torch.float32, torch.bfloat16):
         raise ValueError(f"compute dtype must be torch.float32 or torch.bfloat16, got {dtype}.")
-    return _set_everywhere(module, "compute_dtype", dtype)
-
-
-def resolve_channels_last(channels_last: Switch) -> bool:
-    """Whether images lie in memory with the channels of a pixel beside each other; ``"auto"`` says yes.
-
-    Forward and backward pass of a batch of 512 in bfloat16 were 3 and 15 % faster than in PyTorch's usual layout on two
-    CPUs with AVX512-BF16, and a third faster on one with AMX (benchmarks/README.md).
-
-    Args:
-        channels_last: ``"auto"``, ``"on"`` or ``"off"``.
-
-    Raises:
-        ValueError: any other value.
-    """
-    check_switch("channels_last", channels_last)
-    return channels_last != "off"
-
-
-def set_channels_last(module: _Module, channels_last: bool) -> _Module:
-    """Set the memory layout of every :class:`~crptpro.modules.PixelEncoder` inside ``module``; returns ``module``.
-
-    Args:
-        module: a network, or a loss that owns networks.
-        channels_last: changes rounding only.
-    """
-    return _set_everywhere(module, "channels_last", channels_last)
-
-
-def is_channels_last(module: nn.Module) -> bool:
-    """Whether every :class:`~crptpro.modules.PixelEncoder` inside ``module`` computes with channels last."""
-    return all(getattr(network, "channels_last", True) for network in networks_within(module))
+    for network in networks_within(module):
+        if hasattr(network, "compute_dtype"):
+            cast(Any, network).compute_dtype = dtype
+    return module
 
 
 @contextlib.contextmanager
-def computing(module: nn.Module, dtype: torch.dtype, *, channels_last: bool) -> Iterator[None]:
-    """Have networks compute in a dtype and a layout, and afterwards as freshly built ones do.
-
-    Args:
-        module: a network, or a loss that owns networks.
-        dtype: as for :func:`set_compute_dtype`; float32 afterwards.
-        channels_last: as for :func:`set_channels_last`; on afterwards.
-    """
+def computing(module: nn.Module, dtype: torch.dtype) -> Iterator[None]:
+    """Have networks compute in a dtype (see :func:`set_compute_dtype`), and afterwards in float32 again."""
     try:
-        set_channels_last(set_compute_dtype(module, dtype), channels_last)
+        set_compute_dtype(module, dtype)
         yield
     finally:
-        set_channels_last(set_compute_dtype(module, torch.float32), True)
+        set_compute_dtype(module, torch.float32)
 
 
 def linear_in(inputs: Tensor, layer: nn.Linear, compute_dtype: torch.dtype) -> Tensor:
     """Apply a linear layer whose product runs in ``compute_dtype`` and whose result has the weight's dtype.
 
-    In bf16 the factors are rounded, the sums are kept in fp32 by the kernel, the product is rounded once, and
-    the bias is added in the weight's dtype.
-
-    Args:
-        inputs: ``[*, D_in]``, any floating dtype.
-        layer: with or without bias.
-        compute_dtype: ``torch.bfloat16``, or ``torch.float32`` for "the weight's dtype".
+    In bfloat16 the factors and the product are rounded; the bias is added in the weight's dtype.
     """
     weight, bias = layer.weight, layer.bias
     if compute_dtype == torch.float32:
@@ -148,8 +97,7 @@ def linear_in(inputs: Tensor, layer: nn.Linear, compute_dtype: torch.dtype) -> T
 def networks_within(module: nn.Module) -> Iterator[nn.Module]:
     """Yield a network and everything inside it, each once.
 
-    ``LossModule.convert_to_functional`` hides networks in the instance dictionary, where ``modules()`` does not look;
-    they are found too.
+    ``LossModule.convert_to_functional`` hides networks in the instance dictionary, where ``modules()`` does not look.
     """
     seen: set[int] = set()
     waiting = [module]
@@ -162,12 +110,7 @@ def networks_within(module: nn.Module) -> Iterator[nn.Module]:
 
 
 def device_of(module: nn.Module) -> torch.device | None:
-    """Return the device of a network's first parameter or buffer; None if it has neither.
-
-    Examples:
-        >>> device_of(nn.Linear(2, 2)), device_of(nn.ReLU())
-        (device(type='cpu'), None)
-    """
+    """Return the device of a network's first parameter or buffer; None if it has neither."""
     first = next(chain(module.parameters(), module.buffers()), None)
     return None if first is None else first.device
 
@@ -188,27 +131,13 @@ def usable_device(name: str | torch.device) -> torch.device:
     return device
 
 
-def _set_everywhere(module: _Module, name: str, value: Any) -> _Module:
-    for network in networks_within(module):
-        if hasattr(network, name):
-            setattr(cast(Any, network), name, value)
-    return module
-
-
 def _is_faster_in_bf16(device: torch.device) -> bool:
     if device.type == "cuda":
         return torch.cuda.get_device_capability(device)[0] >= 8
-    return device.type == "cpu" and _is_cpu_faster_in_bf16()
-
-
-def _is_cpu_faster_in_bf16() -> bool:
-    text = CPUINFO.read_text(errors="replace") if CPUINFO.exists() else ""
-    probes = {"_is_amx_tile_supported": "amx_bf16", "_is_avx512_bf16_supported": "avx512_bf16"}
-    has_amx, has_avx512_bf16 = (
-        getattr(torch.cpu, probe)() if hasattr(torch.cpu, probe) else flag in text
-        for probe, flag in probes.items()
-    )
+    if device.type != "cpu" or not CPUINFO.exists():
+        return False
+    text = CPUINFO.read_text(errors="replace")
     # Intel's cores with AVX512-FP16 leave bf16 to AMX. Where a virtual machine hides it, AVX512-BF16 multiplied
     # matrices at 81 GFLOP/s and float32 at 154 (a core of 2023); AMD's cores are twice as fast in bf16.
     hides_amx = "GenuineIntel" in text and "avx512_fp16" in text
-    return has_amx or (has_avx512_bf16 and not hides_amx)
+    return "amx_bf16" in text or ("avx512_bf16" in text and not hides_amx)

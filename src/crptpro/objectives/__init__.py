@@ -6,7 +6,6 @@ from crptpro.objectives.becl import BeCLLoss
 from crptpro.objectives.methods import (
     Exploration,
     Method,
-    exploration_of,
     get_method,
     method_names,
     method_of,
@@ -29,7 +28,6 @@ __all__ = [
     "RADSACLoss",
     "SimCLRLoss",
     "SkillDDPGLoss",
-    "exploration_of",
     "get_method",
     "method_names",
     "method_of",

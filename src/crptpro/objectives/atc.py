@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, cast
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictParams, dispatch
+from tensordict.nn import dispatch
 from torch import nn
 
 from crptpro.modules import AnchorHead, Projector
@@ -25,8 +25,7 @@ class ATCLoss(PretrainingLoss):
     .. math:: L = -\frac1B\sum_i \log\mathrm{softmax}_j\big(W(a_i + \mathrm{MLP}(a_i))\cdot p_j\big)_i .
 
     There is no temperature. A loss that stays at ln B (6.238 for a batch of 512) says that anchors are not told
-    apart. Images must already be augmented, each independently. Softmax runs in float32 or wider. A batch of one
-    is legal and uninformative (loss 0); non-finite input propagates. In TorchRL batches ``("next", "pixels")`` is the
+    apart. Images must already be augmented, each independently. In TorchRL batches ``("next", "pixels")`` is the
     true successor, so ends of episodes need no mask as in the source.
 
     Args:
@@ -43,29 +42,14 @@ class ATCLoss(PretrainingLoss):
     Returns (``forward``):
         Scalar ``loss_contrast`` (nats) and, detached, ``embedding_cosine`` (mean pairwise cosine of the anchors'
         latents).
-
-    Examples:
-        >>> from crptpro.modules import PixelEncoder
-        >>> from torchrl.objectives import SoftUpdate
-        >>> encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=12)
-        >>> loss = ATCLoss(encoder, latent_dim=4, hidden_dim=16)
-        >>> updater = SoftUpdate(loss, tau=0.01)
-        >>> pixels = torch.randint(0, 256, (6, 3, 12, 12), dtype=torch.uint8)
-        >>> loss(TensorDict({"pixels": pixels, "next": {"pixels": pixels}}, [6]))["loss_contrast"].backward()
     """
 
-    encoder: nn.Module
-    encoder_params: TensorDictParams
-    target_encoder_params: TensorDictParams
-    projector: nn.Module
-    projector_params: TensorDictParams
-    target_projector_params: TensorDictParams
     anchor_head: nn.Module
-    anchor_head_params: TensorDictParams
-    target_anchor_head_params: TensorDictParams
+    anchor_head_params: Any
+    target_anchor_head_params: Any
 
-    network_names: ClassVar[tuple[str, ...]] = ("encoder", "projector", "anchor_head")
-    default_out_keys: ClassVar[tuple[str, ...]] = ("loss_contrast", "embedding_cosine")
+    network_names = ("encoder", "projector", "anchor_head")
+    default_out_keys = ("loss_contrast", "embedding_cosine")
 
     def __init__(
         self,

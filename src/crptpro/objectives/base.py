@@ -1,4 +1,4 @@
-"""What every pre-training loss shares: keys, target networks, re-initialisation, copies."""
+"""What losses share: networks that stay tied to their parameters, and the keys and latents of pre-training losses."""
 
 from __future__ import annotations
 
@@ -13,32 +13,54 @@ from torchrl.objectives import LossModule
 from crptpro.values import as_float
 
 
-class OutKeys:
-    """Entries that ``forward`` returns, or those that a caller names; a base before ``LossModule``."""
+class NetworkLoss(LossModule):
+    """A loss whose networks hold its own parameters, also in a copy, and are re-initialised together with its targets.
 
+    A subclass converts its networks with ``convert_to_functional`` and lists their names in ``network_names``, and what
+    ``forward`` returns in ``default_out_keys``.
+    """
+
+    network_names: ClassVar[tuple[str, ...]] = ()
     default_out_keys: ClassVar[tuple[str, ...]] = ()
-    """Entries that ``forward`` returns."""
 
-    _out_keys: list[NestedKey] | None = None
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.out_keys = list(self.default_out_keys)
+        self._set_in_keys()
 
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """Entries that ``forward`` returns."""
-        if self._out_keys is None:
-            self._out_keys = list(self.default_out_keys)
-        return self._out_keys
+    @torch.no_grad()
+    def reset_parameters_recursive(self) -> None:
+        """Re-initialise every network, in the order of ``network_names``, and copy the new parameters into the targets.
 
-    @out_keys.setter
-    def out_keys(self, values: list[NestedKey]) -> None:
-        self._out_keys = values
+        TorchRL's version re-draws the targets independently and cannot reach plain modules.
+        """
+        for name in self.network_names:
+            network, params = getattr(self, name), getattr(self, f"{name}_params")
+            with params.to_module(network, preserve_module_state=False):
+                _reset(network)
+            if (target := self._modules.get(f"target_{name}_params")) is not None:
+                target.data.update_(params.data)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore from a pickle or a deep copy, tying the networks to the copied parameters again."""
+        super().__setstate__(state)
+        self._erase_cache()  # of detached views of the original's parameters
+        for name in self.network_names:
+            getattr(self, f"{name}_params").to_module(getattr(self, name), preserve_module_state=False)
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        super()._forward_value_estimator_keys(**kwargs)
+        self._set_in_keys()
+
+    def _set_in_keys(self) -> None:
+        """All accepted keys, in the order of their definition."""
+        self._in_keys = [getattr(self.tensor_keys, field.name) for field in fields(self.tensor_keys)]
 
 
-class PretrainingLoss(OutKeys, LossModule):
+class PretrainingLoss(NetworkLoss):
     """A self-supervised loss on pairs of consecutive observations.
 
-    A subclass converts its networks with ``convert_to_functional``, lists their names in ``network_names``,
-    its outputs in ``default_out_keys``, and writes ``forward``. Targets, where it has any, follow by
-    ``SoftUpdate``.
+    A subclass writes ``forward``. Targets, where it has any, follow by ``SoftUpdate``.
     """
 
     @dataclass
@@ -56,98 +78,43 @@ class PretrainingLoss(OutKeys, LossModule):
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
 
-    network_names: ClassVar[tuple[str, ...]] = ()
-    """Names given to ``convert_to_functional``, in the order of re-initialisation."""
+    encoder: nn.Module
+    encoder_params: Any
+    target_encoder_params: Any
+    projector: nn.Module
+    projector_params: Any
+    target_projector_params: Any
 
     method_name: str | None = None
     """Registered method that built this loss, if it was built by name."""
-
-    def __init__(self) -> None:
-        self._in_keys: list[NestedKey] | None = None
-        super().__init__()
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries that ``forward`` reads: all accepted keys, in the order of their definition."""
-        if self._in_keys is None:
-            self._in_keys = [getattr(self.tensor_keys, field.name) for field in fields(self.tensor_keys)]
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
 
     @property
     def views(self) -> dict[NestedKey, NestedKey]:
         """Entries of ``in_keys`` that are a second view of another one: ``{"pixels_view": "pixels"}``.
 
-        No dataset holds them: who trains the loss makes them by augmenting the named entry once more,
-        independently. Empty for a loss that needs none.
+        No dataset holds them: who trains the loss makes them by augmenting the named entry once more, independently.
         """
         return {}
 
-    def target_state(self) -> dict[str, dict[str, Tensor]]:
-        """State dictionary of every target network by its name: ``{"encoder": {"convs.0.weight": ...}}``.
-
-        The tensors are the live ones, not copies. Empty for a loss without targets.
-        """
-        state = {}
-        for name in self.network_names:
-            target = self._modules.get(f"target_{name}_params")
-            if target is not None:
-                leaves = target.items(True, True)
-                state[name] = {
-                    ".".join(key) if isinstance(key, tuple) else key: value.data for key, value in leaves
-                }
-        return state
-
-    @torch.no_grad()
-    def reset_parameters_recursive(self) -> None:
-        """Re-initialise every network, prototypes included, and copy the new parameters into the targets.
-
-        TorchRL's version re-draws the targets independently and cannot reach plain modules; the method starts
-        from targets that equal their sources.
-        """
-        for name in self.network_names:
-            network, params = getattr(self, name), getattr(self, f"{name}_params")
-            with params.to_module(network, preserve_module_state=False):
-                _reset(network)
-            target = self._modules.get(f"target_{name}_params")
-            if target is not None:
-                target.data.update_(params.data)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore from a pickle or a deep copy, tying the networks to the copied parameters again."""
-        super().__setstate__(state)
-        for name in self.network_names:
-            getattr(self, f"{name}_params").to_module(getattr(self, name), preserve_module_state=False)
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        # No value estimator here; changed keys only have to show in in_keys.
-        self._in_keys = None
-
-    def _register_coefficient(self, name: str, value: float | None) -> None:
-        """Keep a coefficient as a float64 scalar: it does not promote float32 tensors, and 0.1 stays 0.1."""
-        number = None if value is None else as_float(value, name)
-        self.register_coeff_buffer(name, number, dtype=torch.float64)
+    def _register_coefficients(self, **values: float | None) -> None:
+        # float64 scalars do not promote float32 tensors, and 0.1 stays 0.1.
+        for name, value in values.items():
+            number = None if value is None else as_float(value, name)
+            self.register_coeff_buffer(name, number, dtype=torch.float64)
 
     def _apply_network(self, name: str, inputs: Tensor, *, target: bool = False) -> Tensor:
-        """Output of one of ``network_names``, with its own or with its target parameters."""
         network = getattr(self, name)
         params = getattr(self, f"target_{name}_params" if target else f"{name}_params")
         with params.to_module(network, preserve_module_state=False):
             return network(inputs)
 
     def _latents(self, pixels: Tensor) -> Tensor:
-        """Latents of the online encoder and projector."""
         return self._apply_network("projector", self._apply_network("encoder", pixels))
 
     @torch.no_grad()
     def _target_latents(self, pixels: Tensor) -> Tensor:
-        """Latents of the target encoder and projector."""
-        return self._apply_network(
-            "projector", self._apply_network("encoder", pixels, target=True), target=True
-        )
+        features = self._apply_network("encoder", pixels, target=True)
+        return self._apply_network("projector", features, target=True)
 
     def _read(self, tensordict: TensorDictBase, key: NestedKey, *, event_dims: int = 3) -> Tensor:
         """One entry with one batch dimension, its last ``event_dims`` as they are."""

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, cast
+from typing import cast
 
 import torch
 import torch.nn.functional as F
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictParams, dispatch
+from tensordict.nn import dispatch
 from torch import nn
 
 from crptpro.modules import SkillHead
@@ -23,16 +23,13 @@ class BeCLLoss(PretrainingLoss):
     :func:`~crptpro.objectives.functional.becl_loss` of :math:`F = h(f_\theta(x'))` with the head h of
     :class:`~crptpro.modules.SkillHead`: for every row, one other row of the same skill is told from all other
     rows. :math:`x'` is the next observation (three agent steps ahead with the method's n-step batches). The
-    gradient reaches encoder and head; there is no target network.
-
-    ``projector`` is the whole head, embedding and projection: what the reward is computed from, and what an
-    artifact carries. All rows should come from one domain, where skills are comparable. Images must already be
-    augmented. Cosines and exponentials run in float32 or wider. A batch of one is legal and uninformative
-    (loss 0); non-finite input propagates.
+    gradient reaches encoder and head; there is no target network. All rows should come from one domain, where
+    skills are comparable. A batch of one is legal and uninformative (loss 0).
 
     Args:
         encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
-        projector: features to ``[B, D]``; default ``SkillHead(encoder.feature_dim, skill_dim, hidden_dim)``.
+        projector: the whole head, features to ``[B, D]``; default
+            ``SkillHead(encoder.feature_dim, skill_dim, hidden_dim)``.
         skill_dim: D, equal to the number of skills in the source.
         hidden_dim: hidden width of the default head.
         temperature: tau, divides the cosines; positive.
@@ -42,14 +39,6 @@ class BeCLLoss(PretrainingLoss):
 
     Returns (``forward``):
         Scalar ``loss_contrast`` (nats) and, detached, ``embedding_cosine`` (mean pairwise cosine of F).
-
-    Examples:
-        >>> from crptpro.modules import PixelEncoder
-        >>> encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=12, pixel_offset=0.5)
-        >>> loss = BeCLLoss(encoder, skill_dim=4, hidden_dim=16)
-        >>> pixels = torch.randint(0, 256, (6, 3, 12, 12), dtype=torch.uint8)
-        >>> skill = F.one_hot(torch.arange(6) % 4, 4).float()
-        >>> loss(TensorDict({"next": {"pixels": pixels}, "skill": skill}, [6]))["loss_contrast"].backward()
     """
 
     @dataclass
@@ -67,15 +56,8 @@ class BeCLLoss(PretrainingLoss):
     default_keys = _AcceptedKeys  # type: ignore[assignment]
     tensor_keys: _AcceptedKeys  # type: ignore[assignment]
 
-    encoder: nn.Module
-    encoder_params: TensorDictParams
-    target_encoder_params: TensorDictParams
-    projector: nn.Module
-    projector_params: TensorDictParams
-    target_projector_params: TensorDictParams
-
-    network_names: ClassVar[tuple[str, ...]] = ("encoder", "projector")
-    default_out_keys: ClassVar[tuple[str, ...]] = ("loss_contrast", "embedding_cosine")
+    network_names = ("encoder", "projector")
+    default_out_keys = ("loss_contrast", "embedding_cosine")
     _schedulable_buffers = frozenset({"temperature"})
 
     def __init__(
@@ -94,7 +76,7 @@ class BeCLLoss(PretrainingLoss):
         self.convert_to_functional(encoder, "encoder")
         self.convert_to_functional(projector, "projector")
         self.skill_dim = latent_dim_of(projector) or skill_dim
-        self._register_coefficient("temperature", temperature)
+        self._register_coefficients(temperature=temperature)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -1,8 +1,7 @@
 """The mathematics of every objective as free functions on plain tensors.
 
 ``scores`` are cosine similarities before division by a temperature. Nothing here holds state, mutates its
-input, synchronises with the host, or repairs bad numbers: non-finite input gives non-finite output, and the
-training loops check finiteness.
+input, synchronises with the host, or repairs bad numbers: non-finite input gives non-finite output.
 """
 
 from __future__ import annotations
@@ -22,10 +21,8 @@ def sinkhorn_knopp(scores: Tensor, *, temperature: float | Tensor = 0.1, iterati
     r"""Soft assignments with evenly loaded prototypes (CRPTpro Eq. 4-6; SwaV, arXiv 2006.09882).
 
     Starts from :math:`\exp(s/\tau)`, alternately scales the prototype marginal to 1/M and the sample marginal
-    to 1/B, and ends with each sample's assignments summing to 1. No gradient.
-
-    Computed in the log domain, in float32 or wider: equal to the exponentiated form of the released code
-    wherever that is finite, and without need of its guards against overflow and empty rows.
+    to 1/B, and ends with each sample's assignments summing to 1. No gradient. Computed in the log domain, in
+    float32 or wider: equal to the released code's exponentiated form wherever that is finite.
 
     Deviation: the paper's Eq. 4 prints the scores without the exponential; it would divide by sums near 0.
 
@@ -67,7 +64,7 @@ def comparative_loss(
         Scalar, or ``[B]`` for ``"none"``; non-negative, nats.
     """
     log_p = F.log_softmax(_at_least_float32(student_scores) / temperature, dim=-1)
-    return reduce_batch(-(assignments * log_p).sum(dim=-1), reduction)
+    return _reduced(-(assignments * log_p).sum(dim=-1), reduction)
 
 
 def prototype_dispersion(
@@ -75,16 +72,13 @@ def prototype_dispersion(
 ) -> Tensor:
     r"""Intrinsic loss that pushes prototypes apart (CRPTpro Eq. 9).
 
-    :math:`L_{intr} = \frac1{M^2}\sum_{j\ne k} \mathrm{sg}(c_j)\cdot c_k / (\mathrm{sg}(c_j\cdot c_k) + w)`.
-    The left factor and the denominator carry no gradient, so row k receives
-    :math:`\frac1{M^2}\sum_{j\ne k}\mathrm{sg}(c_j)/(s_{jk}+w)`.
+    :math:`L_{intr} = \frac1{M^2}\sum_{j\ne k} \mathrm{sg}(c_j)\cdot c_k / (\mathrm{sg}(c_j\cdot c_k) + w)`, whose left
+    factor and denominator carry no gradient.
 
-    Deviation: the paper prints a sum; its own table only fits the mean over all M x M entries, which is the
-    default (the sum equals it times M^2).
+    Deviation: the paper prints a sum; its own table only fits the mean over all M x M entries, the default.
 
     Args:
-        prototypes: ``[M, D]`` unit rows. Whether the gradient passes through their normalisation is the
-            caller's choice (:meth:`crptpro.modules.Prototypes.unit_weight`).
+        prototypes: ``[M, D]`` unit rows, see :meth:`crptpro.modules.Prototypes.unit_weight`.
         offset: w, larger than 1 so that the denominator stays positive.
         reduction: ``"mean_all"`` divides by M^2 (the zeroed diagonal counts), ``"mean_offdiag"`` by M(M-1),
             ``"sum"`` by nothing.
@@ -101,8 +95,7 @@ def prototype_dispersion(
         raise ValueError(f"reduction must be one of {', '.join(divisors)}, got {reduction!r}.")
     cosines = prototypes.detach() @ prototypes.T  # (M, D) x (D, M) -> (M, M)
     ratio = cosines / (cosines.detach() + offset)
-    diagonal = torch.eye(count, dtype=torch.bool, device=prototypes.device)
-    return ratio.masked_fill(diagonal, 0.0).sum() / divisors[reduction]
+    return ratio.masked_fill(_diagonal(count, prototypes), 0.0).sum() / divisors[reduction]
 
 
 def knn_distances(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
@@ -136,18 +129,9 @@ def knn_distances(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
 
 
 def knn_distance(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
-    """Euclidean distance to the k-th nearest key: the exploration reward of CRPTpro (Eq. 11).
+    """Euclidean distance ``[N]`` to the k-th nearest key: the exploration reward of CRPTpro (Eq. 11).
 
-    Args:
-        queries: ``[N, D]`` (l2-normalised for the prototype reward, which then lies in [0, 2]).
-        keys: ``[K, D]``.
-        k: which neighbour, counting a copy of the query itself.
-
-    Returns:
-        ``[N]``.
-
-    Raises:
-        ValueError: fewer keys than ``k``.
+    Arguments and errors are those of :func:`knn_distances`; a copy of the query counts as a neighbour.
     """
     return knn_distances(queries, keys, k=k)[:, -1]
 
@@ -182,18 +166,10 @@ def particle_reward(
 
 
 def particle_entropy(distances: Tensor, *, scale: float | Tensor = 1.0, clip: float = 0.0) -> Tensor:
-    r"""Return :math:`\log(1 + \overline{\mathrm{relu}(d/scale - clip)})` (APT, arXiv 2103.04551).
+    r"""Return :math:`\log(1 + \overline{\mathrm{relu}(d/scale - clip)})`, ``[N]``, of distances ``[N, k]``.
 
-    Form of rll-research/url_benchmark ``utils.py``: division and clipping act on each distance, the average
-    over the k neighbours comes after, the logarithm last.
-
-    Args:
-        distances: ``[N, k]``, of each particle to its neighbours.
-        scale: positive; a running statistic of the distances, kept by the caller.
-        clip: subtracted before the relu.
-
-    Returns:
-        ``[N]``, non-negative.
+    APT (arXiv 2103.04551) in the form of rll-research/url_benchmark ``utils.py``: division and clipping act on each
+    distance, the average over the k neighbours comes after, the logarithm last.
     """
     return torch.log1p(F.relu(distances / scale - clip).mean(dim=-1))
 
@@ -234,14 +210,13 @@ def info_nce(
         logits = queries @ positives.T / temperature  # (B, D) x (D, B) -> (B, B)
     elif negatives == "both":
         views = torch.cat([anchors, positives])
-        itself = torch.eye(2 * count, dtype=torch.bool, device=anchors.device)
-        logits = (views @ views.T / temperature).masked_fill(itself, float("-inf"))
+        logits = (views @ views.T / temperature).masked_fill(_diagonal(2 * count, anchors), float("-inf"))
         labels = torch.cat([labels + count, labels])
         valid = None if valid is None else torch.cat([valid, valid])
     else:
         raise ValueError(f"negatives must be 'positives' or 'both', got {negatives!r}.")
     rows = F.cross_entropy(_at_least_float32(logits), labels, reduction="none")
-    return reduce_batch(rows, reduction, valid)
+    return _reduced(rows, reduction, valid)
 
 
 def becl_loss(
@@ -254,13 +229,12 @@ def becl_loss(
 ) -> Tensor:
     r"""Behaviour contrastive loss (Rooshy-yang/BeCL ``agent/becl.py``); the reward is ``exp(-loss)`` per row.
 
-    Features are l2-normalised. Row i has one positive: the first other row with the same skill, or, where no
-    other row has it, the first other row, as in the released code.
-    :math:`\ell_i = -\log(pos_i / (\sum_{j\ne i} e^{s_{ij}} + \epsilon) + \epsilon)`, similarities over the
-    temperature with the row's maximum subtracted.
+    :math:`\ell_i = -\log(pos_i / (\sum_{j\ne i} e^{s_{ij}} + \epsilon) + \epsilon)` of cosines over the temperature,
+    the row's maximum subtracted. The positive is the first other row with the same skill, or, where no other row has
+    it, the first other row, as in the released code.
 
     Args:
-        features: ``[B, D]``, B at least 2.
+        features: ``[B, D]``, B at least 2; l2-normalised here.
         skills: ``[B]`` integer skill indices.
         temperature: divides the cosines.
         eps: guard in the quotient and in the logarithm.
@@ -276,56 +250,27 @@ def becl_loss(
     if count < 2:
         raise ValueError(f"becl_loss needs at least two rows, got {count}.")
     unit = F.normalize(_at_least_float32(features), dim=-1)
-    itself = torch.eye(count, dtype=torch.bool, device=features.device)
+    itself = _diagonal(count, features)
     similarity = (unit @ unit.T / temperature).masked_fill(itself, float("-inf"))
     weights = (similarity - similarity.amax(dim=1, keepdim=True).detach()).exp()  # diagonal: exactly 0
     same_skill = (skills.unsqueeze(0) == skills.unsqueeze(1)) & ~itself
     # argmax of 0/1 (2 for a match) picks the first match, else the first off-diagonal row.
     positive = (same_skill.int() * 2 + (~itself).int()).argmax(dim=1, keepdim=True)
     quotient = weights.gather(1, positive).squeeze(1) / (weights.sum(dim=1) + eps)
-    return reduce_batch(-(quotient + eps).log(), reduction)
-
-
-def reduce_batch(rows: Tensor, reduction: Reduction, valid: Tensor | None = None) -> Tensor:
-    """Reduce per-row values; the mean is over valid rows, and 0 when there is none.
-
-    Args:
-        rows: ``[B]``.
-        reduction: ``"none"``, ``"mean"`` or ``"sum"``.
-        valid: ``[B]`` bool or None for all; invalid rows become 0 and pass no gradient, whatever they hold.
-
-    Raises:
-        ValueError: unknown reduction.
-    """
-    if reduction not in ("none", "mean", "sum"):
-        raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}.")
-    if valid is not None:
-        rows = torch.where(valid, rows, torch.zeros_like(rows))
-    if reduction == "none":
-        return rows
-    if reduction == "sum":
-        return rows.sum()
-    return rows.sum() / (max(rows.numel(), 1) if valid is None else valid.sum().clamp_min(1))
+    return _reduced(-(quotient + eps).log(), reduction)
 
 
 @torch.no_grad()
 def assignment_entropy(assignments: Tensor) -> Tensor:
-    """Mean entropy of the rows in nats, in [0, ln M]; ln M means that assignments say nothing.
-
-    Args:
-        assignments: ``[B, M]``, rows sum to 1.
-    """
+    """Mean entropy of assignments ``[B, M]`` in nats, in [0, ln M]; ln M means that they say nothing."""
     return torch.special.entr(assignments).sum(dim=-1).mean()
 
 
 @torch.no_grad()
 def prototypes_in_use(assignments: Tensor) -> Tensor:
-    """Number of prototypes that are the largest assignment of at least one sample, as a float scalar.
+    """Number of prototypes that are the largest of some row of assignments ``[B, M]``, as a float scalar.
 
     In a collapsed run all assignments tie and the count is rounding; read it beside the entropy.
-
-    Args:
-        assignments: ``[B, M]``.
     """
     used = assignments.new_zeros(assignments.shape[-1])
     return used.index_fill(0, assignments.argmax(dim=-1), 1.0).sum()
@@ -333,12 +278,9 @@ def prototypes_in_use(assignments: Tensor) -> Tensor:
 
 @torch.no_grad()
 def mean_pairwise_cosine(unit_rows: Tensor) -> Tensor:
-    """Mean cosine over all ordered pairs of different rows; 1 means that all embeddings coincide.
+    """Mean cosine over all ordered pairs of different unit rows ``[B, D]``; 1 means that all embeddings coincide.
 
     Computed from the norm of the sum, O(BD). A single row gives 0.
-
-    Args:
-        unit_rows: ``[B, D]`` l2-normalised.
     """
     count = unit_rows.shape[0]
     return _off_diagonal_sum(unit_rows) / max(count * (count - 1), 1)
@@ -346,11 +288,7 @@ def mean_pairwise_cosine(unit_rows: Tensor) -> Tensor:
 
 @torch.no_grad()
 def prototype_ane(prototypes: Tensor) -> Tensor:
-    """Average negative-pair cosine: sum over j != k of c_j . c_k, divided by M^2 (the paper's ANE).
-
-    Args:
-        prototypes: ``[M, D]`` unit rows.
-    """
+    """Mean negative-pair cosine of unit rows ``[M, D]`` (the paper's ANE): sum over j != k of c_j . c_k, over M^2."""
     return _off_diagonal_sum(prototypes) / prototypes.shape[0] ** 2
 
 
@@ -371,8 +309,7 @@ def prototype_kne(prototypes: Tensor, *, k: int = 3) -> Tensor:
     count = prototypes.shape[0]
     if not 1 <= k < count:
         raise ValueError(f"k must be between 1 and {count - 1} for {count} prototypes, got {k}.")
-    itself = torch.eye(count, dtype=torch.bool, device=prototypes.device)
-    cosines = (prototypes @ prototypes.T).masked_fill(itself, float("-inf"))
+    cosines = (prototypes @ prototypes.T).masked_fill(_diagonal(count, prototypes), float("-inf"))
     return cosines.topk(k, dim=-1).values[:, -1].mean()
 
 
@@ -383,9 +320,6 @@ def prototype_metrics(prototypes: Tensor, *, offset: float = 1.5) -> dict[str, T
     Args:
         prototypes: ``[M, D]``, rows of any length, M at least 4.
         offset: w of the dispersion.
-
-    Returns:
-        Keys ``prototype_ane``, ``prototype_kne_3``, ``prototype_kne_half``, ``prototype_dispersion``.
 
     Examples:
         >>> sorted(prototype_metrics(torch.eye(8)))
@@ -400,8 +334,24 @@ def prototype_metrics(prototypes: Tensor, *, offset: float = 1.5) -> dict[str, T
     }
 
 
+def _reduced(rows: Tensor, reduction: Reduction, valid: Tensor | None = None) -> Tensor:
+    if reduction not in ("none", "mean", "sum"):
+        raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}.")
+    if valid is not None:
+        rows = torch.where(valid, rows, torch.zeros_like(rows))
+    if reduction == "none":
+        return rows
+    if reduction == "sum":
+        return rows.sum()
+    return rows.sum() / (max(rows.numel(), 1) if valid is None else valid.sum().clamp_min(1))
+
+
 def _at_least_float32(values: Tensor) -> Tensor:
     return values if values.dtype == torch.float64 else values.float()
+
+
+def _diagonal(count: int, like: Tensor) -> Tensor:
+    return torch.eye(count, dtype=torch.bool, device=like.device)
 
 
 def _off_diagonal_sum(rows: Tensor) -> Tensor:

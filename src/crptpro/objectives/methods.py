@@ -10,7 +10,7 @@ import difflib
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from torch import nn
 from torchrl.objectives import LossModule
@@ -49,8 +49,7 @@ class Exploration:
     """Exploring agent: ``"rad-sac"``, ``"averaged-sac"`` (DrQ's K = M = 2 on detached features), ``"skill-ddpg"``."""
 
     env_steps: int = 200_000
-    """Simulator steps: in total over the domains of a group, or of the one domain. The random phases come out of them,
-    so there are a few per cent fewer encoder updates than the steps would allow."""
+    """Simulator steps over all domains of a group, or of the one domain; the random phases come out of them."""
 
     is_single_domain: bool = False
     """The (S) variants: pre-trained on one domain only."""
@@ -116,9 +115,6 @@ class Method:
     updates: int = 50_000
     """Encoder updates in total, over all domains."""
 
-    domain_updates: Mapping[str, int] = field(default_factory=dict)
-    """Encoder updates on one domain by its name, for a method that starts from another one's encoder."""
-
     batch_size: int = 512
     """Transitions per update."""
 
@@ -166,15 +162,14 @@ class Method:
         The code of the loss is not part of it, only its class's name.
         """
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        loss_class = values.pop("loss_class")
-        plain = {key: dict(value) if isinstance(value, Mapping) else value for key, value in values.items()}
-        return {
-            **{key: value for key, value in plain.items() if key not in ("name", "is_builtin", "is_preset")},
-            "loss_class": None
-            if loss_class is None
-            else f"{loss_class.__module__}.{loss_class.__qualname__}",
-            "exploration": None if self.exploration is None else dataclasses.asdict(self.exploration),
-        }
+        for name in ("name", "is_builtin", "is_preset"):
+            del values[name]
+        values = {key: dict(value) if isinstance(value, Mapping) else value for key, value in values.items()}
+        if self.loss_class is not None:
+            values["loss_class"] = f"{self.loss_class.__module__}.{self.loss_class.__qualname__}"
+        if self.exploration is not None:
+            values["exploration"] = dataclasses.asdict(self.exploration)
+        return values
 
     def build_encoder(self, in_channels: int = 9, image_size: int = 84, **options: Any) -> PixelEncoder:
         """Build a fresh encoder of the kind that the method trains.
@@ -188,8 +183,6 @@ class Method:
 
     def build(self, encoder: nn.Module, **options: Any) -> LossModule:
         """Build the loss on ``encoder``; ``options`` override the method's own.
-
-        The result remembers this method's name, by which :func:`method_of` finds it.
 
         Raises:
             CRPTproError: a method that pre-trains nothing.
@@ -205,7 +198,7 @@ class Method:
                 f"The method {self.name!r} has no option {', '.join(unknown)}; it has {', '.join(known)}."
             )
         loss = self.loss_class(encoder, **{**self.loss_options, **options})
-        loss.method_name = self.name
+        loss.method_name = self.name  # by which method_of finds it
         return loss
 
 
@@ -242,66 +235,50 @@ _PROTO_RL_C = Method(
     exploration=Exploration(),
     downstream={"replay_capacity": 100_000},
 )
-_SINGLE_DOMAIN: dict[str, Any] = {"env_steps": 500_000, "is_single_domain": True}
+_BECL = Exploration(
+    reward="skill-contrast",
+    agent="skill-ddpg",
+    encoder_updates_each=3,
+    encodes_before_update=True,
+    agent_update_interval=2,
+    n_step=3,
+    skill_dim=16,
+    random_agent_steps=2_000,
+)
+
+
+def _single_domain(method: Method, name: str, **exploration: Any) -> Method:
+    explores = replace(
+        cast(Exploration, method.exploration), env_steps=500_000, is_single_domain=True, **exploration
+    )
+    return replace(method, name=name, updates=125_000, exploration=explores)
+
+
+def _preset(method: Method, name: str, **fields: Any) -> Method:
+    return replace(method, name=name, is_preset=True, **fields)
+
 
 # The first method of a class that is no preset is what a loss of that class built by hand is trained like.
 TABLE = (
     _CRPTPRO,
-    replace(
-        _CRPTPRO,
-        name="crptpro-no-bonus",
-        updates=0,
-        starts_from="crptpro",
-        downstream=_NO_BONUS,
-        is_preset=True,
-    ),
+    _preset(_CRPTPRO, "crptpro-no-bonus", updates=0, starts_from="crptpro", downstream=_NO_BONUS),
     # Deviation: targets at half the student's temperature, which leave the plateau at ln M sooner, and three times the
     # learning rate, which gets further once it is left (docs/study.md).
-    replace(
-        _CRPTPRO,
-        name="crptpro-fast",
-        learning_rate=3e-4,
-        loss_options={"assignment_temperature": 0.05},
-        is_preset=True,
-    ),
-    replace(
-        _CRPTPRO,
-        name="crptpro-finetune",
-        updates=2_000,
-        domain_updates={
-            "pendulum": 2_000,
-            "manip": 2_000,
-            "cartpole": 3_000,
-            "cheetah": 1_000,
-            "walker": 500,
-        },
-        starts_from="crptpro",
-        is_preset=True,
-    ),
+    _preset(_CRPTPRO, "crptpro-fast", learning_rate=3e-4, loss_options={"assignment_temperature": 0.05}),
+    _preset(_CRPTPRO, "crptpro-finetune", updates=2_000, starts_from="crptpro"),
     # The authors' published code where it differs from the paper: predictor width, and 3 x 16,666 updates.
-    replace(_CRPTPRO, name="released-code", updates=49_998, loss_options={"hidden_dim": 512}, is_preset=True),
+    _preset(_CRPTPRO, "released-code", updates=49_998, loss_options={"hidden_dim": 512}),
     _ATC,
-    replace(
+    _preset(
         _ATC,
-        name="atc-native",
+        "atc-native",
         batch_size=256,
         encoder_options={"strides": (2, 2, 2, 1), "init": "kaiming"},
-        is_preset=True,
     ),
     _APT_C,
-    replace(
-        _APT_C,
-        name="apt-s",
-        updates=125_000,
-        exploration=Exploration(reward="particle", agent="averaged-sac", **_SINGLE_DOMAIN),
-    ),
+    _single_domain(_APT_C, "apt-s"),
     _PROTO_RL_C,
-    replace(
-        _PROTO_RL_C,
-        name="proto-rl-s",
-        updates=125_000,
-        exploration=Exploration(transfers_actor=True, **_SINGLE_DOMAIN),
-    ),
+    _single_domain(_PROTO_RL_C, "proto-rl-s", transfers_actor=True),
     # An update of BeCL's agent every second agent step brings three encoder updates: 150,000 for 50,000 of the agent.
     Method(
         "becl",
@@ -309,16 +286,7 @@ TABLE = (
         updates=150_000,
         encoder_tau=None,
         encoder_options={"pixel_offset": 0.5},
-        exploration=Exploration(
-            reward="skill-contrast",
-            agent="skill-ddpg",
-            encoder_updates_each=3,
-            encodes_before_update=True,
-            agent_update_interval=2,
-            n_step=3,
-            skill_dim=16,
-            random_agent_steps=2_000,
-        ),
+        exploration=_BECL,
         downstream=_NO_BONUS,
     ),
     # Trains its encoder end to end, with the critic.
@@ -355,9 +323,6 @@ def register_method(name: str, loss_class: type[LossModule], **fields: Any) -> M
         name: unique name; registering a name again with another class is refused.
         loss_class: built as ``loss_class(encoder, **loss_options)``.
         **fields: further fields of :class:`Method`, such as ``updates=10_000`` or ``exploration=Exploration()``.
-
-    Returns:
-        The registered method.
 
     Raises:
         ValueError: the name is taken by another class, or a number is out of its range.
@@ -400,34 +365,23 @@ def method_names(*, presets: bool = False) -> list[str]:
 
 
 def method_of(loss: LossModule | type[LossModule]) -> Method:
-    """Return how a loss is trained.
+    """Return how a loss, or a class of them, is trained.
 
     The method that built it by name; else the first method of its class or its nearest base class; else CRPTpro's
     numbers. Of a loss built by hand that has targets, or has none, ``encoder_tau`` says so.
-
-    Args:
-        loss: a loss, or its class.
     """
     loss_class = loss if isinstance(loss, type) else type(loss)
     named = _METHODS.get(getattr(loss, "method_name", None) or "")
     if named is not None and named.loss_class is not None and issubclass(loss_class, named.loss_class):
         return named
-    found = next((row for base in loss_class.__mro__ for row in _methods_of(base)), None)
+    listed = [row for row in _METHODS.values() if not row.is_preset]
+    found = next((row for base in loss_class.__mro__ for row in listed if row.loss_class is base), None)
     if found is not None and found.loss_class is loss_class:
         return found
     method = replace(found or _CRPTPRO, name=loss_class.__name__, loss_class=loss_class, is_builtin=False)
     if isinstance(loss, type):
         return method
     has_targets = any(name.startswith("target_") for name, _ in loss.named_children())
-    if has_targets and method.encoder_tau is None:
-        return replace(method, encoder_tau=_CRPTPRO.encoder_tau)
-    return method if has_targets else replace(method, encoder_tau=None)
-
-
-def exploration_of(loss: LossModule | type[LossModule]) -> Exploration:
-    """Return how active pre-training of a loss explores; Proto-RL's way where its method does not say."""
-    return method_of(loss).exploration or Exploration()
-
-
-def _methods_of(loss_class: type) -> list[Method]:
-    return [row for row in _METHODS.values() if row.loss_class is loss_class and not row.is_preset]
+    if has_targets == (method.encoder_tau is not None):
+        return method
+    return replace(method, encoder_tau=_CRPTPRO.encoder_tau if has_targets else None)

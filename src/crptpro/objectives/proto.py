@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, cast
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictParams, dispatch
+from tensordict.nn import dispatch
 from torch import Tensor, nn
 
 from crptpro.modules import Predictor, Projector, Prototypes
@@ -37,9 +37,7 @@ class ProtoLoss(PretrainingLoss):
     * :math:`L_{intr}` = :func:`~crptpro.objectives.functional.prototype_dispersion` of the prototypes.
 
     ``loss_comp`` that stays at ln M (6.238 for 512 prototypes), or ``embedding_cosine`` that stays near 1, is
-    a dead run. Images must already be augmented. Normalisation, softmax and Sinkhorn always run in float32 or
-    wider. Non-finite weights or latents propagate to the loss. A batch of one is legal and uninformative (uniform
-    assignments).
+    a dead run. Images must already be augmented. Normalisation, softmax and Sinkhorn always run in float32 or wider.
 
     Call :meth:`before_update` before each forward of a training loop: it keeps the prototype rows at unit
     length, as the released code does in place. ``forward`` itself never writes to a parameter.
@@ -77,21 +75,15 @@ class ProtoLoss(PretrainingLoss):
         >>> (out["loss_comp"] + out["loss_intr"]).backward()
     """
 
-    encoder: nn.Module
-    encoder_params: TensorDictParams
-    target_encoder_params: TensorDictParams
-    projector: nn.Module
-    projector_params: TensorDictParams
-    target_projector_params: TensorDictParams
     predictor: nn.Module
-    predictor_params: TensorDictParams
-    target_predictor_params: TensorDictParams
+    predictor_params: Any
+    target_predictor_params: Any
     prototypes: Prototypes
-    prototypes_params: TensorDictParams
-    target_prototypes_params: TensorDictParams
+    prototypes_params: Any
+    target_prototypes_params: Any
 
-    network_names: ClassVar[tuple[str, ...]] = ("encoder", "projector", "predictor", "prototypes")
-    default_out_keys: ClassVar[tuple[str, ...]] = (
+    network_names = ("encoder", "projector", "predictor", "prototypes")
+    default_out_keys = (
         "loss_comp",
         "loss_intr",
         "comp",
@@ -136,10 +128,12 @@ class ProtoLoss(PretrainingLoss):
         self.convert_to_functional(predictor, "predictor")
         self.convert_to_functional(prototypes, "prototypes")
         self.sinkhorn_iterations = as_int(sinkhorn_iterations, "sinkhorn_iterations", minimum=0)
-        self._register_coefficient("intr_loss_coef", intr_loss_coef)
-        self._register_coefficient("offset", offset)
-        self._register_coefficient("temperature", temperature)
-        self._register_coefficient("assignment_temperature", assignment_temperature)
+        self._register_coefficients(
+            intr_loss_coef=intr_loss_coef,
+            offset=offset,
+            temperature=temperature,
+            assignment_temperature=assignment_temperature,
+        )
 
     def before_update(self) -> ProtoLoss:
         """Scale the prototype rows to unit length in place, outside autograd. Returns self."""

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, dispatch
 from tensordict.utils import unravel_key
 from torch import Tensor
-from torchrl.modules import ProbabilisticActor
+from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, ValueEstimators
 
-from crptpro.modules import PixelCritic, PixelEncoder, SquashedGaussianActor, TwinCritic
-from crptpro.modules.actor_critic import SquashedGaussian, standard_normal_like
-from crptpro.objectives.base import OutKeys, require_positive
+from crptpro.modules import PixelEncoder, SquashedGaussianActor, TwinCritic
+from crptpro.modules.actor_critic import PixelCritic, standard_normal_like
+from crptpro.objectives.base import NetworkLoss, require_positive
 from crptpro.values import as_float
 
 
-class RADSACLoss(OutKeys, SACLoss):
+class RADSACLoss(NetworkLoss, SACLoss):
     r"""RAD-SAC of CRPTpro (liuxin0824/CRPTpro and denisyarats/proto, ``proto.py``) on TorchRL's ``SACLoss``.
 
     With :math:`h, h'` the features of an observation and the next, :math:`a' \sim \pi(h')`:
@@ -31,17 +31,11 @@ class RADSACLoss(OutKeys, SACLoss):
 
     Of n-step transitions, whose ``steps_to_next_obs`` TorchRL's ``MultiStepTransform`` writes, gamma is raised to n.
 
-    Features never receive a gradient. What differs from ``SACLoss``: squared error; the temperature loss of
-    the released code (not its logarithm); the log-std squash and pre-tanh log-probability of
-    :class:`~crptpro.modules.SquashedGaussianActor`; one trunk under both Q heads, so the critic is one
-    network with two outputs instead of a stack of two; no ``td_error`` is written into the input; and separate steps
-    :meth:`critic_loss` and :meth:`actor_and_temperature_loss`, because the actor, the temperature and the target are
-    updated every second time, against the critic just stepped::
-
-        loss.critic_loss(td)["loss_qvalue"].backward(); critic_optimizer.step()
-        if update % 2 == 0:
-            out = loss.actor_and_temperature_loss(td)   # backward each, step both
-            target_updater.step()                       # SoftUpdate(loss, tau=0.01)
+    Features never receive a gradient. What differs from ``SACLoss``: squared error; the temperature loss of the
+    released code (not its logarithm); the log-std squash and pre-tanh log-probability of
+    :class:`~crptpro.modules.SquashedGaussianActor`; one trunk under both Q heads, so the critic is one network with
+    two outputs; and separate steps :meth:`critic_loss` and :meth:`actor_and_temperature_loss`, because actor,
+    temperature and target are updated every second time, against the critic just stepped.
 
     Deviation: the released code always bootstraps; here ``terminated`` cuts it, which no task of the paper has.
 
@@ -51,13 +45,12 @@ class RADSACLoss(OutKeys, SACLoss):
         gamma: discount per agent step, in [0, 1].
         alpha_init: initial temperature, positive: its logarithm is what is learned.
         target_entropy: in nats; None for minus the action dimension.
-        observation: key of the features; also read under ``"next"``. ``set_keys`` changes it and the others.
         generator: source of all action noise; torch's global one if None. Not part of the state dictionary.
 
     Returns (``forward``):
         ``loss_actor``, ``loss_qvalue``, ``loss_alpha`` and, detached scalars, ``alpha``, ``entropy`` (-log
         pi, nats), ``q_mean``, ``target_q_mean``, ``td_error`` (mean over rows of the larger of the two heads'
-        absolute errors). Non-finite input propagates; the loop checks. Batches of any shape, one row included.
+        absolute errors).
 
     Raises:
         ValueError: ``gamma`` outside [0, 1], or an ``alpha_init`` that is not positive.
@@ -86,6 +79,7 @@ class RADSACLoss(OutKeys, SACLoss):
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
+    network_names = ("actor_network", "qvalue_network")
     view_names: ClassVar[tuple[str, ...]] = ("observation",)
     """Configurable keys of the views of an observation."""
 
@@ -108,21 +102,20 @@ class RADSACLoss(OutKeys, SACLoss):
         gamma: float = 0.99,
         alpha_init: float = 0.1,
         target_entropy: float | None = None,
-        observation: NestedKey = "features",
         generator: torch.Generator | None = None,
     ) -> None:
         gamma = as_float(gamma, "gamma", minimum=0, maximum=1)
         require_positive(alpha_init=alpha_init)
+        views = [self.default_keys().observation]
         policy = ProbabilisticActor(
-            TensorDictModule(actor, in_keys=[observation], out_keys=["loc", "scale"]),
+            TensorDictModule(actor, in_keys=views, out_keys=["loc", "scale"]),
             in_keys=["loc", "scale"],
-            out_keys=["action"],
-            distribution_class=SquashedGaussian,
+            distribution_class=TanhNormal,
             return_log_prob=True,
         )
         super().__init__(
             policy,
-            TensorDictModule(critic, in_keys=[observation, "action"], out_keys=["state_action_value"]),
+            TensorDictModule(critic, in_keys=[*views, "action"], out_keys=["state_action_value"]),
             # Not 1 or 2: any count makes SACLoss stack the parameters into new ones, and for a single module
             # draw them anew, losing the orthogonal initialisation and the identity with ``critic``.
             num_qvalue_nets=0,
@@ -132,12 +125,18 @@ class RADSACLoss(OutKeys, SACLoss):
             scalar_output_mode="exclude",
         )
         self.num_qvalue_nets = 2
-        # Hidden from nn.Module, as LossModule hides its networks: the parameters are registered once.
-        self.__dict__["actor"] = actor
-        self.__dict__["critic"] = critic
         self.generator = generator
-        self.set_keys(observation=observation)
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
+
+    @property
+    def actor(self) -> Any:
+        """The policy that is trained, on features."""
+        return cast(Any, self.actor_network)[0].module
+
+    @property
+    def critic(self) -> Any:
+        """The critic that is trained."""
+        return cast(Any, self.qvalue_network).module
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -147,41 +146,22 @@ class RADSACLoss(OutKeys, SACLoss):
 
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not changed."""
-        loss, metadata = self.qvalue_v2_loss(tensordict)
-        out = {
-            "loss_qvalue": loss,
-            "q_mean": metadata["q"].mean(),
-            "target_q_mean": metadata["target_q"].mean(),
-            "td_error": metadata["td_error"].mean(),
-        }
-        return TensorDict(out, batch_size=[])
-
-    def actor_and_temperature_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """``loss_actor`` and ``loss_alpha`` of one action draw, with ``alpha`` and ``entropy``."""
-        loss_actor, metadata = self.actor_loss(tensordict)
-        log_prob = metadata["log_prob"]
-        out = {
-            "loss_actor": loss_actor,
-            "loss_alpha": self._alpha_loss(log_prob).mean(),
-            "alpha": self._alpha,
-            "entropy": -log_prob.mean(),
-        }
-        return TensorDict(out, batch_size=[])
-
-    def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Critic loss and detached per-row metadata (``td_error``, ``q``, ``target_q``)."""
         target = self._compute_target_v2(tensordict)  # (B,)
         action = tensordict.get(self.tensor_keys.action)
         with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
             values = torch.stack([self._q_values(view, action) for view in self._views(tensordict)], -2)
         errors = values - target[..., None, None]  # (B, views, 2)
-        # Sum over the views and the two heads of the mean over the batch.
-        loss = errors.square().sum((-2, -1)).mean()
-        largest = errors.detach().abs().amax(-1).mean(-1)
-        return loss, {"td_error": largest, "q": values.detach().mean(-2), "target_q": target}
+        out = {
+            # Sum over the views and the two heads of the mean over the batch.
+            "loss_qvalue": errors.square().sum((-2, -1)).mean(),
+            "q_mean": values.detach().mean(-2).mean(),
+            "target_q_mean": target.mean(),
+            "td_error": errors.detach().abs().amax(-1).mean(-1).mean(),
+        }
+        return TensorDict(out, batch_size=[])
 
-    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Actor loss and the detached log-probability of its actions."""
+    def actor_and_temperature_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """``loss_actor`` and ``loss_alpha`` of one action draw, with ``alpha`` and ``entropy``."""
         features = self._policy_features(self._views(tensordict)[0])
         noise = self._noise(features)
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
@@ -189,7 +169,14 @@ class RADSACLoss(OutKeys, SACLoss):
         # Detached weights: the gradient passes through Q to the action and to nothing else.
         with self._cached_detached_qvalue_params.to_module(self.qvalue_network, preserve_module_state=False):
             value = self._q_values_on_features(features, action).amin(-1)
-        return (self._alpha * log_prob - value).mean(), {"log_prob": log_prob.detach()}
+        loss_actor, log_prob = (self._alpha * log_prob - value).mean(), log_prob.detach()
+        out = {
+            "loss_actor": loss_actor,
+            "loss_alpha": self._alpha_loss(log_prob).mean(),
+            "alpha": self._alpha,
+            "entropy": -log_prob.mean(),
+        }
+        return TensorDict(out, batch_size=[])
 
     def _alpha_loss(self, log_prob: Tensor) -> Tensor:
         # SACLoss uses log_alpha in place of alpha.
@@ -246,26 +233,10 @@ class RADSACLoss(OutKeys, SACLoss):
         following = (*views, keys.reward, keys.done, keys.terminated)
         self._in_keys = [*views, keys.action, *(unravel_key(("next", key)) for key in following)]
 
-    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        super()._forward_value_estimator_keys(**kwargs)
-        self._set_in_keys()
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore from a pickle or a deep copy, tying the networks to the copied parameters again."""
-        super().__setstate__(state)
-        # SACLoss caches detached views of the critic's parameters; copied, they are views of nothing that trains.
-        self._erase_cache()
-        self.actor_network_params.to_module(self.actor_network, preserve_module_state=False)
-        self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False)
-
     @torch.no_grad()
     def reset_parameters_recursive(self) -> None:
         """Re-initialise actor and critic, copy the critic into its target, restore the first temperature."""
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            self.actor.reset_parameters()
-        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
-            self.critic.reset_parameters()
-        self.target_qvalue_network_params.data.update_(self.qvalue_network_params.data)
+        super().reset_parameters_recursive()
         self.log_alpha.copy_(self.alpha_init.log())
 
 
@@ -286,8 +257,6 @@ class AveragedSACLoss(RADSACLoss):
     Args:
         actor: on features.
         critic: on features and actions; the target is a copy of all of it.
-        observation: key of the first view's features; also read under ``"next"``.
-        observation_view: key of the second view's, likewise.
         **options: of :class:`RADSACLoss`. A ``generator`` is asked for the next actions of the first view, of
             the second, then for the actor's.
 
@@ -309,18 +278,6 @@ class AveragedSACLoss(RADSACLoss):
     tensor_keys: _AcceptedKeys
     view_names: ClassVar[tuple[str, ...]] = ("observation", "observation_view")
 
-    def __init__(
-        self,
-        actor: SquashedGaussianActor,
-        critic: TwinCritic | PixelCritic,
-        *,
-        observation: NestedKey = "features",
-        observation_view: NestedKey = "features_view",
-        **options: Any,
-    ) -> None:
-        super().__init__(actor, critic, observation=observation, **options)
-        self.set_keys(observation_view=observation_view)
-
 
 class DrQLoss(AveragedSACLoss):
     r"""DrQ (arXiv 2004.13649; denisyarats/drq ``drq.py``): :class:`AveragedSACLoss` with the encoder inside.
@@ -336,8 +293,6 @@ class DrQLoss(AveragedSACLoss):
         encoder: trained in place.
         actor: on the encoder's features.
         critic: on the encoder's features and actions.
-        observation: key of the first view, images ``[B, C, H, W]``; also read under ``"next"``.
-        observation_view: key of the second view, likewise.
         **options: of :class:`RADSACLoss`.
 
     Raises:
@@ -358,20 +313,11 @@ class DrQLoss(AveragedSACLoss):
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
-    critic: PixelCritic
 
     def __init__(
-        self,
-        encoder: PixelEncoder,
-        actor: SquashedGaussianActor,
-        critic: TwinCritic,
-        *,
-        observation: NestedKey = "pixels",
-        observation_view: NestedKey = "pixels_view",
-        **options: Any,
+        self, encoder: PixelEncoder, actor: SquashedGaussianActor, critic: TwinCritic, **options: Any
     ) -> None:
-        keys = {"observation": observation, "observation_view": observation_view}
-        super().__init__(actor, PixelCritic(encoder, critic), **keys, **options)
+        super().__init__(actor, PixelCritic(encoder, critic), **options)
 
     @property
     def encoder(self) -> PixelEncoder:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, cast
+from typing import cast
 
 import torch
 import torch.nn.functional as F
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictParams, dispatch
+from tensordict.nn import dispatch
 from torch import nn
 
 from crptpro.modules import Projector
@@ -26,8 +26,7 @@ class SimCLRLoss(PretrainingLoss):
     .. math:: L = -\frac1{2B}\sum_i \log\frac{\exp(z_i\cdot z_{p(i)}/\tau)}{\sum_{j\ne i}\exp(z_i\cdot z_j/\tau)} .
 
     It says in :attr:`views` that ``pixels_view`` is a second view of ``pixels``;
-    :func:`~crptpro.training.pretrain` makes it by shifting the same images again. Softmax runs in float32 or
-    wider. A batch of one is legal and uninformative (loss 0); non-finite input propagates.
+    :func:`~crptpro.training.pretrain` makes it by shifting the same images again.
 
     Deviation: APT has published no code for DeepMind Control; loss and temperature are those of the authors' code
     for Atari, the head (one linear layer, 128) is the one that every method here has.
@@ -44,13 +43,6 @@ class SimCLRLoss(PretrainingLoss):
     Returns (``forward``):
         Scalar ``loss_contrast`` (nats) and, detached, ``embedding_cosine`` (mean pairwise cosine of the first
         views' latents).
-
-    Examples:
-        >>> from crptpro.modules import PixelEncoder
-        >>> encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=12)
-        >>> loss = SimCLRLoss(encoder, latent_dim=4)
-        >>> pixels = torch.randint(0, 256, (6, 3, 12, 12), dtype=torch.uint8)
-        >>> loss(TensorDict({"pixels": pixels, "pixels_view": pixels}, [6]))["loss_contrast"].backward()
     """
 
     @dataclass
@@ -68,15 +60,8 @@ class SimCLRLoss(PretrainingLoss):
     default_keys = _AcceptedKeys  # type: ignore[assignment]
     tensor_keys: _AcceptedKeys  # type: ignore[assignment]
 
-    encoder: nn.Module
-    encoder_params: TensorDictParams
-    target_encoder_params: TensorDictParams
-    projector: nn.Module
-    projector_params: TensorDictParams
-    target_projector_params: TensorDictParams
-
-    network_names: ClassVar[tuple[str, ...]] = ("encoder", "projector")
-    default_out_keys: ClassVar[tuple[str, ...]] = ("loss_contrast", "embedding_cosine")
+    network_names = ("encoder", "projector")
+    default_out_keys = ("loss_contrast", "embedding_cosine")
     _schedulable_buffers = frozenset({"temperature"})
 
     def __init__(
@@ -94,7 +79,7 @@ class SimCLRLoss(PretrainingLoss):
         self.convert_to_functional(encoder, "encoder")
         self.convert_to_functional(projector, "projector")
         self.latent_dim = latent_dim_of(projector) or latent_dim
-        self._register_coefficient("temperature", temperature)
+        self._register_coefficients(temperature=temperature)
 
     @property
     def views(self) -> dict[NestedKey, NestedKey]:

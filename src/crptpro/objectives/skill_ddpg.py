@@ -7,18 +7,16 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictParams, dispatch
+from tensordict.nn import dispatch
 from tensordict.utils import unravel_key
 from torch import Tensor
-from torchrl.objectives import LossModule
 
 from crptpro.modules import DeterministicActor, TwinCritic
-from crptpro.modules.actor_critic import with_skill
-from crptpro.objectives.base import OutKeys
+from crptpro.objectives.base import NetworkLoss
 from crptpro.values import as_float
 
 
-class SkillDDPGLoss(OutKeys, LossModule):
+class SkillDDPGLoss(NetworkLoss):
     r"""DDPG of the unsupervised RL benchmark (rll-research/url_benchmark ``agent/ddpg.py``; BeCL's own agent).
 
     With :math:`s = [h, z]` the features of an observation and its skill, :math:`s^+ = [h^+, z]` n steps later:
@@ -40,22 +38,10 @@ class SkillDDPGLoss(OutKeys, LossModule):
 
     Returns (``forward``):
         ``loss_actor``, ``loss_qvalue`` and, detached scalars, ``q_mean``, ``target_q_mean``, ``td_error`` (mean
-        over rows of the larger of the two heads' absolute errors). Non-finite input propagates. Batches of any
-        shape, one row included.
+        over rows of the larger of the two heads' absolute errors).
 
     Raises:
         ValueError: ``noise_clip`` negative, or a critic for other features than the actor's.
-
-    Examples:
-        >>> actor = DeterministicActor(6, 2, skill_dim=3, hidden_dim=8)
-        >>> loss = SkillDDPGLoss(actor, TwinCritic(6 + 3, 2, hidden_dim=8, has_tanh=True))
-        >>> from torchrl.objectives import SoftUpdate
-        >>> updater = SoftUpdate(loss, tau=0.01)
-        >>> h, one = torch.randn(4, 6), torch.ones(4, 1)
-        >>> after = {"features": h, "reward": one, "discount": 0.97 * one}
-        >>> root = {"features": h, "skill": torch.eye(4, 3), "action": torch.zeros(4, 2)}
-        >>> loss(TensorDict({**root, "next": after}, [4]))["loss_qvalue"].shape
-        torch.Size([])
     """
 
     @dataclass
@@ -78,14 +64,15 @@ class SkillDDPGLoss(OutKeys, LossModule):
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
+    network_names = ("actor_network", "qvalue_network")
     default_out_keys = ("loss_actor", "loss_qvalue", "q_mean", "target_q_mean", "td_error")
 
     actor_network: DeterministicActor
-    actor_network_params: TensorDictParams
-    target_actor_network_params: TensorDictParams
+    actor_network_params: Any
+    target_actor_network_params: Any
     qvalue_network: TwinCritic
-    qvalue_network_params: TensorDictParams
-    target_qvalue_network_params: TensorDictParams
+    qvalue_network_params: Any
+    target_qvalue_network_params: Any
 
     def __init__(
         self,
@@ -101,30 +88,27 @@ class SkillDDPGLoss(OutKeys, LossModule):
                 f"The critic was built for {critic.config['feature_dim']} inputs, the actor sees {inputs} (features "
                 f"and skill); build the critic with feature_dim={inputs}."
             )
-        self._in_keys: list[NestedKey] | None = None
         super().__init__()
         self.noise_clip = as_float(noise_clip, "noise_clip", minimum=0)
         self.generator = generator
         self.convert_to_functional(actor, "actor_network")
         self.convert_to_functional(critic, "qvalue_network", create_target_params=True)
-        # Hidden from nn.Module, as LossModule hides its networks: the parameters are registered once.
-        self.__dict__["actor"] = actor
-        self.__dict__["critic"] = critic
-        self._tie()
 
     @property
-    def in_keys(self) -> list[NestedKey]:
-        """Entries that ``forward`` reads."""
-        if self._in_keys is None:
-            keys = self.tensor_keys
-            following = (keys.observation, keys.reward, keys.discount)
-            root = [keys.observation, keys.skill, keys.action]
-            self._in_keys = [*root, *(unravel_key(("next", key)) for key in following)]
-        return self._in_keys
+    def actor(self) -> Any:
+        """The policy that is trained."""
+        return self.actor_network
 
-    @in_keys.setter
-    def in_keys(self, values: list[NestedKey]) -> None:
-        self._in_keys = values
+    @property
+    def critic(self) -> Any:
+        """The critic that is trained."""
+        return self.qvalue_network
+
+    def _set_in_keys(self) -> None:
+        keys = self.tensor_keys
+        following = (keys.observation, keys.reward, keys.discount)
+        root = [keys.observation, keys.skill, keys.action]
+        self._in_keys = [*root, *(unravel_key(("next", key)) for key in following)]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -138,7 +122,7 @@ class SkillDDPGLoss(OutKeys, LossModule):
         target = self._target(tensordict)  # (B,)
         inputs = self._inputs(tensordict, tensordict)
         with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
-            values = self.critic(inputs, tensordict.get(self.tensor_keys.action))  # (B, 2)
+            values = self.qvalue_network(inputs, tensordict.get(self.tensor_keys.action))  # (B, 2)
         errors = values - target.unsqueeze(-1)
         out = {
             "loss_qvalue": errors.square().sum(-1).mean(),
@@ -151,49 +135,29 @@ class SkillDDPGLoss(OutKeys, LossModule):
     def actor_loss(self, tensordict: TensorDictBase) -> Tensor:
         """The actor's loss, against the critic as it is now."""
         inputs = self._inputs(tensordict, tensordict)
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            action = self.actor.sample(inputs, noise_clip=self.noise_clip, generator=self.generator)
+        action = self._act(inputs)
         # Detached weights: the gradient passes through Q to the action and to nothing else.
         with self.qvalue_network_params.data.to_module(self.qvalue_network, preserve_module_state=False):
-            value = self.critic(inputs, action).amin(-1)
+            value = self.qvalue_network(inputs, action).amin(-1)
         return -value.mean()
 
     @torch.no_grad()
     def _target(self, tensordict: TensorDictBase) -> Tensor:
         following = tensordict.get("next")
         inputs = self._inputs(following, tensordict)
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            action = self.actor.sample(inputs, noise_clip=self.noise_clip, generator=self.generator)
+        action = self._act(inputs)
         with self.target_qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
-            value = self.critic(inputs, action).amin(-1)
+            value = self.qvalue_network(inputs, action).amin(-1)
         reward, discount = (
             following.get(key).squeeze(-1) for key in (self.tensor_keys.reward, self.tensor_keys.discount)
         )
         return reward + discount * value
 
-    def _inputs(self, observed: TensorDictBase, root: TensorDictBase) -> Tensor:
-        return with_skill(
-            observed.get(self.tensor_keys.observation).detach(), root.get(self.tensor_keys.skill)
-        )
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        # No value estimator here; changed keys only have to show in in_keys.
-        self._in_keys = None
-
-    def _tie(self) -> None:
-        for name in ("actor_network", "qvalue_network"):
-            getattr(self, f"{name}_params").to_module(getattr(self, name), preserve_module_state=False)
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore from a pickle or a deep copy, tying the networks to the copied parameters again."""
-        super().__setstate__(state)
-        self._tie()
-
-    @torch.no_grad()
-    def reset_parameters_recursive(self) -> None:
-        """Re-initialise actor and critic, and copy the critic into its target."""
+    def _act(self, inputs: Tensor) -> Tensor:
         with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            self.actor.reset_parameters()
-        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
-            self.critic.reset_parameters()
-        self.target_qvalue_network_params.data.update_(self.qvalue_network_params.data)
+            return self.actor_network.sample(inputs, noise_clip=self.noise_clip, generator=self.generator)
+
+    def _inputs(self, observed: TensorDictBase, root: TensorDictBase) -> Tensor:
+        features = observed.get(self.tensor_keys.observation).detach()
+        skill = root.get(self.tensor_keys.skill).to(features.dtype)
+        return torch.cat([features, skill.expand(*features.shape[:-1], skill.shape[-1])], dim=-1)

@@ -297,7 +297,7 @@ def pretrain_active(
         run = stack.enter_context(Run(run_dir, unit="env_steps", streams=("pretrain", "explore", "episodes"),
                                       records=records, config=settings, resume=resume, progress=progress))  # fmt: skip
         dtype = resolve_precision(run.saved_setting("precision", settings.precision), device)
-        stack.enter_context(computing(loss, dtype, channels_last=True))
+        stack.enter_context(computing(loss, dtype))
         run.require_same({
             "domains": list(named), "precision": "bf16" if dtype == torch.bfloat16 else "fp32",
             "loss": describe_loss(loss), "exploration": {

@@ -172,7 +172,7 @@ def pretrain(
         run = stack.enter_context(Run(run_dir, unit="updates", streams=("pretrain",), records=records, config=settings,
                                       resume=resume, progress=progress))  # fmt: skip
         dtype = resolve_precision(run.saved_setting("precision", settings.precision), device)
-        stack.enter_context(computing(loss, dtype, channels_last=True))
+        stack.enter_context(computing(loss, dtype))
         buffers, generators = stack.enter_context(
             open_datasets(datasets, loss, seed=settings.seed, device=device)
         )

@@ -2,14 +2,7 @@
 
 from crptpro.transforms.color_swap import ColorSwap
 from crptpro.transforms.contrastive_reward import ContrastiveReward
-from crptpro.transforms.dense_shift import (
-    DenseShiftFeatures,
-    choose_feature_mode,
-    crop_features,
-    dense_maps_bytes,
-    dense_shift_geometry,
-    dense_shift_maps,
-)
+from crptpro.transforms.dense_shift import DenseShiftFeatures, choose_feature_mode
 from crptpro.transforms.frozen_encoder import FrozenEncoder
 from crptpro.transforms.particle_reward import ParticleReward
 from crptpro.transforms.prototype_reward import PrototypeReward
@@ -24,10 +17,6 @@ __all__ = [
     "PrototypeReward",
     "RandomShift",
     "choose_feature_mode",
-    "crop_features",
-    "dense_maps_bytes",
-    "dense_shift_geometry",
-    "dense_shift_maps",
     "draw_offsets",
     "random_shift",
 ]

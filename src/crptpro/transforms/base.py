@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -15,7 +14,8 @@ from torchrl.envs.transforms import Transform
 if TYPE_CHECKING:
     from typing import Self
 
-KeyPair = tuple[NestedKey, NestedKey]
+Keys = Any
+"""One key, or a sequence of them."""
 
 PIXEL_KEYS: list[NestedKey] = ["pixels", ("next", "pixels")]
 
@@ -25,21 +25,13 @@ def is_next(key: NestedKey) -> bool:
     return isinstance(key, tuple) and key[0] == "next"
 
 
-def with_next(key: NestedKey) -> NestedKey:
-    """Return where a replay batch keeps this entry of an environment's step."""
-    return key if is_next(key) else unravel_key(("next", key))
-
-
 def without_next(key: NestedKey) -> NestedKey:
     """Return where an environment's step keeps this entry of a replay batch."""
     return unravel_key(key[1:]) if is_next(key) else unravel_key(key)
 
 
-def as_key_list(keys: NestedKey | Sequence[NestedKey]) -> list[NestedKey]:
-    """Return a list of keys.
-
-    As in TorchRL, a string or a tuple of strings is one (nested) key and a list is several. A tuple that
-    holds tuples can only be meant as several.
+def as_key_list(keys: Keys) -> list[NestedKey]:
+    """Return a list of keys: as in TorchRL, a string or a tuple of strings is one (nested) key and a list is several.
 
     Examples:
         >>> as_key_list(("next", "pixels"))
@@ -51,12 +43,37 @@ def as_key_list(keys: NestedKey | Sequence[NestedKey]) -> list[NestedKey]:
     return [unravel_key(key) for key in ([keys] if is_one else keys)]
 
 
+def paired_keys(in_keys: Keys, out_keys: Keys | None) -> tuple[list[NestedKey], list[NestedKey]]:
+    """Return both lists of keys; in place if there are no ``out_keys``.
+
+    Raises:
+        ValueError: lists of unequal length.
+    """
+    read = as_key_list(in_keys)
+    written = read if out_keys is None else as_key_list(out_keys)
+    if len(read) != len(written):
+        raise ValueError(f"in_keys {read} and out_keys {written} must pair up.")
+    return read, written
+
+
+def read_entry(transform: Transform, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """Return an entry.
+
+    Raises:
+        KeyError: naming what is there instead.
+    """
+    value = tensordict.get(key, None)
+    if value is None:
+        present = list(tensordict.keys(True, True))
+        raise KeyError(f"{type(transform).__name__} found no {key!r} among {present}; set its keys.")
+    return value
+
+
 class PixelTransform(Transform):
     """Computes one entry from each image entry, in replay batches (``forward``) and in environments.
 
-    Keys under ``"next"`` belong to replay batches: on an environment only root keys count, at each reset and each step,
-    because what they name there is the root entry of the next step. A subclass writes ``_apply_transform`` and
-    :meth:`written_spec`.
+    Keys under ``"next"`` belong to replay batches: on an environment only root keys count, at each reset and each step.
+    A subclass writes ``_apply_transform`` and, where it is not that of the image, :meth:`written_spec`.
 
     Args:
         in_keys: images; ``"pixels"`` and, where a batch has it, ``("next", "pixels")`` if None. Keys that are named
@@ -67,17 +84,11 @@ class PixelTransform(Transform):
         ValueError: ``in_keys`` and ``out_keys`` of unequal length.
     """
 
-    def __init__(
-        self,
-        in_keys: NestedKey | Sequence[NestedKey] | None,
-        out_keys: NestedKey | Sequence[NestedKey] | None,
-    ) -> None:
-        read = PIXEL_KEYS if in_keys is None else as_key_list(in_keys)
-        written = read if out_keys is None else as_key_list(out_keys)
-        if len(read) != len(written):
-            raise ValueError(f"in_keys {read} and out_keys {written} must pair up.")
+    def __init__(self, in_keys: Keys | None, out_keys: Keys | None) -> None:
+        read, written = paired_keys(PIXEL_KEYS if in_keys is None else in_keys, out_keys)
         super().__init__(in_keys=read, out_keys=written)
-        self._pairs: list[KeyPair] = list(zip(read, written))
+        self._pairs = list(zip(read, written))
+        self._root_pairs = [pair for pair in self._pairs if not is_next(pair[0])]
         self._optional = PIXEL_KEYS[1:] if in_keys is None else []
 
     def written_spec(self, read: Any) -> Any:
@@ -85,53 +96,41 @@ class PixelTransform(Transform):
         return read.clone()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Transform every key of a sampled batch.
-
-        As TorchRL's transforms do, this sets new tensors in the very tensordict it is given. A buffer's
-        ``sample()`` and ``buffer[indices]`` hand over a fresh one, so what is stored stays as it is.
+        """Transform every key of a sampled batch; what is stored stays as it is.
 
         Raises:
             KeyError: a named key is missing.
         """
         return self._apply_to(tensordict, self._pairs)
 
-    def _apply_to(self, tensordict: TensorDictBase, pairs: list[KeyPair]) -> TensorDictBase:
+    def _apply_to(
+        self, tensordict: TensorDictBase, pairs: list[tuple[NestedKey, NestedKey]]
+    ) -> TensorDictBase:
         for in_key, out_key in pairs:
-            pixels = tensordict.get(in_key, None)
-            if pixels is not None:
-                tensordict.set(out_key, self._apply_transform(pixels))
-            elif in_key not in self._optional and not self.missing_tolerance:
-                present = list(tensordict.keys(True, True))
-                raise KeyError(f"{type(self).__name__} found no {in_key!r} among {present}; set in_keys.")
+            if in_key in self._optional and in_key not in tensordict.keys(True):
+                continue
+            tensordict.set(out_key, self._apply_transform(read_entry(self, tensordict, in_key)))
         return tensordict
 
-    def _root_pairs(self) -> list[KeyPair]:
-        return [pair for pair in self._pairs if not is_next(pair[0])]
-
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._apply_to(next_tensordict, self._root_pairs())
+        return self._apply_to(next_tensordict, self._root_pairs)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._apply_to(tensordict_reset, self._root_pairs())
+        return self._apply_to(tensordict_reset, self._root_pairs)
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
         """Register what the root keys write.
 
         Raises:
             KeyError: the environment has no such observation.
         """
-        for in_key, out_key in self._root_pairs():
-            if in_key not in observation_spec.keys(True, True):
-                name = type(self).__name__
-                raise KeyError(f"{name} found no {in_key!r} in the observations {observation_spec}.")
-            observation_spec[out_key] = self.written_spec(observation_spec[in_key])
-        return observation_spec
-
-    def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Register new root keys; keys under ``"next"`` belong to replay batches and are not an env's."""
         output_spec = output_spec.clone()
-        observation_spec = output_spec["full_observation_spec"]
-        output_spec["full_observation_spec"] = self.transform_observation_spec(observation_spec)
+        observations = output_spec["full_observation_spec"]
+        for in_key, out_key in self._root_pairs:
+            if in_key not in observations.keys(True, True):
+                name = type(self).__name__
+                raise KeyError(f"{name} found no {in_key!r} in the observations {observations}.")
+            observations[out_key] = self.written_spec(observations[in_key])
         return output_spec
 
 
@@ -140,11 +139,8 @@ class IntrinsicReward(Transform):
 
     .. math:: r = r_\mathrm{ext} + c \hat r
 
-    A subclass writes ``_intrinsic_reward``. Works on replay batches (``forward``, keys under ``"next"``) and on
-    environments, where the batch is what one step returns: all of a vectorised environment, one sample of a
-    single one. A reset is not rewarded. Nothing depends on training mode.
-
-    In an environment's step the entries are those without the leading ``"next"``; it may be left out of the keys.
+    A subclass writes ``_intrinsic_reward``. Works on replay batches (``forward``) and on environments, where the batch
+    is what one step returns: all of a vectorised environment. A reset is not rewarded.
 
     Args:
         networks: that are read, by attribute name. They are somebody else's, and no part of the state dictionary.
@@ -161,96 +157,65 @@ class IntrinsicReward(Transform):
         self,
         networks: dict[str, nn.Module | None],
         *,
-        coef: float | None,
-        in_keys: NestedKey | Sequence[NestedKey],
-        out_keys: NestedKey | Sequence[NestedKey],
-        reward_key: NestedKey,
+        coef: float | None = None,
+        in_keys: Keys = ("next", "features"),
+        out_keys: Keys = ("next", "intrinsic_reward"),
+        reward_key: NestedKey = ("next", "reward"),
     ) -> None:
-        read, written = as_key_list(in_keys), as_key_list(out_keys)
-        if len(read) != 1 or len(written) != 1:
-            raise ValueError(
-                f"{type(self).__name__} reads and writes one key each, got {read} and {written}."
-            )
-        super().__init__(in_keys=[without_next(read[0])], out_keys=[without_next(written[0])])
-        self._networks = tuple(networks)
+        read, written = paired_keys(in_keys, out_keys)
+        if len(read) != 1:
+            raise ValueError(f"{type(self).__name__} reads and writes one key each, got {read}.")
+        super().__init__(in_keys=read, out_keys=written)
         self.__dict__.update(networks)
         self.coef = coef
-        self.reward_key = without_next(reward_key)
+        self.reward_key = reward_key
 
-    def _intrinsic_reward(self, features: Tensor, root: TensorDictBase) -> Tensor:
-        """Return the reward of each row before the coefficient, float32 ``[B]``, without gradient.
-
-        Args:
-            features: ``[B, D]``, of next observations.
-            root: of the same rows, what was there before the step; its batch may have more dimensions.
-        """
+    def _intrinsic_reward(self, features: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Return the reward of each row ``[B, D]`` of the batch before the coefficient, float32 ``[B]``."""
         raise NotImplementedError
 
+    @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the intrinsic reward of a sampled batch, under ``"next"``, and add it to the reward.
-
-        As TorchRL's transforms do, this sets new tensors in the very tensordict it is given. A buffer's
-        ``sample()`` and ``buffer[indices]`` hand over a fresh one, so stored rewards stay as they are.
+        """Write the intrinsic reward of a batch and add it to the reward; stored rewards stay as they are.
 
         Raises:
             KeyError: features or reward are missing.
         """
-        return self._add(tensordict, tensordict, with_next)
-
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._add(tensordict, next_tensordict, without_next)
-
-    @torch.no_grad()
-    def _add(
-        self, root: TensorDictBase, tensordict: TensorDictBase, place: Callable[[NestedKey], NestedKey]
-    ) -> TensorDictBase:
-        features = self._read(tensordict, place(self.in_keys[0]))
-        intrinsic = self._intrinsic_reward(features.reshape(-1, features.shape[-1]), root)
+        features = read_entry(self, tensordict, self.in_keys[0])
+        intrinsic = self._intrinsic_reward(features.reshape(-1, features.shape[-1]), tensordict)
         if self.coef is None:
-            tensordict.set(place(self.out_keys[0]), intrinsic.reshape(*features.shape[:-1], 1))
+            tensordict.set(self.out_keys[0], intrinsic.reshape(*features.shape[:-1], 1))
             return tensordict
-        reward = self._read(tensordict, place(self.reward_key))
+        reward = read_entry(self, tensordict, self.reward_key)
         intrinsic = intrinsic.to(reward).view_as(reward)
-        tensordict.set(place(self.out_keys[0]), intrinsic)
+        tensordict.set(self.out_keys[0], intrinsic)
         # A new tensor: the sampled reward may share memory with the storage.
-        tensordict.set(place(self.reward_key), reward + self.coef * intrinsic)
+        tensordict.set(self.reward_key, reward + self.coef * intrinsic)
         return tensordict
 
-    def _read(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        value = tensordict.get(key, None)
-        if value is None:
-            present = list(tensordict.keys(True, True))
-            name = type(self).__name__
-            raise KeyError(f"{name} found no {key!r} among {present}; set in_keys or reward_key.")
-        return value
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self.forward(tensordict.copy().set("next", next_tensordict)).get("next")
 
-    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
         """Register the intrinsic reward and the sum, both unbounded.
 
         Raises:
             KeyError: the environment has no such reward.
         """
-        shape, dtype, device = (*reward_spec.shape, 1), torch.float32, reward_spec.device
+        output_spec = output_spec.clone()
+        rewards = output_spec["full_reward_spec"]
+        spec = Unbounded(shape=(*rewards.shape, 1), dtype=torch.float32, device=rewards.device)
         if self.coef is not None:
-            if self.reward_key not in reward_spec.keys(True, True):
-                name = type(self).__name__
-                raise KeyError(f"{name} found no {self.reward_key!r} in the rewards {reward_spec}.")
-            external = reward_spec[self.reward_key]
-            shape, dtype, device = external.shape, external.dtype, external.device
-            reward_spec[self.reward_key] = Unbounded(shape=shape, dtype=dtype, device=device)
-        reward_spec[self.out_keys[0]] = Unbounded(shape=shape, dtype=dtype, device=device)
-        return reward_spec
+            key = without_next(self.reward_key)
+            if key not in rewards.keys(True, True):
+                raise KeyError(f"{type(self).__name__} found no {key!r} in the rewards {rewards}.")
+            spec = Unbounded(shape=rewards[key].shape, dtype=rewards[key].dtype, device=rewards.device)
+            rewards[key] = spec.clone()
+        rewards[without_next(self.out_keys[0])] = spec
+        return output_spec
 
     def clone(self) -> Self:
         """Return a transform without parent, with a state of its own; networks and generator are shared."""
         copy = super().clone()
         copy._buffers = {name: value.clone() for name, value in self._buffers.items() if value is not None}
         return copy
-
-    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        # The networks are hidden from nn.Module, but go where the transform goes.
-        for name in self._networks:
-            network = getattr(self, name)
-            if network is not None:
-                network._apply(fn)
-        return super()._apply(fn, recurse)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from tensordict.utils import NestedKey
 from torch import Tensor
 
-from crptpro.transforms.base import PixelTransform
+from crptpro.transforms.base import Keys, PixelTransform
 
 CHANNELS = 3
 
@@ -48,11 +45,7 @@ class ColorSwap(PixelTransform):
         ValueError: ``out_keys`` that do not pair with ``in_keys``.
     """
 
-    def __init__(
-        self,
-        in_keys: NestedKey | Sequence[NestedKey] | None = None,
-        out_keys: NestedKey | Sequence[NestedKey] | None = None,
-    ) -> None:
+    def __init__(self, in_keys: Keys | None = None, out_keys: Keys | None = None) -> None:
         super().__init__(in_keys, out_keys)
 
     def _apply_transform(self, obs: Tensor) -> Tensor:

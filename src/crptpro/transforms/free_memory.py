@@ -28,40 +28,30 @@ def free_bytes(device: torch.device) -> int:
 def cgroup_free_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> Iterator[int]:
     """Yield what each memory-limited cgroup around this process has left, in bytes; what is unreadable counts not.
 
-    Linux counts against the group of a process and all groups around it, in either version of the interface.
     psutil does not look at them: inside a container it reports the machine.
 
     Args:
         own: the process's groups, one ``number:controllers:path`` a line.
         root: where the groups are mounted.
     """
-    for directory in _cgroup_directories(own, root):
-        for limit_file, usage_file, cache in _FILES:
-            try:
-                limit = int((directory / limit_file).read_text())  # "max" for no limit
-                usage = int((directory / usage_file).read_text())
-            except (OSError, ValueError):
-                continue
-            yield max(0, limit - usage + _statistic(directory / "memory.stat", cache))
-
-
-def _cgroup_directories(own: Path, root: Path) -> Iterator[Path]:
-    try:
-        lines = own.read_text().splitlines()
-    except OSError:
-        return
-    for line in lines:
+    for line in own.read_text().splitlines() if own.exists() else []:
         _, controllers, group = line.split(":", 2)
-        if controllers == "" or "memory" in controllers.split(","):
-            base = root if controllers == "" else root / "memory"
-            innermost = base / group.lstrip("/")
-            yield innermost
-            yield from (parent for parent in innermost.parents if parent.is_relative_to(base))
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        base = root / "memory" if controllers else root
+        innermost = base / group.lstrip("/")
+        for directory in (
+            innermost,
+            *(parent for parent in innermost.parents if parent.is_relative_to(base)),
+        ):
+            for limit, usage, cache in _FILES:
+                try:
+                    left = int((directory / limit).read_text()) - int((directory / usage).read_text())
+                except (OSError, ValueError):  # "max" for no limit
+                    continue
+                yield max(0, left + _statistic(directory / "memory.stat", cache))
 
 
 def _statistic(path: Path, name: str) -> int:
-    try:
-        pairs = (line.split() for line in path.read_text().splitlines())
-        return next((int(value) for key, value in pairs if key == name), 0)
-    except (OSError, ValueError):
-        return 0
+    lines = path.read_text().splitlines() if path.exists() else []
+    return next((int(value) for key, value in map(str.split, lines) if key == name), 0)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data.tensor_specs import Unbounded
 
 from crptpro.modules.precision import device_of
-from crptpro.transforms.base import PixelTransform
+from crptpro.transforms.base import Keys, PixelTransform
 
 
 class FrozenEncoder(PixelTransform):
@@ -19,13 +17,8 @@ class FrozenEncoder(PixelTransform):
 
     Any ``nn.Module`` that maps images to features will do, a ResNet or a vision transformer as well as a
     :class:`~crptpro.modules.PixelEncoder`; whether it wants uint8 or scaled images is its own affair. It is used by
-    reference and put into evaluation mode: nothing is copied and its ``requires_grad`` flags stay as they are, so
-    an encoder that a loss is still training can be looked through at any time. Acting on an environment
-    encodes what each reset and step returned; ``("next", ...)`` keys are for replay batches only.
-
-    An encoder may live on another device than the images: they are moved there, and the features come back to
-    where the images were. (Attaching a transform to an environment that has a device moves the transform, and
-    so the encoder, to that device: TorchRL does this to every transform.)
+    reference, in evaluation mode, so an encoder that a loss is still training can be looked through at any time. Images
+    are moved to the encoder's device, and the features back to where the images were.
 
     Args:
         encoder: maps ``[N, C, H, W]`` to ``[N, ...]``.
@@ -48,8 +41,8 @@ class FrozenEncoder(PixelTransform):
         self,
         encoder: nn.Module,
         *,
-        in_keys: NestedKey | Sequence[NestedKey] = "pixels",
-        out_keys: NestedKey | Sequence[NestedKey] = "features",
+        in_keys: Keys = "pixels",
+        out_keys: Keys = "features",
     ) -> None:
         super().__init__(in_keys, out_keys)
         self.encoder = encoder.eval()

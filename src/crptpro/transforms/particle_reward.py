@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from crptpro.modules.precision import device_of
@@ -30,36 +29,19 @@ class ParticleReward(IntrinsicReward):
     with :math:`d_{ij}` the distance between a projection, not normalised, and its j-th nearest among the
     projections of the same batch, itself included (:math:`d_{i1} = 0`), and s the running mean of these
     distances over all calls. The mean takes the batch in before it is used; distances that are not finite do not enter
-    it. Source of this form: rll-research/url_benchmark ``utils.py`` (``PBE`` and ``RMS``); APT's authors publish no
-    code for DMControl.
+    it. Source of this form: rll-research/url_benchmark ``utils.py`` (``PBE`` and ``RMS``).
 
-    Works on replay batches (``forward``, keys under ``"next"``) and on environments, where the batch is what
-    one step returns: a vectorised environment of N gives N particles. On a single environment that is one,
-    which has no neighbour: it earns 0 and leaves the statistic alone. Never put it on evaluation
-    environments. Nothing depends on training mode.
-
-    Deviation: in a batch smaller than k the whole batch are the neighbours; the published code fails there.
-    Where all distances seen so far are 0 the bonus is 0; there it is not a number.
+    Deviation: in a batch smaller than k the whole batch are the neighbours, and a single particle earns 0; the
+    published code fails there. Where all distances seen so far are 0 the bonus is 0; there it is not a number.
 
     Args:
         projector: maps features to the latent space; None if ``in_keys`` already names projections.
-        coef: :math:`c` in :math:`r_\mathrm{ext} + c \hat r`; None writes :math:`\hat r` only.
         k: neighbours, the particle itself included.
-        in_keys: one key, features ``[*, feature_dim]`` (or projections ``[*, D]``) of the next observation.
-        out_keys: one key for :math:`\hat r`, of the reward's shape.
-        reward_key: :math:`r_\mathrm{ext}`, ``[*, 1]``, which the sum replaces.
-
-    In an environment's step the entries are those without the leading ``"next"``.
+        **options: ``coef``, ``in_keys``, ``out_keys`` and ``reward_key`` of
+            :class:`~crptpro.transforms.base.IntrinsicReward`.
 
     Raises:
         ValueError: ``k`` below 2, or more than one key.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> bonus = ParticleReward(None, k=3)  # features that are projections already
-        >>> batch = bonus(TensorDict({"next": {"features": torch.randn(5, 4)}}, [5]))
-        >>> batch["next", "intrinsic_reward"].shape
-        torch.Size([5, 1])
     """
 
     projector: nn.Module | None
@@ -70,15 +52,10 @@ class ParticleReward(IntrinsicReward):
         self,
         projector: nn.Module | None,
         *,
-        coef: float | None = None,
         k: int = 12,
-        in_keys: NestedKey | Sequence[NestedKey] = ("next", "features"),
-        out_keys: NestedKey | Sequence[NestedKey] = ("next", "intrinsic_reward"),
-        reward_key: NestedKey = ("next", "reward"),
+        **options: Any,
     ) -> None:
-        super().__init__(
-            {"projector": projector}, coef=coef, in_keys=in_keys, out_keys=out_keys, reward_key=reward_key
-        )
+        super().__init__({"projector": projector}, **options)
         self.k = as_int(k, "k", minimum=2)
         where = None if projector is None else device_of(projector)
         # The published starting point: mean 0, as if seen a ten-thousandth of a time.
@@ -107,10 +84,9 @@ class ParticleReward(IntrinsicReward):
     def _take_in(self, distances: Tensor) -> None:
         # In float64 without reading from the device; one NaN taken in would stay for ever.
         finite = distances.isfinite()
-        new = finite.sum()
-        self.distance_count.add_(new)
+        self.distance_count.add_(finite.sum())
         deviations = torch.where(finite, distances - self.distance_mean, 0.0)
         self.distance_mean.add_(deviations.sum() / self.distance_count)
 
-    def _intrinsic_reward(self, features: Tensor, root: TensorDictBase) -> Tensor:
+    def _intrinsic_reward(self, features: Tensor, tensordict: TensorDictBase) -> Tensor:
         return self.intrinsic_reward(features)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from crptpro.modules.heads import latent_dim_of
@@ -36,13 +35,11 @@ class PrototypeReward(IntrinsicReward):
     512 prototypes and k = 3), and rows of the queue not yet filled are zero vectors at distance 1. A row that is not
     finite is never drawn.
 
-    Works on replay batches (``forward``, keys under ``"next"``) and on environments. The candidates come
-    from the batch at hand: on a single environment that is one sample, which fills the queue with itself
-    and earns 0; use replay batches or many environments. Never put it on evaluation environments. Nothing depends on
-    training mode.
+    The candidates come from the batch at hand: one sample alone fills the queue with itself and earns 0. Never put it
+    on evaluation environments.
 
-    Deviation: the released pre-training fills Q on the way and hands it over; here Q starts from zeros unless
-    ``queue`` is given.
+    Deviation: the released pre-training fills Q on the way and hands it over; here Q starts from zeros unless ``queue``
+    is given.
 
     Args:
         projector: maps features to the latent space, frozen; None if ``in_keys`` already names projections.
@@ -50,28 +47,15 @@ class PrototypeReward(IntrinsicReward):
         coef: :math:`\beta`; None writes :math:`\hat r` only.
         knn_k: k, counted with copies of the sample itself.
         queue_size: length of Q, a multiple of M.
-        in_keys: one key, features ``[*, feature_dim]`` (or projections ``[*, D]``) of the next observation.
-        out_keys: one key for :math:`\hat r`, of the reward's shape.
-        reward_key: :math:`r_\mathrm{ext}`, ``[*, 1]``, which the sum replaces.
         queue: ``[queue_size, D]`` to start from, such as a checkpoint's, the row that is overwritten first in front;
             zeros when None.
         generator: source of the draws; the global generator of the device when None. Not part of the state
             dict.
-
-    In an environment's step the entries are those without the leading ``"next"``.
+        **keys: ``in_keys``, ``out_keys`` and ``reward_key`` of :class:`~crptpro.transforms.base.IntrinsicReward`.
 
     Raises:
         ValueError: a queue size that is no multiple of M, a queue of another shape, more than one key, a ``knn_k``
             that does not lie in 1 to ``queue_size``, or a projector whose outputs are not as long as the prototypes.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> from crptpro.modules import Prototypes
-        >>> bonus = PrototypeReward(None, Prototypes(4, 4), queue_size=8)  # features that are projections already
-        >>> after = {"features": torch.randn(5, 4), "reward": torch.zeros(5, 1)}
-        >>> batch = bonus(TensorDict({"next": after}, [5]))
-        >>> torch.equal(batch["next", "reward"], 0.2 * batch["next", "intrinsic_reward"])
-        True
     """
 
     projector: nn.Module | None
@@ -87,11 +71,9 @@ class PrototypeReward(IntrinsicReward):
         coef: float | None = 0.2,
         knn_k: int = 3,
         queue_size: int = 2048,
-        in_keys: NestedKey | Sequence[NestedKey] = ("next", "features"),
-        out_keys: NestedKey | Sequence[NestedKey] = ("next", "intrinsic_reward"),
-        reward_key: NestedKey = ("next", "reward"),
         queue: Tensor | None = None,
         generator: torch.Generator | None = None,
+        **keys: Any,
     ) -> None:
         weight = prototypes.get_parameter("weight")
         num_prototypes, latent_dim = weight.shape
@@ -107,23 +89,12 @@ class PrototypeReward(IntrinsicReward):
         told = None if projector is None else latent_dim_of(projector)
         if told is not None:
             _check_latents(told, latent_dim)
-        super().__init__(
-            {"projector": projector, "prototypes": prototypes},
-            coef=coef,
-            in_keys=in_keys,
-            out_keys=out_keys,
-            reward_key=reward_key,
-        )
+        super().__init__({"projector": projector, "prototypes": prototypes}, coef=coef, **keys)
         self.knn_k = as_int(knn_k, "knn_k", minimum=1, maximum=queue_size)
         self.generator = generator
         start = torch.zeros(queue_size, latent_dim) if queue is None else queue
         self.register_buffer("queue", start.detach().to(weight.device, torch.float32, copy=True))
         self.register_buffer("queue_pointer", torch.tensor(0, device=weight.device))
-
-    def reset_queue(self) -> None:
-        """Empty the queue: all rows zero, pointer at the first."""
-        self.queue.zero_()
-        self.queue_pointer.zero_()
 
     @torch.no_grad()
     def intrinsic_reward(self, features: Tensor) -> Tensor:
@@ -149,7 +120,7 @@ class PrototypeReward(IntrinsicReward):
         self.queue_pointer.add_(count).remainder_(self.queue.shape[0])
         return knn_distance(latents, self.queue, k=self.knn_k)
 
-    def _intrinsic_reward(self, features: Tensor, root: TensorDictBase) -> Tensor:
+    def _intrinsic_reward(self, features: Tensor, tensordict: TensorDictBase) -> Tensor:
         return self.intrinsic_reward(features)
 
 
@@ -163,9 +134,8 @@ def _check_latents(length: int, expected: int) -> None:
 def warn_if_mostly_zero(num_prototypes: int, batch_size: int, knn_k: int) -> None:
     """Say so where most rows will earn nothing.
 
-    Every prototype draws a candidate from the batch: from a small one each row so often that the k nearest candidates
-    of most rows are the row itself. A row is drawn about Poisson(M / B) times, whose median is k from M / B = k - 1/3
-    on. With 512 prototypes, k = 3 and batches of 128 three quarters of the rows get 0.
+    Every prototype draws a candidate from the batch. A row is drawn about Poisson(M / B) times, whose median is k from
+    M / B = k - 1/3 on: with 512 prototypes, k = 3 and batches of 128 three quarters of the rows get 0.
 
     Args:
         num_prototypes: M.
