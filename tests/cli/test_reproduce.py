@@ -59,8 +59,8 @@ def test_all_means_the_experiments_that_have_something_of_what_is_asked_for(
     call: Call, tmp_path: Path
 ) -> None:
     options = ("--scale", "tiny", "--dry-run", "--out", tmp_path)
-    status, out, _ = call("reproduce", "all", "--groups", "B", *options)
-    assert status == 0
+    status, out, err = call("reproduce", "all", "--groups", "B", *options)
+    assert status == 0, err
     assert out.startswith("seen, finetune, ablation")
     line = refused(call("reproduce", "all", "colors", "--groups", "B", *options))
     assert "Nothing of unseen, colors" in line

