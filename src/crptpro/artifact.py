@@ -128,7 +128,7 @@ def write_artifact(
     from safetensors.torch import save
 
     given, path = as_path(path), as_path(path).resolve()
-    require_replaceable(path, format_name)
+    _require_replaceable(path, format_name)
     tensors = {}
     for name, module in modules.items():
         state = module.state_dict() if isinstance(module, nn.Module) else module
@@ -168,30 +168,15 @@ def read_artifact(
         CRPTproError: (or ``error``) naming what is missing, damaged, of another kind or too new.
     """
     path = as_path(path).resolve()
-    for attempt in (1, 2):
-        previous = _previous(path)  # where a writer has it between its two renames
-        try:
-            source = previous if previous.is_dir() and not path.exists() else path
-            return _read(source, format_name, version, error)
-        except (error, OSError):
-            if attempt == 2:  # once more: a writer may have replaced it meanwhile
-                raise
-    raise AssertionError
+    previous = _previous(path)  # where a writer that was killed between its two renames left it
+    return _read(previous if previous.is_dir() and not path.exists() else path, format_name, version, error)
 
 
-def require_replaceable(
-    path: str | Path, format_name: str, *, error: type[CRPTproError] = CRPTproError
-) -> None:
-    """Refuse to replace anything but an artifact of the same kind.
-
-    Raises:
-        CRPTproError: (or ``error``) if there is something else at ``path``.
-    """
-    path = as_path(path)
+def _require_replaceable(path: Path, format_name: str) -> None:
     if not path.exists() or (path.is_dir() and not any(path.iterdir())):
         return
     if not (path / CARD_FILE).exists() or read_json(path / CARD_FILE).get("format") != format_name:
-        raise error(
+        raise CRPTproError(
             f"{path} exists and is no {format_name!r}; it is not replaced. Choose another directory, such as "
             f"{path / 'encoder'}."
         )

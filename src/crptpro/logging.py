@@ -153,39 +153,36 @@ class RunLogger:
         found = [row for row in self._rows if row["stream"] == stream]
         return [{key: value for key, value in row.items() if key != "stream"} for row in found]
 
-    def state_dict(self, streams: Iterable[str] | None = None) -> dict[str, Any]:
-        """Return how far the record goes, after forcing it to disk; belongs into every checkpoint.
-
-        Args:
-            streams: streams of the stage that makes the checkpoint, so that resuming it leaves those of other stages in
-                the same directory alone; ``None`` for all.
-        """
+    def state_dict(self, streams: Iterable[str]) -> dict[str, int]:
+        """Return the number of rows per stream, forced to disk; belongs into every checkpoint."""
         if self.path.exists():
             with open(self.path, "rb") as file:
                 os.fsync(file.fileno())
-        names = None if streams is None else list(streams)
-        counts = {name: len(self.rows(name)) for name in names or self._streams()}
-        return {"rows": counts, "streams": names}
+        return {name: len(self.rows(name)) for name in streams}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Take back the rows written after the checkpoint, so that the resumed run writes each row once."""
-        for name, count in state["rows"].items():
+    def load_state_dict(self, state: Mapping[str, int]) -> None:
+        """Take back the rows written after the checkpoint, so that the resumed run writes each row once.
+
+        Streams that ``state`` does not name, those of other stages in the same directory, are left alone.
+        """
+        for name, count in state.items():
             if (missing := count - len(self.rows(name))) > 0:
                 _LOG.warning(
                     "%s: %d rows of %r are missing that the checkpoint counted.", self.path, missing, name
                 )
-        others = math.inf if state["streams"] is not None else 0
-        seen: Counter[str] = Counter()
-        kept = []
+        before, seen, kept = self._streams(), Counter[str](), []
         for row in self._rows:
             seen[row["stream"]] += 1
-            if seen[row["stream"]] <= state["rows"].get(row["stream"], others):
+            if seen[row["stream"]] <= state.get(row["stream"], math.inf):
                 kept.append(row)
-        self._replace(kept)
-
-    def truncate_to(self, stream: str, counter: str, value: int) -> None:
-        """Take back the rows of ``stream`` whose ``counter`` exceeds ``value`` (-1: all of them)."""
-        self._replace([r for r in self._rows if r["stream"] != stream or r.get(counter, 0) <= value])
+        if len(kept) < len(self._rows):
+            self._write_rows(kept)
+        self._rows = kept
+        for stream in before:
+            if stream in self._streams():
+                self._write_csv(stream)
+            else:
+                self._csv(stream).unlink(missing_ok=True)
 
     def writes_into(self, directory: str | Path) -> bool:
         """Whether the record lies in ``directory`` or below it: only then is all of it that directory's own."""
@@ -222,18 +219,6 @@ class RunLogger:
             _LOG.warning("%s: dropped %d damaged line(s).", self.path, len(lines) - len(rows))
             self._write_rows(rows)
         return rows
-
-    def _replace(self, rows: list[dict[str, Any]]) -> None:
-        """Make these the rows of the record."""
-        before = self._streams()
-        if len(rows) < len(self._rows):
-            self._write_rows(rows)
-        self._rows = rows
-        for stream in before:
-            if stream in self._streams():
-                self._write_csv(stream)
-            else:
-                self._csv(stream).unlink(missing_ok=True)
 
     def _write_rows(self, rows: Iterable[Mapping[str, Any]]) -> None:
         write_whole(self.path, "".join(json.dumps(row) + "\n" for row in rows))

@@ -17,13 +17,7 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from crptpro.artifact import (
-    CARD_FILE,
-    identity_of,
-    read_artifact,
-    require_replaceable,
-    write_artifact,
-)
+from crptpro.artifact import CARD_FILE, identity_of, read_artifact, write_artifact
 from crptpro.data import FrameDataset
 from crptpro.errors import PretrainedError, UnknownNameError
 from crptpro.modules import (
@@ -109,26 +103,23 @@ class Pretrained:
                 digest.update(value.detach().cpu().contiguous().numpy().tobytes())
         return f"{self.method}:{digest.hexdigest()}"
 
-    def require(self, *, prototypes: bool = False, **pixels: float | None) -> Pretrained:
-        """Check what this artifact is about to be used for. Returns self.
+    def require(self, *, image_size: int, frame_stack: int | None = None) -> Pretrained:
+        """Check the images that the encoder is about to be given. Returns self.
 
         Args:
-            prototypes: whether a projector and prototypes are needed.
-            **pixels: any of ``image_size``, ``frame_stack`` (RGB frames per observation), ``pixel_scale`` (factor on
-                the 0..255 values) and ``pixel_offset`` (subtracted after scaling); ``None`` is not checked, nor what
-                an encoder does not say of itself.
+            image_size: height and width in pixels.
+            frame_stack: RGB images per observation; ``None`` is not checked.
 
         Raises:
-            PretrainedError: naming everything that does not fit, and both values.
+            PretrainedError: naming everything that does not fit, and both values. What an encoder does not say of
+                itself is not checked.
         """
         has = _pixel_facts(self.encoder)
         wrong = [
             f"it was trained with {name} {has[name]}, not {value}"
-            for name, value in pixels.items()
-            if value is not None and has[name] is not None and abs(has[name] - value) > 1e-9
+            for name, value in (("image_size", image_size), ("frame_stack", frame_stack))
+            if None not in (value, has[name]) and has[name] != value
         ]
-        if prototypes and (self.prototypes is None or self.projector is None):
-            wrong.append(f"it has no prototypes (method {self.method!r})")
         if wrong:
             raise PretrainedError(
                 f"The pretrained encoder ({self.method}) does not fit: {'; '.join(wrong)}. "
@@ -137,13 +128,10 @@ class Pretrained:
         return self
 
     def build_loss(self) -> LossModule:
-        """Build the loss that this was trained with, weights and targets included, trainable again.
-
-        The artifact itself stays as it is.
+        """Build the loss that this was trained with, as trainable copies of all networks, targets included.
 
         Raises:
-            PretrainedError: if its method is not registered or does not take the stored networks, or if it was saved
-                without what training reads.
+            PretrainedError: its method is not registered, does not take these networks, or they were saved slim.
         """
         if self.card.get("slim") or "trimmed_from" in self.card:
             raise PretrainedError(
@@ -213,21 +201,14 @@ def _feature_moments(
     opened = [FrameDataset.open(d) if isinstance(d, (str, Path)) else d for d in datasets]
     if not opened:
         raise PretrainedError("random-encoder-standardised needs datasets to standardise its features on.")
-    total, squares, count = 0.0, 0.0, 0
+    features = []
     for index, dataset in enumerate(opened):
         dataset.set_rng(torch.Generator().manual_seed(derive_seed(seed, "standardise", index)))
         pixels = dataset.sample(-(-samples // len(opened)))["pixels"]
-        for chunk in pixels.split(64):
-            features = encoder(chunk).double()
-            total, squares, count = (
-                total + features.sum(0),
-                squares + features.square().sum(0),
-                count + len(features),
-            )
-    mean = torch.as_tensor(total) / count
-    deviation = (torch.as_tensor(squares) / count - mean.square()).clamp_min(0).sqrt()
+        features += [encoder(chunk) for chunk in pixels.split(64)]
+    deviation, mean = torch.std_mean(torch.cat(features), dim=0, correction=0)
     # A feature that never changes stays 0 after centring, whatever it is divided by.
-    return mean.float(), torch.where(deviation > 1e-6, deviation, torch.ones_like(deviation)).float()
+    return mean, torch.where(deviation > 1e-6, deviation, torch.ones_like(deviation))
 
 
 def save_pretrained(
@@ -263,7 +244,6 @@ def save_pretrained(
     if dtype not in (None, "bfloat16"):
         raise ValueError(f"`dtype` must be 'bfloat16' or None, got {dtype!r}.")
     path = as_path(path)
-    require_replaceable(path, FORMAT, error=PretrainedError)
     source = _as_pretrained(trained, actor)
     if slim:
         source = _slimmed(source)
@@ -334,8 +314,17 @@ def _as_pretrained(trained: Any, actor: nn.Module | None) -> Pretrained:
     """Gather what is to be saved."""
     if isinstance(trained, Pretrained):
         return trained if actor is None else replace(trained, actor=actor)
-    facts = _facts_of_loss(trained) if isinstance(trained, nn.Module) else _facts_of_result(trained)
-    loss = facts.pop("loss")
+    if isinstance(trained, nn.Module):
+        result = {"loss": trained, "method": method_of(trained).name}
+    else:
+        result = {
+            name: getattr(trained, name, None) for name in ("loss", "method", "training", "actor", "queue")
+        }
+    loss = result["loss"]
+    if not isinstance(loss, nn.Module):
+        raise PretrainedError(
+            f"A {type(trained).__name__} cannot be saved as a pretrained encoder: it is no loss, and no result of one."
+        )
     encoder: Any = _unwrapped(getattr(loss, "encoder", None))
     if encoder is None:
         raise PretrainedError(f"{type(loss).__name__} has no `.encoder`; a pre-training loss exposes it.")
@@ -355,27 +344,16 @@ def _as_pretrained(trained: Any, actor: nn.Module | None) -> Pretrained:
         if isinstance(value, Tensor) and key != "queue" and not key.startswith(covered)
     }
     card = {
-        "method": facts["method"],
+        "method": result["method"],
         "loss": {
             "class": f"{type(loss).__module__}.{type(loss).__qualname__}",
             "config": _loss_options(loss),
         },
-        "training": facts["training"],
+        "training": result.get("training"),
     }
-    actor = facts["actor"] if actor is None else actor
-    return Pretrained(encoder, **heads, **targets, queue=facts["queue"], actor=actor, card=card, rest=rest)
-
-
-def _facts_of_result(result: Any) -> dict[str, Any]:
-    if not isinstance(getattr(result, "loss", None), nn.Module):
-        raise PretrainedError(
-            f"A {type(result).__name__} cannot be saved as a pretrained encoder: it is no loss, and no result of one."
-        )
-    return {name: getattr(result, name, None) for name in ("loss", "method", "training", "actor", "queue")}
-
-
-def _facts_of_loss(loss: nn.Module) -> dict[str, Any]:
-    return {"loss": loss, "method": method_of(loss).name, "training": None, "actor": None, "queue": None}
+    actor = result.get("actor") if actor is None else actor
+    queue = result.get("queue")
+    return Pretrained(encoder, **heads, **targets, queue=queue, actor=actor, card=card, rest=rest)
 
 
 def _slimmed(source: Pretrained) -> Pretrained:

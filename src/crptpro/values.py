@@ -14,8 +14,6 @@ from typing import Any, Literal, get_args
 import numpy as np
 import torch
 
-Switch = Literal["auto", "on", "off"]
-
 Quality = Literal["exact", "fast"]
 """How frames are rendered. ``"fast"`` uses smaller shadow maps: up to twice as fast on software GL, with fewer than 1 %
 of the pixels changed (8 % on the terrain of quadruped_escape)."""
@@ -152,16 +150,6 @@ def check_numbers(config: Any, *, counts: Mapping[str, int], rates: Mapping[str,
             values[name] = as_float(value, name, minimum=0, maximum=maximum)
     for name, value in values.items():
         object.__setattr__(config, name, value)
-
-
-def check_switch(name: str, value: str) -> None:
-    """Refuse anything but ``"auto"``, ``"on"`` and ``"off"``.
-
-    Raises:
-        ValueError: naming the setting and its value.
-    """
-    if value not in get_args(Switch):
-        raise ValueError(f"`{name}` must be 'auto', 'on' or 'off', got {value!r}.")
 
 
 def _require_range(

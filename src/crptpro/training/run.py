@@ -259,8 +259,7 @@ class Run:
                 self.records.load_state_dict(self.saved["record"])
             logger.info("Continues from %s %s.", f"{self.position:,}", self.unit)
         elif self.records is not None and self.run_dir is not None and self.records.writes_into(self.run_dir):
-            for stream in self.streams:
-                self.records.truncate_to(stream, self.unit, -1)
+            self.records.load_state_dict(dict.fromkeys(self.streams, 0))
         self._started = self._saved_time = self._row_time = time.monotonic()
 
     # --- the loop -----------------------------------------------------------------------------------------------
