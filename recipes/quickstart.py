@@ -63,6 +63,8 @@ class Config:
     """render quality; fast uses smaller shadow maps, less than 1 % of the pixels differ [exact]"""
     action_repeat: int = 4
     """env steps per decision; fewer pictures per episode than with the paper's [2]"""
+    prototypes: int = 256
+    """with more, batches of 128 would leave the exploration bonus mostly 0 [512]"""
     assignment_temperature: float = 0.05
     """of Sinkhorn-Knopp; at the paper's the loss stands still for over a thousand updates first [0.1]"""
     pretrain: PretrainConfig = PRETRAIN
@@ -84,7 +86,9 @@ def main(config: Config) -> None:
 
     logger.info("2/4 pre-train one encoder on all of them")
     seed_everything(config.seed)
-    loss = ProtoLoss(PixelEncoder(), assignment_temperature=config.assignment_temperature)
+    loss = ProtoLoss(
+        PixelEncoder(), num_prototypes=config.prototypes, assignment_temperature=config.assignment_temperature
+    )
     settings = replace(config.pretrain, seed=config.seed)
     result = pretrain(loss, datasets, run_dir=config.out / "pretrain", config=settings)
     encoder = save_pretrained(result, config.out / "encoder")

@@ -103,27 +103,6 @@ def test_no_text_in_a_name_or_a_value_breaks_the_record_or_its_reopening(tmp_pat
         assert rows[0]["note"] == text
 
 
-def test_a_run_directory_is_a_path_as_a_shell_means_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    with RunLogger("~/runs/a") as logger:
-        logger.log({"loss": 1}, stream="train", updates=1)
-    assert (tmp_path / "runs" / "a" / "train.csv").exists()
-    with pytest.raises(ValueError, match="`run_dir` is empty"):
-        RunLogger("")
-
-
-def test_records_have_the_rights_that_the_umask_leaves(tmp_path: Path) -> None:
-    before = os.umask(0o007)
-    try:
-        with RunLogger(tmp_path / "run", config={"a": 1}) as logger:
-            logger.log({"loss": 1}, stream="train", updates=1)
-    finally:
-        os.umask(before)
-    assert {path.stat().st_mode & 0o777 for path in (tmp_path / "run").iterdir()} == {0o660}
-
-
 def test_a_resumed_run_writes_each_row_once(tmp_path: Path) -> None:
     def write(logger: RunLogger, start: int, stop: int) -> None:
         for updates in range(start, stop):
