@@ -14,7 +14,7 @@ from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
 from torchrl.envs.transforms import Transform
 
 from crptpro.artifact import require_disk
-from crptpro.data.storage import RingStorage, gather_stacks, map_rows, read_rows, stack_rows
+from crptpro.data.storage import RingStorage, StackStorage, map_rows, read_rows
 from crptpro.errors import DatasetError
 from crptpro.values import as_float, as_int, as_path
 
@@ -52,14 +52,11 @@ class FrameReplay(ReplayBuffer):
     - ``index`` (0 is the oldest transition) and ``number``, ``("next", "number")``, int64 ``[B]``: how many frames were
       stored before the observation's newest one. A number is never used again; :meth:`observations` reads it.
 
-    With ``n_step`` above 1 only those transitions are drawn whose n transitions lie in one episode and in the ring; as
-    in url_benchmark (``replay_buffer.py``), a window is not cut short at an episode's end. ``("next", ...)`` is then n
-    agent steps ahead: its flags are the last transition's, its reward is the n-step return, and
-    ``("next", "discount")`` ``[B, 1]`` weighs the value of the next observation
-    (:func:`~crptpro.data.storage.n_step_return`). Indexing, ``replay[i]``, reads single transitions.
-
-    Deviation: url_benchmark draws an episode uniformly and then an anchor in it, and only from finished episodes; here
-    every admissible anchor is equally likely, the running episode's included.
+    With ``n_step`` above 1 only transitions are drawn whose n transitions lie in one episode and in the ring (as in
+    url_benchmark's ``replay_buffer.py``, none is cut short). ``("next", ...)`` is then n agent steps ahead: its flags
+    are the last transition's, its reward is the n-step return, and ``("next", "discount")`` ``[B, 1]`` weighs the value
+    of the next observation (:func:`~crptpro.data.storage.n_step_return`). Indexing reads single transitions.
+    Deviation: url_benchmark draws an episode uniformly, and then an anchor in it; here every anchor is equally likely.
 
     A ring on disk is its own checkpoint: :meth:`state_dict` holds a few counters, and loading one restores exactly the
     content of its moment, provided that at most ``slack`` frames were written since. With checkpoints every n
@@ -238,7 +235,7 @@ def stack_frames(buffer: ReplayBuffer, *, frame_stack: int = 3, **options: Any) 
     return replay
 
 
-class StoredReplay:
+class StoredReplay(StackStorage):
     """The observations in the files of a :class:`FrameReplay`, oldest first, without writing to them.
 
     A ring that went round holds the newest part alone. Nobody may be writing to ``path``, which was the replay's.
@@ -248,31 +245,27 @@ class StoredReplay:
     """
 
     def __init__(self, path: str | Path, *, frame_stack: int = 3) -> None:
-        path = as_path(path)
+        path, self.frame_stack = as_path(path), frame_stack
         number, row_of = (map_rows(path / f"{name}.memmap", torch.int64, ()) for name in ("number", "row_of"))
-        self._step = map_rows(path / "step.memmap", torch.int32, ())
-        self._rows, self._frame_stack = len(number), frame_stack
-        size = math.isqrt((path / "pixels.memmap").stat().st_size // (3 * self._rows))
-        self._frames = map_rows(path / "pixels.memmap", torch.uint8, (3, size, size), self._rows)
+        self.step, rows = map_rows(path / "step.memmap", torch.int32, ()), len(number)
+        size = math.isqrt((path / "pixels.memmap").stat().st_size // (3 * rows))
+        self.pixels = map_rows(path / "pixels.memmap", torch.uint8, (3, size, size), rows)
         # `number` counts from 1. Transitions that were overwritten, and rows never written (0), point elsewhere.
         end = int(number.max())
-        oldest = max(0, end - self._rows)
+        oldest = max(0, end - rows)
         starts = torch.cat([row_of[:1], row_of[row_of > 0]]).unique()
         starts = starts[(starts >= oldest) & (starts + 1 < end)]
-        age = self._step[starts % self._rows].clamp(max=frame_stack - 1)
-        self._starts = starts[starts - age >= oldest]
+        self._starts = starts[starts - self.step[starts % rows].clamp(max=frame_stack - 1) >= oldest]
         if not len(self._starts):
             raise DatasetError(f"The replay in {path} has no transition.")
+        super().__init__(len(self._starts))
 
     def __len__(self) -> int:
-        """Return how many transitions it holds."""
-        return len(self._starts)
+        return self.max_size
 
-    def observations(self, index: Tensor) -> Tensor:
+    def observations(self, numbers: Tensor) -> Tensor:
         """Return the observations of transitions ``[B]``, 0 being the oldest, uint8 ``[B, k * 3, H, W]``."""
-        numbers = self._starts[index]
-        rows = stack_rows(numbers, self._step[numbers % self._rows], self._frame_stack)
-        return gather_stacks(self._frames, rows % self._rows)
+        return self._stacks(self._starts[numbers])
 
 
 def as_it_is(sample: TensorDictBase) -> TensorDictBase:
@@ -294,7 +287,9 @@ class _RingWriter(ImmutableDatasetWriter):
         """Store transitions in temporal order; see :class:`FrameReplay`."""
         ring: RingStorage = self._storage
         channels = ring.pixels.shape[1]
-        rows = read_rows(data, channels=channels, frame_stack=ring.frame_stack, extra=self._extra)
+        rows = read_rows(
+            data, channels=channels, frame_stack=ring.frame_stack, extra=self._extra, what="A replay"
+        )
         for name, values in {"pixels": rows.following, **rows.columns}.items():
             if values.shape[1:] != ring.content[name].shape[1:]:
                 expected, got = tuple(ring.content[name].shape[1:]), tuple(values.shape[1:])
