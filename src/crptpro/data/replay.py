@@ -166,21 +166,8 @@ class FrameReplay(ReplayBuffer):
         """Frames stored so far, those that were overwritten included; the newest one's number is one less."""
         return self._storage.frames
 
-    @property
-    def returns_pixels(self) -> bool:
-        """Whether samples have stacks."""
-        return self._storage.returns_pixels
-
-    @returns_pixels.setter
-    def returns_pixels(self, value: bool) -> None:
-        self._storage.returns_pixels = value
-
     def observations(self, numbers: Tensor) -> Tensor:
-        """Return observations by number, int64 ``[B]``, as uint8 ``[B, frame_stack * C, H, W]``.
-
-        Raises:
-            DatasetError: if one of them is not in the ring, or no longer.
-        """
+        """Return observations by number, int64 ``[B]``, as uint8 ``[B, frame_stack * C, H, W]``."""
         with self._replay_lock:
             return self._storage.observations(numbers)
 
@@ -190,17 +177,13 @@ class FrameReplay(ReplayBuffer):
             return {"ring": self._storage.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the content of the moment the state was taken.
-
-        Raises:
-            CheckpointError: if the ring has another size, or was overwritten by more than ``slack`` frames since.
-        """
+        """Restore the content of the moment the state was taken, or raise a CheckpointError."""
         with self._replay_lock:
             self._storage.load_state_dict(state_dict["ring"])
 
 
 def stack_frames(buffer: ReplayBuffer, *, frame_stack: int = 3, **options: Any) -> FrameReplay:
-    """Turn a buffer of single frames, as most public data sets are, into one whose samples are stacks.
+    """Copy a buffer of single frames, as most public data sets are, into one in RAM whose samples are stacks.
 
     Args:
         buffer: any TorchRL buffer or data set whose rows, in the order of their indices, are transitions of whole
@@ -208,12 +191,6 @@ def stack_frames(buffer: ReplayBuffer, *, frame_stack: int = 3, **options: Any) 
             ``("next", "reward" | "done")``.
         frame_stack: k, frames per stack.
         **options: ``batch_size``, ``generator`` and ``transform`` of :class:`FrameReplay`.
-
-    Returns:
-        A copy in RAM, each frame once, that :func:`crptpro.training.pretrain` takes as a dataset.
-
-    Raises:
-        ValueError: for rows of another form.
 
     Examples:
         >>> dataset = stack_frames(minari_buffer)  # doctest: +SKIP
@@ -274,10 +251,7 @@ def as_it_is(sample: TensorDictBase) -> TensorDictBase:
 
 
 class _RingWriter(ImmutableDatasetWriter):
-    """Hands what a buffer is extended by to the ring, checked.
-
-    Reading and checking a TensorDict of one transition costs about 0.25 ms; an agent step of walker takes 50 ms.
-    """
+    """Hands what a buffer is extended by to the ring, checked: about 0.25 ms for a single transition."""
 
     def __init__(self, extra: Mapping[str, tuple[tuple[int, ...], torch.dtype]]):
         super().__init__()
@@ -305,8 +279,7 @@ class _RingWriter(ImmutableDatasetWriter):
 class _WindowSampler(RandomSampler):
     """Draws uniformly, with replacement, from the transitions whose window of n lies in one episode.
 
-    For windows of 1 it is its base class, draw for draw. For longer ones a draw that does not fit is redrawn, so
-    that the cost does not grow with the ring.
+    A draw that does not fit is redrawn, so that the cost does not grow with the ring.
     """
 
     def sample(self, storage: RingStorage, batch_size: int) -> tuple[Tensor, dict]:

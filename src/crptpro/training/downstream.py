@@ -407,7 +407,7 @@ def attach_transforms(
         replay.append_transform(RandomShift(in_keys=pixels, **shift))
         replay.append_transform(FrozenEncoder(encoder, in_keys=pixels, out_keys=features))
     else:
-        replay.returns_pixels = False
+        replay.storage.returns_pixels = False
         kept = projector if keeps_projections else None
         replay.append_transform(
             DenseShiftFeatures(encoder, replay, projector=kept, dtype=map_dtype, observations=slots, **shift)

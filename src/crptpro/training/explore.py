@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.utils import unravel_key
 from torch import Tensor, nn
 from torchrl.envs.transforms import Transform
 from torchrl.envs.utils import step_mdp
@@ -41,7 +40,6 @@ from crptpro.objectives import (
     RADSACLoss,
     SkillDDPGLoss,
     get_method,
-    method_names,
     method_of,
 )
 from crptpro.seeding import derive_seed
@@ -50,7 +48,6 @@ from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.pretrain import (
     SHIFT_PAD,
     PretrainResult,
-    before_update,
     describe_loss,
     ending,
     make_optimizer,
@@ -67,7 +64,8 @@ from crptpro.values import Quality, check_numbers
 
 logger = logging.getLogger(__name__)
 
-PIXELS: tuple[NestedKey, ...] = ("pixels", ("next", "pixels"))
+PIXELS: dict[NestedKey, NestedKey] = {"pixels": "features", ("next", "pixels"): ("next", "features")}
+"""Entries of a batch, with those of their features."""
 SECOND_VIEWS: dict[NestedKey, NestedKey] = {
     "pixels_view": "pixels",
     ("next", "pixels_view"): ("next", "pixels"),
@@ -241,7 +239,7 @@ def pretrain_active(
     Args:
         loss: the objective with its networks; trained in place.
         domains: one or several, by domain or task name.
-        method: name of a registered method that explores; by default the first one of the loss's class that does.
+        method: name of a registered method that explores; by default that of the loss's class.
         run_dir: records (``pretrain.csv``, ``explore.csv``, ``episodes.csv``), replays and checkpoints; ``None`` keeps
             nothing but the result.
         config: every number.
@@ -256,7 +254,7 @@ def pretrain_active(
         NonFiniteError: a loss, a weight or an action is not finite; the last checkpoint is kept.
         DiskSpaceError: the disk cannot hold the replays.
     """
-    recipe = _exploring_method(loss) if method is None else get_method(method)
+    recipe = method_of(loss) if method is None else get_method(method)
     asked = dataclasses.replace(config or ExploreConfig(), **overrides)
     named = _named(domains, recipe)
     plan = plan_exploration(recipe, list(named.values()), asked)
@@ -276,11 +274,6 @@ def pretrain_active(
             "exploration": {**dataclasses.asdict(exploration), "reward": reward},
         })  # fmt: skip
         torch.manual_seed(derive_seed(settings.seed, "active", "loss"))
-        logger.info(
-            "active pre-training: %s env steps over %s (%s decisions in each, the first %s random), %s encoder updates "
-            "of batch %d", f"{plan.env_steps:,}", ", ".join(named), f"{plan.agent_steps:,}",
-            f"{settings.random_agent_steps:,}", f"{plan.encoder_updates:,}", settings.batch_size,
-        )  # fmt: skip
         capacity = min(settings.replay_capacity, plan.agent_steps)
         slack = 4 * (settings.checkpoint_interval_env_steps // sum(plan.repeats)) + SPARE_FRAMES
         if run.run_dir is not None and not run.saved:
@@ -303,8 +296,10 @@ def pretrain_active(
         run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor,
                  **{f"explorer_{e.name}": e for e in explorers})  # fmt: skip
 
+        before_update = getattr(loss, "before_update", lambda: None)  # prototypes are brought to unit length
+
         def update_encoder(batch: TensorDictBase) -> TensorDictBase:
-            before_update(loss)  # prototypes are brought to unit length
+            before_update()
             losses = loss(batch)
             optimizer.zero_grad(set_to_none=True)
             total_loss(losses).backward()
@@ -525,28 +520,16 @@ class Explorer:
             extra_columns=None if skills is None else {"skill": ((skills,), torch.float32)},
             generator=self.generators["replay"],
         )  # fmt: skip
-        agent_views = SECOND_VIEWS if isinstance(self.learner.loss, AveragedSACLoss) else {}
-        views = {**getattr(self.loss, "views", {}), **agent_views}
-        images = [*PIXELS, *agent_views]
-        replay.append_transform(
-            RandomShift(pad=SHIFT_PAD, in_keys=[*views.values(), *PIXELS], out_keys=[*views, *PIXELS],
-                        generator=self.generators["shift"])
-        )  # fmt: skip
+        views, encoded = dict(getattr(self.loss, "views", {})), dict(PIXELS)
+        if isinstance(self.learner.loss, AveragedSACLoss):
+            views |= SECOND_VIEWS
+            encoded |= {"pixels_view": "features_view", ("next", "pixels_view"): ("next", "features_view")}
+        shift = RandomShift(pad=SHIFT_PAD, in_keys=[*views.values(), *PIXELS], out_keys=[*views, *PIXELS],
+                            generator=self.generators["shift"])  # fmt: skip
+        replay.append_transform(shift)
         # Adds the features of every image to a batch, without gradient.
-        keys = [features_key(key) for key in images]
-        self.encode = FrozenEncoder(self.loss.encoder, in_keys=images, out_keys=keys)
+        self.encode = FrozenEncoder(self.loss.encoder, in_keys=[*encoded], out_keys=[*encoded.values()])
         return replay
-
-
-def features_key(pixels_key: NestedKey) -> NestedKey:
-    """Return the key of an image entry's features.
-
-    Examples:
-        >>> features_key(("next", "pixels_view"))
-        ('next', 'features_view')
-    """
-    *lead, last = (pixels_key,) if isinstance(pixels_key, str) else pixels_key
-    return unravel_key((*lead, str(last).replace("pixels", "features")))
 
 
 def _named(domains: str | Domain | Sequence[str | Domain], method: Method) -> dict[str, str | Domain]:
@@ -570,12 +553,3 @@ def _named(domains: str | Domain | Sequence[str | Domain], method: Method) -> di
             "or use the method's cross-domain variant (-c)."
         )
     return named
-
-
-def _exploring_method(loss: LossModule) -> Method:
-    """Return the method of a loss, or else the first one of its class that explores."""
-    found = method_of(loss)
-    if found.exploration is not None:
-        return found
-    rows = [get_method(name) for name in method_names()]
-    return next((row for row in rows if row.loss_class is type(loss) and row.exploration is not None), found)

@@ -181,8 +181,10 @@ def pretrain(
         run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor,
                  generators=generators, **samplers)  # fmt: skip
 
+        before_update = getattr(loss, "before_update", lambda: None)  # prototypes are brought to unit length
+
         def update(batch: TensorDictBase) -> TensorDictBase:
-            before_update(loss)  # prototypes are brought to unit length
+            before_update()
             losses = loss(batch)
             optimizer.zero_grad(set_to_none=True)
             total_loss(losses).backward()
@@ -276,12 +278,6 @@ def make_optimizer(
     for name, target in kept.items():
         getattr(loss, name).data.update_(target)
     return optimizer, schedule, targets
-
-
-def before_update(loss: LossModule) -> None:
-    """Call the loss's own ``before_update``, if it has one."""
-    if callable(hook := getattr(loss, "before_update", None)):
-        hook()
 
 
 def total_loss(losses: TensorDictBase) -> Tensor:
