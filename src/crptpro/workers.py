@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,19 @@ def can_be_sent(function: Callable[..., Any]) -> bool:
         return b"__main__" not in pickle.dumps(function) or bool(main_file and Path(main_file).exists())
     except Exception:  # objects may refuse in ways of their own
         return False
+
+
+class Inline(Executor):
+    """An executor that does the work at once, where it is submitted."""
+
+    def submit(self, function: Any, /, *arguments: Any, **options: Any) -> Future[Any]:
+        """Call the function; its exception is that of the result."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(function(*arguments, **options))
+        except BaseException as reason:
+            future.set_exception(reason)
+        return future
 
 
 class WorkerPool(ProcessPoolExecutor):

@@ -10,18 +10,16 @@ import sys
 import textwrap
 import time
 import zlib
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torchrl.modules import RandomPolicy
-from toy_gymnasium import PAINTER
 from toy_world import (
     DYING,
     FAILING,
@@ -48,6 +46,7 @@ from crptpro.errors import (
     WorldFailedError,
 )
 from crptpro.seeding import derive_seed
+from crptpro.workers import Inline
 
 SMALL: dict[str, Any] = {"image_size": 8, "progress": False}
 ASKED: dict[str, Any] = {"transitions": 65, "seed": 3, **SMALL}
@@ -112,42 +111,27 @@ def test_an_endless_episode_is_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not dataset.transitions["next", "terminated"].any()
 
 
-class Shuffled:
-    """Stands for the pool: three episodes under way, of which any may be the next to finish, or none ever."""
-
-    finishes = True
+class Pool(Inline):
+    """Stands for a pool of processes."""
 
     def __init__(self, workers: int, prepare: Any, *arguments: Any):
         prepare(*arguments)
-        self.processes: dict[int, Any] = {}
 
-    def submit(self, work: Any, *arguments: Any) -> Future:
-        future: Future = Future()
-        if self.finishes:
-            future.set_result(work(*arguments))
-        return future
-
-    def end(self) -> None:
-        collect._roller.close()
+    def end(self) -> None: ...
 
 
-@pytest.mark.parametrize("order", range(2))
-def test_the_order_in_which_episodes_finish_does_not_change_the_data(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, collected: dict[str, Path], order: int
+def test_the_number_of_workers_does_not_change_the_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, collected: dict[str, Path]
 ) -> None:
-    def any_of(running: list[Future], *_: Any) -> Any:
-        return SimpleNamespace(done={choose.choice(running)})
-
-    choose = random.Random(order)
-    monkeypatch.setattr(collect, "WorkerPool", Shuffled)
-    monkeypatch.setattr(collect, "wait", any_of)
+    monkeypatch.setattr(collect, "WorkerPool", Pool)
     again = collect_group([VARIABLE, FIXED], tmp_path, workers=3, **ASKED)
     for name, path in collected.items():
         assert data_bytes(again[name]) == data_bytes(path)
 
 
-def test_processes_that_hang_are_noticed_and_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collect, "WorkerPool", type("Hanging", (Shuffled,), {"finishes": False}))
+def test_processes_that_hang_are_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(collect, "WorkerPool", Pool)
+    monkeypatch.setattr(Pool, "submit", lambda *_: Future())
     monkeypatch.setattr(collect, "STALL_S", 0.1)
     with pytest.raises(RenderingError, match=r"episode 0 of toy-fixed.*no sign of life.*MUJOCO_GL"):
         collect_random(FIXED, tmp_path, transitions=50, workers=2, **SMALL)
@@ -217,12 +201,11 @@ def test_domains_are_collected_once_each_into_safe_directories(
     assert dataset_path(tmp_path, "gymnasium:Half/Cheetah-v5") == tmp_path / "gymnasium-Half-Cheetah-v5"
 
 
-def test_a_world_that_draws_by_itself_is_collected_without_gl(
+def test_a_world_that_draws_by_itself_is_collected_without_gl_and_the_card_says_with_what(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rendering, "select_backend", lambda **_: pytest.fail("a GL backend was proven"))
-    card = FrameDataset.open(collect_random(PAINTER, tmp_path, transitions=5, quality="fast", **SMALL)).card
-    assert card["render"]["backend"] == "none"
+    card = FrameDataset.open(collect_random(FIXED, tmp_path, transitions=5, quality="fast", **SMALL)).card
     assert (card["quality"], card["image_size"]) == ("fast", 8)
     assert {"torch", "torchrl", "mujoco", "python"} <= set(card["versions"])
     assert card["sessions"][0]["versions"] == card["versions"]
@@ -289,7 +272,7 @@ PROGRAM = """
     {more}
     if __name__ == "__main__":
         {limit}
-        collect_random(SLOW, {root!r}, transitions=200, seed=1, workers={workers}, image_size=8)
+        collect_random(SLOW, {root!r}, transitions=300, seed=1, workers={workers}, image_size=8)
 """
 
 
@@ -336,30 +319,38 @@ def stop_while_collecting(process: subprocess.Popen, path: Path, how: int, *, wh
 
 
 @pytest.mark.slow
-def test_interrupted_killed_and_started_again_gives_the_same_bytes(tmp_path: Path) -> None:
-    whole, path = tmp_path / "whole", tmp_path / "data" / "toy-slow"
-    collect_toy(whole, variable_length, domain="toy-slow", seed=1, transitions=200)
-
-    errors = stop_while_collecting(start(tmp_path, path.parent), path, signal.SIGINT, whole_group=True)
+def test_interrupted_or_killed_and_started_again_gives_the_same_bytes(tmp_path: Path) -> None:
+    whole = collect_toy(tmp_path / "whole", variable_length, domain="toy-slow", seed=1, transitions=300)
+    interrupted, killed = tmp_path / "interrupted", tmp_path / "killed"
+    with ThreadPoolExecutor(2) as threads:
+        stops = [
+            threads.submit(
+                stop_while_collecting, start(tmp_path, root), root / "toy-slow", how, whole_group=is_group
+            )
+            for root, how, is_group in ((interrupted, signal.SIGINT, True), (killed, signal.SIGKILL, False))
+        ]
+    errors = stops[0].result()
     assert errors.count(b"Traceback") == 1  # as Ctrl-C does: the program's own, none of its processes'
     assert b"KeyboardInterrupt" in errors
-    with pytest.raises(DatasetError, match="is unfinished"):
-        FrameDataset.open(path)
-    stop_while_collecting(start(tmp_path, path.parent), path, signal.SIGKILL, whole_group=False)
-    assert not (path / "card.json").exists()
-
-    assert collect_random(SLOW, path.parent, transitions=200, seed=1, **SMALL) == path
-    assert data_bytes(path) == data_bytes(whole)
+    stops[1].result()
+    for root in (interrupted, killed):
+        with pytest.raises(DatasetError, match="is unfinished"):
+            FrameDataset.open(root / "toy-slow")
+        path = collect_random(SLOW, root, transitions=300, seed=1, **SMALL)
+        assert data_bytes(path) == data_bytes(whole)
 
 
 @pytest.mark.slow
 def test_processes_that_cannot_be_started_are_an_error_that_says_why(tmp_path: Path) -> None:
     few = "import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (32, 32))"
-    errors = start(tmp_path, tmp_path / "few", workers=8, limit=few).communicate(timeout=300)[1]
-    assert b"This shell allows 32 open files: raise that (`ulimit -n 4096`), or use fewer workers" in errors
     unguarded = 'collect_random(SLOW, sys.argv[0] + "data", transitions=400, workers=2, image_size=8)'
-    errors = start(tmp_path, tmp_path / "unguarded", more=unguarded).communicate(timeout=300)[1]
-    assert b'needs `if __name__ == "__main__":` around its main program' in errors
+    programs = [
+        start(tmp_path, tmp_path / "few", workers=8, limit=few),
+        start(tmp_path, tmp_path / "unguarded", more=unguarded),
+    ]
+    limited, unguarded_said = (program.communicate(timeout=300)[1] for program in programs)
+    assert b"This shell allows 32 open files: raise that (`ulimit -n 4096`), or use fewer workers" in limited
+    assert b'needs `if __name__ == "__main__":` around its main program' in unguarded_said
 
 
 # --- with the real renderer

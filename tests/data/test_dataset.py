@@ -161,14 +161,6 @@ def test_indexing_follows_tensors(dataset: FrameDataset, index: Any) -> None:
         dataset[26]
 
 
-def test_frames_have_their_physical_state_beside_them(
-    dataset: FrameDataset, episodes: list[TensorDict]
-) -> None:
-    assert torch.equal(dataset.frames["pixels"][5], episodes[1]["pixels"][0])
-    assert torch.equal(dataset.frames["qvel"][5], episodes[1]["qvel"][0])
-    assert dataset.frames["qpos"].dtype == torch.float64
-
-
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda dataset: pickle.loads(pickle.dumps(dataset))])
 def test_a_copy_samples_what_the_original_samples(path: Path, copied: Any) -> None:
     dataset = FrameDataset.open(path, generator=torch.Generator().manual_seed(1), frame_stack=2)

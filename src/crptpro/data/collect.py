@@ -9,8 +9,9 @@ import pickle
 import re
 import signal
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures import Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -28,7 +29,7 @@ from crptpro.errors import CRPTproError, DatasetError, RenderingError, WorkerLos
 from crptpro.progress import Progress
 from crptpro.seeding import derive_seed, kept_global_rng, require_seed
 from crptpro.values import Colors, Quality, as_int, as_path
-from crptpro.workers import SPAWN, WorkerPool, can_be_sent
+from crptpro.workers import SPAWN, Inline, WorkerPool, can_be_sent
 
 logger = logging.getLogger(__name__)
 
@@ -106,7 +107,7 @@ def collect_group(
     require_seed(seed)
     root, image_size = as_path(root, "root"), as_int(image_size, "image_size", minimum=1)
     paths: dict[str, Path] = {}
-    jobs: list[_Collection] = []
+    jobs: list[_Job] = []
     with ExitStack() as stack:
         for domain in map(get_domain, expand_groups(domains)):
             path = dataset_path(root, domain.name)
@@ -126,9 +127,7 @@ def collect_group(
                 continue
             stack.callback(dataset.writer.close)
             make = functools.partial(make_env, domain, seed=0, frame_stack=1, physics_state=True, **settings)
-            jobs.append(
-                _Collection(domain, dataset, make, seed, episode_length(domain, action_repeat=repeat))
-            )
+            jobs.append(_Job(domain, dataset, make, seed, episode_length(domain, action_repeat=repeat)))
         if jobs:
             _announce(jobs, root, image_size)
             for job in jobs if workers > 1 else ():
@@ -169,11 +168,8 @@ def collect_episode(
     return env.rollout(limit, policy, callback, auto_reset=False, tensordict=first, return_contiguous=True)
 
 
-class _Collection:
-    """One dataset, and its episodes that run or wait for an earlier one.
-
-    Episodes may finish in any order and are appended in order, so that the dataset depends on the request alone.
-    """
+class _Job:
+    """One dataset; its episodes are planned, and appended, in the order of their indices."""
 
     def __init__(
         self,
@@ -185,54 +181,39 @@ class _Collection:
     ):
         self.domain, self.dataset, self.make, self.seed = domain, dataset, make, seed
         self.writer: Any = dataset.writer
-        self.usual_length = length
+        self.planned, self.usual_length = self.writer.episodes, length
         self.longest = max(LONGEST_EPISODE_AGENT_STEPS, length or 0)
-        self.running: set[int] = set()
-        self.waiting: dict[int, TensorDictBase] = {}
+        self.queue: deque[tuple[str, Future]] = deque()
 
     @property
     def missing(self) -> int:
         """Transitions that are not durable yet."""
         return self.writer.target - self.writer.transitions
 
-    def next_plan(self, ahead: int) -> dict[str, Any] | None:
-        """Return the next episode worth starting, at most ``ahead`` under way; ``None`` if those should suffice."""
-        first = index = self.writer.episodes
-        wanted = limit = self.missing
-        while index in self.running or index in self.waiting:
-            known = len(self.waiting[index]) if index in self.waiting else None
-            wanted -= known or self.usual_length or 1
-            limit -= known or 1  # a running one has at least one transition
-            index += 1
-        if wanted <= 0 or index - first >= ahead:
+    def next_plan(self) -> dict[str, Any] | None:
+        """Return the next episode worth starting, or ``None`` if those under way should suffice."""
+        index, name = self.planned, self.domain.name
+        under_way = index - self.writer.episodes
+        if self.missing <= under_way * (self.usual_length or 1):
             return None
-        self.running.add(index)
-        name = self.domain.name
+        self.planned += 1
         return {
             "domain": name,
             "episode": index,
             "env_seed": derive_seed(self.seed, "collect", name, index),
             "action_seed": derive_seed(self.seed, "collect-actions", name, index),
-            "limit": min(limit, self.longest),
+            "limit": min(self.missing - under_way, self.longest),
         }
 
-    def accept(self, index: int, card: Mapping[str, Any], rollout: TensorDictBase) -> None:
-        """Take a finished episode; it and those that waited for it are durable when this returns."""
-        self.running.discard(index)
-        if self.dataset.is_complete:
-            return
+    def accept(self, card: Mapping[str, Any], rollout: TensorDictBase) -> None:
+        """Append an episode, which is durable when this returns."""
         self.writer.note_environment(card)
-        self.waiting[index] = rollout
-        while not self.dataset.is_complete and self.writer.episodes in self.waiting:
-            episode = self.waiting.pop(self.writer.episodes)
-            self.usual_length = self.usual_length or len(episode)
-            self.dataset.extend(episode)
-            self.writer.end_episode()
-        if self.dataset.is_complete:
-            self.waiting.clear()
+        self.usual_length = self.usual_length or len(rollout)
+        self.dataset.extend(rollout)
+        self.writer.end_episode()
 
 
-def _announce(jobs: list[_Collection], root: Path, image_size: int) -> None:
+def _announce(jobs: list[_Job], root: Path, image_size: int) -> None:
     """Say how much will be written (action and state: at most 1 kB each), and refuse what the disk cannot hold."""
     sizes = {}
     for job in jobs:
@@ -243,32 +224,27 @@ def _announce(jobs: list[_Collection], root: Path, image_size: int) -> None:
     require_disk(root, sum(sizes.values()), f"Collecting {', '.join(sizes)}")
 
 
-def _collect(jobs: list[_Collection], workers: int, progress: bool) -> None:
-    with ExitStack() as stack:
-        crew = stack.enter_context(closing(_Crew({job.domain.name: job.make for job in jobs}, workers)))
-        bars = [
-            Progress(job.writer.target, job.writer.transitions, "transitions", label=job.domain.name,
-                     is_shown=progress, lines=10)
-            for job in jobs
-        ]  # fmt: skip
-        for bar in bars:
-            stack.callback(bar.close)
-        running: dict[Future, tuple[_Collection, dict[str, Any]]] = {}
-        while any(not job.dataset.is_complete for job in jobs):
-            for job in jobs:  # all workers on the first that needs one: each makes each environment once
-                while len(running) < workers and (plan := job.next_plan(4 * workers)) is not None:
-                    running[crew.submit(plan)] = (job, plan)
-            plans = [plan for _, plan in running.values()]
-            for future in crew.finished(list(running), ", ".join(map(_describe, plans))):
-                job, plan = running.pop(future)
-                job.accept(plan["episode"], *pickle.loads(future.result()))
-            for job, bar in zip(jobs, bars):
-                bar.reach(min(bar.total, job.writer.transitions + sum(map(len, job.waiting.values()))))
+def _collect(jobs: list[_Job], workers: int, progress: bool) -> None:
+    ahead = 2 * workers if workers > 1 else 1
+    with closing(_Crew({job.domain.name: job.make for job in jobs}, workers)) as crew:
+        for job in jobs:
+            name, writer = job.domain.name, job.writer
+            bar = Progress(
+                writer.target, writer.transitions, "transitions", label=name, is_shown=progress, lines=10
+            )
+            while not job.dataset.is_complete:
+                for each in jobs:  # all workers on the first that needs one: each makes each environment once
+                    while not job.queue or sum(len(other.queue) for other in jobs) < ahead:
+                        if (plan := each.next_plan()) is None:
+                            break
+                        episode = f"episode {plan['episode']} of {plan['domain']}"
+                        each.queue.append((episode, crew.submit(plan, episode)))
+                episode, future = job.queue.popleft()
+                job.accept(*pickle.loads(crew.result(future, episode)))
+                bar.reach(writer.transitions)
                 bar.show()
-
-
-def _describe(plan: Mapping[str, Any]) -> str:
-    return f"episode {plan['episode']} of {plan['domain']}"
+            job.queue.clear()  # more was under way than was needed
+            bar.close()
 
 
 class _Crew:
@@ -276,20 +252,15 @@ class _Crew:
 
     def __init__(self, factories: Mapping[str, Callable[[], EnvBase]], workers: int):
         self.workers, self._steps = workers, SPAWN.RawValue("q", 0)
-        self._seen, self._seen_s = 0, time.monotonic()
         self._roller = _Roller(factories, self._steps)
-        self._pool = WorkerPool(workers, _prepare, factories, self._steps) if workers > 1 else None
+        self._work = _work if workers > 1 else self._roller.roll
+        self._pool: Any = WorkerPool(workers, _prepare, factories, self._steps) if workers > 1 else Inline()
 
-    def submit(self, plan: dict[str, Any]) -> Future:
-        if self._pool is None:
-            future: Future = Future()
-            with kept_global_rng():
-                future.set_result(self._roller.roll(plan))
-            return future
+    def submit(self, plan: dict[str, Any], episode: str) -> Future:
         try:
-            return self._pool.submit(_work, plan)
+            return self._pool.submit(self._work, plan)
         except BrokenProcessPool:
-            raise self._lost(_describe(plan)) from None
+            raise self._lost(episode) from None
         except OSError as reason:
             hint = "Use fewer workers."
             if reason.errno == errno.EMFILE:
@@ -301,23 +272,25 @@ class _Crew:
                 f"{self.workers} collecting processes cannot be started: {reason}. {hint}"
             ) from reason
 
-    def finished(self, running: list[Future], episodes: str) -> list[Future]:
-        """Wait a second for ``episodes``, and make sure that somebody works."""
-        done = list(wait(running, 1.0, FIRST_COMPLETED).done)
-        if any(isinstance(future.exception(), BrokenProcessPool) for future in done):
-            raise self._lost(episodes)
-        if done or self._steps.value != self._seen:
-            self._seen, self._seen_s = self._steps.value, time.monotonic()
-        elif time.monotonic() - self._seen_s > STALL_S:
-            raise RenderingError(
-                f"The processes that collect {episodes} have given no sign of life for {STALL_S:.0f} s; a render "
-                f"driver that hangs is the usual cause. {_AGAIN}, with fewer workers or another backend "
-                "(MUJOCO_GL=osmesa, or egl)."
-            )
-        return done
+    def result(self, future: Future, episode: str) -> bytes:
+        """Wait for an episode as long as somebody works."""
+        seen, seen_s = -1, 0.0
+        while not wait([future], 1.0).done:
+            if self._steps.value != seen:
+                seen, seen_s = self._steps.value, time.monotonic()
+            elif time.monotonic() - seen_s > STALL_S:
+                raise RenderingError(
+                    f"The processes that collect {episode} have given no sign of life for {STALL_S:.0f} s; a render "
+                    f"driver that hangs is the usual cause. {_AGAIN}, with fewer workers or another backend "
+                    "(MUJOCO_GL=osmesa, or egl)."
+                )
+        try:
+            return future.result()
+        except BrokenProcessPool:
+            raise self._lost(episode) from None
 
-    def _lost(self, episodes: str) -> WorkerLostError:
-        processes = self._pool.processes.values() if self._pool is not None else ()
+    def _lost(self, episode: str) -> WorkerLostError:
+        processes = self._pool.processes.values()
         for process in processes:
             process.join(2.0)
         codes = [process.exitcode for process in processes]
@@ -329,11 +302,11 @@ class _Crew:
             hint = "Out of memory is the usual cause of signal 9: use fewer workers."
         elif not self._steps.value:
             hint += ' A script that collects needs `if __name__ == "__main__":` around its main program.'
-        return WorkerLostError(f"A process that collected ({episodes}) {how}. {hint} {_AGAIN}.")
+        return WorkerLostError(f"A process that collected ({episode}) {how}. {hint} {_AGAIN}.")
 
     def close(self) -> None:
         self._roller.close()
-        if self._pool is not None:
+        if self.workers > 1:
             self._pool.end()
 
 
@@ -356,7 +329,8 @@ class _Roller:
                 self._domain, self._env = plan["domain"], self._factories[plan["domain"]]()
             env: Any = self._env
             seeds = {name: plan[name] for name in ("env_seed", "action_seed", "limit")}
-            rollout = collect_episode(env, callback=count, **seeds)
+            with kept_global_rng():
+                rollout = collect_episode(env, callback=count, **seeds)
         except CRPTproError:
             raise
         except Exception as reason:

@@ -86,13 +86,8 @@ class FrameDataset(ReplayBuffer):
     ) -> FrameDataset:
         """Begin a dataset, or continue one that was interrupted; a complete one is opened.
 
-        Args:
-            path: its directory.
-            domain: the domain's name.
-            transitions: after which it is complete, and can be sampled; the last episode is cut to fit.
-            frame_stack: k, frames per stack.
-            **about: further facts of the card that two attempts must agree in: ``task``, ``seed``, ``action_repeat``,
-                ``quality``, ...
+        It is complete, and can be sampled, after so many transitions; the last episode is cut to fit. ``about`` are
+        further facts of the card that two attempts must agree in: ``task``, ``seed``, ``action_repeat``, ...
 
         Raises:
             DatasetError: if the directory holds something else, or another process is writing there.

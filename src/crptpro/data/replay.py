@@ -83,7 +83,6 @@ class FrameReplay(ReplayBuffer):
     Raises:
         DiskSpaceError: if the disk cannot hold the ring.
         CheckpointError: if ``path`` holds a ring of another size.
-        ValueError: for sizes that cannot be, or an extra column with the name of something that a sample has anyway.
 
     Examples:
         >>> from tensordict import TensorDict

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,14 @@ from torchrl.objectives import SoftUpdate
 
 from crptpro.artifact import read_artifact, write_artifact
 from crptpro.errors import CheckpointError, NonFiniteError
-from crptpro.modules import PixelEncoder, SquashedGaussianActor, resolve_precision, set_compute_dtype
+from crptpro.modules import (
+    DeterministicActor,
+    PixelEncoder,
+    SquashedGaussianActor,
+    TwinCritic,
+    resolve_precision,
+    set_compute_dtype,
+)
 from crptpro.objectives import RADSACLoss, SkillDDPGLoss
 from crptpro.provenance import provenance
 from crptpro.training.compile import accelerate
@@ -72,15 +79,9 @@ class PixelAgent(nn.Module):
 
 
 def save_agent(path: str | Path, agent: PixelAgent, *, card: Mapping[str, Any]) -> Path:
-    """Write encoder and actor with a card; whole or not at all.
+    """Write encoder and actor into a directory with a card, whole or not at all.
 
-    Args:
-        path: directory to write or replace.
-        agent: what to keep; its encoder must be a :class:`~crptpro.modules.PixelEncoder` to be rebuilt from the card.
-        card: what else the reader should know: task, seed, env steps, where the encoder came from.
-
-    Raises:
-        DiskSpaceError: if the disk is full; an agent there is kept.
+    The card has what else the reader should know. A :class:`~crptpro.modules.PixelEncoder` can be rebuilt from it.
     """
     modules = {"encoder": agent.encoder, "actor": agent.actor}
     content = {
@@ -130,13 +131,7 @@ class SACLearner:
     Each of the three has its own Adam, as in Proto-RL's and CRPTpro's released agents. Actor and temperature step at
     every ``actor_interval``-th agent step, the target moves at every ``target_interval``-th.
 
-    Args:
-        loss: the SAC losses; their parameters are trained in place.
-        learning_rate: of the three optimisers.
-        critic_tau: EMA rate of the target critic.
-        actor_interval: agent steps between two actor steps.
-        target_interval: agent steps between two target updates.
-        compile: compile the losses.
+    ``critic_tau`` is the EMA rate of the target critic; ``compile`` compiles the losses.
     """
 
     def __init__(
@@ -209,3 +204,37 @@ class SkillDDPGLearner(SACLearner):
         self._step(losses["loss_actor"], "actor")
         self.targets.step()
         return losses.detach()
+
+
+def make_sac(
+    loss_class: Callable[..., RADSACLoss],
+    feature_dim: int,
+    action_dim: int,
+    *,
+    hidden_dim: int,
+    device: torch.device,
+    has_tanh: bool = False,
+    actor: nn.Module | None = None,
+    learner: Mapping[str, Any],
+    **options: Any,
+) -> SACLearner:
+    """Return a learner of fresh networks, or of a given actor, on a device; ``options`` are the loss's."""
+    widths: dict[str, Any] = {"hidden_dim": hidden_dim, "has_tanh": has_tanh}
+    actor = actor or SquashedGaussianActor(feature_dim, action_dim, **widths)
+    critic = TwinCritic(feature_dim, action_dim, **widths)
+    return SACLearner(loss_class(actor.to(device), critic.to(device), **options), **learner)
+
+
+def make_skill_ddpg(
+    feature_dim: int,
+    action_dim: int,
+    skill_dim: int,
+    *,
+    hidden_dim: int,
+    device: torch.device,
+    **options: Any,
+) -> SkillDDPGLearner:
+    """Return BeCL's explorer with fresh networks on a device; ``options`` are the loss's."""
+    actor = DeterministicActor(feature_dim, action_dim, skill_dim=skill_dim, hidden_dim=hidden_dim)
+    critic = TwinCritic(feature_dim + skill_dim, action_dim, hidden_dim=hidden_dim, has_tanh=True)
+    return SkillDDPGLearner(SkillDDPGLoss(actor.to(device), critic.to(device), **options))

@@ -22,19 +22,13 @@ from crptpro.domains import Domain
 from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CheckpointError, PretrainedError
 from crptpro.logging import RunLogger
-from crptpro.modules import (
-    SquashedGaussianActor,
-    TwinCritic,
-    resolve_precision,
-    set_compute_dtype,
-    usable_device,
-)
+from crptpro.modules import SquashedGaussianActor, resolve_precision, set_compute_dtype, usable_device
 from crptpro.modules.precision import Precision
 from crptpro.objectives import DrQLoss, RADSACLoss, get_method, method_names
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import derive_seed, seed_everything
-from crptpro.training.agent import PixelAgent, SACLearner, save_agent
+from crptpro.training.agent import PixelAgent, SACLearner, make_sac, save_agent
 from crptpro.training.evaluate import WORKER_BYTES, Episode, Evaluator, summarize
 from crptpro.training.pretrain import SHIFT_PAD, precision_name
 from crptpro.training.run import Generators, Run
@@ -326,22 +320,16 @@ def _make_agent(
 ) -> tuple[SACLearner, PixelAgent]:
     """Return SAC on the encoder's features, or DrQ, whose critic trains the encoder, and the agent that acts."""
     action_dim, device = env.action_spec.shape[-1], torch.device(config.device)
-    is_drq, explored = pretrained.method == "drq", pretrained.actor
-    widths: dict[str, Any] = {"hidden_dim": config.hidden_dim, "has_tanh": is_drq}
+    is_drq, explored, actor = pretrained.method == "drq", pretrained.actor, None
     if isinstance(explored, SquashedGaussianActor) and explored.config["action_dim"] == action_dim:
         actor = copy.deepcopy(explored).requires_grad_(True).train()  # it explored the task's own domain
-    else:
-        actor = SquashedGaussianActor(encoder.feature_dim, action_dim, **widths)
-    critic = TwinCritic(encoder.feature_dim, action_dim, **widths).to(device)
-    options: dict[str, Any] = {
-        "gamma": config.discount, "alpha_init": config.initial_temperature, "generator": generator,
-    }  # fmt: skip
-    if is_drq:
-        loss: RADSACLoss = DrQLoss(encoder.requires_grad_(True), actor.to(device), critic, **options)
-    else:
-        loss = RADSACLoss(actor.to(device), critic, **options)
-    rates = {"learning_rate": config.learning_rate, "critic_tau": config.critic_tau}
-    return SACLearner(loss, compile=config.compile, **rates), PixelAgent(encoder, loss.actor)
+    learner = make_sac(
+        functools.partial(DrQLoss, encoder.requires_grad_(True)) if is_drq else RADSACLoss,
+        encoder.feature_dim, action_dim, hidden_dim=config.hidden_dim, device=device, has_tanh=is_drq, actor=actor,
+        gamma=config.discount, alpha_init=config.initial_temperature, generator=generator,
+        learner={name: getattr(config, name) for name in ("learning_rate", "critic_tau", "compile")},
+    )  # fmt: skip
+    return learner, PixelAgent(encoder, learner.loss.actor)
 
 
 def _make_replay(

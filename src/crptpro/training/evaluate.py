@@ -35,19 +35,16 @@ WORKER_BYTES = 500_000_000
 
 @dataclass(frozen=True)
 class Episode:
-    """One evaluated episode.
-
-    Attributes:
-        episode: index within the evaluation, from 0.
-        episode_return: sum of the environment's own rewards, without any bonus.
-        agent_steps: decisions, ``env_steps / action_repeat``.
-        seed: what the environment was seeded with before its reset.
-    """
+    """One evaluated episode."""
 
     episode: int
+    """index within the evaluation, from 0"""
     episode_return: float
+    """sum of the environment's own rewards, without any bonus"""
     agent_steps: int
+    """decisions, ``env_steps / action_repeat``"""
     seed: int
+    """what the environment was seeded with before its reset"""
 
 
 def evaluate(

@@ -24,26 +24,11 @@ from crptpro.domains import Domain, get_domain
 from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CRPTproError
 from crptpro.logging import RunLogger
-from crptpro.modules import (
-    DeterministicActor,
-    SquashedGaussianActor,
-    TwinCritic,
-    computing,
-    resolve_precision,
-    set_compute_dtype,
-    usable_device,
-)
+from crptpro.modules import computing, resolve_precision, set_compute_dtype, usable_device
 from crptpro.modules.precision import Precision
-from crptpro.objectives import (
-    AveragedSACLoss,
-    Method,
-    RADSACLoss,
-    SkillDDPGLoss,
-    get_method,
-    method_of,
-)
+from crptpro.objectives import AveragedSACLoss, Method, RADSACLoss, get_method, method_of
 from crptpro.seeding import derive_seed
-from crptpro.training.agent import PixelAgent, SACLearner, SkillDDPGLearner
+from crptpro.training.agent import PixelAgent, SACLearner, SkillDDPGLearner, make_sac, make_skill_ddpg
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.pretrain import (
     SHIFT_PAD,
@@ -70,7 +55,7 @@ SECOND_VIEWS: dict[NestedKey, NestedKey] = {
     "pixels_view": "pixels",
     ("next", "pixels_view"): ("next", "pixels"),
 }
-AGENT_LEARNING_RATE, DISCOUNT = 1e-4, 0.99
+DISCOUNT = 0.99
 
 
 @dataclass(frozen=True)
@@ -172,11 +157,7 @@ class ExplorationPlan:
 def plan_exploration(
     method: Method, domains: Sequence[str | Domain], config: ExploreConfig | None = None
 ) -> ExplorationPlan:
-    """Spread a method's budget over domains.
-
-    Raises:
-        CRPTproError: the method does not explore, or the budget ends before the first update.
-    """
+    """Spread a method's budget over domains; refused if the method does not explore, or would learn nothing."""
     if method.exploration is None:
         raise CRPTproError(f"{method.name} learns from datasets and does not explore; use pretrain().")
     settings = (config or ExploreConfig()).resolved(method)
@@ -243,16 +224,13 @@ def pretrain_active(
         run_dir: records (``pretrain.csv``, ``explore.csv``, ``episodes.csv``), replays and checkpoints; ``None`` keeps
             nothing but the result.
         config: every number.
-        records: used instead of a record in ``run_dir``.
-        progress: show a bar, or lines in a log file.
+        records: as of :func:`~crptpro.training.pretrain`.
+        progress: likewise.
         **overrides: single settings of :class:`ExploreConfig`, e.g. ``env_steps=50_000``.
 
     Raises:
         CRPTproError: a single-domain method was given several domains, the loss does not suffice for the reward, or
-            the budget is too small for any update.
-        CheckpointError: ``run_dir`` holds a run of other settings (named).
-        NonFiniteError: a loss, a weight or an action is not finite; the last checkpoint is kept.
-        DiskSpaceError: the disk cannot hold the replays.
+            the budget is too small for any update; otherwise as :func:`~crptpro.training.pretrain`.
     """
     recipe = method_of(loss) if method is None else get_method(method)
     asked = dataclasses.replace(config or ExploreConfig(), **overrides)
@@ -473,24 +451,16 @@ class Explorer:
         self._td = step_mdp(transition)
 
     def _make_learner(self, feature_dim: int, action_dim: int) -> SACLearner:
-        kind, hidden = self.exploration.agent, self.config.hidden_dim
+        kind, skills = self.exploration.agent, self.exploration.skill_dim
+        shared: dict[str, Any] = {
+            "hidden_dim": self.config.hidden_dim, "device": self.device, "generator": self.generators["policy"],
+        }  # fmt: skip
         if kind == "skill-ddpg":
-            skills = self.exploration.skill_dim
-            actor: nn.Module = DeterministicActor(
-                feature_dim, action_dim, skill_dim=skills, hidden_dim=hidden
-            )
-            critic = TwinCritic(feature_dim + skills, action_dim, hidden_dim=hidden, has_tanh=True)
-        else:
-            actor = SquashedGaussianActor(feature_dim, action_dim, hidden_dim=hidden)
-            critic = TwinCritic(feature_dim, action_dim, hidden_dim=hidden)
-        networks: Any = (actor.to(self.device), critic.to(self.device))
-        generator = self.generators["policy"]
-        if kind == "skill-ddpg":
-            skilled = SkillDDPGLoss(*networks, generator=generator)
-            return SkillDDPGLearner(skilled, learning_rate=AGENT_LEARNING_RATE)
+            return make_skill_ddpg(feature_dim, action_dim, skills, **shared)
         loss_class = {"rad-sac": RADSACLoss, "averaged-sac": AveragedSACLoss}[kind]
-        loss = loss_class(*networks, gamma=DISCOUNT, alpha_init=0.1, generator=generator)
-        return SACLearner(loss, learning_rate=AGENT_LEARNING_RATE)
+        return make_sac(
+            loss_class, feature_dim, action_dim, gamma=DISCOUNT, alpha_init=0.1, learner={}, **shared
+        )
 
     def _make_reward(self) -> Transform:
         loss, generator, kind = self.loss, self.generators["reward"], self.exploration.reward

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -20,9 +20,9 @@ from crptpro.envs import make_env, needs_gl
 from crptpro.envs.rendering import select_backend
 from crptpro.provenance import cpu_cores
 from crptpro.training.run import Run
+from crptpro.workers import Inline
 
 SPARE_FRAMES = 2_000
-T = TypeVar("T")
 
 
 class EnvThread:
@@ -51,11 +51,11 @@ class EnvThread:
         # With one thread of torch others want the cores.
         has_cores = config.device == "cpu" and cpu_cores() > 1 and torch.get_num_threads() > 1
         runs_ahead = has_cores and not (needs_gl(domain) and select_backend() == "glfw")
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="environment") if runs_ahead else None
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="environment") if runs_ahead else Inline()
         try:
-            self.env = self._submit(self.make_env).result()
+            self.env: EnvBase = self._thread.submit(self.make_env).result()
         except BaseException:
-            self._shutdown()
+            self._thread.shutdown()
             raise
 
     def reset(self, seed: int) -> TensorDictBase:
@@ -65,11 +65,11 @@ class EnvThread:
             self.env.set_seed(seed)
             return self.env.reset()
 
-        return self._submit(reset).result()
+        return self._thread.submit(reset).result()
 
     def step(self, td: TensorDictBase) -> Future[TensorDictBase]:
         """Begin the step that ``td["action"]`` asks for; nobody may change ``td`` until its result is there."""
-        return self._submit(lambda: self.env.step(td))
+        return self._thread.submit(self.env.step, td)
 
     def uniform_action(self, generator: torch.Generator) -> Tensor:
         """Return a uniformly random action in ``[-1, 1]^A``."""
@@ -77,24 +77,8 @@ class EnvThread:
 
     def close(self) -> None:
         """Free the render context."""
-        try:
-            self._submit(self.env.close).result()
-        finally:
-            self._shutdown()
-
-    def _submit(self, work: Callable[[], T]) -> Future[T]:
-        if self._thread is not None:
-            return self._thread.submit(work)
-        future: Future[T] = Future()
-        try:
-            future.set_result(work())
-        except BaseException as reason:
-            future.set_exception(reason)
-        return future
-
-    def _shutdown(self) -> None:
-        if self._thread is not None:
-            self._thread.shutdown()
+        with self._thread:
+            self._thread.submit(self.env.close).result()
 
 
 def make_replay(run: Run, path: Path | None, env: EnvBase, capacity: int, **options: Any) -> FrameReplay:
