@@ -148,8 +148,6 @@ class Run:
         self._earlier_seconds = 0.0
         self._is_shown, self._progress = progress, Progress(0, 0, unit, is_shown=False)
 
-    # --- beginning and end --------------------------------------------------------------------------------------
-
     def __enter__(self) -> Run:
         with contextlib.ExitStack() as stack:
             stack.enter_context(kept_global_rng())
@@ -221,8 +219,6 @@ class Run:
                 self.records.truncate_to(stream, self.unit, -1)
         self._started = self._saved_time = self._row_time = time.monotonic()
 
-    # --- the loop -----------------------------------------------------------------------------------------------
-
     def until(self, total: int, *, checkpoint_interval: int | None = None) -> Iterator[int]:
         """Yield the position until it has reached ``total``; the body of the loop calls :meth:`advance`.
 
@@ -279,8 +275,6 @@ class Run:
         """Write the last checkpoint, of a complete run."""
         if not (self.saved.get("is_finished") and self.saved["position"] == self.position):
             self.save(is_finished=True)
-
-    # --- the record ---------------------------------------------------------------------------------------------
 
     def log(self, values: Mapping[str, Tensor], stream: str | None = None) -> None:
         """Take scalars of one update into the means of a stream's next row; the first stream's by default.
@@ -345,8 +339,6 @@ class Run:
         rows = self.history[stream] or self.rows(stream)
         left_out = {self.unit, *self.counters, "unix_time_s"}
         return {name: value for name, value in rows[-1].items() if name not in left_out} if rows else {}
-
-    # --- checkpoints --------------------------------------------------------------------------------------------
 
     def save(self, *, is_finished: bool = False) -> None:
         """Write a checkpoint of everything that :meth:`keep` was given, unless it is not finite; two are kept."""
