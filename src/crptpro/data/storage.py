@@ -70,9 +70,6 @@ def gather_stacks(frames: Tensor, rows: Tensor) -> Tensor:
     return stacks.view(len(rows), rows.shape[1] * channels, *size)
 
 
-# --- transitions as they come ----------------------------------------------------------------------------------------
-
-
 class Rows(NamedTuple):
     """T transitions in temporal order."""
 
@@ -161,9 +158,6 @@ def read_rows(
     columns["truncated"] = column("truncated", done & ~terminated)
     columns |= {name: entry(name) for name in extra}
     return Rows(stacks, next_stacks[:, -channels:], columns)
-
-
-# --- storages --------------------------------------------------------------------------------------------------------
 
 
 class StackStorage(Storage):

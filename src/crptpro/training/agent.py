@@ -206,7 +206,7 @@ class SkillDDPGLearner(SACLearner):
         return losses.detach()
 
 
-def make_sac(
+def make_sac_loss(
     loss_class: Callable[..., RADSACLoss],
     feature_dim: int,
     action_dim: int,
@@ -215,17 +215,16 @@ def make_sac(
     device: torch.device,
     has_tanh: bool = False,
     actor: nn.Module | None = None,
-    learner: Mapping[str, Any],
     **options: Any,
-) -> SACLearner:
-    """Return a learner of fresh networks, or of a given actor, on a device; ``options`` are the loss's."""
+) -> RADSACLoss:
+    """Return a SAC loss of fresh networks, or of a given actor, on a device; ``options`` are the loss's."""
     widths: dict[str, Any] = {"hidden_dim": hidden_dim, "has_tanh": has_tanh}
-    actor = actor or SquashedGaussianActor(feature_dim, action_dim, **widths)
+    actor = SquashedGaussianActor(feature_dim, action_dim, **widths) if actor is None else actor
     critic = TwinCritic(feature_dim, action_dim, **widths)
-    return SACLearner(loss_class(actor.to(device), critic.to(device), **options), **learner)
+    return loss_class(actor.to(device), critic.to(device), **options)
 
 
-def make_skill_ddpg(
+def make_skill_ddpg_loss(
     feature_dim: int,
     action_dim: int,
     skill_dim: int,
@@ -233,8 +232,8 @@ def make_skill_ddpg(
     hidden_dim: int,
     device: torch.device,
     **options: Any,
-) -> SkillDDPGLearner:
-    """Return BeCL's explorer with fresh networks on a device; ``options`` are the loss's."""
+) -> SkillDDPGLoss:
+    """Return the loss of BeCL's explorer with fresh networks on a device; ``options`` are the loss's."""
     actor = DeterministicActor(feature_dim, action_dim, skill_dim=skill_dim, hidden_dim=hidden_dim)
     critic = TwinCritic(feature_dim + skill_dim, action_dim, hidden_dim=hidden_dim, has_tanh=True)
-    return SkillDDPGLearner(SkillDDPGLoss(actor.to(device), critic.to(device), **options))
+    return SkillDDPGLoss(actor.to(device), critic.to(device), **options)

@@ -28,7 +28,7 @@ from crptpro.objectives import DrQLoss, RADSACLoss, get_method, method_names
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import derive_seed, seed_everything
-from crptpro.training.agent import PixelAgent, SACLearner, make_sac, save_agent
+from crptpro.training.agent import PixelAgent, SACLearner, make_sac_loss, save_agent
 from crptpro.training.evaluate import WORKER_BYTES, Episode, Evaluator, summarize
 from crptpro.training.pretrain import SHIFT_PAD, precision_name
 from crptpro.training.run import Generators, Run
@@ -156,19 +156,16 @@ DEFAULTS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class DownstreamResult:
-    """What a downstream run leaves.
-
-    Attributes:
-        agent: the trained agent; callable as a deterministic policy.
-        evaluations: one row per evaluated episode: ``env_steps``, ``episode``, ``episode_return``, ...
-        agent_path: artifact of the agent; ``None`` without a run directory.
-        env_steps: simulator steps taken.
-    """
+    """What a downstream run leaves."""
 
     agent: PixelAgent
+    """callable as a deterministic policy"""
     evaluations: list[dict[str, Any]]
+    """one row per evaluated episode: ``env_steps``, ``episode``, ``episode_return``, ..."""
     agent_path: Path | None
+    """artifact of the agent; ``None`` without a run directory"""
     env_steps: int
+    """simulator steps taken"""
 
 
 def train_downstream(
@@ -299,9 +296,6 @@ def train_downstream(
         return DownstreamResult(agent, run.rows("eval"), path, run.position)
 
 
-# --- parts ------------------------------------------------------------------------------------------------------------
-
-
 def _artifact(pretrained: Pretrained | str | Path, seed: int) -> Pretrained:
     if isinstance(pretrained, Pretrained):
         return pretrained
@@ -323,13 +317,13 @@ def _make_agent(
     is_drq, explored, actor = pretrained.method == "drq", pretrained.actor, None
     if isinstance(explored, SquashedGaussianActor) and explored.config["action_dim"] == action_dim:
         actor = copy.deepcopy(explored).requires_grad_(True).train()  # it explored the task's own domain
-    learner = make_sac(
+    loss = make_sac_loss(
         functools.partial(DrQLoss, encoder.requires_grad_(True)) if is_drq else RADSACLoss,
         encoder.feature_dim, action_dim, hidden_dim=config.hidden_dim, device=device, has_tanh=is_drq, actor=actor,
         gamma=config.discount, alpha_init=config.initial_temperature, generator=generator,
-        learner={name: getattr(config, name) for name in ("learning_rate", "critic_tau", "compile")},
     )  # fmt: skip
-    return learner, PixelAgent(encoder, learner.loss.actor)
+    rates = {"learning_rate": config.learning_rate, "critic_tau": config.critic_tau}
+    return SACLearner(loss, compile=config.compile, **rates), PixelAgent(encoder, loss.actor)
 
 
 def _make_replay(

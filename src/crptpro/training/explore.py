@@ -28,7 +28,13 @@ from crptpro.modules import computing, resolve_precision, set_compute_dtype, usa
 from crptpro.modules.precision import Precision
 from crptpro.objectives import AveragedSACLoss, Method, RADSACLoss, get_method, method_of
 from crptpro.seeding import derive_seed
-from crptpro.training.agent import PixelAgent, SACLearner, SkillDDPGLearner, make_sac, make_skill_ddpg
+from crptpro.training.agent import (
+    PixelAgent,
+    SACLearner,
+    SkillDDPGLearner,
+    make_sac_loss,
+    make_skill_ddpg_loss,
+)
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.pretrain import (
     SHIFT_PAD,
@@ -181,17 +187,14 @@ def plan_exploration(
 
 @dataclass(frozen=True)
 class ExploreResult(PretrainResult):
-    """How an active pre-training ended.
-
-    Attributes:
-        env_steps: simulator steps over all domains.
-        actor: the exploring actor, for a method that hands it to downstream runs.
-        queue: candidates of the prototype reward, float32 ``[queue_size, D]``, the oldest first.
-    """
+    """How an active pre-training ended."""
 
     env_steps: int = 0
+    """simulator steps over all domains"""
     actor: nn.Module | None = field(default=None, repr=False)
+    """the exploring actor, for a method that hands it to downstream runs"""
     queue: Tensor | None = field(default=None, repr=False)
+    """candidates of the prototype reward, float32 ``[queue_size, D]``, the oldest first"""
 
 
 def pretrain_active(
@@ -461,11 +464,10 @@ class Explorer:
             "hidden_dim": self.config.hidden_dim, "device": self.device, "generator": self.generators["policy"],
         }  # fmt: skip
         if kind == "skill-ddpg":
-            return make_skill_ddpg(feature_dim, action_dim, skills, **shared)
+            return SkillDDPGLearner(make_skill_ddpg_loss(feature_dim, action_dim, skills, **shared))
         loss_class = {"rad-sac": RADSACLoss, "averaged-sac": AveragedSACLoss}[kind]
-        return make_sac(
-            loss_class, feature_dim, action_dim, gamma=DISCOUNT, alpha_init=0.1, learner={}, **shared
-        )
+        shared |= {"gamma": DISCOUNT, "alpha_init": 0.1}
+        return SACLearner(make_sac_loss(loss_class, feature_dim, action_dim, **shared))
 
     def _make_reward(self) -> Transform:
         loss, generator, kind = self.loss, self.generators["reward"], self.exploration.reward

@@ -83,27 +83,24 @@ class PretrainConfig:
 
 @dataclass(frozen=True)
 class PretrainResult:
-    """How a pre-training ended; :func:`~crptpro.pretrained.save_pretrained` writes its encoder.
-
-    Attributes:
-        loss: the objective with its trained networks.
-        method: name of the method.
-        updates: encoder updates in total, over all domains and resumptions.
-        resumed_from: where this call continued, in updates (in env steps for an active method); 0 for a fresh run.
-        metrics: the last row of the record.
-        collapse: verdict of :class:`~crptpro.training.collapse.CollapseMonitor`.
-        training: how it was trained, as plain values, for the artifact's card.
-        history: the rows that this call wrote, oldest first.
-    """
+    """How a pre-training ended; :func:`~crptpro.pretrained.save_pretrained` writes its encoder."""
 
     loss: LossModule = field(repr=False)
+    """the objective with its trained networks"""
     method: str
+    """name of the method"""
     updates: int
+    """encoder updates in total, over all domains and resumptions"""
     resumed_from: int
+    """where this call continued, in updates (in env steps for an active method); 0 for a fresh run"""
     metrics: dict[str, Any]
+    """the last row of the record"""
     collapse: dict[str, Any]
+    """verdict of :class:`~crptpro.training.collapse.CollapseMonitor`"""
     training: dict[str, Any] = field(repr=False)
+    """how it was trained, as plain values, for the artifact's card"""
     history: list[dict[str, Any]] = field(default_factory=list, repr=False)
+    """the rows that this call wrote, oldest first"""
 
 
 def pretrain(
