@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from benchmarks import updates
 from benchmarks.loops import fresh_loss, fresh_pretrained
 from benchmarks.measure import Loop, save, side_by_side, table
-from benchmarks.synthetic import drifting_dataset, make_drifting_env
+from benchmarks.synthetic import drifting_dataset
 from crptpro.console import run_main
 from crptpro.data import FrameDataset
 from crptpro.errors import CRPTproError
@@ -192,7 +192,7 @@ def learned_weights(settings: Settings, **switches: Any) -> nn.Module:
     torch.manual_seed(0)
     start = settings.batch_size
     return train_downstream(
-        "drifting", fresh_pretrained(**settings.sizes), env_factory=make_drifting_env, precision="fp32",
+        "drifting", fresh_pretrained(**settings.sizes), precision="fp32",
         env_steps=2 * (start + settings.parity_updates), random_agent_steps=start, batch_size=settings.batch_size,
         replay_capacity=2 * start + settings.parity_updates, features="dense", eval_episodes=1, eval_workers=0,
         eval_interval_env_steps=10**9, device=settings.device, progress=False, **switches,

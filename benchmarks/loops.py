@@ -24,9 +24,8 @@ import torch
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from benchmarks import synthetic
-from benchmarks.synthetic import drifting_dataset, make_drifting_env
+from benchmarks.synthetic import drifting_dataset, make_drifting_task
 from crptpro.data import FrameDataset, FrameReplay, collect_random
-from crptpro.envs import make_env
 from crptpro.modules import PixelEncoder, Projector, Prototypes
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import Pretrained
@@ -135,7 +134,7 @@ def downstream(
             stack.callback(register_optimizer_step_post_hook(lambda *_: laps.lap("learn")).remove)
         train_downstream(
             task or "drifting", fresh_pretrained(image_size=image_size, prototypes=prototypes), progress=False,
-            env_factory=make_env if task else make_drifting_env, env_steps=500_000, replay_capacity=transitions,
+            env_steps=500_000, replay_capacity=transitions,
             random_agent_steps=1 if is_filled else transitions, eval_episodes=1, eval_workers=0,
             eval_interval_env_steps=500_000, **settings,
         )  # fmt: skip
@@ -144,7 +143,7 @@ def downstream(
 def fill(replay: FrameReplay, transitions: int, image_size: int, *, encodes: bool) -> None:
     """Store episodes of the drifting world, and encode them where the replay's transforms keep features."""
     action_dim = replay[:1]["action"].shape[-1] if len(replay) else synthetic.ACTION_DIM
-    env = make_drifting_env("drifting", seed=1, image_size=image_size, action_dim=action_dim)
+    env = make_drifting_task(action_dim, seed=1, image_size=image_size)
     while len(replay) < transitions:
         replay.extend(env.rollout(transitions - len(replay)))
     for first in range(0, transitions if encodes else 0, 500):

@@ -14,10 +14,10 @@ import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import CatFrames, EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from crptpro.data import collect_random
-from crptpro.domains import Domain
+from crptpro.domains import Domain, register_domain
 
 ACTION_DIM = 6
 """Of the cheetah."""
@@ -77,13 +77,14 @@ def make_drifting(*, seed: int, image_size: int, clock: Path | None = None) -> E
     return DriftingWorld(seed=seed, image_size=image_size, clock=clock)
 
 
-def make_drifting_env(
-    task: object, *, seed: int, image_size: int = 84, frame_stack: int = 3, action_dim: int = ACTION_DIM,
-    **ignored: object,
-) -> EnvBase:  # fmt: skip
-    """Build the world with stacks of frames, called as :func:`crptpro.envs.make_env` is."""
-    world = DriftingWorld(seed=seed, image_size=image_size, action_dim=action_dim)
-    return TransformedEnv(world, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
+def make_drifting_task(
+    action_dim: int = ACTION_DIM, *, seed: int, image_size: int = 84, action_repeat: int = 2
+) -> EnvBase:
+    """Build the world of a task, whose decisions count as ``action_repeat`` simulator steps."""
+    return DriftingWorld(seed=seed, image_size=image_size, action_dim=action_dim)
+
+
+register_domain(Domain("drifting", "drifting_task", make=make_drifting_task, episode_env_steps=2 * LENGTH))
 
 
 def drifting_dataset(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from pathlib import Path
 
@@ -10,16 +9,11 @@ import torch
 from toy_world import FIXED, VARIABLE
 
 from crptpro.data import collect_group
-from crptpro.domains import Domain
 from crptpro.envs import make_env
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training import evaluate, load_agent, pretrain, train_downstream
-
-
-def make_task(task: Domain, name: str, **settings: object) -> object:
-    return make_env(task, **settings)
 
 
 def test_collect_pretrain_freeze_and_learn(tmp_path: Path) -> None:
@@ -37,9 +31,9 @@ def test_collect_pretrain_freeze_and_learn(tmp_path: Path) -> None:
     artifact = load_pretrained(tmp_path / "encoder")
     frozen = {key: value.clone() for key, value in artifact.encoder.state_dict().items()}
     learned = train_downstream(
-        "toy", artifact, run_dir=tmp_path / "run", env_factory=functools.partial(make_task, FIXED),
-        env_steps=25, action_repeat=1, random_agent_steps=5, batch_size=8, replay_capacity=25, queue_size=16,
-        hidden_dim=16, eval_interval_env_steps=25, eval_episodes=2, precision="fp32", progress=False,
+        FIXED, artifact, run_dir=tmp_path / "run", env_steps=25, random_agent_steps=5, batch_size=8,
+        replay_capacity=25, queue_size=16, hidden_dim=16, eval_interval_env_steps=25, eval_episodes=2,
+        precision="fp32", progress=False,
     )  # fmt: skip
     assert learned.env_steps == 25  # 20 of them with an update
     assert [row["updates"] for row in learned.evaluations][-1] == 20

@@ -12,7 +12,7 @@ import crptpro
 PACKAGE = Path(crptpro.__file__).parent
 FOUNDATION = [
     "errors", "values", "seeding", "provenance", "artifact", "directory_lock", "console", "logging",
-    "plugins",
+    "plugins", "workers", "progress",
 ]  # fmt: skip
 ORDER = [
     "domains", "transforms.base", "transforms.color_swap", "envs", "data", "modules", "objectives", "transforms",

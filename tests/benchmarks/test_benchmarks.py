@@ -17,12 +17,14 @@ import torch
 import tyro
 from benchmarks.loops import ITEMS, downstream
 from benchmarks.measure import Loop, side_by_side
-from benchmarks.synthetic import drifting_dataset, make_drifting_env
+from benchmarks.synthetic import drifting_dataset, make_drifting_task
 from torch import nn
 from torchrl.data import LazyMemmapStorage
 
 from benchmarks import collection, gpu, loops, memory, revisions, sampling, synthetic, updates
 from crptpro.data import FrameDataset, FrameReplay
+from crptpro.domains import Domain
+from crptpro.envs import make_env
 from crptpro.errors import CRPTproError
 
 ROOT = Path(__file__).parents[2]
@@ -92,7 +94,7 @@ def test_every_benchmark_explains_its_options(name: str, capsys: pytest.CaptureF
 
 
 def test_frames_of_a_drifting_picture_all_differ_and_are_no_flat_colour() -> None:
-    pixels = make_drifting_env("drifting", seed=1, frame_stack=1).rollout(200)["pixels"]
+    pixels = make_drifting_task(seed=1).rollout(200)["pixels"]
     assert len({frame.numpy().tobytes() for frame in pixels}) == 200
     assert pixels.float().std() > 20
     assert (pixels[:, :, 1:].int() - pixels[:, :, :-1].int()).abs().float().mean() < 15
@@ -157,7 +159,8 @@ def test_updates_beside_the_plain_implementation(tmp_path: Path, capsys: pytest.
 
 @pytest.mark.usefixtures("in_this_process")
 def test_a_decision_by_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loops, "make_env", functools.partial(make_drifting_env, action_dim=2))
+    drifting = Domain("cheap", "cheap_run", make=functools.partial(make_drifting_task, 2))
+    monkeypatch.setattr("crptpro.training.world.make_env", lambda _, **options: make_env(drifting, **options))
     updates.main(dataclasses.replace(TINY, only=("decision",), out=tmp_path))
     found = written(tmp_path / "updates.json")["decision"]
     assert set(found["median_s_by_stage"]) == {"sample", "learn", "wait for the image", "store", "act"}

@@ -28,7 +28,7 @@ COMMANDS = (
 @pytest.mark.parametrize(("command", "named"), [
     ((), COMMANDS),
     (("collect",), ["--out", "--transitions", "--quality {exact,fast}", "group letters", "--colors"]),
-    (("pretrain",), ["--method", "--updates", "--batch-size", "--precision", "--loss", "--snapshots", "crptpro 50,"]),
+    (("pretrain",), ["--method", "--updates", "--batch-size", "--precision", "--loss", "crptpro 50,"]),
     (("pretrain", "--method", "apt-c"), ["--env-steps", "--hidden-dim"]),
     (("finetune",), ["--out", "--updates", "--batch-size", "--logging.wandb"]),
     (("downstream",), ["--pretrained", "random-encoder", "drq", "--replay-capacity", "--features", "500,000"]),

@@ -11,7 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -162,14 +161,6 @@ def test_indexing_follows_tensors(dataset: FrameDataset, index: Any) -> None:
         dataset[26]
 
 
-def test_frames_have_their_physical_state_beside_them(
-    dataset: FrameDataset, episodes: list[TensorDict]
-) -> None:
-    assert torch.equal(dataset.frames["pixels"][5], episodes[1]["pixels"][0])
-    assert torch.equal(dataset.frames["qvel"][5], episodes[1]["qvel"][0])
-    assert dataset.frames["qpos"].dtype == torch.float64
-
-
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda dataset: pickle.loads(pickle.dumps(dataset))])
 def test_a_copy_samples_what_the_original_samples(path: Path, copied: Any) -> None:
     dataset = FrameDataset.open(path, generator=torch.Generator().manual_seed(1), frame_stack=2)
@@ -185,7 +176,7 @@ def test_a_checkpoint_refers_to_the_dataset(
     assert sum(file.stat().st_size for file in files) < 10_000
     dataset.loads(tmp_path / "checkpoint")
     other = FrameDataset.open(write_dataset(tmp_path / "other", episodes[:3]))
-    with pytest.raises(DatasetError, match="another dataset: transitions was 26"):
+    with pytest.raises(DatasetError, match="transitions 12 there, 26 asked for"):
         other.loads(tmp_path / "checkpoint")
 
 
@@ -258,20 +249,6 @@ def test_a_torchrl_collector_fills_a_dataset(tmp_path: Path) -> None:
         dataset.extend(rollout)
     with pytest.raises(DatasetError, match="use extend"):
         dataset[0] = dataset[1]
-
-
-@pytest.mark.parametrize("kind", [np.int64, torch.tensor, float, int])
-def test_counts_are_taken_as_the_numbers_they_mean_and_what_is_written_can_be_read(
-    tmp_path: Path, kind: Any
-) -> None:
-    asked = collection_request(seed=3, action_repeat=2)
-    dataset = FrameDataset.create(
-        tmp_path, **asked | {name: kind(asked[name]) for name in ("transitions", "seed")}
-    )
-    dataset.extend(random_episode(asked["transitions"], size=8))
-    again = FrameDataset.open(tmp_path)
-    assert (again.card["transitions"], again.card["seed"]) == (27, 3)
-    assert type(again.card["request"]["seed"]) is int
 
 
 def test_numbers_that_are_not_finite_never_enter_a_dataset(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +31,11 @@ class ToyEnv(EnvBase):
         seed: int = 0,
         image_size: int = 8,
         physics_state: bool = False,
-        on_step: Callable[[int], None] = lambda count: None,
+        on_step: Callable[[int], None] | None = None,
     ):
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
-        self.lengths, self.on_step, self.image_size = lengths, on_step, image_size
+        self.lengths, self.image_size = lengths, image_size
+        self.on_step = on_step or (lambda count: None)
         self.physics_state, self.episode_seed, self.resets, self.steps = physics_state, seed, 0, 0
         observation = {"pixels": Bounded(0, 255, shape=(3, image_size, image_size), dtype=torch.uint8)}
         if physics_state:
@@ -94,46 +96,26 @@ def _die(count: int) -> None:
         os._exit(7)
 
 
-def _hang(count: int) -> None:
-    if count == 5:
-        time.sleep(1000)
-
-
 def _fail(count: int) -> None:
     if count == 5:
         raise ValueError("the simulator exploded")
 
 
-def make_fixed(*, seed: int, image_size: int, physics_state: bool) -> EnvBase:
-    return ToyEnv(fixed_length, seed=seed, image_size=image_size, physics_state=physics_state)
+def make_toy(lengths: Callable[[int], int], on_step: Any = None, *, seed: int, image_size: int) -> EnvBase:
+    return ToyEnv(lengths, seed=seed, image_size=image_size, on_step=on_step)
 
 
-def make_variable(*, seed: int, image_size: int, physics_state: bool) -> EnvBase:
-    return ToyEnv(variable_length, seed=seed, image_size=image_size, physics_state=physics_state)
+def make_physical(
+    lengths: Callable[[int], int], *, seed: int, image_size: int, physics_state: bool
+) -> EnvBase:
+    return ToyEnv(lengths, seed=seed, image_size=image_size, physics_state=physics_state)
 
 
-def make_slow(*, seed: int, image_size: int) -> EnvBase:
-    return ToyEnv(variable_length, seed=seed, image_size=image_size, on_step=_pause_like_a_renderer)
-
-
-def make_dying(*, seed: int, image_size: int) -> EnvBase:
-    return ToyEnv(fixed_length, seed=seed, image_size=image_size, on_step=_die)
-
-
-def make_hanging(*, seed: int, image_size: int) -> EnvBase:
-    return ToyEnv(fixed_length, seed=seed, image_size=image_size, on_step=_hang)
-
-
-def make_failing(*, seed: int, image_size: int) -> EnvBase:
-    return ToyEnv(fixed_length, seed=seed, image_size=image_size, on_step=_fail)
-
-
-FIXED = Domain("toy-fixed", "toy-fixed_go", make=make_fixed, episode_env_steps=10)
-VARIABLE = Domain("toy-variable", "toy-variable_go", make=make_variable)
-SLOW = Domain("toy-slow", "toy-slow_go", make=make_slow)
-DYING = Domain("toy-dying", "toy-dying_go", make=make_dying)
-HANGING = Domain("toy-hanging", "toy-hanging_go", make=make_hanging)
-FAILING = Domain("toy-failing", "toy-failing_go", make=make_failing)
+FIXED = Domain("toy-fixed", "toy-fixed_go", make=partial(make_physical, fixed_length), episode_env_steps=10)
+VARIABLE = Domain("toy-variable", "toy-variable_go", make=partial(make_physical, variable_length))
+SLOW = Domain("toy-slow", "toy-slow_go", make=partial(make_toy, variable_length, _pause_like_a_renderer))
+DYING = Domain("toy-dying", "toy-dying_go", make=partial(make_toy, fixed_length, _die))
+FAILING = Domain("toy-failing", "toy-failing_go", make=partial(make_toy, fixed_length, _fail))
 
 
 def rollout_of(

@@ -1,3 +1,5 @@
+"""A plateau is announced and passes; a dead run is called so."""
+
 from __future__ import annotations
 
 import logging
@@ -5,7 +7,7 @@ import math
 
 import pytest
 
-from crptpro.training.collapse import CollapseMonitor
+from crptpro.training import CollapseMonitor
 
 UNIFORM = math.log(512)
 
@@ -13,7 +15,7 @@ UNIFORM = math.log(512)
 def test_a_run_that_never_stands_still_is_learning(caplog: pytest.LogCaptureFixture) -> None:
     monitor = CollapseMonitor(512)
     with caplog.at_level(logging.INFO):
-        states = [monitor.observe(u, comp=6.6 - u / 100, cosine=0.5) for u in (10, 90, 150)]
+        states = [monitor.observe(u, comp=6.63 - u / 1000, cosine=0.5) for u in (10, 90, 150)]
     assert set(states) == {"learning"}
     assert monitor.finish(150)["verdict"] == "learning"
     assert not caplog.records
@@ -27,14 +29,12 @@ def test_a_plateau_is_announced_once_and_its_end_with_its_length(caplog: pytest.
             assert monitor.observe(updates, comp=UNIFORM, cosine=0.9999) == "plateau"
         monitor.observe(1_400, comp=6.0, cosine=0.7)
         assert monitor.observe(1_500, comp=5.8, cosine=0.6) == "learning"
-    levels = [record.levelname for record in caplog.records]
-    assert levels == ["INFO", "INFO"]
+    assert [record.levelname for record in caplog.records] == ["INFO", "INFO"]
     assert "Update 200: plateau" in caplog.text
     assert "after 1200 updates" in caplog.text
     verdict = monitor.finish(1_500)
     assert verdict["plateaus"] == [{"entered": 200, "left": 1_400}]
-    assert verdict["plateau_updates"] == 1_200
-    assert verdict["verdict"] == "learning"
+    assert (verdict["plateau_updates"], verdict["verdict"]) == (1_200, "learning")
 
 
 def test_one_observation_outside_does_not_end_a_plateau() -> None:
@@ -49,8 +49,9 @@ def test_a_plateau_beyond_patience_is_dead_and_can_still_recover(caplog: pytest.
     monitor = CollapseMonitor(512, patience_updates=300)
     states = [monitor.observe(u, comp=UNIFORM) for u in (100, 200, 300, 400, 500)]
     assert states == ["plateau"] * 4 + ["dead"]
-    assert [r.levelname for r in caplog.records] == ["ERROR"]
-    assert monitor.verdict(500)["verdict"] == "dead"
+    assert [record.levelname for record in caplog.records] == ["ERROR"]
+    assert monitor.finish(500)["verdict"] == "dead"
+    assert "DEAD RUN: do not use this encoder" in caplog.text
     monitor.observe(600, comp=5.0)
     assert monitor.observe(700, comp=5.0) == "learning"
     assert "called dead" in caplog.text
@@ -62,43 +63,26 @@ def test_training_that_ends_on_a_short_plateau_is_announced_but_not_called_dead(
     monitor = CollapseMonitor(512)
     monitor.observe(100, comp=UNIFORM, cosine=0.5)
     verdict = monitor.finish(150)
-    assert verdict["verdict"] == "plateau"
-    assert verdict["plateau_updates"] == 50
-    assert [r.levelname for r in caplog.records] == ["WARNING"]
+    assert (verdict["verdict"], verdict["plateau_updates"]) == ("plateau", 50)
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert "has not begun to learn" in caplog.text
 
 
-def test_training_that_ends_beyond_patience_is_called_dead(caplog: pytest.LogCaptureFixture) -> None:
-    monitor = CollapseMonitor(512, patience_updates=100)
-    for updates in (100, 300):
-        monitor.observe(updates, comp=UNIFORM)
-    assert monitor.finish(300)["verdict"] == "dead"
-    assert "DEAD RUN: training ended" in caplog.text
-
-
-def test_a_loss_without_prototypes_is_watched_by_its_cosine() -> None:
+def test_cosines_are_watched_without_prototypes_and_one_collapsed_domain_is_named(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     monitor = CollapseMonitor(None)
     assert monitor.observe(100, comp=UNIFORM, cosine=0.5) == "learning"
-    assert monitor.observe(200, cosine={"walker": 0.999, "finger": 0.995}) == "plateau"
-
-
-def test_one_collapsed_domain_of_several_is_named(caplog: pytest.LogCaptureFixture) -> None:
-    monitor = CollapseMonitor(512)
-    assert monitor.observe(100, comp=5.0, cosine={"walker": 0.4, "pendulum": 0.9999}) == "learning"
-    verdict = monitor.finish(100)
-    assert verdict["collapsed_domains"] == ["pendulum"]
+    assert monitor.observe(200, cosine={"walker": 0.4, "pendulum": 0.9999}) == "learning"
+    assert monitor.finish(200)["collapsed_domains"] == ["pendulum"]
     assert "pendulum" in caplog.text
-
-
-def test_a_loss_above_the_floor_is_no_plateau() -> None:
-    assert CollapseMonitor(512).observe(100, comp=6.63, cosine=0.5) == "learning"
+    assert monitor.observe(300, cosine={"walker": 0.999, "pendulum": 0.995}) == "plateau"
 
 
 def test_a_restored_monitor_judges_as_the_original() -> None:
-    original = CollapseMonitor(512, patience_updates=300)
+    original, restored = (CollapseMonitor(512, patience_updates=300) for _ in range(2))
     original.observe(100, comp=UNIFORM, cosine={"a": 0.9})
     original.observe(200, comp=6.0, cosine={"a": 0.9})
-    restored = CollapseMonitor(512, patience_updates=300)
     restored.load_state_dict(original.state_dict())
     for updates, comp in ((300, 6.0), (400, UNIFORM), (800, UNIFORM)):
         assert original.observe(updates, comp=comp) == restored.observe(updates, comp=comp)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from typing import Any
 
 import pytest
 import torch
-from worlds import EPISODE, make_encoder, make_toy_env
+from worlds import EPISODE, SIZE, make_encoder, world
 
+from crptpro.envs import make_env
 from crptpro.errors import NonFiniteError
 from crptpro.modules import SquashedGaussianActor
 from crptpro.training import PixelAgent, evaluate, summarize, uniform_policy
 from crptpro.training.evaluate import Episode, Evaluator
+
+make_toy_env = functools.partial(make_env, world("toy"), seed=0, image_size=SIZE)
 
 
 def make_agent(seed: int = 0) -> PixelAgent:
@@ -21,12 +25,8 @@ def make_agent(seed: int = 0) -> PixelAgent:
     return PixelAgent(encoder, SquashedGaussianActor(encoder.feature_dim, 2, hidden_dim=16))
 
 
-def make_env() -> Any:
-    return make_toy_env("toy", seed=0)
-
-
 def test_an_evaluation_is_the_same_whatever_was_evaluated_before() -> None:
-    env, agent = make_env(), make_agent()
+    env, agent = make_toy_env(), make_agent()
     first = evaluate(agent, env, episodes=3, seed=5, progress=False)
     evaluate(agent, env, episodes=2, seed=9, progress=False)
     assert evaluate(agent, env, episodes=3, seed=5, progress=False) == first
@@ -35,10 +35,12 @@ def test_an_evaluation_is_the_same_whatever_was_evaluated_before() -> None:
 
 
 def test_chance_is_uniform_and_seeded() -> None:
-    env = make_env()
-    one, two = (evaluate(uniform_policy(env, seed=s), env, episodes=2, progress=False) for s in (0, 0))
+    env = make_toy_env()
+    one, two, other = (
+        evaluate(uniform_policy(env, seed=s), env, episodes=2, progress=False) for s in (0, 0, 1)
+    )
     assert one == two
-    assert evaluate(uniform_policy(env, seed=1), env, episodes=2, progress=False) != one
+    assert other != one
 
 
 def test_a_summary_has_the_unbiased_deviation() -> None:
@@ -48,64 +50,46 @@ def test_a_summary_has_the_unbiased_deviation() -> None:
 
 
 def test_a_non_finite_action_names_the_episode_and_the_decision() -> None:
-    calls = 0
-
-    def policy(pixels: torch.Tensor) -> torch.Tensor:
-        nonlocal calls
-        calls += 1
-        return torch.full((2,), float("nan") if calls == EPISODE + 4 else 0.1)
-
+    actions = iter([0.1] * (EPISODE + 3) + [float("nan")])
     with pytest.raises(NonFiniteError, match="episode 1, decision 3: the policy acts"):
-        evaluate(policy, make_env(), episodes=2, progress=False)
+        evaluate(lambda _: torch.full((2,), next(actions)), make_toy_env(), episodes=2, progress=False)
 
 
 @pytest.mark.parametrize("episodes", [0, 1.5, "2"])
 def test_an_impossible_number_of_episodes_is_refused(episodes: Any) -> None:
     with pytest.raises(ValueError, match="`episodes` must be"):
-        evaluate(make_agent(), make_env(), episodes=episodes, progress=False)
+        evaluate(make_agent(), make_toy_env(), episodes=episodes, progress=False)
 
 
-def collect(workers: int, make: Any = make_env) -> tuple[Evaluator, list[Any]]:
+def evaluator(workers: int, make: Any = make_toy_env, seed: int = 0) -> tuple[Evaluator, list[Any]]:
     results: list[Any] = []
-    evaluator = Evaluator(
-        make, episodes=3, seed=1, workers=workers, progress=False,
+    found = Evaluator(
+        make, make_agent(seed), episodes=2, seed=1, workers=workers, progress=False,
         on_result=lambda episodes, counters: results.append((episodes, dict(counters))),
     )  # fmt: skip
-    return evaluator, results
+    return found, results
 
 
-def test_workers_evaluate_a_snapshot_and_hand_it_out_when_asked() -> None:
-    here, found = collect(0)
-    agent = make_agent()
-    here.start(agent, env_steps=40)
-    beside, results = collect(2)
-    beside.start(agent, env_steps=40)
+def test_workers_evaluate_a_snapshot_hand_it_out_when_asked_and_it_is_part_of_a_checkpoint() -> None:
+    here, expected = evaluator(0)
+    here.start(env_steps=40)
+    assert expected[0][1] == {"env_steps": 40}
+    beside, results = evaluator(2)
+    beside.start(env_steps=40)
     with torch.no_grad():
-        for parameter in agent.actor.parameters():
+        for parameter in beside.agent.actor.parameters():
             parameter.zero_()
+    state = beside.state_dict()
     assert results == []
     beside.finish()
-    assert results == found
-    assert results[0][1] == {"env_steps": 40}
-    for evaluator in (here, beside):
-        evaluator.close()
-
-
-def test_an_evaluation_under_way_is_part_of_a_checkpoint() -> None:
-    beside, results = collect(2)
-    beside.agent = make_agent()
-    beside.start(beside.agent, env_steps=40)
-    state = beside.state_dict()
-    beside.finish()
-    again, repeated = collect(0)
-    again.agent = make_agent(seed=7)
+    assert results == expected
+    again, repeated = evaluator(0, seed=7)
     again.load_state_dict(state)
     again.finish()
-    # The encoder is frozen and the run's own; only what learns is in the state.
-    assert [counters for _, counters in repeated] == [counters for _, counters in results]
+    assert repeated == expected
     assert again.state_dict() == {}
-    for evaluator in (beside, again):
-        evaluator.close()
+    for each in (here, beside, again):
+        each.close()
 
 
 def die() -> Any:
@@ -115,18 +99,18 @@ def die() -> Any:
 def test_lost_workers_are_replaced_by_this_process(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    evaluator, results = collect(1, die)
-    evaluator.start(make_agent(), env_steps=0)
-    monkeypatch.setattr(evaluator, "make_env", make_env)
+    lost, results = evaluator(1, die)
+    lost.start(env_steps=0)
+    monkeypatch.setattr(lost, "make_env", make_toy_env)
     with caplog.at_level("WARNING", logger="crptpro"):
-        evaluator.finish()
+        lost.finish()
     assert len(results) == 1
     assert "evaluating in this process from here on" in caplog.text
-    evaluator.close()
+    lost.close()
 
 
 def test_a_world_that_no_worker_can_build_is_evaluated_here() -> None:
-    evaluator, results = collect(2, lambda: make_env())
-    evaluator.start(make_agent(), env_steps=0)
+    alone, results = evaluator(2, lambda: make_toy_env())
+    alone.start(env_steps=0)
     assert len(results) == 1
-    evaluator.close()
+    alone.close()

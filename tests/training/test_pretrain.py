@@ -19,6 +19,7 @@ from crptpro.errors import CheckpointError, DatasetError, NonFiniteError
 from crptpro.objectives import ATCLoss, SimCLRLoss, get_method
 from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training import PretrainConfig, PretrainResult, finetune, pretrain
+from crptpro.training.pretrain import make_optimizer
 
 SETTINGS = PretrainConfig(
     batch_size=8, learning_rate=1e-3, seed=3, log_interval=4, checkpoint_interval=5, precision="fp32"
@@ -67,9 +68,7 @@ def test_an_update_is_one_adam_step_and_one_ema_step_of_the_targets() -> None:
     before = {name: value.clone() for name, value in loss.state_dict().items()}
     run(loss, 1)
     moved = loss.state_dict()
-    weight, target = "encoder_params.convs.0.weight", "target_encoder_params.convs.0.weight"
-    names = [name for name in moved if name.endswith("weight") and name.startswith("encoder_params")]
-    weight = names[0]
+    weight = next(name for name in moved if name.startswith("encoder_params") and name.endswith("weight"))
     target = f"target_{weight}"
     step = moved[weight] - before[weight]
     # Adam's first step has the size of the learning rate wherever there is a gradient.
@@ -78,16 +77,16 @@ def test_an_update_is_one_adam_step_and_one_ema_step_of_the_targets() -> None:
 
 
 def test_training_lowers_the_loss_and_the_record_says_so(tmp_path: Path) -> None:
-    result = run(make_loss(), 120, tmp_path)
+    result = run(make_loss(), 60, tmp_path)
     rows = record(tmp_path / "pretrain.csv")
-    assert [int(row["updates"]) for row in rows] == list(range(4, 124, 4))
+    assert [int(row["updates"]) for row in rows] == list(range(4, 64, 4))
     assert float(rows[-1]["loss_comp"]) < float(rows[0]["loss_comp"])
     assert {"loss", "loss/dark", "loss/bright", "cosine/dark", "cosine/bright", "prototype_kne_3"} <= {
         *rows[0]
     }
     assert float(rows[0]["ln_num_prototypes"]) == pytest.approx(math.log(8))
     assert result.metrics["loss"] == pytest.approx(float(rows[-1]["loss"]))
-    assert (result.updates, result.resumed_from, result.is_dead) == (120, 0, False)
+    assert (result.updates, result.resumed_from, result.collapse["verdict"]) == (60, 0, "learning")
 
 
 @pytest.mark.parametrize("method", ["crptpro", "atc", "apt-c"])
@@ -165,24 +164,14 @@ def test_a_run_of_other_settings_is_refused_by_name(
 
 
 def test_the_learning_rate_rises_and_falls_as_the_method_says() -> None:
-    rates: list[float] = []
-
-    class Watched(ATCLoss):
-        def before_update(self) -> None:
-            rates.append(next(iter(optimizers)).param_groups[0]["lr"])
-
-    optimizers: list[torch.optim.Adam] = []
-    original = torch.optim.Adam.__init__
-
-    def remember(self: torch.optim.Adam, *arguments: Any, **options: Any) -> None:
-        original(self, *arguments, **options)
-        optimizers.append(self)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(torch.optim.Adam, "__init__", remember)
-        run(Watched(make_encoder(), latent_dim=8), 6, method="atc", warmup_updates=2)
-    expected = [0.0, 0.5, 1.0, 0.853553, 0.5, 0.146447]
-    assert [rate / 1e-3 for rate in rates] == pytest.approx(expected, abs=1e-6)
+    options = {"learning_rate": 1.0, "warmup_updates": 2, "encoder_tau": None, "updates": 6}
+    optimizer, schedule, _ = make_optimizer(make_loss(), get_method("atc"), **options)
+    rates = []
+    for _ in range(6):
+        rates += schedule.get_last_lr()
+        optimizer.step()
+        schedule.step()
+    assert rates == pytest.approx([0.0, 0.5, 1.0, 0.853553, 0.5, 0.146447], abs=1e-6)
 
 
 def test_a_second_view_is_the_same_image_under_another_shift() -> None:
@@ -219,24 +208,14 @@ def test_a_dead_run_is_announced_by_name_of_the_plateau(caplog: pytest.LogCaptur
         result = run(loss, 12)
     assert result.collapse["verdict"] == "plateau"
     assert "at ln(M) = 2.0794" in caplog.text
-    assert "the encoder has not begun to learn" in caplog.text
+    assert "encoder has not begun to learn" in caplog.text
 
 
-def test_snapshots_along_the_run_are_loadable_encoders(tmp_path: Path) -> None:
-    result = run(make_loss(), 6, tmp_path, snapshots=(2, 4))
-    early, late = (load_pretrained(tmp_path / f"encoder_at_{done}") for done in (2, 4))
-    assert early.identity() != late.identity()
-    save_pretrained(result, tmp_path / "encoder")
-    trained = load_pretrained(tmp_path / "encoder")
-    assert trained.method == "crptpro"
-    assert trained.card["training"]["updates"] == 6
-    assert [facts["domain"] for facts in trained.card["training"]["datasets"]] == ["dark", "bright"]
-
-
-def test_fine_tuning_continues_from_weights_and_targets_with_a_fresh_adam(tmp_path: Path) -> None:
-    first = run(make_loss(), 6)
-    save_pretrained(first, tmp_path / "encoder")
-    before = load_pretrained(tmp_path / "encoder")
+def test_the_artifact_says_how_it_was_trained_and_can_be_trained_further(tmp_path: Path) -> None:
+    before = load_pretrained(save_pretrained(run(make_loss(), 6), tmp_path / "encoder"))
+    training = before.card["training"]
+    assert (before.method, training["updates"]) == ("crptpro", 6)
+    assert [facts["domain"] for facts in training["datasets"]] == ["dark", "bright"]
     result = finetune(before, {"bright": make_dataset(1)}, config=SETTINGS, updates=3, progress=False)
     assert result.method == "crptpro"
     assert result.training["started_from"] == before.identity()
@@ -286,12 +265,12 @@ def test_an_impossible_setting_is_refused_by_name(setting: str, value: Any, mess
         PretrainConfig(**{setting: value})
 
 
-def test_bf16_stays_within_the_spread_of_two_fp32_seeds_for_200_updates() -> None:
+def test_bf16_stays_within_the_spread_of_two_fp32_seeds() -> None:
     def curve(precision: str, seed: int) -> torch.Tensor:
         config = PretrainConfig(
             batch_size=16, learning_rate=1e-3, seed=seed, log_interval=10, precision=precision
         )  # type: ignore[arg-type]
-        return torch.tensor([row["loss_comp"] for row in run(make_loss(seed), 200, config=config).history])
+        return torch.tensor([row["loss_comp"] for row in run(make_loss(seed), 100, config=config).history])
 
     reference, other_seed, fast = curve("fp32", 0), curve("fp32", 1), curve("bf16", 0)
     assert reference[-1] < reference[0] - 0.05  # it learns, so that there is something to differ in

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import csv
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs import CatFrames, EnvBase, TransformedEnv
-from toy_world import ToyEnv
+from torchrl.envs import EnvBase
+from toy_world import ToyEnv, fixed_length
 
+from crptpro.domains import Domain
 from crptpro.modules import PixelEncoder, Projector, Prototypes
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import Pretrained
 
 SIZE, EPISODE = 16, 10
+HERE = Path(__file__).parent
 
 
 def make_dataset(domain: int, *, transitions: int = 60) -> ReplayBuffer:
@@ -39,9 +46,8 @@ def make_encoder(channels: int = 3) -> PixelEncoder:
 
 def make_loss(seed: int = 0, *, channels: int = 3, **options: Any) -> ProtoLoss:
     torch.manual_seed(seed)
-    return ProtoLoss(
-        make_encoder(channels), **{"num_prototypes": 8, "latent_dim": 8, "hidden_dim": 16, **options}
-    )
+    small = {"num_prototypes": 8, "latent_dim": 8, "hidden_dim": 16}
+    return ProtoLoss(make_encoder(channels), **{**small, **options})
 
 
 def make_pretrained(method: str = "crptpro") -> Pretrained:
@@ -51,11 +57,36 @@ def make_pretrained(method: str = "crptpro") -> Pretrained:
     return Pretrained(encoder, **heads, card={"method": method})
 
 
-def make_toy_env(
-    task: str, *, seed: int, image_size: int = SIZE, frame_stack: int = 3, **settings: object
-) -> EnvBase:
-    env = ToyEnv(lambda _: EPISODE, seed=seed, image_size=image_size)
-    return TransformedEnv(env, CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
+def make_toy(*, seed: int, image_size: int, action_repeat: int) -> EnvBase:
+    return ToyEnv(fixed_length, seed=seed, image_size=image_size)
+
+
+def world(name: str, make: Callable[..., EnvBase] = make_toy) -> Domain:
+    return Domain(name, f"{name}_go", make=make)
+
+
+def signalling(name: str, step: int, number: signal.Signals) -> Domain:
+    """A world that sends a signal to this process with one of its steps."""
+    steps = 0
+
+    def count(_: int) -> None:
+        nonlocal steps
+        steps += 1
+        if steps == step:
+            os.kill(os.getpid(), number)
+
+    def make(*, seed: int, image_size: int, action_repeat: int) -> EnvBase:
+        return ToyEnv(fixed_length, seed=seed, image_size=image_size, on_step=count)
+
+    return world(name, make)
+
+
+def python(code: str) -> subprocess.CompletedProcess[str]:
+    """Run a program that may import these tests' modules."""
+    path = os.pathsep.join([str(HERE), str(HERE.parent / "data"), *sys.path])
+    environment = {**os.environ, "PYTHONPATH": path}
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
 def same_state(one: torch.nn.Module, two: torch.nn.Module) -> bool:

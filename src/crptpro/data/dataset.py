@@ -42,15 +42,14 @@ class FrameDataset(ReplayBuffer):
     :meth:`observations` reads. A pair never crosses an episode.
 
     Frames are mapped from disk without write access: several processes can open one dataset, threads may sample one
-    object. :meth:`open` reads a finished dataset; :meth:`create` begins or continues one, and ``extend`` fills it::
+    object. :meth:`open` reads a finished dataset; :meth:`create` begins or continues one, and ``extend`` fills it with
+    what :class:`~crptpro.data.FrameReplay` takes, but each episode must begin at its reset::
 
         dataset = FrameDataset.create("data/mine", domain="mine", transitions=10_000)
         for rollout in Collector(env, RandomPolicy(env.full_action_spec), frames_per_batch=100, total_frames=-1):
             dataset.extend(rollout)
             if dataset.is_complete:
                 break
-
-    ``extend`` takes what :class:`~crptpro.data.FrameReplay` takes, but each episode must begin at its reset.
 
     Args:
         storage: what to read.
@@ -87,13 +86,8 @@ class FrameDataset(ReplayBuffer):
     ) -> FrameDataset:
         """Begin a dataset, or continue one that was interrupted; a complete one is opened.
 
-        Args:
-            path: its directory.
-            domain: the domain's name.
-            transitions: after which it is complete, and can be sampled; the last episode is cut to fit.
-            frame_stack: k, frames per stack.
-            **about: further facts of the card that two attempts must agree in: ``task``, ``seed``, ``action_repeat``,
-                ``quality``, ...
+        It is complete, and can be sampled, after so many transitions; the last episode is cut to fit. ``about`` are
+        further facts of the card that two attempts must agree in: ``task``, ``seed``, ``action_repeat``, ...
 
         Raises:
             DatasetError: if the directory holds something else, or another process is writing there.
@@ -106,7 +100,7 @@ class FrameDataset(ReplayBuffer):
             writer = EpisodeWriter(path, request)
             if not (path / CARD_FILE).exists():
                 return cls(FrameStorage(path, frame_stack), writer=writer)
-        _require_request(path, read_card(path)["request"], request, "holds a dataset")
+        _require_request(path, read_card(path)["request"], request)
         return cls.open(path, frame_stack=frame_stack)
 
     def observations(self, numbers: Tensor) -> Tensor:
@@ -186,42 +180,32 @@ class FrameStorage(StackStorage):
     def __len__(self) -> int:
         return self.max_size
 
-    def get(self, index: Any, **how: Any) -> TensorDict:
-        """Return transitions by index; see the base class."""
-        if not self.card:
-            raise DatasetError(f"{self.path} is being collected: it can be read once it is complete.")
-        return super().get(index, **how)
-
     def columns_at(self, index: Tensor, **how: Any) -> TensorDict:
         """Return everything but pixels; see the base class."""
+        self._require_complete()
         columns = self.transitions.apply(lambda column: column.index_select(0, index), batch_size=index.shape)
         number = columns.pop("row")
         return columns.set("number", number).set(("next", "number"), number + 1)
+
+    def _require_complete(self) -> None:
+        if not self.card:
+            raise DatasetError(f"{self.path} is being collected: it can be read once it is complete.")
 
     def _empty(self) -> None:
         self.set()
 
     def state_dict(self) -> dict[str, Any]:
         """Return what tells this dataset from another one: a checkpoint does not copy it."""
-        names = ("domain", "task", "seed", "transitions", "frames", "quality", "colors", "action_repeat")
-        return {name: self.card.get(name) for name in names} | {"frame_stack": self.frame_stack}
+        return {"request": self.card.get("request", {}), "frame_stack": self.frame_stack}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Check that a checkpoint belongs to this dataset.
-
-        Raises:
-            DatasetError: if it was written with another one.
-        """
-        for name, mine in self.state_dict().items():
-            if mine != state_dict.get(name):
-                raise DatasetError(
-                    f"The checkpoint was written with another dataset: {name} was {state_dict.get(name)}, "
-                    f"{self.path} has {mine}. Open the dataset it was written with."
-                )
+        """Check that a checkpoint belongs to this dataset."""
+        mine = self.state_dict()
+        _require_request(self.path, mine.pop("request"), state_dict["request"])
+        _require_request(self.path, mine, {"frame_stack": state_dict["frame_stack"]})
 
     def __reduce__(self) -> Any:
-        if not self.card:
-            raise DatasetError(f"{self.path} is being collected: it can be copied once it is complete.")
+        self._require_complete()
         return _load, (self.path, self.frame_stack, str(self.device))
 
 
@@ -234,10 +218,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
 
     The rows of an episode are on the disk before ``collection.json`` counts them; what a kill left behind them is cut
     off when the next episode is written. As long as no episode is durable, another request takes this one's place.
-
-    Args:
-        path: the directory, which is locked until the dataset is complete or :meth:`close` is called.
-        request: facts of the card; ``transitions`` is the number to reach.
+    The directory is locked until the dataset is complete or :meth:`close` is called.
     """
 
     def __init__(self, path: Path, request: dict[str, Any]):
@@ -280,26 +261,15 @@ class EpisodeWriter(ImmutableDatasetWriter):
     def extend(self, data: TensorDictBase) -> Tensor:
         """Take transitions of one environment in temporal order, as :class:`~crptpro.data.FrameReplay` does.
 
-        Those beyond the ones asked for are left out.
-
-        Returns:
-            The indices of the transitions that became durable, int64.
-
-        Raises:
-            DatasetError: if the dataset is complete, an episode has other shapes, or the files cannot be written.
-            DiskSpaceError: if the disk is full; whole episodes are kept.
-            ValueError: for entries that are missing or of another shape.
-            NonFiniteError: for a reward or an action that is NaN or infinite.
+        Those beyond the ones asked for are left out. Returns the indices of those that became durable, int64.
         """
-        before, storage = self.transitions, self._storage
+        before, stack = self.transitions, self._storage.frame_stack
         if before >= self.target:
             raise DatasetError(f"{self.path} is complete and read-only; collect another one.")
         channels = self.state["columns"]["frames/pixels"][1][0] if before else 3
-        state: list[Any] = [name for name in ("qpos", "qvel") if name in data and data.get(name).shape[-1]]
-        state += [("next", name) for name in state]
-        rows = read_rows(
-            data, channels=channels, frame_stack=storage.frame_stack, extra=state, what="A dataset"
-        )
+        extra: list[Any] = [name for name in ("qpos", "qvel") if name in data and data.get(name).shape[-1]]
+        extra += [("next", name) for name in extra]
+        rows = read_rows(data, channels=channels, frame_stack=stack, extra=extra, what="A dataset")
         last = self._pending[-1].following[-1] if self._pending else None
         for begins, part in rows.part(0, self.target - self._taken).pieces(last):
             if begins:
@@ -346,11 +316,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
             self._storage.load()  # read back once before anybody is told that it is there
 
     def note_environment(self, card: Mapping[str, Any]) -> None:
-        """Note what renders the frames (``backend``, ``gl_renderer``, ...) for the card.
-
-        Raises:
-            DatasetError: if earlier episodes were rendered by another backend or renderer.
-        """
+        """Note what renders the frames for the card; another ``backend`` or ``gl_renderer`` than before is refused."""
         sessions = self.state["sessions"]
         before = sessions[-1]["render"] if sessions else {}
         for name in ("backend", "gl_renderer"):
@@ -377,9 +343,8 @@ class EpisodeWriter(ImmutableDatasetWriter):
         def whole(name: Any) -> np.ndarray:
             return torch.cat([part.columns[name] for part in parts]).numpy()
 
-        columns = {
-            "frames/pixels": torch.cat([parts[0].newest[:1], *(part.following for part in parts)]).numpy()
-        }
+        frames = [parts[0].newest[:1], *(part.following for part in parts)]
+        columns = {"frames/pixels": torch.cat(frames).numpy()}
         for name in ("qpos", "qvel"):
             if name in parts[0].columns:
                 values = np.concatenate([whole(name), whole(("next", name))[-1:]])
@@ -409,7 +374,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
                 shutil.rmtree(self.path / part, ignore_errors=True)
             self._save()
             return
-        _require_request(self.path, state["request"], self.request, "was begun")
+        _require_request(self.path, state["request"], self.request)
         for path, expected in _sizes(self.path, state).items():
             require_size(path, min(expected, path.stat().st_size if path.exists() else 0), expected)
         self.state = state | {"request": self.request}
@@ -436,11 +401,10 @@ class EpisodeWriter(ImmutableDatasetWriter):
 def _append(path: Path, values: np.ndarray, rows: int) -> None:
     """Write rows behind the first ``rows`` of a file, through to the disk."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    content = np.ascontiguousarray(values).reshape(-1).view(np.uint8).data
-    with open(path, "ab", buffering=0) as file:
+    with open(path, "ab") as file:
         file.truncate(rows * (values.nbytes // len(values)))
-        while content:
-            content = content[file.write(content) :]
+        file.write(np.ascontiguousarray(values).tobytes())
+        file.flush()
         os.fsync(file.fileno())
 
 
@@ -453,26 +417,22 @@ def _sizes(path: Path, state: Mapping[str, Any]) -> dict[Path, int]:
     }
 
 
-def _require_request(path: Path, found: dict[str, Any], request: dict[str, Any], what: str) -> None:
+def _require_request(path: Path, found: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
     """Compare the request that a directory was filled for with the one that is made now."""
     differing = [
         f"{name} {found.get(name)!r} there, {value!r} asked for"
-        for name, value in request.items()
+        for name, value in asked.items()
         if found.get(name) != value
     ]
     if differing:
         raise DatasetError(
-            f"{path} {what} with other settings: {'; '.join(differing)}. "
-            "Ask for the same, choose another directory, or remove this one to collect anew."
+            f"{path} is a dataset of other settings: {'; '.join(differing)}. Ask for the same, choose another "
+            "directory, or remove this one to collect anew."
         )
 
 
 def read_card(path: Path) -> dict[str, Any]:
-    """Read and check a dataset's card against its files, without reading the frames.
-
-    Raises:
-        DatasetError: naming what is missing, unfinished, truncated or foreign.
-    """
+    """Read and check a dataset's card against its files, without reading the frames."""
     file = path / CARD_FILE
     if not file.exists():
         raise DatasetError(_why_no_card(path))
@@ -501,9 +461,10 @@ def _why_no_card(path: Path) -> str:
         return f"{path} is not a directory. A dataset is made by collect_random or `crptpro collect`."
     if (path / COLLECTION_FILE).exists():
         state = read_json(path / COLLECTION_FILE, error=DatasetError)
+        asked = state.get("request", {}).get("transitions")
         return (
-            f"{path} is unfinished: {state.get('transitions', 0)} of {state.get('request', {}).get('transitions')} "
-            "transitions are collected. Run the same collect command again to complete it."
+            f"{path} is unfinished: {state.get('transitions', 0)} of {asked} transitions are collected. "
+            "Run the same collect command again to complete it."
         )
     kinds = sorted(child.parent.name for child in path.glob(f"*/{CARD_FILE}"))
     hint = f" Did you mean one of its datasets: {', '.join(kinds)}?" if kinds else ""

@@ -14,7 +14,7 @@ from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
 from torchrl.envs.transforms import Transform
 
 from crptpro.artifact import require_disk
-from crptpro.data.storage import RingStorage, gather_stacks, map_rows, read_rows, stack_rows
+from crptpro.data.storage import RingStorage, StackStorage, map_rows, read_rows
 from crptpro.errors import DatasetError
 from crptpro.values import as_float, as_int, as_path
 
@@ -52,14 +52,11 @@ class FrameReplay(ReplayBuffer):
     - ``index`` (0 is the oldest transition) and ``number``, ``("next", "number")``, int64 ``[B]``: how many frames were
       stored before the observation's newest one. A number is never used again; :meth:`observations` reads it.
 
-    With ``n_step`` above 1 only those transitions are drawn whose n transitions lie in one episode and in the ring; as
-    in url_benchmark (``replay_buffer.py``), a window is not cut short at an episode's end. ``("next", ...)`` is then n
-    agent steps ahead: its flags are the last transition's, its reward is the n-step return, and
-    ``("next", "discount")`` ``[B, 1]`` weighs the value of the next observation
-    (:func:`~crptpro.data.storage.n_step_return`). Indexing, ``replay[i]``, reads single transitions.
-
-    Deviation: url_benchmark draws an episode uniformly and then an anchor in it, and only from finished episodes; here
-    every admissible anchor is equally likely, the running episode's included.
+    With ``n_step`` above 1 only transitions are drawn whose n transitions lie in one episode and in the ring (as in
+    url_benchmark's ``replay_buffer.py``, none is cut short). ``("next", ...)`` is then n agent steps ahead: its flags
+    are the last transition's, its reward is the n-step return, and ``("next", "discount")`` ``[B, 1]`` weighs the value
+    of the next observation (:func:`~crptpro.data.storage.n_step_return`). Indexing reads single transitions.
+    Deviation: url_benchmark draws an episode uniformly, and then an anchor in it; here every anchor is equally likely.
 
     A ring on disk is its own checkpoint: :meth:`state_dict` holds a few counters, and loading one restores exactly the
     content of its moment, provided that at most ``slack`` frames were written since. With checkpoints every n
@@ -86,7 +83,6 @@ class FrameReplay(ReplayBuffer):
     Raises:
         DiskSpaceError: if the disk cannot hold the ring.
         CheckpointError: if ``path`` holds a ring of another size.
-        ValueError: for sizes that cannot be, or an extra column with the name of something that a sample has anyway.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -169,21 +165,8 @@ class FrameReplay(ReplayBuffer):
         """Frames stored so far, those that were overwritten included; the newest one's number is one less."""
         return self._storage.frames
 
-    @property
-    def returns_pixels(self) -> bool:
-        """Whether samples have stacks."""
-        return self._storage.returns_pixels
-
-    @returns_pixels.setter
-    def returns_pixels(self, value: bool) -> None:
-        self._storage.returns_pixels = value
-
     def observations(self, numbers: Tensor) -> Tensor:
-        """Return observations by number, int64 ``[B]``, as uint8 ``[B, frame_stack * C, H, W]``.
-
-        Raises:
-            DatasetError: if one of them is not in the ring, or no longer.
-        """
+        """Return observations by number, int64 ``[B]``, as uint8 ``[B, frame_stack * C, H, W]``."""
         with self._replay_lock:
             return self._storage.observations(numbers)
 
@@ -193,17 +176,13 @@ class FrameReplay(ReplayBuffer):
             return {"ring": self._storage.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the content of the moment the state was taken.
-
-        Raises:
-            CheckpointError: if the ring has another size, or was overwritten by more than ``slack`` frames since.
-        """
+        """Restore the content of the moment the state was taken, or raise a CheckpointError."""
         with self._replay_lock:
             self._storage.load_state_dict(state_dict["ring"])
 
 
 def stack_frames(buffer: ReplayBuffer, *, frame_stack: int = 3, **options: Any) -> FrameReplay:
-    """Turn a buffer of single frames, as most public data sets are, into one whose samples are stacks.
+    """Copy a buffer of single frames, as most public data sets are, into one in RAM whose samples are stacks.
 
     Args:
         buffer: any TorchRL buffer or data set whose rows, in the order of their indices, are transitions of whole
@@ -211,12 +190,6 @@ def stack_frames(buffer: ReplayBuffer, *, frame_stack: int = 3, **options: Any) 
             ``("next", "reward" | "done")``.
         frame_stack: k, frames per stack.
         **options: ``batch_size``, ``generator`` and ``transform`` of :class:`FrameReplay`.
-
-    Returns:
-        A copy in RAM, each frame once, that :func:`crptpro.training.pretrain` takes as a dataset.
-
-    Raises:
-        ValueError: for rows of another form.
 
     Examples:
         >>> dataset = stack_frames(minari_buffer)  # doctest: +SKIP
@@ -238,7 +211,7 @@ def stack_frames(buffer: ReplayBuffer, *, frame_stack: int = 3, **options: Any) 
     return replay
 
 
-class StoredReplay:
+class StoredReplay(StackStorage):
     """The observations in the files of a :class:`FrameReplay`, oldest first, without writing to them.
 
     A ring that went round holds the newest part alone. Nobody may be writing to ``path``, which was the replay's.
@@ -248,31 +221,27 @@ class StoredReplay:
     """
 
     def __init__(self, path: str | Path, *, frame_stack: int = 3) -> None:
-        path = as_path(path)
+        path, self.frame_stack = as_path(path), frame_stack
         number, row_of = (map_rows(path / f"{name}.memmap", torch.int64, ()) for name in ("number", "row_of"))
-        self._step = map_rows(path / "step.memmap", torch.int32, ())
-        self._rows, self._frame_stack = len(number), frame_stack
-        size = math.isqrt((path / "pixels.memmap").stat().st_size // (3 * self._rows))
-        self._frames = map_rows(path / "pixels.memmap", torch.uint8, (3, size, size), self._rows)
+        self.step, rows = map_rows(path / "step.memmap", torch.int32, ()), len(number)
+        size = math.isqrt((path / "pixels.memmap").stat().st_size // (3 * rows))
+        self.pixels = map_rows(path / "pixels.memmap", torch.uint8, (3, size, size), rows)
         # `number` counts from 1. Transitions that were overwritten, and rows never written (0), point elsewhere.
         end = int(number.max())
-        oldest = max(0, end - self._rows)
+        oldest = max(0, end - rows)
         starts = torch.cat([row_of[:1], row_of[row_of > 0]]).unique()
         starts = starts[(starts >= oldest) & (starts + 1 < end)]
-        age = self._step[starts % self._rows].clamp(max=frame_stack - 1)
-        self._starts = starts[starts - age >= oldest]
+        self._starts = starts[starts - self.step[starts % rows].clamp(max=frame_stack - 1) >= oldest]
         if not len(self._starts):
             raise DatasetError(f"The replay in {path} has no transition.")
+        super().__init__(len(self._starts))
 
     def __len__(self) -> int:
-        """Return how many transitions it holds."""
-        return len(self._starts)
+        return self.max_size
 
-    def observations(self, index: Tensor) -> Tensor:
+    def observations(self, numbers: Tensor) -> Tensor:
         """Return the observations of transitions ``[B]``, 0 being the oldest, uint8 ``[B, k * 3, H, W]``."""
-        numbers = self._starts[index]
-        rows = stack_rows(numbers, self._step[numbers % self._rows], self._frame_stack)
-        return gather_stacks(self._frames, rows % self._rows)
+        return self._stacks(self._starts[numbers])
 
 
 def as_it_is(sample: TensorDictBase) -> TensorDictBase:
@@ -281,10 +250,7 @@ def as_it_is(sample: TensorDictBase) -> TensorDictBase:
 
 
 class _RingWriter(ImmutableDatasetWriter):
-    """Hands what a buffer is extended by to the ring, checked.
-
-    Reading and checking a TensorDict of one transition costs about 0.25 ms; an agent step of walker takes 50 ms.
-    """
+    """Hands what a buffer is extended by to the ring, checked: about 0.25 ms for a single transition."""
 
     def __init__(self, extra: Mapping[str, tuple[tuple[int, ...], torch.dtype]]):
         super().__init__()
@@ -294,7 +260,9 @@ class _RingWriter(ImmutableDatasetWriter):
         """Store transitions in temporal order; see :class:`FrameReplay`."""
         ring: RingStorage = self._storage
         channels = ring.pixels.shape[1]
-        rows = read_rows(data, channels=channels, frame_stack=ring.frame_stack, extra=self._extra)
+        rows = read_rows(
+            data, channels=channels, frame_stack=ring.frame_stack, extra=self._extra, what="A replay"
+        )
         for name, values in {"pixels": rows.following, **rows.columns}.items():
             if values.shape[1:] != ring.content[name].shape[1:]:
                 expected, got = tuple(ring.content[name].shape[1:]), tuple(values.shape[1:])
@@ -310,8 +278,7 @@ class _RingWriter(ImmutableDatasetWriter):
 class _WindowSampler(RandomSampler):
     """Draws uniformly, with replacement, from the transitions whose window of n lies in one episode.
 
-    For windows of 1 it is its base class, draw for draw. For longer ones a draw that does not fit is redrawn, so
-    that the cost does not grow with the ring.
+    A draw that does not fit is redrawn, so that the cost does not grow with the ring.
     """
 
     def sample(self, storage: RingStorage, batch_size: int) -> tuple[Tensor, dict]:

@@ -32,11 +32,7 @@ _MAP_NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)
 
 
 def map_rows(path: Path, dtype: torch.dtype, shape: Sequence[int], rows: int | None = None) -> Tensor:
-    """Map a raw file of rows (as many as there are by default): writing to the tensor leaves the file alone.
-
-    Raises:
-        DatasetError: if the file is missing, empty, or of another size.
-    """
+    """Map a raw file of rows (as many as there are by default): writing to the tensor leaves the file alone."""
     row_bytes = math.prod(shape) * dtype.itemsize
     try:
         with open(path, "rb") as file:
@@ -57,49 +53,29 @@ def require_size(path: Path, size: int, expected: int | None) -> None:
         )
 
 
-# --- stacks ----------------------------------------------------------------------------------------------------------
-
-
 def stack_rows(row: Tensor, step: Tensor, frame_stack: int) -> Tensor:
     """Return the frame rows of a stack, oldest to newest, int64 ``[B, frame_stack]``.
 
+    ``row`` int64 ``[B]`` is that of the newest frame, ``step`` ``[B]`` the number of frames of its episode before it.
     Rows before the episode's first frame are that frame, as ``CatFrames(padding="same")`` does after a reset.
-
-    Args:
-        row: int64 ``[B]``, row of each observation's newest frame.
-        step: ``[B]``, number of frames of the same episode before it.
-        frame_stack: k, frames per stack.
     """
     age = torch.arange(frame_stack - 1, -1, -1, device=row.device)
     return row.unsqueeze(-1) - torch.minimum(age, step.to(torch.int64).unsqueeze(-1))
 
 
 def gather_stacks(frames: Tensor, rows: Tensor) -> Tensor:
-    """Gather ``[B, k]`` frame rows into stacks ``[B, k * C, H, W]``; contiguous, the dtype of ``frames``.
-
-    Two gathers for an observation and its successor are faster than one of the k + 1 frames they share, which would
-    have to be copied again to be contiguous.
-    """
+    """Gather ``[B, k]`` frame rows into stacks ``[B, k * C, H, W]``; contiguous, the dtype of ``frames``."""
     channels, *size = frames.shape[1:]
     stacks = frames.reshape(len(frames), -1).index_select(0, rows.reshape(-1))
     return stacks.view(len(rows), rows.shape[1] * channels, *size)
 
 
-# --- transitions as they come ----------------------------------------------------------------------------------------
-
-
 class Rows(NamedTuple):
-    """T transitions in temporal order.
+    """T transitions in temporal order."""
 
-    Args:
-        stacks: uint8 ``[T, m * C, H, W]``, observations of m frames, oldest to newest.
-        following: uint8 ``[T, C, H, W]``, the newest frame of the next observations.
-        columns: everything else by name, ``[T, ...]``: ``action``, ``reward``, ``done``, ``terminated``, ``truncated``.
-    """
-
-    stacks: Tensor
-    following: Tensor
-    columns: dict[NestedKey, Tensor]
+    stacks: Tensor  # uint8 [T, m * C, H, W], observations of m frames, oldest to newest
+    following: Tensor  # uint8 [T, C, H, W], the newest frame of the next observations
+    columns: dict[NestedKey, Tensor]  # [T, ...]: action, reward, done, terminated, truncated, ...
 
     @property
     def newest(self) -> Tensor:
@@ -114,10 +90,8 @@ class Rows(NamedTuple):
     def pieces(self, last: Tensor | None) -> Iterator[tuple[bool, Rows]]:
         """Split where episodes begin; yields whether a piece begins one, and its rows.
 
-        A row continues the one before if that one was not done and led to the frame that this one begins with.
-
-        Args:
-            last: the newest frame of what was stored before; ``None`` if no episode is running.
+        A row continues the one before if that one was not done and led to the frame that this one begins with. The
+        first one may continue an episode that is running, of which ``last`` is the newest frame.
         """
         newest, length = self.newest, len(self.following)
         if not length:
@@ -127,7 +101,7 @@ class Rows(NamedTuple):
             begins = (newest[1:] != self.following[:-1]).flatten(1).any(1) | self.columns["done"][:-1, 0]
             starts += (1 + begins.nonzero().squeeze(-1)).tolist()
         for first, end in itertools.pairwise(sorted({0, *starts, length})):
-            yield first in starts, self if (first, end) == (0, length) else self.part(first, end)
+            yield first in starts, self.part(first, end)
 
     def first_frames(self) -> Tensor:
         """Return the first observation's frames without those that an episode's start repeats, ``[s, C, H, W]``."""
@@ -139,20 +113,11 @@ class Rows(NamedTuple):
 
 
 def read_rows(
-    data: TensorDictBase,
-    *,
-    channels: int,
-    frame_stack: int,
-    extra: Sequence[NestedKey] = (),
-    what: str = "A replay",
+    data: TensorDictBase, *, channels: int, frame_stack: int, extra: Sequence[NestedKey] = (), what: str
 ) -> Rows:
     """Read what a TorchRL environment, rollout or collector hands out, ``[T]`` in temporal order or ``[]``.
 
     ``pixels`` are single frames of so many channels or stacks of them; ``what`` is being written, for messages.
-
-    Raises:
-        ValueError: for entries that are missing or of another shape.
-        NonFiniteError: for a reward or an action that is NaN or infinite.
     """
     if not is_tensor_collection(data) or data.ndim > 1:
         got = f"a batch {tuple(data.shape)}" if is_tensor_collection(data) else type(data).__name__
@@ -161,20 +126,17 @@ def read_rows(
         )
 
     def entry(key: NestedKey, default: Tensor | None = None) -> Tensor:
-        value = following.get(key[1], None) if isinstance(key, tuple) else data.get(key, None)
+        value = data.get(key, default)
         if value is None:
-            if default is None:
-                found = sorted(map(str, data.keys(True, True)))
-                raise ValueError(f"{what} needs {key!r} with every transition; there are {found}.")
-            return default
-        value = value if value.device.type == "cpu" else value.cpu()
-        return value if data.ndim else value.unsqueeze(0)
+            found = sorted(map(str, data.keys(True, True)))
+            raise ValueError(f"{what} needs {key!r} with every transition; there are {found}.")
+        value = value.cpu()
+        return value if data.ndim or value is default else value.unsqueeze(0)
 
     def column(name: str, default: Tensor | None = None) -> Tensor:
         value = entry(("next", name), default)
         return value if value.ndim == 2 else value.reshape(len(value), 1)
 
-    following = data.get("next", TensorDict({}, data.shape))
     stacks, next_stacks = entry("pixels"), entry(("next", "pixels"))
     for pixels in (stacks, next_stacks):
         fits = pixels.ndim == 4 and pixels.shape[1] in (channels, frame_stack * channels)
@@ -184,11 +146,12 @@ def read_rows(
                 f"{tuple(pixels.shape[1:])}."
             )
     columns = {"action": entry("action"), "reward": column("reward"), "done": (done := column("done"))}
-    for name, values in (("reward", columns["reward"]), ("action", columns["action"])):
-        if not (finite := torch.isfinite(values)).all():
+    for name in ("reward", "action"):
+        finite = torch.isfinite(columns[name])
+        if not finite.all():
             row = int((~finite).flatten(1).any(1).nonzero()[0])
             raise NonFiniteError(
-                f"The {name} of transition {row} is {values[row].tolist()}. {what} takes finite numbers only; "
+                f"The {name} of transition {row} is {columns[name][row].tolist()}. {what} takes finite numbers only; "
                 "mend the environment, or leave the episode out."
             )
     columns["terminated"] = terminated = column("terminated", done)
@@ -197,26 +160,17 @@ def read_rows(
     return Rows(stacks, next_stacks[:, -channels:], columns)
 
 
-# --- storages --------------------------------------------------------------------------------------------------------
-
-
 class StackStorage(Storage):
     """A TorchRL storage of transitions that keeps each frame once and makes the stacks when it is read.
 
     Frames are counted as they are stored; the ``number`` of an observation is that of its newest frame.
-
-    Attributes:
-        pixels: uint8 ``[rows, C, H, W]``; frame n lies in row ``n % rows``.
-        step: ``[rows]``, frames of the same episode before each.
-        frame_stack: k, frames per observation.
-        returns_pixels: whether :meth:`get` makes the stacks.
     """
 
-    pixels: Tensor
-    step: Tensor
+    pixels: Tensor  # uint8 [rows, C, H, W]; frame n lies in row n % rows
+    step: Tensor  # [rows], frames of the same episode before each
     frame_stack: int
-    device: torch.device
-    returns_pixels: bool = True
+    device = torch.device("cpu")
+    returns_pixels = True
 
     def columns_at(self, index: Tensor, **how: Any) -> TensorDict:
         """Return everything but pixels of transitions ``[B]``, with both observations' numbers."""
@@ -237,11 +191,7 @@ class StackStorage(Storage):
         return sample if positions.ndim == 1 else sample.reshape(positions.shape)
 
     def observations(self, numbers: Tensor) -> Tensor:
-        """Return observations by number, uint8 ``[B, k * C, H, W]``.
-
-        Raises:
-            DatasetError: if a frame of one of them is not there, or no longer.
-        """
+        """Return observations by number, uint8 ``[B, k * C, H, W]``; a DatasetError if one is not there any more."""
         numbers, held = torch.as_tensor(numbers, dtype=torch.int64, device=self.device), self.held()
         first = numbers - torch.clamp(self.step[numbers % len(self.pixels)], max=self.frame_stack - 1)
         gone = (first < held.start) | (numbers >= held.stop)
@@ -252,10 +202,9 @@ class StackStorage(Storage):
         return self._stacks(numbers)
 
     def _stacks(self, numbers: Tensor) -> Tensor:
-        rows = len(self.pixels)
-        return gather_stacks(
-            self.pixels, stack_rows(numbers, self.step[numbers % rows], self.frame_stack) % rows
-        )
+        count = len(self.pixels)
+        rows = stack_rows(numbers, self.step[numbers % count], self.frame_stack)
+        return gather_stacks(self.pixels, rows % count)
 
     def _positions(self, index: Any) -> Tensor:
         if isinstance(index, tuple) and len(index) == 1:
@@ -314,7 +263,6 @@ class RingStorage(StackStorage):
         path: Path | None,
     ):
         super().__init__(capacity)
-        self.device = torch.device("cpu")
         self.rows, self.window, self.slack, self.path = window + slack, window, slack, path
         self.frame_stack, self.n_step, self.discount = frame_stack, n_step, discount
         self.root_columns = root_columns
@@ -324,27 +272,25 @@ class RingStorage(StackStorage):
         # ``number`` is one more than the row's counter, 0 if it was never written; ``row_of`` belongs to
         # transitions, which have a counter of their own.
         own = {"step": torch.int32, "number": torch.int64, "row_of": torch.int64}
-        self._maps: list[mmap.mmap] = []
-        if path is not None:
-            path.mkdir(parents=True, exist_ok=True)
         specs = {**columns, **{name: ((), dtype) for name, dtype in own.items()}}
         self.content: dict[NestedKey, Tensor] = {
-            name: self._allocate(name, *spec) for name, spec in specs.items()
+            name: torch.zeros(self.rows, *shape, dtype=dtype, device="cpu")
+            if path is None
+            else map_file(path / f"{name}.memmap", dtype, (self.rows, *shape))
+            for name, (shape, dtype) in specs.items()
         }
         self.pixels, self.step = self.content["pixels"], self.content["step"]
         self.number, self.row_of = self.content["number"], self.content["row_of"]
         self.column_names = tuple(name for name in columns if name != "pixels")
 
-    # -- writing
-
     def write(self, rows: Rows) -> Tensor:
         """Store transitions in temporal order; returns their observations' numbers, int64 ``[T]``."""
-        total, numbers = len(rows.following), []
-        for begin in range(0, total, self.max_size):
-            part = rows if total <= self.max_size else rows.part(begin, begin + self.max_size)
+        numbers = []
+        for begin in range(0, len(rows.following), self.max_size):
+            part = rows.part(begin, begin + self.max_size)
             last = self.pixels[(self.frames - 1) % self.rows] if self.is_open else None
             numbers += [self._write_piece(piece, begins=begins) for begins, piece in part.pieces(last)]
-        return numbers[0] if len(numbers) == 1 else torch.cat(numbers)
+        return torch.cat(numbers)
 
     def _write_piece(self, rows: Rows, *, begins: bool) -> Tensor:
         """Store transitions of one episode."""
@@ -359,9 +305,8 @@ class RingStorage(StackStorage):
         self._put("number", self.frames, number + 1)
         self._put("pixels", self.frames, frames)
         self._put("step", self.frames, number - self.frames + self.episode_step + 1)
-        start = self.frames + lead - 1
         for name, values in rows.columns.items():
-            self._put(name, start, values)
+            self._put(name, self.frames + lead - 1, values)
         number = number[:length] + (lead - 1)
         self._put("row_of", self.transitions, number)
         self.frames += count
@@ -388,8 +333,6 @@ class RingStorage(StackStorage):
                 return
             self.oldest += 1
 
-    # -- reading
-
     def __len__(self) -> int:
         return self.transitions - self.oldest
 
@@ -407,7 +350,7 @@ class RingStorage(StackStorage):
         number = self._numbers_at(index)
         row = number % self.rows
         # The transitions of a window follow one another in rows, and its last one leads to the next observation.
-        last = row if n_step == 1 else (row + n_step - 1) % self.rows
+        last = (row + n_step - 1) % self.rows
         root, following = {"number": number}, {"number": number + n_step}
         for name in self.column_names:
             if name in self.root_columns:
@@ -429,32 +372,26 @@ class RingStorage(StackStorage):
     def _numbers_at(self, index: Tensor) -> Tensor:
         return self.row_of[(self.oldest + index) % self.rows]
 
-    # -- keeping
-
     def state_dict(self) -> dict[str, Any]:
         """Return the counters, and the rows themselves if they are in RAM."""
-        for mapped in self._maps:
-            mapped.flush()  # only a crash of the machine makes a difference
         counters = {name: getattr(self, name) for name in self.COUNTERS}
         state: dict[str, Any] = {"counters": counters, "rows": self.rows, "window": self.window}
         if self.path is None:
             used = min(self.frames, self.rows)
-            state["content"] = {name: column[:used].clone() for name, column in self.content.items()}
+            return state | {"content": {name: column[:used].clone() for name, column in self.content.items()}}
+        for name in self.content:  # only a crash of the machine makes a difference
+            with open(self.path / f"{name}.memmap", "r+b") as file:
+                os.fsync(file.fileno())
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Return to the content of the moment ``state_dict`` was taken.
-
-        Raises:
-            CheckpointError: if it belongs to a ring of another size, or its rows were overwritten since.
-        """
-        shape = (state_dict["rows"], state_dict["window"])
+        """Return to the content of the moment ``state_dict`` was taken, or raise a CheckpointError."""
+        shape, counters = (state_dict["rows"], state_dict["window"]), state_dict["counters"]
         if shape != (self.rows, self.window):
             raise CheckpointError(
                 f"The replay's checkpoint has {shape[0]} rows, {shape[1]} of them in use; this replay has "
                 f"{self.rows} and {self.window}. Use the capacity and slack it was written with."
             )
-        counters = state_dict["counters"]
         if "content" in state_dict:
             for name, column in state_dict["content"].items():
                 self.content[name][: len(column)] = column
@@ -466,8 +403,7 @@ class RingStorage(StackStorage):
     def _check_rows(self, frames: int) -> None:
         """Make sure that every row of a state's window still holds what it held then."""
         needed = torch.arange(max(0, frames - self.window), frames, device="cpu")
-        lost = int((self.number[needed % self.rows] != needed + 1).sum())
-        if lost:
+        if lost := int((self.number[needed % self.rows] != needed + 1).sum()):
             since = int(self.number.max()) - frames
             why = "the files were removed or replaced; put them back."
             if since > self.slack:
@@ -482,19 +418,7 @@ class RingStorage(StackStorage):
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy cannot share the files that this ring goes on writing: it holds the rows in RAM.
-        return {**super().__getstate__(), "_maps": [], "path": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        super().__setstate__(state)
-        self.pixels, self.step = self.content["pixels"], self.content["step"]
-        self.number, self.row_of = self.content["number"], self.content["row_of"]
-
-    def _allocate(self, name: str, shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-        if self.path is None:
-            return torch.zeros(self.rows, *shape, dtype=dtype, device="cpu")
-        mapped = map_file(self.path / f"{name}.memmap", self.rows * math.prod(shape) * dtype.itemsize)
-        self._maps.append(mapped)
-        return torch.frombuffer(mapped, dtype=dtype).view(self.rows, *shape)
+        return {**super().__getstate__(), "path": None}
 
 
 def n_step_return(rewards: Tensor, terminated: Tensor, discount: float) -> tuple[Tensor, Tensor]:
@@ -504,15 +428,8 @@ def n_step_return(rewards: Tensor, terminated: Tensor, discount: float) -> tuple
         R = \sum_{i=0}^{n-1} \gamma^i \Big(\prod_{j<i} d_j\Big) r_i, \qquad
         D = \gamma^n \prod_{j=0}^{n-1} d_j
 
-    with the environment's discount :math:`d_j = 0` where transition j terminated and 1 elsewhere.
-
-    Args:
-        rewards: ``[B, n, 1]``.
-        terminated: bool ``[B, n, 1]``; a truncation is none.
-        discount: gamma, in [0, 1].
-
-    Returns:
-        R and D, each ``[B, 1]``.
+    with :math:`d_j = 0` where transition j terminated (a truncation is none) and 1 elsewhere. ``rewards`` and
+    ``terminated`` are ``[B, n, 1]``, R and D ``[B, 1]``.
     """
     total, factor = torch.zeros_like(rewards[:, 0]), torch.ones_like(rewards[:, 0])
     for reward, ended in zip(rewards.unbind(1), terminated.unbind(1)):
@@ -521,28 +438,18 @@ def n_step_return(rewards: Tensor, terminated: Tensor, discount: float) -> tuple
     return total, factor
 
 
-def map_file(path: Path, size: int) -> mmap.mmap:
-    """Map a file of ``size`` bytes, which are reserved if it is new.
-
-    Raises:
-        CheckpointError: there is a file of another size.
-        DiskSpaceError: the disk cannot hold it; nothing is left of what was reserved.
-        OSError: naming the file, for any other reason.
-    """
-    # A new one has its name once it is whole: a kill while it is reserved leaves nothing that looks like rows.
-    is_new, partial = not path.exists(), path.with_name(f".{path.name}.partial")
+def map_file(path: Path, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
+    """Map a file that writing to the tensor changes; its bytes are reserved if it is new, all of them or none."""
+    size = math.prod(shape) * dtype.itemsize
+    partial = path.with_name(f".{path.name}.partial")
     try:
-        with open(partial if is_new else path, "w+b" if is_new else "r+b") as file:
-            if is_new:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            # It has its name once it is whole: a kill while it is reserved leaves nothing that looks like rows.
+            with open(partial, "w+b") as file:
                 # Reserved, not sparse: a disk that fills up later would end the process by a bus error.
                 os.posix_fallocate(file.fileno(), 0, size)
-                os.replace(partial, path)
-            if (found := os.fstat(file.fileno()).st_size) != size:
-                raise CheckpointError(
-                    f"{path} has {found:,} bytes, this replay needs {size:,}: it belongs to a replay of another size. "
-                    "Use the capacity and slack it was written with, or another directory."
-                )
-            return mmap.mmap(file.fileno(), size)
+            os.replace(partial, path)
     except OSError as reason:
         if is_disk_full(reason) or reason.errno == errno.EFBIG:
             raise DiskSpaceError(
@@ -552,3 +459,9 @@ def map_file(path: Path, size: int) -> mmap.mmap:
         raise writing_error(path, reason) from reason
     finally:
         partial.unlink(missing_ok=True)
+    if (found := path.stat().st_size) != size:
+        raise CheckpointError(
+            f"{path} has {found:,} bytes, this replay needs {size:,}: it belongs to a replay of another size. "
+            "Use the capacity and slack it was written with, or another directory."
+        )
+    return torch.from_file(str(path), shared=True, size=math.prod(shape), dtype=dtype).view(shape)

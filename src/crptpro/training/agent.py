@@ -1,81 +1,87 @@
-"""What acts and what learns: the agent on pixels, the learner that steps its optimisers, the environment's thread."""
+"""What acts and what learns: the agent on pixels, and the learners that step its optimisers."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.envs import EnvBase
 from torchrl.objectives import SoftUpdate
 
 from crptpro.artifact import read_artifact, write_artifact
 from crptpro.errors import CheckpointError, NonFiniteError
-from crptpro.modules import PixelEncoder, SquashedGaussianActor, resolve_precision, set_compute_dtype
+from crptpro.modules import (
+    DeterministicActor,
+    PixelEncoder,
+    SquashedGaussianActor,
+    TwinCritic,
+    resolve_precision,
+    set_compute_dtype,
+)
 from crptpro.objectives import RADSACLoss, SkillDDPGLoss
 from crptpro.provenance import provenance
 from crptpro.training.compile import accelerate
 
 AGENT_FORMAT, AGENT_VERSION = "crptpro-agent", 2
-T = TypeVar("T")
 
 
-class PixelAgent:
-    """An encoder and the actor on it, acting on one observation at a time; callable as a deterministic policy.
+class PixelAgent(nn.Module):
+    """An encoder and the actor on its features, acting on one observation; callable as a deterministic policy."""
 
-    Args:
-        encoder: maps pixels to features.
-        actor: maps features to actions.
-    """
+    encoder: nn.Module
+    actor: Any
 
-    def __init__(self, encoder: nn.Module, actor: SquashedGaussianActor) -> None:
+    def __init__(self, encoder: nn.Module, actor: nn.Module) -> None:
+        super().__init__()
         self.encoder, self.actor = encoder, actor
 
     @torch.no_grad()
-    def __call__(self, pixels: Tensor) -> Tensor:
+    def forward(self, pixels: Tensor) -> Tensor:
         """Return ``tanh`` of the mean, float32 ``[A]``, for uint8 ``[C, H, W]`` (no shift, no noise)."""
-        device = next(self.actor.parameters()).device
-        return self.actor.mode(self.encoder(pixels.unsqueeze(0).to(device))).squeeze(0).float().cpu()
+        return self.actor.mode(self._features(pixels)).squeeze(0).float().cpu()
 
     @torch.no_grad()
-    def explore(self, pixels: Tensor, generator: torch.Generator) -> Tensor:
+    def explore(
+        self, pixels: Tensor, generator: torch.Generator, *, where: str, skill: Tensor | None = None
+    ) -> Tensor:
         """Return a sample of the policy, float32 ``[A]`` in ``[-1, 1]``, for uint8 ``[C, H, W]``.
 
+        ``skill`` is one-hot ``[S]``, for an actor that takes one.
+
         Raises:
-            NonFiniteError: the policy has diverged; no simulator should see its actions.
+            NonFiniteError: the policy has diverged; no simulator should see its actions. It says ``where``.
         """
-        device = next(self.actor.parameters()).device
-        features = self.encoder(pixels.unsqueeze(0).to(device))
-        action = self.actor.sample(features, generator=generator)[0].squeeze(0).float().cpu().clamp(-1, 1)
+        inputs = self._features(pixels)
+        if skill is not None:
+            inputs = torch.cat([inputs, skill.unsqueeze(0).to(inputs.device)], -1)
+        sampled = self.actor.sample(inputs, generator=generator)
+        action = sampled if isinstance(sampled, Tensor) else sampled[0]
+        action = action.squeeze(0).float().cpu().clamp(-1, 1)
         if not torch.isfinite(action).all():
             raise NonFiniteError(
-                f"The policy acts {action.tolist()}: it has diverged. The last checkpoint is kept; lower the learning "
-                "rate or use precision='fp32'."
+                f"{where}: the policy acts {action.tolist()}, it has diverged. The last checkpoint is kept; lower the "
+                "learning rate or use precision='fp32'."
             )
         return action
 
     def snapshot(self) -> PixelAgent:
         """Return the agent as it is now; an encoder that is trained is copied, a frozen one is shared."""
-        trains_encoder = any(parameter.requires_grad for parameter in self.encoder.parameters())
-        encoder = copy.deepcopy(self.encoder) if trains_encoder else self.encoder
-        return PixelAgent(encoder, copy.deepcopy(self.actor))
+        is_trained = any(parameter.requires_grad for parameter in self.encoder.parameters())
+        return copy.deepcopy(self, {} if is_trained else {id(self.encoder): self.encoder})
+
+    def _features(self, pixels: Tensor) -> Tensor:
+        device = next(self.actor.parameters()).device
+        return self.encoder(pixels.unsqueeze(0).to(device))
 
 
 def save_agent(path: str | Path, agent: PixelAgent, *, card: Mapping[str, Any]) -> Path:
-    """Write encoder and actor with a card; whole or not at all.
+    """Write encoder and actor into a directory with a card, whole or not at all.
 
-    Args:
-        path: directory to write or replace.
-        agent: what to keep; its encoder must be a :class:`~crptpro.modules.PixelEncoder` to be rebuilt from the card.
-        card: what else the reader should know: task, seed, env steps, where the encoder came from.
-
-    Raises:
-        DiskSpaceError: if the disk is full; an agent there is kept.
+    The card has what else the reader should know. A :class:`~crptpro.modules.PixelEncoder` can be rebuilt from it.
     """
     modules = {"encoder": agent.encoder, "actor": agent.actor}
     content = {
@@ -88,9 +94,7 @@ def save_agent(path: str | Path, agent: PixelAgent, *, card: Mapping[str, Any]) 
 
 
 def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[PixelAgent, dict[str, Any]]:
-    """Rebuild an agent from its artifact.
-
-    It acts in the arithmetic that its run learned in: what the card's ``precision`` means on this machine.
+    """Rebuild an agent from its artifact, to act in the arithmetic that its run learned in.
 
     Args:
         path: directory.
@@ -106,26 +110,19 @@ def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[P
     card, tensors = read_artifact(
         path, format_name=AGENT_FORMAT, version=AGENT_VERSION, error=CheckpointError
     )
+    if encoder is None and card.get("encoder_class") != PixelEncoder.__name__:
+        raise CheckpointError(
+            f"{path} acts on a {card.get('encoder_class')}, which only its author can build: pass encoder=."
+        )
     try:
         if encoder is None:
-            if card["encoder_class"] != PixelEncoder.__name__:
-                raise CheckpointError(
-                    f"{path} acts on a {card['encoder_class']}, which only its author can build: pass encoder=."
-                )
             encoder = PixelEncoder(**card["modules"]["encoder"])
-        actor = SquashedGaussianActor(**card["modules"]["actor"])
+        agent = PixelAgent(encoder, SquashedGaussianActor(**card["modules"]["actor"]))
+        agent.load_state_dict(tensors)
         dtype = resolve_precision(card.get("config", {}).get("precision", "fp32"), "cpu")
-        for name, module in (("encoder", encoder), ("actor", actor)):
-            prefix = f"{name}."
-            module.load_state_dict(
-                {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
-            )
-            set_compute_dtype(module.requires_grad_(False).eval(), dtype)
     except (KeyError, TypeError, ValueError, RuntimeError) as reason:
-        if isinstance(reason, CheckpointError):
-            raise
         raise CheckpointError(f"{path} holds no agent that can be rebuilt: {reason!r}") from reason
-    return PixelAgent(encoder, actor), card
+    return set_compute_dtype(agent.requires_grad_(False).eval(), dtype), card
 
 
 class SACLearner:
@@ -134,13 +131,7 @@ class SACLearner:
     Each of the three has its own Adam, as in Proto-RL's and CRPTpro's released agents. Actor and temperature step at
     every ``actor_interval``-th agent step, the target moves at every ``target_interval``-th.
 
-    Args:
-        loss: the SAC losses; their parameters are trained in place.
-        learning_rate: of the three optimisers.
-        critic_tau: EMA rate of the target critic.
-        actor_interval: agent steps between two actor steps.
-        target_interval: agent steps between two target updates.
-        compile: compile the losses.
+    ``critic_tau`` is the EMA rate of the target critic; ``compile`` compiles the losses.
     """
 
     def __init__(
@@ -153,20 +144,22 @@ class SACLearner:
         target_interval: int = 2,
         compile: bool = False,
     ) -> None:
-        self.loss = loss
         self.actor_interval, self.target_interval = actor_interval, target_interval
-        self.targets = SoftUpdate(loss, tau=critic_tau)
         groups = {
             "critic": loss.critic.parameters(),
             "actor": loss.actor.parameters(),
             "temperature": [loss.log_alpha],
         }
+        self._begin(loss, groups, learning_rate, critic_tau)
+        self._critic_loss = accelerate(loss.critic_loss, compile=compile)
+        self._actor_loss = accelerate(loss.actor_and_temperature_loss, compile=compile)
+
+    def _begin(self, loss: Any, groups: Mapping[str, Any], learning_rate: float, critic_tau: float) -> None:
+        self.loss, self.targets = loss, SoftUpdate(loss, tau=critic_tau)
         self.optimizers = {
             name: torch.optim.Adam(list(group), lr=learning_rate, fused=True)
             for name, group in groups.items()
         }
-        self._critic_loss = accelerate(loss.critic_loss, compile=compile)
-        self._actor_loss = accelerate(loss.actor_and_temperature_loss, compile=compile)
 
     def update(self, batch: TensorDictBase, *, agent_step: int) -> TensorDictBase:
         """Do one update on a batch with features and rewards; returns detached scalars."""
@@ -189,98 +182,58 @@ class SACLearner:
 
     def components(self) -> dict[str, Any]:
         """Return what a checkpoint must hold."""
-        return {"agent_loss": self.loss, "agent_targets": self.targets,
-                **{f"optimizer_{name}": optimizer for name, optimizer in self.optimizers.items()}}  # fmt: skip
+        optimizers = {f"optimizer_{name}": optimizer for name, optimizer in self.optimizers.items()}
+        return {"agent_loss": self.loss, "agent_targets": self.targets, **optimizers}
 
 
-class SkillDDPGLearner:
+class SkillDDPGLearner(SACLearner):
     """Steps the critic, then the actor against it, then moves the target, every time (BeCL's explorer).
 
     Source: rll-research/url_benchmark ``agent/ddpg.py``.
-
-    Args:
-        loss: the DDPG losses; their parameters are trained in place.
-        learning_rate: of both optimisers.
-        critic_tau: EMA rate of the target critic.
     """
 
     def __init__(self, loss: SkillDDPGLoss, *, learning_rate: float = 1e-4, critic_tau: float = 0.01) -> None:
-        self.loss = loss
-        self.targets = SoftUpdate(loss, tau=critic_tau)
         groups = {"critic": loss.critic.parameters(), "actor": loss.actor.parameters()}
-        self.optimizers = {
-            name: torch.optim.Adam(list(group), lr=learning_rate, fused=True)
-            for name, group in groups.items()
-        }
+        self._begin(loss, groups, learning_rate, critic_tau)
 
     def update(self, batch: TensorDictBase, *, agent_step: int) -> TensorDictBase:
         """Do one update on a batch with features, skills and n-step rewards; returns detached scalars."""
         losses = self.loss.critic_loss(batch)
-        SACLearner._step(self, losses["loss_qvalue"], "critic")  # type: ignore[arg-type]
+        self._step(losses["loss_qvalue"], "critic")
         losses["loss_actor"] = self.loss.actor_loss(batch)
-        SACLearner._step(self, losses["loss_actor"], "actor")  # type: ignore[arg-type]
+        self._step(losses["loss_actor"], "actor")
         self.targets.step()
         return losses.detach()
 
-    def components(self) -> dict[str, Any]:
-        """Return what a checkpoint must hold."""
-        return SACLearner.components(self)  # type: ignore[arg-type]
+
+def make_sac_loss(
+    loss_class: Callable[..., RADSACLoss],
+    feature_dim: int,
+    action_dim: int,
+    *,
+    hidden_dim: int,
+    device: torch.device,
+    has_tanh: bool = False,
+    actor: nn.Module | None = None,
+    **options: Any,
+) -> RADSACLoss:
+    """Return a SAC loss of fresh networks, or of a given actor, on a device; ``options`` are the loss's."""
+    widths: dict[str, Any] = {"hidden_dim": hidden_dim, "has_tanh": has_tanh}
+    actor = SquashedGaussianActor(feature_dim, action_dim, **widths) if actor is None else actor
+    critic = TwinCritic(feature_dim, action_dim, **widths)
+    return loss_class(actor.to(device), critic.to(device), **options)
 
 
-class EnvThread:
-    """Makes, steps and closes one environment in a thread of its own, where its render context is.
-
-    MuJoCo lets other threads run while it simulates and draws: the next observation is drawn while an update computes.
-    What an environment returns does not depend on when it is asked, so that this changes no number.
-
-    Args:
-        make_env: builds the environment.
-        runs_ahead: ``False`` does everything in the caller's thread.
-    """
-
-    def __init__(self, make_env: Callable[[], EnvBase], *, runs_ahead: bool) -> None:
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="environment") if runs_ahead else None
-        try:
-            self.env = self._submit(make_env).result()
-        except BaseException:
-            self._shutdown()
-            raise
-
-    def reset(self, seed: int) -> TensorDictBase:
-        """Seed the environment and begin the episode of the seed."""
-
-        def reset() -> TensorDictBase:
-            self.env.set_seed(seed)
-            return self.env.reset()
-
-        return self._submit(reset).result()
-
-    def step(self, td: TensorDictBase) -> Future[TensorDictBase]:
-        """Begin the step that ``td["action"]`` asks for; nobody may change ``td`` until its result is there."""
-        return self._submit(lambda: self.env.step(td))
-
-    def close(self) -> None:
-        """Free the render context."""
-        try:
-            self._submit(self.env.close).result()
-        finally:
-            self._shutdown()
-
-    def _submit(self, work: Callable[[], T]) -> Future[T]:
-        if self._thread is not None:
-            return self._thread.submit(work)
-        future: Future[T] = Future()
-        try:
-            future.set_result(work())
-        except BaseException as reason:
-            future.set_exception(reason)
-        return future
-
-    def _shutdown(self) -> None:
-        if self._thread is not None:
-            self._thread.shutdown()
-
-
-def uniform_action(env: EnvBase, generator: torch.Generator) -> Tensor:
-    """Return a uniformly random action in ``[-1, 1]^A``."""
-    return 2 * torch.rand(env.action_spec.shape, generator=generator) - 1
+def make_skill_ddpg_loss(
+    feature_dim: int,
+    action_dim: int,
+    skill_dim: int,
+    *,
+    hidden_dim: int,
+    device: torch.device,
+    **options: Any,
+) -> SkillDDPGLoss:
+    """Return the loss of BeCL's explorer with fresh networks on a device; ``options`` are the loss's."""
+    actor = DeterministicActor(feature_dim, action_dim, skill_dim=skill_dim, hidden_dim=hidden_dim)
+    critic = TwinCritic(feature_dim + skill_dim, action_dim, hidden_dim=hidden_dim, has_tanh=True)
+    return SkillDDPGLoss(actor.to(device), critic.to(device), **options)

@@ -7,14 +7,11 @@ import logging
 import math
 from collections.abc import Mapping
 from statistics import fmean
-from typing import Any, Literal
+from typing import Any
 
 from torch import nn
 
-_LOG = logging.getLogger(__name__)
-
-State = Literal["learning", "plateau", "dead"]
-
+logger = logging.getLogger(__name__)
 
 LOSS_MARGIN = 0.005
 """How near to ln(M) counts, as a fraction of it."""
@@ -25,11 +22,10 @@ EXIT_OBSERVATIONS = 2
 class CollapseMonitor:
     """Watch a pre-training run for collapse and announce what it sees.
 
-    A comparative loss of ln(M) (6.238 for 512 prototypes) means that predictions or assignments are uniform;
-    a mean pairwise cosine near 1 means that every observation has the same embedding. Small trials of the
-    paper's loss stay there for about 1,200 updates and then leave, so being there is a ``plateau`` at first
-    (announced once, as expected to pass) and ``dead`` only when it lasts longer than ``patience_updates``.
-    Training that ends on a plateau that is still short has proved neither: its verdict stays ``plateau``.
+    A comparative loss of ln(M) (6.238 for 512 prototypes) means that predictions or assignments are uniform; a mean
+    pairwise cosine near 1 means that every observation has the same embedding. Small trials of the paper's loss stay
+    there for about 1,200 updates and then leave. So being there is a ``plateau`` at first, and ``dead`` only when it
+    lasts longer than ``patience_updates``.
 
     Args:
         num_prototypes: M; ``None`` for a loss without prototypes, which is watched by cosine only.
@@ -53,7 +49,7 @@ class CollapseMonitor:
     ) -> None:
         self.floor = math.log(num_prototypes) if num_prototypes and num_prototypes > 1 else None
         self.patience_updates, self.cosine_threshold = patience_updates, cosine_threshold
-        self.state: State = "learning"
+        self.state = "learning"
         self.plateaus: list[list[int | None]] = []  # [entry update, exit update or None]
         self.outside: list[int] = []  # observations outside the plateau that is not over yet
         self.comp: float | None = None
@@ -68,39 +64,42 @@ class CollapseMonitor:
         """
         weight = getattr(getattr(loss, "prototypes", None), "weight", None)
         has_projector = isinstance(getattr(loss, "projector", None), nn.Module)
-        return cls(
-            None if weight is None else len(weight), cosine_threshold=0.99 if has_projector else 0.9999
-        )
+        threshold = 0.99 if has_projector else 0.9999
+        return cls(None if weight is None else len(weight), cosine_threshold=threshold)
 
     def observe(
         self, updates: int, *, comp: float | None = None, cosine: float | Mapping[str, float] | None = None
-    ) -> State:
-        """Take one measurement and return the state after it.
+    ) -> str:
+        """Take the measurement after so many updates, and return the state after it.
 
-        Args:
-            updates: updates done so far.
-            comp: comparative loss in nats, mean since the last observation; ``None`` if the loss has none.
-            cosine: mean pairwise cosine of embeddings in [-1, 1]: one number, or one per domain (their mean
-                decides).
+        ``comp`` is the comparative loss in nats, for a loss that has one; ``cosine`` the mean pairwise cosine of
+        embeddings, one number or one per domain (their mean decides).
         """
         self.comp = comp
         if cosine is not None:
-            self.cosines = dict(cosine) if isinstance(cosine, Mapping) else {"all": float(cosine)}
+            self.cosines = dict(cosine) if isinstance(cosine, Mapping) else {"all": cosine}
         reasons = self._reasons()
-        if reasons and self.state == "learning":
-            self.state = "plateau"
-            self.plateaus.append([updates, None])
-            _LOG.info(
-                "Update %d: plateau (%s). Expected to pass; called dead after %d updates of it.",
-                updates, reasons, self.patience_updates,
-            )  # fmt: skip
-        self.outside = [] if reasons or self.state == "learning" else [*self.outside, updates]
+        if self.state == "learning":
+            if reasons:
+                self.state, self.outside = "plateau", []
+                self.plateaus.append([updates, None])
+                logger.info(
+                    "Update %d: plateau (%s). Expected to pass; called dead after %d updates of it.",
+                    updates, reasons, self.patience_updates,
+                )  # fmt: skip
+            return self.state
+        entered: Any = self.plateaus[-1][0]
+        self.outside = [] if reasons else [*self.outside, updates]
         if len(self.outside) >= EXIT_OBSERVATIONS:
-            self._leave()
-        entered = self.plateaus[-1][0] if self.state == "plateau" else None
-        if entered is not None and reasons and updates - entered > self.patience_updates:
+            self.plateaus[-1][1] = left = self.outside[0]
+            was_dead, self.state, self.outside = self.state == "dead", "learning", []
+            logger.log(
+                logging.WARNING if was_dead else logging.INFO, "Update %s: left the plateau after %d updates%s.",
+                left, left - entered, " (it had been called dead)" if was_dead else "",
+            )  # fmt: skip
+        elif reasons and self.state == "plateau" and updates - entered > self.patience_updates:
             self.state = "dead"
-            _LOG.error(
+            logger.error(
                 "Update %d: DEAD RUN: %s since update %d, longer than %d updates. "
                 "The encoder is not learning; check the data and the temperatures.",
                 updates, reasons, entered, self.patience_updates,
@@ -108,12 +107,10 @@ class CollapseMonitor:
         return self.state
 
     def verdict(self, updates: int) -> dict[str, Any]:
-        """Return the judgement after ``updates`` updates as plain values; changes nothing.
+        """Return the judgement after so many updates as plain values; changes nothing.
 
-        Returns:
-            ``verdict`` (``"learning"``, ``"plateau"`` or ``"dead"``), ``plateaus`` (entry and exit updates),
-            ``plateau_updates`` (their total length), ``ln_num_prototypes``, the last ``comp`` and ``cosine`` per
-            domain, and ``collapsed_domains`` (those above the threshold).
+        ``verdict`` is ``"learning"``, ``"plateau"`` or ``"dead"``, ``plateau_updates`` the total length of the
+        ``plateaus``, ``collapsed_domains`` are those whose cosine is above the threshold.
         """
         length = sum((updates if leave is None else leave) - (enter or 0) for enter, leave in self.plateaus)
         return {
@@ -129,20 +126,20 @@ class CollapseMonitor:
     def finish(self, updates: int) -> dict[str, Any]:
         """Announce how training ended and return :meth:`verdict`."""
         verdict = self.verdict(updates)
-        if self.state == "dead":
-            _LOG.error(
-                "DEAD RUN: training ended at update %d on a plateau entered at update %s (%s). "
-                "Do not use this encoder; check the data and the temperatures.",
-                updates, self.plateaus[-1][0], self._reasons() or "not left yet",
-            )  # fmt: skip
-        elif self.state == "plateau":
-            _LOG.warning(
-                "Training ended at update %d on a plateau entered at update %s (%s): the encoder has not begun to "
-                "learn. That may pass (small trials of the paper's loss took about 1,200 updates); train longer.",
-                updates, self.plateaus[-1][0], self._reasons() or "not left yet",
+        if self.state != "learning":
+            advice = (
+                "DEAD RUN: do not use this encoder; check the data and the temperatures."
+                if self.state == "dead"
+                else "The encoder has not begun to learn. That may pass (small trials of the paper's loss took about "
+                "1,200 updates); train longer."
+            )
+            logger.log(
+                logging.ERROR if self.state == "dead" else logging.WARNING,
+                "Training ended at update %d on a plateau entered at update %s (%s). %s",
+                updates, self.plateaus[-1][0], self._reasons() or "not left yet", advice,
             )  # fmt: skip
         elif verdict["collapsed_domains"]:
-            _LOG.warning(
+            logger.warning(
                 "Embeddings of %s have collapsed (pairwise cosine above %g), not those of every domain.",
                 ", ".join(verdict["collapsed_domains"]), self.cosine_threshold,
             )  # fmt: skip
@@ -150,12 +147,12 @@ class CollapseMonitor:
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a resumed run needs to judge as if never interrupted."""
-        return copy.deepcopy({name: getattr(self, name) for name in _KEPT})
+        names = ("state", "plateaus", "outside", "comp", "cosines")
+        return copy.deepcopy({name: getattr(self, name) for name in names})
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore :meth:`state_dict`."""
-        for name in _KEPT:
-            setattr(self, name, copy.deepcopy(state[name]))
+        vars(self).update(copy.deepcopy(dict(state)))
 
     def _reasons(self) -> str:
         """Say what is wrong now; empty if nothing is."""
@@ -166,16 +163,3 @@ class CollapseMonitor:
         if self.cosines and (mean := fmean(self.cosines.values())) > self.cosine_threshold:
             found.append(f"pairwise cosine {mean:.4f}")
         return ", ".join(found)
-
-    def _leave(self) -> None:
-        since, was_dead = self.outside[0], self.state == "dead"
-        self.plateaus[-1][1] = since
-        _LOG.log(
-            logging.WARNING if was_dead else logging.INFO,
-            "Update %s: left the plateau after %d updates%s.",
-            since, since - (self.plateaus[-1][0] or 0), " (it had been called dead)" if was_dead else "",
-        )  # fmt: skip
-        self.state, self.outside = "learning", []
-
-
-_KEPT = ("state", "plateaus", "outside", "comp", "cosines")

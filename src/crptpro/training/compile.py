@@ -11,6 +11,7 @@ from tensordict.nn import CudaGraphModule
 from crptpro.errors import CompileError
 
 Update = Callable[[TensorDictBase], TensorDictBase]
+COMPILERS = ("torch._dynamo", "torch._inductor", "torch._functorch", "triton")
 
 
 def accelerate(update: Update, *, compile: bool = False, cuda_graph: bool = False) -> Update:
@@ -41,10 +42,8 @@ def accelerate(update: Update, *, compile: bool = False, cuda_graph: bool = Fals
             out = fast(batch)
             return out.clone() if cuda_graph else out
         except Exception as reason:
-            if (
-                not any(kind.__module__.startswith(COMPILERS) for kind in type(reason).__mro__)
-                and not cuda_graph
-            ):
+            is_compilers = any(kind.__module__.startswith(COMPILERS) for kind in type(reason).__mro__)
+            if not (is_compilers or cuda_graph):
                 raise
             what = (str(reason).strip().splitlines() or [type(reason).__name__])[0]
             raise CompileError(
@@ -53,6 +52,3 @@ def accelerate(update: Update, *, compile: bool = False, cuda_graph: bool = Fals
             ) from reason
 
     return call
-
-
-COMPILERS = ("torch._dynamo", "torch._inductor", "torch._functorch", "triton")

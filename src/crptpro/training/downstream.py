@@ -7,8 +7,6 @@ import copy
 import dataclasses
 import functools
 import logging
-import math
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,26 +18,21 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
 from crptpro.data import FrameReplay
-from crptpro.domains import get_domain
-from crptpro.envs import make_env, needs_gl, resolve_action_repeat
-from crptpro.envs.rendering import select_backend
-from crptpro.errors import CheckpointError, NonFiniteError, PretrainedError, UnknownNameError
+from crptpro.domains import Domain
+from crptpro.envs import resolve_action_repeat
+from crptpro.errors import CheckpointError, PretrainedError
 from crptpro.logging import RunLogger
-from crptpro.modules import (
-    SquashedGaussianActor,
-    TwinCritic,
-    resolve_precision,
-    set_compute_dtype,
-    usable_device,
-)
+from crptpro.modules import SquashedGaussianActor, resolve_precision, set_compute_dtype, usable_device
 from crptpro.modules.precision import Precision
 from crptpro.objectives import DrQLoss, RADSACLoss, get_method, method_names
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import derive_seed, seed_everything
-from crptpro.training.agent import EnvThread, PixelAgent, SACLearner, save_agent, uniform_action
-from crptpro.training.evaluate import WORKER_BYTES, Episode, Evaluator, can_be_sent, summarize
+from crptpro.training.agent import PixelAgent, SACLearner, make_sac_loss, save_agent
+from crptpro.training.evaluate import WORKER_BYTES, Episode, Evaluator, summarize
+from crptpro.training.pretrain import SHIFT_PAD, precision_name
 from crptpro.training.run import Generators, Run
+from crptpro.training.world import SPARE_FRAMES, EnvThread, make_replay
 from crptpro.transforms import (
     DenseShiftFeatures,
     FrozenEncoder,
@@ -50,14 +43,12 @@ from crptpro.transforms import (
 from crptpro.transforms.free_memory import free_bytes
 from crptpro.transforms.prototype_reward import warn_if_mostly_zero
 from crptpro.values import Colors, Quality, check_numbers
+from crptpro.workers import can_be_sent
 
 logger = logging.getLogger(__name__)
 
-EnvFactory = Callable[..., EnvBase]
-SHIFT_PAD = 4
 WORTH_WORKERS = 20
 """Evaluation episodes of a run from which on workers pay: starting one takes as long as an episode."""
-SPARE_FRAMES = 2_000
 
 
 @dataclass(frozen=True)
@@ -124,11 +115,7 @@ class DownstreamConfig:
     """where networks and features are"""
 
     def __post_init__(self) -> None:
-        """Convert numbers to plain values.
-
-        Raises:
-            ValueError: naming the setting, its value and what is allowed.
-        """
+        """Convert numbers to plain values, or raise a ValueError that names the setting."""
         counts = {
             "env_steps": 1, "batch_size": 1, "replay_capacity": 1, "random_agent_steps": 1, "knn_k": 1, "queue_size": 1,
             "hidden_dim": 1, "action_repeat": 1, "eval_interval_env_steps": 1, "eval_episodes": 1, "eval_workers": 0,
@@ -149,22 +136,19 @@ class DownstreamConfig:
                 "`random_agent_steps`, or no update would ever start."
             )
 
-    def resolved(self, task: str, pretrained: Pretrained) -> Any:
+    def resolved(self, task: str | Domain, pretrained: Pretrained) -> Any:
         """Return the settings with the method's and the domain's values where they were left open."""
         known = pretrained.method in method_names(presets=True)
-        own = DOWNSTREAM_DEFAULTS | dict(get_method(pretrained.method).downstream if known else {})
+        own = DEFAULTS | dict(get_method(pretrained.method).downstream if known else {})
         values = {name: value for name, value in own.items() if getattr(self, name, self) is None}
         if "replay_capacity" in values:
             values["replay_capacity"] = max(values["replay_capacity"], self.random_agent_steps)
         if self.action_repeat is None:
-            try:
-                values["action_repeat"] = resolve_action_repeat(task, None)
-            except UnknownNameError:  # only a caller's own factory knows the task
-                values["action_repeat"] = 2
+            values["action_repeat"] = resolve_action_repeat(task)
         return dataclasses.replace(self, **values)
 
 
-DOWNSTREAM_DEFAULTS: dict[str, Any] = {
+DEFAULTS: dict[str, Any] = {
     "env_steps": 500_000, "replay_capacity": 40_000, "learning_rate": 1e-4, "intrinsic_reward_coef": 0.2,
 }  # fmt: skip
 """What a method has downstream unless its row in the table says otherwise."""
@@ -172,48 +156,40 @@ DOWNSTREAM_DEFAULTS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class DownstreamResult:
-    """What a downstream run leaves.
-
-    Attributes:
-        agent: the trained agent; callable as a deterministic policy.
-        evaluations: one row per evaluated episode: ``env_steps``, ``episode``, ``episode_return``, ...
-        agent_path: artifact of the agent; ``None`` without a run directory.
-        env_steps: simulator steps taken.
-    """
+    """What a downstream run leaves."""
 
     agent: PixelAgent
+    """callable as a deterministic policy"""
     evaluations: list[dict[str, Any]]
+    """one row per evaluated episode: ``env_steps``, ``episode``, ``episode_return``, ..."""
     agent_path: Path | None
+    """artifact of the agent; ``None`` without a run directory"""
     env_steps: int
+    """simulator steps taken"""
 
 
 def train_downstream(
-    task: str,
+    task: str | Domain,
     pretrained: Pretrained | str | Path,
     *,
     run_dir: str | Path | None = None,
     config: DownstreamConfig | None = None,
     records: RunLogger | None = None,
-    resume: bool = True,
     progress: bool = True,
-    env_factory: EnvFactory = make_env,
     **overrides: Any,
 ) -> DownstreamResult:
     """Learn a task with SAC on a frozen encoder (CRPTpro, Sec. III-C), or with DrQ, which trains its own encoder.
 
     Args:
-        task: any name that :func:`crptpro.envs.make_env` knows.
+        task: any name that :func:`crptpro.envs.make_env` knows, or a :class:`~crptpro.domains.Domain`.
         pretrained: an artifact, its directory, the name of an encoder that ships, or one of the controls
             ``"random-encoder"`` and ``"drq"``.
         run_dir: records (``eval.csv``, ``train.csv``, ``episodes.csv``), checkpoints, replay and agent; ``None`` keeps
-            nothing but the result.
+            nothing but the result. The same call continues from the newest checkpoint there. Checkpoints are taken
+            between episodes: a kill costs the episodes since the last one and, on a CPU, changes no number.
         config: every number; the paper's by default.
         records: used instead of a record in ``run_dir``.
-        resume: continue from the newest checkpoint in ``run_dir``. Checkpoints are taken between episodes: a kill
-            costs the episodes since the last one and, on a CPU, changes no number.
         progress: show a bar, or lines in a log file.
-        env_factory: makes the environments; called as :func:`~crptpro.envs.make_env` is, in a thread of its own and in
-            the processes that evaluate.
         **overrides: single settings of :class:`DownstreamConfig`, e.g. ``env_steps=100_000``.
 
     Raises:
@@ -222,69 +198,67 @@ def train_downstream(
         NonFiniteError: a loss, a weight, an action or a reward is not finite; the last checkpoint is kept.
         DiskSpaceError: the disk cannot hold the replay.
     """
-    artifact = _artifact(
-        pretrained, (config or DownstreamConfig()).seed if "seed" not in overrides else overrides["seed"]
-    )
-    settings = dataclasses.replace(config or DownstreamConfig(), **overrides).resolved(task, artifact)
+    settings: Any = dataclasses.replace(config or DownstreamConfig(), **overrides)
+    artifact = _artifact(pretrained, settings.seed)
+    settings, name = settings.resolved(task, artifact), task if isinstance(task, str) else task.task
     device, repeat = usable_device(settings.device), settings.action_repeat
     with contextlib.ExitStack() as stack:
         run = stack.enter_context(Run(run_dir, unit="env_steps", streams=("train", "episodes", "eval"), records=records,
-                                      config={"task": task, **dataclasses.asdict(settings)}, resume=resume,
+                                      config={"task": name, **dataclasses.asdict(settings)},
                                       progress=progress))  # fmt: skip
         dtype = resolve_precision(run.saved_setting("precision", settings.precision), device)
-        features = run.saved_setting("features", settings.features)
-        run.require_same({**settings_of(task, artifact, settings, dtype), "features": features})
+        # The budget may grow, and machines differ; everything else decides the numbers of the run.
+        free = ("env_steps", "eval_workers", "compile", "device")
+        run.require_same({
+            "task": name, "pretrained": artifact.identity(),
+            **{key: value for key, value in dataclasses.asdict(settings).items() if key not in free},
+            "precision": precision_name(dtype), "features": run.saved_setting("features", settings.features),
+        })  # fmt: skip
         seed_everything(derive_seed(settings.seed, "downstream"))
         generators = Generators(settings.seed, "replay", "shift", "bonus", "policy", "random_actions")
-        make_this_env = env_builder(task, artifact.encoder, settings, env_factory)
-        env = EnvThread(make_this_env, runs_ahead=runs_ahead(task, settings.device))
+        env = EnvThread(task, artifact.encoder, settings, seed=settings.seed, action_repeat=repeat)
         stack.callback(env.close)
         artifact.require(image_size=env.env.observation_spec["pixels"].shape[-1])
-        encoder = frozen_copy(artifact.encoder, device, dtype)
-        learner, agent = make_agent(artifact, encoder, env.env, settings, generators["policy"])
+        encoder = _frozen_copy(artifact.encoder, device, dtype)
+        learner, agent = _make_agent(artifact, encoder, env.env, settings, generators["policy"])
         set_compute_dtype(learner.loss, dtype)
-        evaluator = Evaluator(make_this_env, episodes=settings.eval_episodes, seed=settings.seed, progress=progress,
-                              workers=eval_workers(task, make_this_env, settings),
-                              on_result=functools.partial(record_evaluation, run, task, artifact.label))  # fmt: skip
-        evaluator.agent = agent
+        evaluator = Evaluator(env.make_env, agent, episodes=settings.eval_episodes, seed=settings.seed,
+                              workers=_eval_workers(name, env.make_env, settings), progress=progress,
+                              on_result=functools.partial(_record_evaluation, run, name, artifact.label))  # fmt: skip
         stack.callback(evaluator.close)
-        replay = make_replay(env.env, settings, generators["replay"], run)
-        memory = attach_transforms(replay, artifact, encoder, settings, generators, run,
+        is_complete = bool(run.saved.get("is_finished")) and run.saved["position"] >= settings.env_steps
+        replay = _make_replay(run, env.env, settings, generators["replay"], is_complete=is_complete)
+        memory = attach_transforms(replay, artifact, encoder, settings, generators, run, dtype=dtype,
                                    reserved_bytes=evaluator.workers * WORKER_BYTES)  # fmt: skip
         counters = run.tally
         counters.update(updates=0, episodes=0, next_evaluation=0, last_evaluation=-1)
-        run.keep(
-            **learner.components(),
-            **memory,
-            generators=generators,
-            evaluator=evaluator,
-            **({} if is_complete(run, settings) else {"replay": replay}),
-        )
+        run.keep(**learner.components(), **memory, generators=generators, evaluator=evaluator,
+                 replay=None if is_complete else replay)  # fmt: skip
 
-        for position in run.until(
+        def start_evaluation() -> None:
+            if (
+                run.position != counters["last_evaluation"]
+            ):  # a shorter run has ended, and was evaluated, here
+                agent_steps = run.position // repeat
+                evaluator.start(env_steps=run.position, agent_steps=agent_steps, updates=counters["updates"])
+            counters["last_evaluation"] = run.position
+            interval = settings.eval_interval_env_steps
+            counters["next_evaluation"] = (run.position // interval + 1) * interval
+
+        for first in run.until(
             settings.env_steps, checkpoint_interval=settings.checkpoint_interval_env_steps
         ):
-            if position >= counters["next_evaluation"]:
-                if (
-                    position != counters["last_evaluation"]
-                ):  # a shorter run has ended, and was evaluated, here
-                    evaluator.start(
-                        agent, env_steps=position, agent_steps=position // repeat, updates=counters["updates"]
-                    )
-                counters["last_evaluation"] = position
-                counters["next_evaluation"] = (
-                    position // settings.eval_interval_env_steps + 1
-                ) * settings.eval_interval_env_steps
+            if first >= counters["next_evaluation"]:
+                start_evaluation()
             td = env.reset(derive_seed(settings.seed, "downstream", "episode", counters["episodes"]))
-            episode_return, first, done = 0.0, run.position, False
+            episode_return, done = 0.0, False
             while not done and run.position < settings.env_steps:
                 agent_step = run.position // repeat
-                is_random = agent_step < settings.random_agent_steps
-                td["action"] = (
-                    uniform_action(env.env, generators["random_actions"])
-                    if is_random
-                    else agent.explore(td["pixels"], generators["policy"])
-                )
+                if is_random := agent_step < settings.random_agent_steps:
+                    td["action"] = env.uniform_action(generators["random_actions"])
+                else:
+                    where = f"{name}, agent step {agent_step}"
+                    td["action"] = agent.explore(td["pixels"], generators["policy"], where=where)
                 step = env.step(td)  # the next observation is drawn while the update computes
                 if not is_random:
                     # The sample has features under random shifts, and the bonus is part of its reward.
@@ -295,52 +269,31 @@ def train_downstream(
                         run.log({"intrinsic_reward": intrinsic.mean()})
                     counters["updates"] += 1
                 transition = step.result()
-                reward = transition["next", "reward"].item()
-                if not math.isfinite(reward):
-                    raise NonFiniteError(f"{task}: the reward of agent step {agent_step} is {reward}.")
                 replay.extend(transition)
-                episode_return += reward
+                episode_return += transition["next", "reward"].item()
                 done = bool(transition["next", "done"].item())
                 td = step_mdp(transition)
                 run.advance(repeat)
-                if run.every(settings.log_interval_env_steps) and run.means["train"].counts:
+                if run.every(settings.log_interval_env_steps) and run.means("train"):
                     row = run.write("train", updates=counters["updates"])
                     run.show(q=row["q_mean"])
             counters["episodes"] += 1
-            length = (run.position - first) // repeat
-            run.write(
-                "episodes",
-                {"episode_return": episode_return, "episode_agent_steps": length},
-                episodes=counters["episodes"],
-            )
+            ended = {
+                "episode_return": episode_return,
+                "episode_agent_steps": (run.position - first) // repeat,
+            }
+            run.write("episodes", ended, episodes=counters["episodes"])
 
-        if run.position != counters["last_evaluation"]:
-            evaluator.start(
-                agent, env_steps=run.position, agent_steps=run.position // repeat, updates=counters["updates"]
-            )
-            counters["last_evaluation"] = run.position
+        start_evaluation()
         evaluator.finish()
         run.finish()
         path = None
         if run.run_dir is not None:
-            card = {
-                "task": task,
-                "env_steps": run.position,
-                "config": dataclasses.asdict(settings),
-                **run.settings,
-            }
+            card = {"env_steps": run.position, "config": dataclasses.asdict(settings), **run.settings}
             path = save_agent(run.run_dir / "agent", agent, card=card)
             if run.records is not None:
-                run.records.artifact(path, name=f"agent_{task}", kind="agent")
+                run.records.artifact(path, name=f"agent_{name}", kind="agent")
         return DownstreamResult(agent, run.rows("eval"), path, run.position)
-
-
-# --- parts ------------------------------------------------------------------------------------------------------------
-
-
-def is_complete(run: Run, config: Any) -> bool:
-    """Whether nothing is left to do, so that the replay, which may be gone, is not needed."""
-    return bool(run.saved.get("is_finished")) and run.saved["position"] >= config.env_steps
 
 
 def _artifact(pretrained: Pretrained | str | Path, seed: int) -> Pretrained:
@@ -351,115 +304,41 @@ def _artifact(pretrained: Pretrained | str | Path, seed: int) -> Pretrained:
     return load_pretrained(pretrained)
 
 
-def settings_of(task: str, pretrained: Pretrained, config: Any, dtype: torch.dtype) -> dict[str, Any]:
-    """Return everything that decides the numbers of a run; its budget may grow, and machines differ."""
-    free = ("env_steps", "precision", "features", "eval_workers", "compile", "device")
-    return {
-        "task": task,
-        "pretrained": pretrained.identity(),
-        "precision": "bf16" if dtype == torch.bfloat16 else "fp32",
-        **{name: value for name, value in dataclasses.asdict(config).items() if name not in free},
-    }
-
-
-def env_builder(task: str, encoder: Any, config: Any, env_factory: EnvFactory) -> Callable[[], EnvBase]:
-    """Return a function without arguments that builds the environment for an encoder's images."""
-    settings: dict[str, Any] = {
-        "quality": config.quality,
-        "action_repeat": config.action_repeat,
-        "image_size": getattr(encoder, "image_size", 84),
-        "frame_stack": getattr(encoder, "in_channels", 9) // 3,
-    }
-    if config.colors != "normal":  # a factory of one's own need not know of colours
-        settings["colors"] = config.colors
-    # The domain itself, whose name may be registered in this process only.
-    name = get_domain(task) if env_factory is make_env else task
-    return functools.partial(env_factory, name, seed=config.seed, **settings)
-
-
-def runs_ahead(task: str, device: str) -> bool:
-    """Whether the next observation is drawn in another thread: where this process has cores for it; not with GLFW."""
-    if (
-        device != "cpu" or cpu_cores() == 1 or torch.get_num_threads() == 1
-    ):  # one thread: others want the cores
-        return False
-    with contextlib.suppress(UnknownNameError):  # only a caller's own factory knows the task
-        return not (needs_gl(task) and select_backend() == "glfw")
-    return True
-
-
-def frozen_copy(network: nn.Module, device: torch.device, dtype: torch.dtype) -> Any:
-    """Return a frozen copy on the device, computing in ``dtype``; another run may hold the artifact too."""
+def _frozen_copy(network: nn.Module, device: torch.device, dtype: torch.dtype) -> Any:
+    """Return a frozen copy; another run may hold the artifact too."""
     return set_compute_dtype(copy.deepcopy(network).requires_grad_(False).eval().to(device), dtype)
 
 
-def make_agent(
-    pretrained: Pretrained,
-    encoder: Any,
-    env: EnvBase,
-    config: Any,
-    generator: torch.Generator,
+def _make_agent(
+    pretrained: Pretrained, encoder: Any, env: EnvBase, config: Any, generator: torch.Generator
 ) -> tuple[SACLearner, PixelAgent]:
     """Return SAC on the encoder's features, or DrQ, whose critic trains the encoder, and the agent that acts."""
     action_dim, device = env.action_spec.shape[-1], torch.device(config.device)
-    is_drq = pretrained.method == "drq"
-    widths: dict[str, Any] = {"hidden_dim": config.hidden_dim, "has_tanh": is_drq}
-    actor = transferred_actor(pretrained, env, config) or SquashedGaussianActor(
-        encoder.feature_dim, action_dim, **widths
-    )
-    critic = TwinCritic(encoder.feature_dim, action_dim, **widths)
-    options: dict[str, Any] = {
-        "gamma": config.discount, "alpha_init": config.initial_temperature, "generator": generator,
-    }  # fmt: skip
-    loss: RADSACLoss
-    if is_drq:
-        loss = DrQLoss(encoder.requires_grad_(True), actor.to(device), critic.to(device), **options)
-    else:
-        loss = RADSACLoss(actor.to(device), critic.to(device), **options)
-    learner = SACLearner(
-        loss, learning_rate=config.learning_rate, critic_tau=config.critic_tau, compile=config.compile
-    )
-    return learner, PixelAgent(encoder, loss.actor)
+    is_drq, explored, actor = pretrained.method == "drq", pretrained.actor, None
+    if isinstance(explored, SquashedGaussianActor) and explored.config["action_dim"] == action_dim:
+        actor = copy.deepcopy(explored).requires_grad_(True).train()  # it explored the task's own domain
+    loss = make_sac_loss(
+        functools.partial(DrQLoss, encoder.requires_grad_(True)) if is_drq else RADSACLoss,
+        encoder.feature_dim, action_dim, hidden_dim=config.hidden_dim, device=device, has_tanh=is_drq, actor=actor,
+        gamma=config.discount, alpha_init=config.initial_temperature, generator=generator,
+    )  # fmt: skip
+    rates = {"learning_rate": config.learning_rate, "critic_tau": config.critic_tau}
+    return SACLearner(loss, compile=config.compile, **rates), PixelAgent(encoder, loss.actor)
 
 
-def transferred_actor(pretrained: Pretrained, env: EnvBase, config: Any) -> SquashedGaussianActor | None:
-    """Return a trainable copy of the actor that explored the task's own domain while the encoder was pre-trained."""
-    actor = pretrained.actor
-    if (
-        not isinstance(actor, SquashedGaussianActor)
-        or actor.config["action_dim"] != env.action_spec.shape[-1]
-    ):
-        return None
-    return copy.deepcopy(actor).requires_grad_(True).train()
-
-
-def make_replay(env: EnvBase, config: Any, generator: torch.Generator, run: Run) -> FrameReplay:
-    """Return the replay of a run: frames stored once, on disk below the run's directory, where it has one.
-
-    A checkpoint holds counters and no frames: whatever the last two refer to outlives the next one.
-
-    Raises:
-        CheckpointError: the run is to be continued, and its frames are gone.
-        DiskSpaceError: the disk cannot hold the frames.
-    """
-    channels, height, width = env.observation_spec["pixels"].shape
-    path = None if run.run_dir is None or is_complete(run, config) else run.run_dir / "replay"
-    if path is not None and not run.saved:
-        shutil.rmtree(path, ignore_errors=True)  # of an attempt without a checkpoint
+def _make_replay(
+    run: Run, env: EnvBase, config: Any, generator: torch.Generator, *, is_complete: bool
+) -> FrameReplay:
+    """Return the replay below the run's directory; a complete run needs none."""
+    path = None if run.run_dir is None or is_complete else run.run_dir / "replay"
     if path is not None and run.saved and not path.exists():
         raise CheckpointError(
             f"{run.run_dir} has done {run.saved['position']:,} env steps; to continue it needs its frames, and {path} "
             "is gone. Put it back, or start in another run directory."
         )
-    return FrameReplay(
-        config.replay_capacity,
-        frame_shape=(3, height, width),
-        action_dim=env.action_spec.shape[-1],
-        frame_stack=channels // 3,
-        path=path,
-        slack=2 * (config.checkpoint_interval_env_steps // config.action_repeat) + SPARE_FRAMES,
-        generator=generator,
-    )
+    # A checkpoint holds counters and no frames: whatever the last two refer to outlives the next one.
+    slack = 2 * (config.checkpoint_interval_env_steps // config.action_repeat) + SPARE_FRAMES
+    return make_replay(run, path, env, config.replay_capacity, slack=slack, generator=generator)
 
 
 def attach_transforms(
@@ -470,6 +349,7 @@ def attach_transforms(
     generators: Mapping[str, torch.Generator],
     run: Run,
     *,
+    dtype: torch.dtype,
     reserved_bytes: int,
 ) -> dict[str, Any]:
     """Attach to the replay what turns a sample into the learner's batch; returns what a checkpoint must hold of it.
@@ -478,64 +358,49 @@ def attach_transforms(
     maps, or the shifted image encoded anew. The bonus is added to the sampled reward.
     """
     device = torch.device(config.device)
-    pixels = ["pixels", ("next", "pixels")]
+    shift: dict[str, Any] = {"pad": SHIFT_PAD, "generator": generators["shift"]}
+    pixels, features = ["pixels", ("next", "pixels")], ["features", ("next", "features")]
     if pretrained.method == "drq":
         views = ["pixels_view", ("next", "pixels_view")]
-        replay.append_transform(
-            RandomShift(
-                pad=SHIFT_PAD,
-                in_keys=[*pixels, *pixels],
-                out_keys=[*views, *pixels],
-                generator=generators["shift"],
-            )
-        )
+        replay.append_transform(RandomShift(in_keys=[*pixels, *pixels], out_keys=[*views, *pixels], **shift))
         return {}
-    has_bonus = (
-        pretrained.prototypes is not None
-        and pretrained.projector is not None
-        and config.intrinsic_reward_coef > 0
-    )
-    if config.intrinsic_reward_coef > 0 and not has_bonus:
+    projector: Any = pretrained.projector
+    prototypes: Any = pretrained.prototypes
+    has_bonus = prototypes is not None and projector is not None and config.intrinsic_reward_coef > 0
+    if has_bonus:
+        projector, prototypes = [_frozen_copy(n, device, dtype) for n in (projector, prototypes)]
+    elif config.intrinsic_reward_coef > 0:
         logger.info("no exploration bonus: the encoder of %s has no prototypes", pretrained.label)
-    networks: Any = (pretrained.projector, pretrained.prototypes) if has_bonus else ()
-    projector, prototypes = [frozen_copy(n, device, encoder.compute_dtype) for n in networks] or [None, None]
     # An update projects its whole batch, an agent step every shift of one observation.
     keeps_projections = has_bonus and config.batch_size >= 2 * (2 * SHIFT_PAD + 1) ** 2
-    dtype = (
-        torch.bfloat16
-        if config.features == "dense-bf16"
-        else getattr(encoder, "compute_dtype", torch.float32)
-    )
+    is_rounded = (asked := run.settings["features"]) == "dense-bf16"
+    map_dtype = torch.bfloat16 if is_rounded else dtype
     slots = min(replay.window, 2 * -(-config.env_steps // config.action_repeat))
-    asked = run.settings["features"]
     mode, reason = choose_feature_mode(
-        "dense" if asked == "dense-bf16" else asked, encoder, slots, dtype,
+        "dense" if is_rounded else asked, encoder, slots, map_dtype,
         available_bytes=max(0, free_bytes(device) - reserved_bytes), pad=SHIFT_PAD, device=device,
         latent_dim=prototypes.weight.shape[1] if keeps_projections else None,
     )  # fmt: skip
     logger.info("features: %s", reason)
     # The two ways round differently in bfloat16: a run that is continued keeps its own.
-    run.settings["features"] = "dense-bf16" if asked == "dense-bf16" else mode
-    features = ["features", ("next", "features")]
+    run.settings["features"] = asked if is_rounded else mode
     if mode == "reencode":
         keeps_projections = False
-        replay.append_transform(RandomShift(pad=SHIFT_PAD, in_keys=pixels, generator=generators["shift"]))
+        replay.append_transform(RandomShift(in_keys=pixels, **shift))
         replay.append_transform(FrozenEncoder(encoder, in_keys=pixels, out_keys=features))
     else:
-        replay.returns_pixels = False
+        replay.storage.returns_pixels = False
+        kept = projector if keeps_projections else None
         replay.append_transform(
-            DenseShiftFeatures(
-                encoder, replay, pad=SHIFT_PAD, projector=projector if keeps_projections else None, dtype=dtype,
-                generator=generators["shift"], observations=slots,
-            )
-        )  # fmt: skip
+            DenseShiftFeatures(encoder, replay, projector=kept, dtype=map_dtype, observations=slots, **shift)
+        )
     if not has_bonus:
         return {}
     warn_if_mostly_zero(len(prototypes.weight), config.batch_size, config.knn_k)
     bonus = PrototypeReward(
         None if keeps_projections else projector,
         prototypes,
-        in_keys=("next", "embedding") if keeps_projections else ("next", "features"),
+        in_keys=("next", "embedding" if keeps_projections else "features"),
         coef=config.intrinsic_reward_coef,
         knn_k=config.knn_k,
         queue_size=config.queue_size,
@@ -546,34 +411,29 @@ def attach_transforms(
     return {"bonus": bonus}
 
 
-def eval_workers(task: str, make_this_env: Callable[[], EnvBase], config: Any) -> int:
+def _eval_workers(task: str, make_this_env: Callable[[], EnvBase], config: Any) -> int:
     """Return how many processes evaluate: as asked, or one per core where that works and pays."""
-    asked = config.eval_workers
+    asked, works = config.eval_workers, can_be_sent(make_this_env)
     if asked is not None:
-        if asked and not can_be_sent(make_this_env):
+        if asked and not works:
             raise PretrainedError(
                 f"eval_workers is {asked}, but the environment of {task} cannot be built in another process: its "
-                "factory must be a function of an importable module. Move it there, or set eval_workers=0."
+                "make must be a function of an importable module. Move it there, or set eval_workers=0."
             )
         return asked
     evaluations = -(-config.env_steps // config.eval_interval_env_steps) + 1
-    pays = cpu_cores() > 1 and evaluations * config.eval_episodes >= WORTH_WORKERS
+    pays = evaluations * config.eval_episodes >= WORTH_WORKERS
     workers = min(cpu_cores(), torch.get_num_threads())  # one thread: others want the cores
-    return workers if workers > 1 and pays and can_be_sent(make_this_env) else 0
+    return workers if workers > 1 and pays and works else 0
 
 
-def record_evaluation(
+def _record_evaluation(
     run: Run, task: str, method: str, episodes: Sequence[Episode], counters: Mapping[str, int]
 ) -> None:
     """Write a row per episode, and announce the mean."""
     for e in episodes:
-        row: dict[str, Any] = {
-            "episode_return": e.episode_return,
-            "episode_agent_steps": e.agent_steps,
-            "seed": e.seed,
-            "method": method,
-        }
-        run.write("eval", row, extra=None, episode=e.episode, **counters)
+        row = {"episode_return": e.episode_return, "episode_agent_steps": e.agent_steps, "seed": e.seed}
+        run.write("eval", {**row, "method": method}, extra=None, episode=e.episode, **counters)
     scores = summarize(episodes)
     logger.info(
         "%s: %s env steps, %s updates, return %.1f ± %.1f over %d episodes",

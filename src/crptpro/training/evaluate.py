@@ -5,15 +5,10 @@ from __future__ import annotations
 import copy
 import logging
 import math
-import multiprocessing
-import os
 import pickle
-import signal
 import statistics
-import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -26,10 +21,10 @@ from torchrl.envs.utils import step_mdp
 from tqdm.auto import tqdm
 
 from crptpro.errors import NonFiniteError
-from crptpro.plugins import load_again, loaded_plugins
 from crptpro.seeding import derive_seed
 from crptpro.training.agent import PixelAgent
 from crptpro.values import as_int
+from crptpro.workers import WorkerPool, can_be_sent
 
 logger = logging.getLogger(__name__)
 
@@ -40,45 +35,42 @@ WORKER_BYTES = 500_000_000
 
 @dataclass(frozen=True)
 class Episode:
-    """One evaluated episode.
-
-    Attributes:
-        episode: index within the evaluation, from 0.
-        episode_return: sum of the environment's own rewards, without any bonus.
-        agent_steps: decisions, ``env_steps / action_repeat``.
-        seed: what the environment was seeded with before its reset.
-    """
+    """One evaluated episode."""
 
     episode: int
+    """index within the evaluation, from 0"""
     episode_return: float
+    """sum of the environment's own rewards, without any bonus"""
     agent_steps: int
+    """decisions, ``env_steps / action_repeat``"""
     seed: int
+    """what the environment was seeded with before its reset"""
 
 
 def evaluate(
     policy: Policy, env: EnvBase, *, episodes: int = 10, seed: int = 0, progress: bool = True
 ) -> list[Episode]:
-    """Run ``policy`` for whole episodes and return every episode's own return.
+    """Run a policy for whole episodes and return every episode's own return.
 
-    The environment must carry no intrinsic reward. Every episode has a seed of its own, so that an evaluation is the
-    same whatever was evaluated before, and in however many processes.
+    Every episode has a seed of its own, so that an evaluation is the same whatever was evaluated before, and in
+    however many processes.
 
     Args:
         policy: maps one observation to one action.
-        env: unbatched environment with ``pixels`` uint8 ``[C, H, W]``.
+        env: unbatched environment with ``pixels`` uint8 ``[C, H, W]``, without an intrinsic reward.
         episodes: how many, at least 1.
         seed: of this evaluation.
         progress: show a bar that vanishes when done.
 
     Raises:
         ValueError: fewer than one episode.
-        NonFiniteError: the policy acts with NaN or infinity; names the episode.
+        NonFiniteError: an action or a reward is NaN or infinite; names the episode and the decision.
     """
-    episodes = as_int(episodes, "episodes", minimum=1)
     results: list[Episode] = []
     bar = tqdm(
-        range(episodes), desc="evaluate", unit="episode", leave=False, disable=None if progress else True
-    )
+        range(as_int(episodes, "episodes", minimum=1)), desc="evaluate", unit="episode", leave=False,
+        disable=None if progress else True,
+    )  # fmt: skip
     for index in bar:
         results.append(run_episode(policy, env, episode=index, seed=episode_seed(seed, index)))
         bar.set_postfix(mean_return=f"{statistics.fmean(e.episode_return for e in results):.1f}")
@@ -88,32 +80,21 @@ def evaluate(
 def run_episode(
     policy: Policy, env: EnvBase, *, episode: int, seed: int, on_frame: Callable[[Tensor], Any] | None = None
 ) -> Episode:
-    """Run ``policy`` for one episode.
-
-    Args:
-        policy: maps one observation to one action.
-        env: unbatched environment.
-        episode: index within the evaluation.
-        seed: what the environment is seeded with before its reset.
-        on_frame: called with every RGB picture, uint8 ``[3, H, W]``.
-    """
+    """Run one episode of :func:`evaluate`; ``on_frame`` is called with every RGB picture, uint8 ``[3, H, W]``."""
     env.set_seed(seed)
     td = env.reset()
     episode_return, agent_steps, done = 0.0, 0, False
     while not done:
         if on_frame is not None:
             on_frame(td["pixels"][-3:].clone())
-        td["action"] = action = policy(td["pixels"])
-        if not torch.isfinite(action).all():
-            raise NonFiniteError(
-                f"Evaluation episode {episode}, decision {agent_steps}: the policy acts {action.tolist()}."
-            )
+        td["action"] = policy(td["pixels"])
+        where = f"Evaluation episode {episode}, decision {agent_steps}"
+        if not torch.isfinite(td["action"]).all():
+            raise NonFiniteError(f"{where}: the policy acts {td['action'].tolist()}.")
         transition = env.step(td)
         reward = transition["next", "reward"].item()
         if not math.isfinite(reward):
-            raise NonFiniteError(
-                f"Evaluation episode {episode}, decision {agent_steps}: the reward is {reward}."
-            )
+            raise NonFiniteError(f"{where}: the reward is {reward}.")
         episode_return, agent_steps = episode_return + reward, agent_steps + 1
         done = bool(transition["next", "done"].item())
         td = step_mdp(transition)
@@ -145,18 +126,14 @@ class Evaluator:
     Rows are handed out when :meth:`finish` is called and not when they happen to be there, so that the record of a run
     does not depend on the speed of its machine. Every decision is computed by one CPU thread either way.
 
-    Args:
-        make_env: builds the environment.
-        episodes: of every evaluation.
-        seed: of the run.
-        workers: processes; 0 evaluates in this process.
-        on_result: called with the episodes and the counters of an evaluation.
-        progress: show a bar where this process evaluates.
+    ``on_result`` is called with the episodes and the counters of an evaluation; without ``workers``, or where none can
+    import ``make_env``, this process evaluates.
     """
 
     def __init__(
         self,
         make_env: Callable[[], EnvBase],
+        agent: PixelAgent,
         *,
         episodes: int,
         seed: int,
@@ -164,46 +141,31 @@ class Evaluator:
         on_result: Callable[[list[Episode], Mapping[str, int]], None],
         progress: bool = True,
     ) -> None:
-        self.make_env, self.episodes, self.seed, self.on_result = make_env, episodes, seed, on_result
+        self.make_env, self.agent, self.episodes, self.seed = make_env, agent, episodes, seed
         self.workers, self.progress = min(workers, episodes) if can_be_sent(make_env) else 0, progress
-        self._pool: ProcessPoolExecutor | None = None
+        self.on_result = on_result
+        self._pool: WorkerPool | None = None
         self._env: EnvBase | None = None
         self._pending: tuple[PixelAgent, dict[str, int], list[Future[Episode]]] | None = None
 
-    def start(self, agent: PixelAgent, **counters: int) -> None:
-        """Evaluate the agent as it is now; with processes of its own, return at once.
+    def start(self, **counters: int) -> None:
+        """Evaluate the agent as it is now, ``env_steps`` and other counters into the run; workers do it meanwhile."""
+        self._start(self.agent.snapshot(), counters)
 
-        Args:
-            agent: what to evaluate.
-            **counters: where the run is; ``env_steps`` among them.
-        """
+    def _start(self, snapshot: PixelAgent, counters: dict[str, int]) -> None:
         self.finish()
-        snapshot = agent.snapshot()
         futures: list[Future[Episode]] = []
         if self.workers:
-            if self._pool is None:
-                self._pool = ProcessPoolExecutor(
-                    self.workers,
-                    mp_context=multiprocessing.get_context("spawn"),
-                    initializer=_start_worker,
-                    initargs=(os.getpid(), loaded_plugins(), self.make_env),
-                )
-            sent = pickle.dumps(PixelAgent(copy.deepcopy(snapshot.encoder).cpu(), snapshot.actor.cpu()))
-            seed = self._seed(counters)
-            futures = [
-                self._pool.submit(_run_episode, sent, episode, episode_seed(seed, episode))
-                for episode in range(self.episodes)
-            ]
+            self._pool = self._pool or WorkerPool(self.workers, _prepare, self.make_env)
+            sent = pickle.dumps(copy.deepcopy(snapshot).cpu())
+            seeds = [episode_seed(self._seed(counters), episode) for episode in range(self.episodes)]
+            futures = [self._pool.submit(_evaluate, sent, *numbered) for numbered in enumerate(seeds)]
         self._pending = (snapshot, dict(counters), futures)
         if not self.workers:
             self.finish()
 
     def finish(self) -> None:
-        """Wait for the evaluation that is under way, if any, and hand out its episodes.
-
-        Raises:
-            CRPTproError: an episode failed in a worker as it would here.
-        """
+        """Wait for the evaluation that is under way, if any, and hand out its episodes."""
         if self._pending is None:
             return
         agent, counters, futures = self._pending
@@ -217,14 +179,9 @@ class Evaluator:
             self._end_pool()
         if not futures:
             self._env = self._env or self.make_env()
+            options: dict[str, Any] = {"seed": self._seed(counters), "progress": self.progress}
             with _one_thread():
-                episodes = evaluate(
-                    agent,
-                    self._env,
-                    episodes=self.episodes,
-                    seed=self._seed(counters),
-                    progress=self.progress,
-                )
+                episodes = evaluate(agent, self._env, episodes=self.episodes, **options)
         self._pending = None
         self.on_result(episodes, counters)
 
@@ -233,21 +190,14 @@ class Evaluator:
         if self._pending is None:
             return {}
         agent, counters, _ = self._pending
-        trained = any(parameter.requires_grad for parameter in agent.encoder.parameters())
-        encoder = {"encoder": agent.encoder.state_dict()} if trained else {}
-        return {"counters": counters, "actor": agent.actor.state_dict(), **encoder}
+        return {"counters": counters, "agent": agent.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Start again what was under way; :attr:`agent` must be set to the run's agent before."""
-        if not state:
-            return
-        agent = PixelAgent(copy.deepcopy(self.agent.encoder), copy.deepcopy(self.agent.actor))
-        agent.actor.load_state_dict(state["actor"])
-        if "encoder" in state:
-            agent.encoder.load_state_dict(state["encoder"])
-        self.start(agent, **state["counters"])
-
-    agent: PixelAgent
+        """Start again what was under way."""
+        if state:
+            agent = copy.deepcopy(self.agent)
+            agent.load_state_dict(state["agent"])
+            self._start(agent, state["counters"])
 
     def close(self) -> None:
         """End the processes and free the render context."""
@@ -265,37 +215,18 @@ class Evaluator:
             self._pool = None
 
 
-def can_be_sent(make_env: Callable[[], EnvBase]) -> bool:
-    """Whether a worker can rebuild a factory: it pickles, and needs nothing of the main program."""
-    try:
-        return b"__main__" not in pickle.dumps(make_env)
-    except Exception:  # objects may refuse in ways of their own
-        return False
-
-
 # --- in a worker ------------------------------------------------------------------------------------------------------
 
 _make_env: Callable[[], EnvBase]
 _env: EnvBase | None = None
 
 
-def _start_worker(parent: int, plugins: tuple[str, ...], make_env: Callable[[], EnvBase]) -> None:
+def _prepare(make_env: Callable[[], EnvBase]) -> None:
     global _make_env
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
-    os.environ.setdefault("LP_NUM_THREADS", "1")
-    torch.set_num_threads(1)
-    threading.Thread(target=_exit_with, args=(parent,), daemon=True).start()
-    load_again(plugins)
     _make_env = make_env
 
 
-def _exit_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(1.0)
-    os._exit(1)
-
-
-def _run_episode(agent: bytes, episode: int, seed: int) -> Episode:
+def _evaluate(agent: bytes, episode: int, seed: int) -> Episode:
     global _env
     _env = _env or _make_env()
     return run_episode(pickle.loads(agent), _env, episode=episode, seed=seed)

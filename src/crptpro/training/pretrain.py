@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -18,7 +18,6 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import RandomSampler, ReplayBuffer
 from torchrl.objectives import LossModule, SoftUpdate
-from tyro.conf import arg
 
 from crptpro.data import FrameDataset
 from crptpro.errors import DatasetError
@@ -27,15 +26,15 @@ from crptpro.modules import computing, resolve_precision, usable_device
 from crptpro.modules.precision import Precision
 from crptpro.objectives import Method, get_method, method_of
 from crptpro.objectives.functional import mean_pairwise_cosine, prototype_metrics
-from crptpro.pretrained import Pretrained, load_pretrained, save_pretrained
+from crptpro.pretrained import Pretrained, load_pretrained
+from crptpro.provenance import provenance
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.compile import accelerate
 from crptpro.training.run import Generators, Run
 from crptpro.transforms import RandomShift
-from crptpro.values import as_int, check_numbers
+from crptpro.values import check_numbers
 
 SHIFT_PAD = 4
-COSINE_ROWS = 128
 
 
 @dataclass(frozen=True)
@@ -54,8 +53,6 @@ class PretrainConfig:
     """EMA rate of the target networks, every update (default: the method's; crptpro 0.05)"""
     seed: int = 0
     """seeds sampling, shifts, and what the loss draws"""
-    snapshots: Annotated[tuple[int, ...], arg(help_behavior_hint="(default: none)")] = ()
-    """updates after which the encoder is saved too, as RUN_DIR/encoder_at_<updates>"""
     precision: Precision = "auto"
     """arithmetic of convolutions and big matrix products; auto is bf16 where the hardware is faster in it. Deviation:
     the released code computes in fp32 throughout, which fp32 gives"""
@@ -71,17 +68,11 @@ class PretrainConfig:
     """updates between two checkpoints (default: about every five minutes)"""
 
     def __post_init__(self) -> None:
-        """Convert numbers to plain values.
-
-        Raises:
-            ValueError: naming the setting, its value and what is allowed.
-        """
+        """Convert numbers to plain values, or raise a ValueError that names the setting."""
         counts = {
             "updates": 1, "batch_size": 1, "warmup_updates": 0, "log_interval": 1, "checkpoint_interval": 1,
         }  # fmt: skip
         check_numbers(self, counts=counts, rates={"learning_rate": None, "encoder_tau": 1})
-        snapshots = tuple(as_int(done, "snapshots", minimum=1) for done in self.snapshots)
-        object.__setattr__(self, "snapshots", snapshots)
 
     def resolved(self, method: Method) -> Any:
         """Return these settings with the method's values where they were left open."""
@@ -92,32 +83,24 @@ class PretrainConfig:
 
 @dataclass(frozen=True)
 class PretrainResult:
-    """How a pre-training ended; :func:`~crptpro.pretrained.save_pretrained` writes its encoder.
-
-    Attributes:
-        loss: the objective with its trained networks.
-        method: name of the method.
-        updates: encoder updates in total, over all domains and resumptions.
-        resumed_from: where this call continued, in updates (in env steps for an active method); 0 for a fresh run.
-        metrics: the last row of the record.
-        collapse: verdict of :class:`~crptpro.training.collapse.CollapseMonitor`.
-        training: how it was trained, as plain values, for the artifact's card.
-        history: the rows that this call wrote, oldest first.
-    """
+    """How a pre-training ended; :func:`~crptpro.pretrained.save_pretrained` writes its encoder."""
 
     loss: LossModule = field(repr=False)
+    """the objective with its trained networks"""
     method: str
+    """name of the method"""
     updates: int
+    """encoder updates in total, over all domains and resumptions"""
     resumed_from: int
+    """where this call continued, in updates (in env steps for an active method); 0 for a fresh run"""
     metrics: dict[str, Any]
+    """the last row of the record"""
     collapse: dict[str, Any]
+    """verdict of :class:`~crptpro.training.collapse.CollapseMonitor`"""
     training: dict[str, Any] = field(repr=False)
+    """how it was trained, as plain values, for the artifact's card"""
     history: list[dict[str, Any]] = field(default_factory=list, repr=False)
-
-    @property
-    def is_dead(self) -> bool:
-        """Whether training ended on a plateau longer than the monitor's patience."""
-        return self.collapse["verdict"] == "dead"
+    """the rows that this call wrote, oldest first"""
 
 
 def pretrain(
@@ -128,7 +111,6 @@ def pretrain(
     run_dir: str | Path | None = None,
     config: PretrainConfig | None = None,
     records: RunLogger | None = None,
-    resume: bool = True,
     progress: bool = True,
     started_from: str | None = None,
     **overrides: Any,
@@ -147,10 +129,9 @@ def pretrain(
         datasets: one or several (a sequence, or a mapping of domain names): directories,
             :class:`~crptpro.data.FrameDataset`, or any TorchRL ``ReplayBuffer`` whose samples have the loss's keys.
         method: name of a registered method, whose numbers are the defaults; by default that of the loss's class.
-        run_dir: record (``pretrain.csv``, ``metrics.jsonl``), checkpoints and snapshots; ``None`` writes nothing.
+        run_dir: record (``pretrain.csv``, ``metrics.jsonl``) and checkpoints; ``None`` writes nothing.
         config: every number.
         records: used instead of a record in ``run_dir``, e.g. one that mirrors to W&B.
-        resume: continue what ``run_dir`` holds; ``False`` refuses a directory that holds a run.
         progress: show a bar, or lines in a log file.
         started_from: identity of the artifact that the loss's weights come from, where they do.
         **overrides: single settings of :class:`PretrainConfig`, e.g. ``updates=10_000``.
@@ -170,26 +151,37 @@ def pretrain(
     loss.to(device).train()
     with contextlib.ExitStack() as stack:
         run = stack.enter_context(Run(run_dir, unit="updates", streams=("pretrain",), records=records, config=settings,
-                                      resume=resume, progress=progress))  # fmt: skip
+                                      progress=progress))  # fmt: skip
         dtype = resolve_precision(run.saved_setting("precision", settings.precision), device)
         stack.enter_context(computing(loss, dtype))
-        buffers, generators = stack.enter_context(
-            open_datasets(datasets, loss, seed=settings.seed, device=device)
-        )
+        buffers, generators = stack.enter_context(_opened(datasets, loss, seed=settings.seed, device=device))
         torch.manual_seed(settings.seed)
         optimizer, schedule, targets = make_optimizer(
             loss, recipe, learning_rate=settings.learning_rate, warmup_updates=settings.warmup_updates,
             encoder_tau=settings.encoder_tau, updates=settings.updates, cuda_graph=settings.cuda_graph,
         )  # fmt: skip
         monitor = CollapseMonitor.of(loss)
-        run.require_same(
-            {"started_from": started_from, **settings_of(loss, recipe, settings, buffers, dtype)}
-        )
+        decisive = ("batch_size", "learning_rate", "warmup_updates", "encoder_tau", "seed")
+        run.require_same({
+            **{name: getattr(settings, name) for name in decisive},
+            # A schedule is stretched over the run, so that a run with one cannot be extended.
+            "updates": None if recipe.schedule == "constant" else settings.updates,
+            "schedule": recipe.schedule, "grad_clip": recipe.grad_clip, "precision": precision_name(dtype),
+            "loss": describe_loss(loss), "started_from": started_from,
+            "datasets": [_identity(name, buffer) for name, buffer in buffers.items()],
+        })  # fmt: skip
+        samplers = {
+            f"sampler_{index}": buffer.sampler
+            for index, buffer in enumerate(buffers.values())
+            if type(buffer.sampler) is not RandomSampler and hasattr(buffer.sampler, "state_dict")
+        }
         run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor,
-                 generators=generators, **samplers_of(buffers))  # fmt: skip
+                 generators=generators, **samplers)  # fmt: skip
+
+        before_update = getattr(loss, "before_update", lambda: None)  # prototypes are brought to unit length
 
         def update(batch: TensorDictBase) -> TensorDictBase:
-            normalise_prototypes(loss)
+            before_update()
             losses = loss(batch)
             optimizer.zero_grad(set_to_none=True)
             total_loss(losses).backward()
@@ -204,36 +196,25 @@ def pretrain(
         domains = list(buffers)
         for done in run.until(settings.updates, checkpoint_interval=settings.checkpoint_interval):
             domain = domains[done % len(domains)]
-            batch = (
-                buffers[domain].sample(settings.batch_size).to(device)
-            )  # its transform is the random shift
+            # The buffer's transform is the random shift.
+            batch = buffers[domain].sample(settings.batch_size).to(device)
             losses = fast_update(batch)
             schedule.step()
             run.log(scalars(losses, domain))
             run.advance(1)
             if run.every(settings.log_interval):
                 write_row(run, loss, monitor, batch, domain)
-            if run.position in settings.snapshots and run_dir is not None:
-                save_pretrained(loss, Path(run_dir) / f"encoder_at_{run.position}", slim=True)
         run.finish()
-        if run.means["pretrain"].counts:  # after the checkpoint: a longer run takes this shorter row back
+        if run.means("pretrain"):  # after the checkpoint: a longer run takes this shorter row back
             write_row(run, loss, monitor, batch, domain)
-        collapse, metrics = monitor.finish(run.position), run.last_row("pretrain")
-        training = training_card(
-            run, monitor, metrics=metrics, device=str(device), datasets=facts_of(buffers)
-        )
-        return PretrainResult(loss, recipe.name, run.position, run.resumed_from, metrics, collapse, training,
-                              run.history["pretrain"])  # fmt: skip
+        facts = {
+            "device": str(device),
+            "datasets": [_facts(name, buffer) for name, buffer in buffers.items()],
+        }
+        return PretrainResult(**ending(run, loss, recipe, monitor, run.position, facts))
 
 
-def finetune(
-    pretrained: Pretrained | str | Path,
-    datasets: Any,
-    *,
-    run_dir: str | Path | None = None,
-    config: PretrainConfig | None = None,
-    **options: Any,
-) -> PretrainResult:
+def finetune(pretrained: Pretrained | str | Path, datasets: Any, **options: Any) -> PretrainResult:
     """Train a pretrained artifact further, e.g. on the random data of one more domain.
 
     The networks, the target networks and the prototypes go on from what was saved; Adam starts afresh.
@@ -241,8 +222,6 @@ def finetune(
     Args:
         pretrained: an artifact, its directory, or the name of one that ships.
         datasets: as of :func:`pretrain`.
-        run_dir: as of :func:`pretrain`; the same call continues what was interrupted.
-        config: as of :func:`pretrain`.
         **options: further arguments of :func:`pretrain`, or single settings.
 
     Returns:
@@ -250,40 +229,14 @@ def finetune(
 
     Raises:
         PretrainedError: the artifact cannot be read, or its loss cannot be built again.
-        CheckpointError: ``run_dir`` holds a run from another artifact or with other settings.
     """
     if not isinstance(pretrained, Pretrained):
         pretrained = load_pretrained(pretrained)
-    result = pretrain(
-        pretrained.build_loss(), datasets, method=pretrained.method, run_dir=run_dir, config=config,
-        started_from=pretrained.identity(), **options,
-    )  # fmt: skip
-    before = {"started_from": pretrained.identity(), "previous_training": pretrained.card.get("training")}
+    identity = pretrained.identity()
+    options |= {"method": pretrained.method, "started_from": identity}
+    result = pretrain(pretrained.build_loss(), datasets, **options)
+    before = {"started_from": identity, "previous_training": pretrained.card.get("training")}
     return dataclasses.replace(result, training={**result.training, **before})
-
-
-def settings_of(
-    loss: LossModule,
-    method: Method,
-    config: Any,
-    buffers: Mapping[str, ReplayBuffer],
-    dtype: torch.dtype,
-) -> dict[str, Any]:
-    """Return everything that decides the numbers of a run."""
-    return {
-        "batch_size": config.batch_size,
-        "learning_rate": config.learning_rate,
-        "warmup_updates": config.warmup_updates,
-        "encoder_tau": config.encoder_tau,
-        "seed": config.seed,
-        # A schedule is stretched over the run, so that a run with one cannot be extended.
-        "updates": None if method.schedule == "constant" else config.updates,
-        "schedule": method.schedule,
-        "grad_clip": method.grad_clip,
-        "precision": "bf16" if dtype == torch.bfloat16 else "fp32",
-        "loss": describe_loss(loss),
-        "datasets": identities_of(buffers),
-    }
 
 
 # --- what active pre-training shares ---------------------------------------------------------------------------------
@@ -293,15 +246,11 @@ def make_optimizer(
     loss: LossModule, method: Method, *, learning_rate: float, warmup_updates: int, encoder_tau: float | None,
     updates: int, cuda_graph: bool = False,
 ) -> tuple[torch.optim.Adam, torch.optim.lr_scheduler.LambdaLR, SoftUpdate | None]:  # fmt: skip
-    """Return Adam, the learning-rate schedule over ``updates``, and the EMA of the target networks.
-
-    Raises:
-        ValueError: nothing to train.
-    """
+    """Return Adam, the learning-rate schedule over ``updates``, and the EMA of the target networks."""
     parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
     if not parameters:
         raise ValueError(
-            f"{type(loss).__name__} has no parameters that require a gradient; nothing to train."
+            f"{type(loss).__name__} has no parameters that require a gradient: nothing to train."
         )
     rate = torch.tensor(learning_rate, device=parameters[0].device) if cuda_graph else learning_rate
     optimizer = torch.optim.Adam(parameters, lr=rate, fused=True, capturable=cuda_graph)
@@ -328,22 +277,12 @@ def make_optimizer(
     return optimizer, schedule, targets
 
 
-def normalise_prototypes(loss: LossModule) -> None:
-    """Call the loss's ``before_update``, if it has one: prototypes are brought to unit length before each forward."""
-    if callable(hook := getattr(loss, "before_update", None)):
-        hook()
-
-
 def total_loss(losses: TensorDictBase) -> Tensor:
-    """Return the sum of the ``loss*`` terms.
-
-    Raises:
-        ValueError: there is none, or one is no scalar.
-    """
+    """Return the sum of the ``loss*`` terms, which must be scalars."""
     terms = {name: losses[name] for name in losses.keys() if name.startswith("loss")}  # noqa: SIM118
     if not terms:
         raise ValueError(
-            f"The loss returned no `loss_*` entry, only {sorted(losses.keys())}; nothing to minimise."
+            f"The loss returned no `loss_*` entry, only {sorted(losses.keys())}: nothing to minimise."
         )
     for name, term in terms.items():
         if term.numel() != 1:
@@ -354,59 +293,45 @@ def total_loss(losses: TensorDictBase) -> Tensor:
 def scalars(losses: TensorDictBase, domain: str) -> dict[str, Tensor]:
     """Return what a row shows of an update: every scalar, their sum, and loss and cosine by domain."""
     values = {name: value.reshape(()) for name, value in losses.items() if value.numel() == 1}
-    total = total_loss(losses)
-    values |= {"loss": total, f"loss/{domain}": total}
+    values["loss"] = values[f"loss/{domain}"] = total_loss(losses)
     if "embedding_cosine" in values:
         values[f"cosine/{domain}"] = values["embedding_cosine"]
     return values
 
 
+@torch.no_grad()
 def write_row(
     run: Run, loss: LossModule, monitor: CollapseMonitor, batch: TensorDictBase, domain: str
 ) -> None:
     """Write a row of the ``pretrain`` record with the prototypes' spread, and let the monitor judge it."""
-    means = run.means["pretrain"].read()
-    extra = prototype_row(loss, means)
-    if "embedding_cosine" not in means and (cosine := measured_cosine(loss, batch)) is not None:
-        extra[f"cosine/{domain}"] = cosine
+    means, extra = run.means("pretrain"), {}
+    weight = getattr(getattr(loss, "prototypes", None), "weight", None)
+    if isinstance(weight, Tensor):
+        extra["ln_num_prototypes"] = log_count = math.log(len(weight))
+        if "assignment_entropy" in means and log_count:
+            extra["assignment_entropy_frac"] = means["assignment_entropy"] / log_count
+        if len(weight) >= 4:
+            measured = prototype_metrics(weight.detach(), offset=float(getattr(loss, "offset", 1.5)))
+            extra |= {name: float(value) for name, value in measured.items()}
+    encoder, pixels = getattr(loss, "encoder", None), batch.get("pixels", None)
+    if "embedding_cosine" not in means and isinstance(encoder, nn.Module) and pixels is not None:
+        embeddings = encoder(pixels[:128])
+        if isinstance(projector := getattr(loss, "projector", None), nn.Module):
+            embeddings = projector(embeddings)
+        if isinstance(embeddings, Tensor) and embeddings.ndim == 2:
+            extra[f"cosine/{domain}"] = float(mean_pairwise_cosine(F.normalize(embeddings.float(), dim=-1)))
     row = run.write("pretrain", extra=extra)
     cosines = {
         name.removeprefix("cosine/"): value for name, value in row.items() if name.startswith("cosine/")
     }
-    monitor.observe(
-        run.counters.get("updates", run.position), comp=row.get("comp", row.get("loss_comp")), cosine=cosines
-    )
+    updates = run.counters.get("updates", run.position)
+    monitor.observe(updates, comp=row.get("comp", row.get("loss_comp")), cosine=cosines)
     run.show(loss=row["loss"])
 
 
-@torch.no_grad()
-def prototype_row(loss: LossModule, means: Mapping[str, float]) -> dict[str, float]:
-    """Return the spread of a loss's prototypes; nothing for a loss without any."""
-    weight = getattr(getattr(loss, "prototypes", None), "weight", None)
-    if not isinstance(weight, Tensor):
-        return {}
-    count = len(weight)
-    row = {"ln_num_prototypes": math.log(count)}
-    if "assignment_entropy" in means and count > 1:
-        row["assignment_entropy_frac"] = means["assignment_entropy"] / math.log(count)
-    if count >= 4:
-        measured = prototype_metrics(weight.detach(), offset=float(getattr(loss, "offset", 1.5)))
-        row |= {name: float(value) for name, value in measured.items()}
-    return row
-
-
-@torch.no_grad()
-def measured_cosine(loss: LossModule, batch: TensorDictBase) -> float | None:
-    """Return the mean pairwise cosine of a batch's embeddings, for a loss that does not report it."""
-    encoder, pixels = getattr(loss, "encoder", None), batch.get("pixels", None)
-    if not isinstance(encoder, nn.Module) or pixels is None:
-        return None
-    embeddings = encoder(pixels[:COSINE_ROWS])
-    if isinstance(projector := getattr(loss, "projector", None), nn.Module):
-        embeddings = projector(embeddings)
-    if not isinstance(embeddings, Tensor) or embeddings.ndim != 2:
-        return None
-    return float(mean_pairwise_cosine(F.normalize(embeddings.float(), dim=-1)))
+def precision_name(dtype: torch.dtype) -> str:
+    """Return how settings and cards call an arithmetic."""
+    return "bf16" if dtype == torch.bfloat16 else "fp32"
 
 
 def describe_loss(loss: LossModule) -> dict[str, Any]:
@@ -425,17 +350,24 @@ def describe_loss(loss: LossModule) -> dict[str, Any]:
     return described
 
 
-def training_card(run: Run, monitor: CollapseMonitor, **facts: Any) -> dict[str, Any]:
-    """Return how an encoder was trained, as plain values, for the card of its artifact."""
-    settings = {name: value for name, value in run.settings.items() if name not in ("loss", "datasets")}
-    return {
-        "updates": run.counters.get("updates", run.position),
+def ending(
+    run: Run, loss: LossModule, method: Method, monitor: CollapseMonitor, updates: int, facts: dict[str, Any]
+) -> dict[str, Any]:
+    """Return the fields of a :class:`PretrainResult`, and announce how training ended."""
+    collapse, metrics = monitor.finish(updates), run.last_row("pretrain")
+    training = {
+        "updates": updates,
         "seconds": round(run.seconds, 1),
-        "settings": settings,
-        "collapse": monitor.verdict(run.counters.get("updates", run.position)),
-        "made_with": run.made_with,
+        "settings": {name: value for name, value in run.settings.items() if name not in ("loss", "datasets")},
+        "collapse": collapse,
+        "made_with": provenance(),
+        "metrics": metrics,
         **facts,
     }
+    return {
+        "loss": loss, "method": method.name, "updates": updates, "resumed_from": run.resumed_from, "metrics": metrics,
+        "collapse": collapse, "training": training, "history": run.history["pretrain"],
+    }  # fmt: skip
 
 
 # --- datasets --------------------------------------------------------------------------------------------------------
@@ -447,23 +379,10 @@ CARD_FACTS = (
 
 
 @contextlib.contextmanager
-def open_datasets(
+def _opened(
     datasets: Any, loss: LossModule, *, seed: int, device: torch.device
 ) -> Iterator[tuple[dict[str, ReplayBuffer], Generators]]:
-    """Open datasets, name them, and attach the random shift that the loss wants to each for the time of a run.
-
-    Args:
-        datasets: as of :func:`pretrain`.
-        loss: whose ``in_keys`` and ``views`` say which images are shifted.
-        seed: of the run.
-        device: directories are opened on it.
-
-    Yields:
-        The buffers by domain, and the generators that they and their shifts draw from.
-
-    Raises:
-        DatasetError: there is none, or one does not fit the loss.
-    """
+    """Yield buffers by domain, with the random shift that the loss wants, and the generators that they draw from."""
     if isinstance(datasets, Mapping):
         given: list[tuple[str | None, Any]] = list(datasets.items())
     elif isinstance(datasets, (str, Path)) or hasattr(datasets, "sample"):
@@ -480,9 +399,8 @@ def open_datasets(
             raise DatasetError(
                 f"Dataset {index} is a {type(dataset).__name__}; give a directory, a FrameDataset or a ReplayBuffer."
             )
-        name = name or (getattr(dataset, "card", None) or {}).get("domain") or f"dataset_{index}"
-        name = name if name not in buffers else f"{name}_{index}"
-        buffers[name] = dataset
+        name = name or _card(dataset).get("domain") or f"dataset_{index}"
+        buffers[name if name not in buffers else f"{name}_{index}"] = dataset
     # TorchRL draws indices where the storage is, and its generator must be there, too.
     devices = {f"sample/{name}": getattr(buffer.storage, "device", None) for name, buffer in buffers.items()}
     devices = {name: device for name, device in devices.items() if isinstance(device, torch.device)}
@@ -490,15 +408,12 @@ def open_datasets(
     with contextlib.ExitStack() as stack:
         for name, buffer in buffers.items():
             buffer.set_rng(generators[f"sample/{name}"])
-            shift = random_shift_for(loss, name, buffer, generators["shift"])
-            buffer.append_transform(shift)
+            buffer.append_transform(_shift_for(loss, name, buffer, generators["shift"]))
             stack.callback(buffer.transform.pop, -1)
         yield buffers, generators
 
 
-def random_shift_for(
-    loss: LossModule, name: str, buffer: ReplayBuffer, generator: torch.Generator
-) -> RandomShift:
+def _shift_for(loss: LossModule, name: str, buffer: ReplayBuffer, generator: torch.Generator) -> RandomShift:
     """Return the shift of every image that a loss reads: each entry, and each second view of one, has its own."""
     sample = buffer.sample(1)
     views: Mapping[NestedKey, NestedKey] = getattr(loss, "views", {})
@@ -519,42 +434,25 @@ def random_shift_for(
                 f"{(channels, size, size)}. Collect with those, or build the encoder for the dataset."
             )
     seconds = [view for view, key in views.items() if key in images]
-    return RandomShift(
-        pad=SHIFT_PAD,
-        in_keys=[*(views[view] for view in seconds), *images],
-        out_keys=[*seconds, *images],
-        generator=generator,
-    )
+    read = [*(views[view] for view in seconds), *images]
+    return RandomShift(pad=SHIFT_PAD, in_keys=read, out_keys=[*seconds, *images], generator=generator)
 
 
-def samplers_of(buffers: Mapping[str, ReplayBuffer]) -> dict[str, Any]:
-    """Return the samplers that a checkpoint must hold: those with a state of their own."""
+def _card(buffer: ReplayBuffer) -> dict[str, Any]:
+    return getattr(buffer, "card", None) or {}
+
+
+def _facts(name: str, buffer: ReplayBuffer) -> dict[str, Any]:
+    """Return what the card of an encoder says about a dataset."""
+    card = _card(buffer)
+    return {"domain": name, "transitions": len(buffer), **{k: card[k] for k in CARD_FACTS if k in card}}
+
+
+def _identity(name: str, buffer: ReplayBuffer) -> dict[str, Any]:
+    """Return what must agree for a run to be continued on a dataset."""
+    card = json.dumps(_card(buffer), sort_keys=True, default=str)
     return {
-        f"sampler_{index}": buffer.sampler
-        for index, buffer in enumerate(buffers.values())
-        if type(buffer.sampler) is not RandomSampler and hasattr(buffer.sampler, "state_dict")
+        "name": name,
+        "transitions": len(buffer),
+        "card": hashlib.sha256(card.encode()).hexdigest()[:16],
     }
-
-
-def facts_of(buffers: Mapping[str, ReplayBuffer]) -> list[dict[str, Any]]:
-    """Return what the card of an encoder says about its datasets."""
-    facts = []
-    for name, buffer in buffers.items():
-        card = getattr(buffer, "card", None) or {}
-        facts.append(
-            {"domain": name, "transitions": len(buffer), **{k: card[k] for k in CARD_FACTS if k in card}}
-        )
-    return facts
-
-
-def identities_of(buffers: Mapping[str, ReplayBuffer]) -> list[dict[str, Any]]:
-    """Return what must agree for a run to be continued on these datasets."""
-    cards = [
-        json.dumps(getattr(buffer, "card", None) or {}, sort_keys=True, default=str)
-        for buffer in buffers.values()
-    ]
-    digests = [hashlib.sha256(card.encode()).hexdigest()[:16] for card in cards]
-    return [
-        {"name": name, "transitions": len(buffer), "card": digest}
-        for (name, buffer), digest in zip(buffers.items(), digests)
-    ]

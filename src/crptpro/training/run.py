@@ -1,18 +1,4 @@
-"""One training run: its directory, its record, its checkpoints, its progress; it knows nothing of what is trained.
-
-All training loops use it the same way::
-
-    with Run(run_dir, unit="updates", streams=("pretrain",)) as run:
-        run.require_same(settings)                      # refuses to continue a run of other settings
-        run.keep(loss=loss, optimizer=optimizer)        # part of every checkpoint; restored here if there is one
-        for update in run.until(total):                 # resumes, shows progress, checkpoints, stops on a signal
-            ...
-            run.log(losses)
-            run.advance(1)
-            if run.every(log_interval):
-                run.write("pretrain")
-        run.finish()
-"""
+"""One training run: its directory, its record, its checkpoints, its progress; it knows nothing of what is trained."""
 
 from __future__ import annotations
 
@@ -23,7 +9,7 @@ import signal
 import threading
 import time
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +17,11 @@ import psutil
 import torch
 from torch import Tensor, nn
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
-from tqdm.auto import tqdm
 
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import CheckpointError, DiskSpaceError, NonFiniteError, is_disk_full
 from crptpro.logging import RunLogger
+from crptpro.progress import Progress
 from crptpro.provenance import provenance
 from crptpro.seeding import derive_seed, kept_global_rng
 from crptpro.values import as_path
@@ -44,32 +30,22 @@ logger = logging.getLogger(__name__)
 
 CHECKPOINT_SECONDS = 300.0
 """Between two checkpoints of a run that names no interval."""
-SIGNALS = tuple(
+SIGNALS = [
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)
-)
+]
 """Requests to stop: Ctrl-C, and what clusters send before they take a machine away."""
 
 
 class Generators(dict[str, torch.Generator]):
-    """Random generators by name, each with its own seed, whose states a checkpoint holds.
-
-    Args:
-        seed: of the run.
-        *names: of the generators.
-        devices: of those that are not on the CPU.
-    """
+    """Random generators by name, each with its own seed, and on the CPU unless ``devices`` names another device."""
 
     def __init__(
         self, seed: int, *names: str, devices: Mapping[str, torch.device | None] | None = None
     ) -> None:
-        super().__init__(
-            {
-                name: torch.Generator((devices or {}).get(name) or "cpu").manual_seed(
-                    derive_seed(seed, "generator", name)
-                )
-                for name in names
-            }
-        )
+        super().__init__()
+        for name in names:
+            generator = torch.Generator((devices or {}).get(name) or "cpu")
+            self[name] = generator.manual_seed(derive_seed(seed, "generator", name))
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the state of every generator."""
@@ -81,39 +57,44 @@ class Generators(dict[str, torch.Generator]):
             generator.set_state(state[name])
 
 
-class Means:
-    """Running means of named scalars since the last row of the record, summed on the device."""
+class _Means:
+    """Means of named scalars since the last row of a stream, summed on their device, each with its own count."""
 
     def __init__(self) -> None:
         self.sums: dict[str, Tensor] = {}
         self.counts: dict[str, int] = {}
 
     def add(self, values: Mapping[str, Tensor]) -> None:
-        """Take one more value of each name; names may come at different rates."""
         for name, value in values.items():
             value = value.detach().double()
             self.sums[name] = self.sums[name] + value if name in self.sums else value
             self.counts[name] = self.counts.get(name, 0) + 1
 
     def read(self) -> dict[str, float]:
-        """Return the means."""
         return {name: float(total) / self.counts[name] for name, total in self.sums.items()}
 
-    def clear(self) -> None:
-        """Begin again."""
-        self.sums, self.counts = {}, {}
-
     def state_dict(self) -> dict[str, Any]:
-        """Return sums and counts."""
         return {"sums": self.sums, "counts": self.counts}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore :meth:`state_dict`."""
         self.sums, self.counts = dict(state["sums"]), dict(state["counts"])
 
 
 class Run:
     """The directory, record, checkpoints and progress of one training run.
+
+    ::
+
+        with Run(run_dir, unit="updates", streams=("pretrain",)) as run:
+            run.require_same(settings)                      # refuses to continue a run of other settings
+            run.keep(loss=loss, optimizer=optimizer)        # part of every checkpoint; restored here if there is one
+            for update in run.until(total):                 # resumes, shows progress, checkpoints, stops on a signal
+                ...
+                run.log(losses)
+                run.advance(1)
+                if run.every(log_interval):
+                    run.write("pretrain")
+            run.finish()
 
     A run can be killed at any moment: the same call continues from its last checkpoint, and on a CPU with the same
     number of threads the numbers are those of an uninterrupted run. Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 let the loop
@@ -126,7 +107,6 @@ class Run:
         streams: of the record, that this run writes.
         records: used instead of a record in ``run_dir``.
         config: settings, for the record.
-        resume: continue what ``run_dir`` holds; ``False`` refuses a directory that holds a run.
         progress: show a bar, or lines in a log file.
 
     Attributes:
@@ -137,8 +117,7 @@ class Run:
         history: rows that this call wrote, by stream.
 
     Raises:
-        CheckpointError: ``run_dir`` is in use by another process, holds a run that is not to be continued, or only
-            damaged checkpoints.
+        CheckpointError: ``run_dir`` is in use by another process, or all its checkpoints are damaged.
     """
 
     def __init__(
@@ -149,52 +128,40 @@ class Run:
         streams: tuple[str, ...],
         records: RunLogger | None = None,
         config: Any = None,
-        resume: bool = True,
         progress: bool = True,
     ) -> None:
         self.run_dir = None if run_dir is None else as_path(run_dir, "run_dir")
         self.unit, self.streams, self.records, self.config = unit, streams, records, config
-        self.resume, self.progress = resume, progress
         self.position = self.resumed_from = 0
         self.counters: dict[str, int] = {}
         self.tally: dict[str, int] = {}
         self.history: dict[str, list[dict[str, Any]]] = {stream: [] for stream in streams}
-        self.means = {stream: Means() for stream in streams}
         self.settings: dict[str, Any] = {}
         self.saved: dict[str, Any] = {}
-        self.made_with = provenance()
+        self._means = {stream: _Means() for stream in streams}
         self._checkpoint = Checkpoint(format="archive")
         self._modules: list[nn.Module] = []
         self._stack = contextlib.ExitStack()
         self._signal: int | None = None
-        self._advance = 0
+        self._last_advance = self._row_position = 0
         self._started = self._saved_time = self._row_time = time.monotonic()
-        self._row_position = 0
         self._earlier_seconds = 0.0
-        self._bar: tqdm | None = None
-        self._total, self._lines = 1, 0
-
-    # --- beginning and end --------------------------------------------------------------------------------------
+        self._is_shown, self._progress = progress, Progress(0, 0, unit, is_shown=False)
 
     def __enter__(self) -> Run:
-        self._stack.enter_context(kept_global_rng())
-        try:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(kept_global_rng())
             if self.run_dir is not None:
-                self._stack.enter_context(
-                    DirectoryLock(self.run_dir, error=CheckpointError, is_reentrant=True)
-                )
+                stack.enter_context(DirectoryLock(self.run_dir, error=CheckpointError, is_reentrant=True))
                 self._rotation = CheckpointRotation(self.run_dir / "checkpoints", keep_last=2)
                 self._find_checkpoint()
                 if self.records is None:
-                    self.records = self._stack.enter_context(RunLogger(self.run_dir, config=self.config))
-        except BaseException:
-            self._stack.close()
-            raise
+                    self.records = stack.enter_context(RunLogger(self.run_dir, config=self.config))
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
+        self._progress.close()
         self._stack.close()
 
     @property
@@ -202,19 +169,12 @@ class Run:
         """Training time, all resumptions included."""
         return self._earlier_seconds + time.monotonic() - self._started
 
-    def saved_setting(self, name: str, asked: Any, *, open_value: Any = "auto") -> Any:
-        """Return a setting that the user left open as the interrupted run had it, otherwise as asked.
-
-        What ``"auto"`` stands for depends on the machine, and a run may be continued on another one.
-        """
-        return self.saved.get("settings", {}).get(name, asked) if asked == open_value else asked
+    def saved_setting(self, name: str, asked: Any) -> Any:
+        """Return a setting as asked, or where that is ``"auto"`` as the interrupted run had it, on its machine."""
+        return self.saved.get("settings", {}).get(name, asked) if asked == "auto" else asked
 
     def require_same(self, settings: Mapping[str, Any]) -> None:
-        """Name everything that decides the numbers of the run; plain values.
-
-        Raises:
-            CheckpointError: the run to be continued had other settings; the message names them.
-        """
+        """Name everything that decides the numbers of the run; a run of other settings is refused by name."""
         self.settings = dict(settings)
         if not self.saved:
             return
@@ -234,14 +194,10 @@ class Run:
     def keep(self, **components: Any) -> None:
         """Make objects with ``state_dict`` and ``load_state_dict`` part of every checkpoint, and restore them.
 
-        ``None`` is left out. Without a checkpoint, the rows of an attempt that was killed before its first one are
-        removed.
-
-        Raises:
-            CheckpointError: a component does not fit its saved state.
+        ``None`` is left out. The rows of an attempt that was killed before its first checkpoint are removed.
         """
         self._modules = [value for value in components.values() if isinstance(value, nn.Module)]
-        means = {f"means_{stream}": value for stream, value in self.means.items()}
+        means = {f"means_{stream}": value for stream, value in self._means.items()}
         for name, component in {**components, **means, "global_rng": GlobalRNGState()}.items():
             if component is not None:
                 self._checkpoint.register(name, component)
@@ -262,90 +218,80 @@ class Run:
             self.records.load_state_dict(dict.fromkeys(self.streams, 0))
         self._started = self._saved_time = self._row_time = time.monotonic()
 
-    # --- the loop -----------------------------------------------------------------------------------------------
-
     def until(self, total: int, *, checkpoint_interval: int | None = None) -> Iterator[int]:
         """Yield the position until it has reached ``total``; the body of the loop calls :meth:`advance`.
 
-        Between two passes a checkpoint is written when one is due, or when a signal asks the run to stop.
-
-        Args:
-            total: position at which the run is complete.
-            checkpoint_interval: in ``unit``; ``None`` for :data:`CHECKPOINT_SECONDS`.
-
-        Raises:
-            CheckpointError: the run to be continued is already beyond ``total``.
+        Between two passes a checkpoint is written when one is due (every ``checkpoint_interval`` in ``unit``, or every
+        :data:`CHECKPOINT_SECONDS`), or when a signal asks the run to stop.
         """
         if self.position > total and self.resumed_from:
             raise CheckpointError(
                 f"{self.run_dir} has done {self.position:,} {self.unit}, {total:,} are asked: ask for at least as "
                 "many, or choose another run directory."
             )
-        self._show(total)
-        self._listen()
+        self._progress = Progress(total, self.position, self.unit, is_shown=self._is_shown)
+        if threading.current_thread() is threading.main_thread():  # the only one that receives signals
+            for number in SIGNALS:
+                self._stack.callback(signal.signal, number, signal.signal(number, self._receive))
         while self.position < total:
             before = self.position
             yield self.position
-            stops = self._signal is not None and self.position < total
+            if self.position >= total:
+                return
             if checkpoint_interval is None:
                 is_due = time.monotonic() - self._saved_time >= CHECKPOINT_SECONDS
             else:
                 is_due = self.position // checkpoint_interval > before // checkpoint_interval
-            if self.position < total and (is_due or stops):
+            if is_due or self._signal is not None:
                 self.save()
-            if stops:
-                kept = (
-                    "nothing is kept without run_dir" if self.run_dir is None else "a checkpoint was written"
-                )
+            if self._signal is not None:
+                kept = "a checkpoint was written" if self.run_dir else "nothing is kept without run_dir"
                 logger.warning(
                     "Stopped at %s of %s %s; %s.", f"{self.position:,}", f"{total:,}", self.unit, kept
                 )
-                if self._signal == signal.SIGINT:
-                    raise KeyboardInterrupt
-                raise SystemExit(128 + (self._signal or 0))
+                raise KeyboardInterrupt if self._signal == signal.SIGINT else SystemExit(128 + self._signal)
+
+    def _receive(self, number: int, frame: object) -> None:
+        if self._signal is not None and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        self._signal = number
+        logger.warning("Stopping as soon as a checkpoint can be written; press Ctrl-C again to stop at once.")
 
     def advance(self, count: int) -> None:
         """Move the position, and the bar with it."""
-        self.position, self._advance = self.position + count, count
-        if self._bar is not None:
-            self._bar.update(count)
+        self.position, self._last_advance = self.position + count, count
+        self._progress.reach(self.position)
 
     def every(self, interval: int) -> bool:
         """Whether the last :meth:`advance` reached or crossed a multiple of ``interval``."""
-        return self.position // interval > (self.position - self._advance) // interval
+        return self.position // interval > (self.position - self._last_advance) // interval
+
+    def show(self, **values: float) -> None:
+        """Put values beside the bar; in a log file a line at every twentieth of the run."""
+        self._progress.show(**values)
 
     def finish(self) -> None:
         """Write the last checkpoint, of a complete run."""
-        if self.saved.get("is_finished") and self.saved["position"] == self.position:
-            return
-        self.save(is_finished=True)
-
-    # --- the record ---------------------------------------------------------------------------------------------
+        if not (self.saved.get("is_finished") and self.saved["position"] == self.position):
+            self.save(is_finished=True)
 
     def log(self, values: Mapping[str, Tensor], stream: str | None = None) -> None:
         """Take scalars of one update into the means of a stream's next row; the first stream's by default.
 
-        On a CPU, a loss that is not finite ends the run at once; on a GPU the next row or checkpoint does, without a
-        host synchronisation here.
-
-        Raises:
-            NonFiniteError: naming the term.
+        On a CPU, a loss that is not finite ends the run at once with a NonFiniteError; on a GPU the next row or
+        checkpoint does, without a host synchronisation here.
         """
         for name, value in values.items():
             if name.startswith("loss") and value.device.type == "cpu" and not torch.isfinite(value).all():
-                raise not_finite(f"After {self.position:,} {self.unit}, {name} is {value.item()}")
-        self.means[stream or self.streams[0]].add(values)
+                raise _not_finite(f"After {self.position:,} {self.unit}, {name} is {value.item()}")
+        self._means[stream or self.streams[0]].add(values)
 
-    def row(self, stream: str) -> dict[str, float]:
-        """Return the means since the last row of a stream.
-
-        Raises:
-            NonFiniteError: naming a term that is not finite.
-        """
-        means = self.means[stream].read()
+    def means(self, stream: str) -> dict[str, float]:
+        """Return the means since the last row of a stream, empty if nothing was logged; losses must be finite."""
+        means = self._means[stream].read()
         for name, value in means.items():
             if name.startswith("loss") and not torch.isfinite(torch.tensor(value)):
-                raise not_finite(f"After {self.position:,} {self.unit} or before, {name} is {value}")
+                raise _not_finite(f"After {self.position:,} {self.unit} or before, {name} is {value}")
         return means
 
     def write(
@@ -356,21 +302,14 @@ class Run:
         extra: Mapping[str, float] | None = None,
         **counters: int,
     ) -> dict[str, Any]:
-        """Write a row: ``values``, or else the means since the last row, which begin again, with rate and memory.
+        """Write a row, and return it without its counters: the position, :attr:`counters` and the ones given.
 
-        Args:
-            stream: of the record.
-            values: of the row.
-            extra: further values beside the means.
-            **counters: beside the position and :attr:`counters`.
-
-        Returns:
-            The row without its counters.
+        It has ``values``, or else the means since the last row, which begin again, rate and memory, and ``extra``.
         """
         counters = {self.unit: self.position, **self.counters, **counters}
         if values is None:
-            row: dict[str, Any] = {**self.row(stream), **(extra or {})}
-            self.means[stream].clear()
+            row: dict[str, Any] = {**self.means(stream), **(extra or {})}
+            self._means[stream].load_state_dict({"sums": {}, "counts": {}})
             if stream == self.streams[0]:
                 row |= self._rate_and_memory()
         else:
@@ -396,39 +335,20 @@ class Run:
 
     def last_row(self, stream: str) -> dict[str, Any]:
         """Return the newest row of a stream without its counters; empty if there is none."""
-        rows = self.history[stream] or ([] if self.records is None else self.records.rows(stream))
+        rows = self.history[stream] or self.rows(stream)
         left_out = {self.unit, *self.counters, "unix_time_s"}
         return {name: value for name, value in rows[-1].items() if name not in left_out} if rows else {}
 
-    def show(self, **values: float) -> None:
-        """Put values beside the bar; in a log file a line at every twentieth of the run."""
-        if self._bar is None:
-            return
-        if not self._bar.disable:
-            self._bar.set_postfix({name: f"{value:.4g}" for name, value in values.items()}, refresh=False)
-        elif self.progress and 20 * self.position // self._total > self._lines:
-            self._lines = 20 * self.position // self._total
-            rate = (self.position - self.resumed_from) / max(time.monotonic() - self._started, 1e-9)
-            logger.info(
-                "%s of %s %s (%d %%), %s, %.2f/s, %.0f s left",
-                f"{self.position:,}", f"{self._total:,}", self.unit, 100 * self.position // self._total,
-                ", ".join(f"{name} {value:.4g}" for name, value in values.items()), rate,
-                (self._total - self.position) / max(rate, 1e-9),
-            )  # fmt: skip
-
-    # --- checkpoints --------------------------------------------------------------------------------------------
-
     def save(self, *, is_finished: bool = False) -> None:
-        """Write a checkpoint of everything that :meth:`keep` was given; two are kept.
-
-        Raises:
-            NonFiniteError: the run has diverged; earlier checkpoints are kept.
-            DiskSpaceError: the disk is full; earlier checkpoints are kept.
-        """
+        """Write a checkpoint of everything that :meth:`keep` was given, unless it is not finite; two are kept."""
         for stream in self.streams:
-            self.row(stream)
+            self.means(stream)
         for module in self._modules:
-            require_finite_parameters(module, f"After {self.position:,} {self.unit}")
+            for name, parameter in module.named_parameters():
+                if not torch.isfinite(parameter.detach()).all():
+                    raise _not_finite(
+                        f"After {self.position:,} {self.unit} the parameter {name} is not finite"
+                    )
         self._saved_time = time.monotonic()
         if self.run_dir is None:
             return
@@ -439,32 +359,25 @@ class Run:
             "seconds": self.seconds,
             "is_finished": is_finished,
             "record": None if self.records is None else self.records.state_dict(self.streams),
-            "made_with": self.made_with,
+            "made_with": provenance(),
         }
         try:
             path = self._rotation.save(self._checkpoint, step=self.position, metadata={"run": self.saved})
             for changed in (path, path.parent):
-                sync(changed)
+                _sync(changed)
         except OSError as reason:
-            if is_disk_full(reason):
-                raise DiskSpaceError(
-                    f"The disk is full: no checkpoint could be written to {self._rotation.directory}. Earlier ones are "
-                    "kept; free space and start the same command again."
-                ) from reason
-            raise CheckpointError(
-                f"No checkpoint could be written to {self._rotation.directory}: {reason}. Earlier ones are kept."
+            error, what = (
+                (DiskSpaceError, "the disk is full") if is_disk_full(reason) else (CheckpointError, reason)
+            )
+            raise error(
+                f"No checkpoint could be written to {self._rotation.directory}: {what}. Earlier ones are kept; mend "
+                "that and start the same command again."
             ) from reason
 
     def _find_checkpoint(self) -> None:
         """Read the newest checkpoint that is whole; damaged newer ones are removed."""
-        directory = self._rotation.directory
-        paths = sorted(directory.glob("checkpoint-*"), reverse=True) if directory.is_dir() else []
-        if paths and not self.resume:
-            raise CheckpointError(
-                f"{self.run_dir} already holds a run. Choose another directory, or continue it (resume=True)."
-            )
         damaged = []
-        for path in paths:
+        for path in sorted(self._rotation.directory.glob("checkpoint-*"), reverse=True):
             try:
                 with zipfile.ZipFile(path) as archive:
                     if (broken := archive.testzip()) is not None:
@@ -477,57 +390,21 @@ class Run:
                 damaged.append(path)
         if damaged and not self.saved:
             raise CheckpointError(
-                f"All {len(damaged)} checkpoints in {directory} are damaged. Remove that directory to start again."
+                f"All {len(damaged)} checkpoints in {self._rotation.directory} are damaged. Remove that directory to "
+                "start again."
             )
         for path in damaged:  # they would outrank the checkpoints that follow
             path.unlink()
 
-    # --- signals and the bar ------------------------------------------------------------------------------------
 
-    def _listen(self) -> None:
-        if threading.current_thread() is not threading.main_thread():
-            return  # Python delivers signals to the main thread only
-        for number in SIGNALS:
-            self._stack.callback(signal.signal, number, signal.signal(number, self._receive))
-
-    def _receive(self, number: int, frame: object) -> None:
-        if self._signal is not None and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        self._signal = number
-        logger.warning("Stopping as soon as a checkpoint can be written; press Ctrl-C again to stop at once.")
-
-    def _show(self, total: int) -> None:
-        self._total = max(total, 1)
-        self._lines = 20 * self.position // self._total
-        self._bar = tqdm(
-            total=total,
-            initial=self.position,
-            unit=self.unit.removesuffix("s").replace("_", " "),
-            disable=None if self.progress else True,
-            leave=False,
-        )
-
-
-def not_finite(what: str) -> NonFiniteError:
-    """Return the error that ends a diverged run: what happened, what is kept, and the remedy."""
+def _not_finite(what: str) -> NonFiniteError:
     return NonFiniteError(
         f"{what}. Training stopped and the last checkpoint is kept. "
         "Lower the learning rate, use precision='fp32', or check the data."
     )
 
 
-def require_finite_parameters(module: nn.Module, when: str) -> None:
-    """Refuse to keep a network whose last update spoilt a parameter that no metric has shown yet.
-
-    Raises:
-        NonFiniteError: naming the first parameter with a NaN or an infinity.
-    """
-    for name, parameter in module.named_parameters():
-        if not torch.isfinite(parameter.detach().sum()) and not torch.isfinite(parameter.detach()).all():
-            raise not_finite(f"{when} the parameter {name} is not finite")
-
-
-def sync(path: Path) -> None:
+def _sync(path: Path) -> None:
     """Make a file, or the names in a directory, durable."""
     with contextlib.suppress(OSError):  # some network file systems cannot sync a directory
         handle = os.open(path, os.O_RDONLY)
@@ -537,13 +414,12 @@ def sync(path: Path) -> None:
             os.close(handle)
 
 
-def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+def _flat(value: Any, name: str = "") -> dict[str, Any]:
     """Return nested settings under dotted names."""
-    items: Iterable[tuple[str, Any]]
     if isinstance(value, Mapping):
-        items = [(f"{prefix}.{key}" if prefix else str(key), item) for key, item in value.items()]
+        items = [_flat(item, f"{name}.{key}".lstrip(".")) for key, item in value.items()]
     elif isinstance(value, (list, tuple)):
-        items = [(f"{prefix}[{index}]", item) for index, item in enumerate(value)]
+        items = [_flat(item, f"{name}[{index}]") for index, item in enumerate(value)]
     else:
-        return {prefix: value}
-    return {name: leaf for key, item in items for name, leaf in _flat(item, key).items()}
+        return {name: value}
+    return {name: leaf for found in items for name, leaf in found.items()}

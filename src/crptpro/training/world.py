@@ -1,0 +1,96 @@
+"""An environment that a training loop acts in: a thread of its own, and the replay of what it showed."""
+
+from __future__ import annotations
+
+import functools
+import shutil
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from crptpro.data import FrameReplay
+from crptpro.domains import Domain, get_domain
+from crptpro.envs import make_env, needs_gl
+from crptpro.envs.rendering import select_backend
+from crptpro.provenance import cpu_cores
+from crptpro.training.run import Run
+from crptpro.workers import Inline
+
+SPARE_FRAMES = 2_000
+
+
+class EnvThread:
+    """Makes, steps and closes one environment in a thread of its own, where its render context is.
+
+    MuJoCo lets other threads run while it simulates and draws: the next observation is drawn while an update computes.
+    What an environment returns does not depend on when it is asked, so that this changes no number. Without cores for
+    it, and with GLFW, everything is done in the caller's thread. ``make_env`` builds another one like ``env``, which
+    shows the images that the encoder takes.
+    """
+
+    def __init__(
+        self, task: str | Domain, encoder: Any, config: Any, *, seed: int, action_repeat: int
+    ) -> None:
+        domain = get_domain(task)  # the object: its name may be registered in this process only
+        self.make_env: Callable[[], EnvBase] = functools.partial(
+            make_env,
+            domain,
+            seed=seed,
+            quality=config.quality,
+            colors=getattr(config, "colors", "normal"),
+            action_repeat=action_repeat,
+            image_size=getattr(encoder, "image_size", 84),
+            frame_stack=getattr(encoder, "in_channels", 9) // 3,
+        )
+        # With one thread of torch others want the cores.
+        has_cores = config.device == "cpu" and cpu_cores() > 1 and torch.get_num_threads() > 1
+        runs_ahead = has_cores and not (needs_gl(domain) and select_backend() == "glfw")
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="environment") if runs_ahead else Inline()
+        try:
+            self.env: EnvBase = self._thread.submit(self.make_env).result()
+        except BaseException:
+            self._thread.shutdown()
+            raise
+
+    def reset(self, seed: int) -> TensorDictBase:
+        """Seed the environment and begin the episode of the seed."""
+
+        def reset() -> TensorDictBase:
+            self.env.set_seed(seed)
+            return self.env.reset()
+
+        return self._thread.submit(reset).result()
+
+    def step(self, td: TensorDictBase) -> Future[TensorDictBase]:
+        """Begin the step that ``td["action"]`` asks for; nobody may change ``td`` until its result is there."""
+        return self._thread.submit(self.env.step, td)
+
+    def uniform_action(self, generator: torch.Generator) -> Tensor:
+        """Return a uniformly random action in ``[-1, 1]^A``."""
+        return 2 * torch.rand(self.env.action_spec.shape, generator=generator) - 1
+
+    def close(self) -> None:
+        """Free the render context."""
+        with self._thread:
+            self._thread.submit(self.env.close).result()
+
+
+def make_replay(run: Run, path: Path | None, env: EnvBase, capacity: int, **options: Any) -> FrameReplay:
+    """Return the replay of an environment, in ``path`` or in RAM."""
+    channels, height, width = env.observation_spec["pixels"].shape
+    if path is not None and not run.saved:
+        shutil.rmtree(path, ignore_errors=True)  # of an attempt without a checkpoint
+    return FrameReplay(
+        capacity,
+        frame_shape=(3, height, width),
+        action_dim=env.action_spec.shape[-1],
+        frame_stack=channels // 3,
+        path=path,
+        **options,
+    )

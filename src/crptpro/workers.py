@@ -1,0 +1,90 @@
+"""Worker processes that make environments: spawned, one CPU thread each, and gone when their parent is."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from crptpro.plugins import load_again, loaded_plugins
+
+SPAWN = multiprocessing.get_context("spawn")
+"""A fork would share a GL context."""
+
+
+def can_be_sent(function: Callable[..., Any]) -> bool:
+    """Whether another process can import a function; none can import one of a notebook's cell."""
+    main_file = getattr(sys.modules.get("__main__"), "__file__", None)
+    try:
+        return b"__main__" not in pickle.dumps(function) or bool(main_file and Path(main_file).exists())
+    except Exception:  # objects may refuse in ways of their own
+        return False
+
+
+class Inline(Executor):
+    """An executor that does the work at once, where it is submitted."""
+
+    def submit(self, function: Any, /, *arguments: Any, **options: Any) -> Future[Any]:
+        """Call the function; its exception is that of the result."""
+        future: Future[Any] = Future()
+        try:
+            future.set_result(function(*arguments, **options))
+        except BaseException as reason:
+            future.set_exception(reason)
+        return future
+
+
+class WorkerPool(ProcessPoolExecutor):
+    """An executor whose processes call ``prepare(*arguments)`` first, and ignore Ctrl-C: their parent decides."""
+
+    def __init__(self, workers: int, prepare: Callable[..., None], *arguments: Any) -> None:
+        super().__init__(workers, SPAWN, _begin, (loaded_plugins(), prepare, arguments))
+        self.processes: dict[int, Any] = {}
+
+    def submit(self, function: Any, /, *arguments: Any, **options: Any) -> Future[Any]:
+        """Schedule a call; a process that is started for it ignores Ctrl-C from its first moment."""
+        is_main = threading.current_thread() is threading.main_thread()
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
+        try:
+            return super().submit(function, *arguments, **options)
+        finally:
+            self.processes |= self._processes or {}
+            if is_main:
+                signal.signal(signal.SIGINT, before)
+
+    def end(self) -> None:
+        """End the processes, whatever they do; nobody wants it any more."""
+        for process in self.processes.values():
+            process.terminate()
+        for process in self.processes.values():
+            process.join(5.0)
+            if process.is_alive():
+                process.kill()
+        self.shutdown(cancel_futures=True)
+
+
+def _begin(plugins: tuple[str, ...], prepare: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # One software-rendering thread per process is faster than several; it must be set before GL loads.
+    os.environ.setdefault("LP_NUM_THREADS", "1")
+    torch.set_num_threads(1)
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
+    load_again(plugins)
+    prepare(*arguments)
+
+
+def _exit_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)
