@@ -315,7 +315,7 @@ def _as_pretrained(trained: Any, actor: nn.Module | None) -> Pretrained:
     if isinstance(trained, Pretrained):
         return trained if actor is None else replace(trained, actor=actor)
     if isinstance(trained, nn.Module):
-        result = {"loss": trained, "method": method_of(trained).name}
+        result: dict[str, Any] = {"loss": trained, "method": method_of(trained).name}
     else:
         result = {
             name: getattr(trained, name, None) for name in ("loss", "method", "training", "actor", "queue")

@@ -11,17 +11,7 @@ import numpy as np
 import torch
 from torchrl.checkpoint import GlobalRNGState
 
-from crptpro.errors import CRPTproError
-
-
-def require_seed(seed: int) -> None:
-    """Refuse a seed that no generator takes.
-
-    Raises:
-        CRPTproError: outside [0, 2**32), NumPy's range.
-    """
-    if not 0 <= seed < 2**32:
-        raise CRPTproError(f"`seed` must be from 0 to {2**32 - 1}, got {seed}.")
+from crptpro.values import MAX_SEED, as_int
 
 
 def derive_seed(seed: int, *path: str | int) -> int:
@@ -44,9 +34,9 @@ def seed_everything(seed: int) -> None:
     """Seed Python's, NumPy's and torch's global generators (all devices).
 
     Raises:
-        CRPTproError: a seed outside [0, 2**32).
+        ValueError: a seed outside [0, 2**32), NumPy's range.
     """
-    require_seed(seed)
+    seed = as_int(seed, "seed", minimum=0, maximum=MAX_SEED)
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002 - dm_control and gymnasium read the legacy global generator
     torch.manual_seed(seed)

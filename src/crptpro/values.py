@@ -26,6 +26,10 @@ QUALITIES: tuple[str, ...] = get_args(Quality)
 COLORS: tuple[str, ...] = get_args(Colors)
 
 
+MAX_SEED = 2**32 - 1
+"""NumPy's largest."""
+
+
 def as_int(value: Any, name: str, *, minimum: int | None = None, maximum: int | None = None) -> int:
     """Return a count, size or seed as a plain ``int``: of an int, a NumPy or torch scalar, or a float such as ``1e5``.
 
@@ -141,7 +145,7 @@ def check_numbers(config: Any, *, counts: Mapping[str, int], rates: Mapping[str,
     Raises:
         ValueError: naming the setting, its value and what is allowed.
     """
-    values: dict[str, Any] = {"seed": as_int(config.seed, "seed", minimum=0, maximum=2**32 - 1)}
+    values: dict[str, Any] = {"seed": as_int(config.seed, "seed", minimum=0, maximum=MAX_SEED)}
     for name, minimum in counts.items():
         if (value := getattr(config, name)) is not None:
             values[name] = as_int(value, name, minimum=minimum)

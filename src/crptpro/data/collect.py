@@ -27,8 +27,8 @@ from crptpro.data.dataset import FrameDataset
 from crptpro.domains import LONGEST_EPISODE_AGENT_STEPS, Domain, expand_groups, get_domain
 from crptpro.errors import CRPTproError, DatasetError, RenderingError, WorkerLostError
 from crptpro.progress import Progress
-from crptpro.seeding import derive_seed, kept_global_rng, require_seed
-from crptpro.values import Colors, Quality, as_int, as_path
+from crptpro.seeding import derive_seed, kept_global_rng
+from crptpro.values import MAX_SEED, Colors, Quality, as_int, as_path
 from crptpro.workers import SPAWN, Inline, WorkerPool, can_be_sent
 
 logger = logging.getLogger(__name__)
@@ -103,8 +103,7 @@ def collect_group(
     from crptpro.envs.rendering import select_backend
 
     transitions = as_int(transitions, "transitions", minimum=1)
-    workers, seed = as_int(workers, "workers", minimum=1), as_int(seed, "seed")
-    require_seed(seed)
+    workers, seed = as_int(workers, "workers", minimum=1), as_int(seed, "seed", minimum=0, maximum=MAX_SEED)
     root, image_size = as_path(root, "root"), as_int(image_size, "image_size", minimum=1)
     paths: dict[str, Path] = {}
     jobs: list[_Job] = []
