@@ -34,7 +34,6 @@ from crptpro.domains import (
 )
 from crptpro.envs import make_env
 from crptpro.errors import CRPTproError, DatasetError
-from crptpro.experiments import measure
 from crptpro.logging import RunLogger, WandbOptions
 from crptpro.modules import usable_device
 from crptpro.objectives import get_method
@@ -315,6 +314,8 @@ class Evaluate:
             policy = agent or training.uniform_policy(env, seed=self.seed)
             episodes = training.evaluate(policy, env, episodes=self.episodes, seed=self.seed)
             if self.csv is not None:
+                from crptpro.experiments import measure
+
                 measure.write_rows(
                     self.csv, [{"task": task, "agent": self.agent, **vars(each)} for each in episodes]
                 )
@@ -351,6 +352,8 @@ class Probe:
 
     def run(self) -> None:
         """Print a table, and write what was asked for."""
+        from crptpro.experiments import measure
+
         if self.samples < 1:
             raise CRPTproError(f"--samples must be at least 1, got {self.samples}.")
         require_writable(self.csv, "--csv")  # before minutes of probing
@@ -491,6 +494,8 @@ def main() -> None:
     def run() -> None:
         arguments = load_plugins(sys.argv[1:])
         if arguments[:1] == ["measure"]:  # what jobs of `reproduce` call
+            from crptpro.experiments import measure
+
             measure.main(arguments[1:])
             return
         commands: dict[str, Any] = {

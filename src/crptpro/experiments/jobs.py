@@ -290,7 +290,10 @@ def load_results(root: str | Path) -> Results:
 def _job_row(path: Path) -> dict[str, Any]:
     content, done_path = read_json(path, error=RecordError), path.with_name(DONE)
     done = read_json(done_path, error=RecordError) if done_path.exists() else {}
-    row = {name: content.get(name) for name in DESCRIBED} | {name: done.get(name) for name in MADE}
+    try:
+        row = {name: content[name] for name in DESCRIBED} | {name: done.get(name) for name in MADE}
+    except KeyError as reason:
+        raise RecordError(f"{path} does not describe a job: it has no {reason}.") from None
     return row | {
         "path": path.parent,
         "done": done_path.exists(),

@@ -14,7 +14,7 @@ import math
 import re
 import shlex
 from collections.abc import Iterable, Sequence
-from itertools import combinations, product
+from itertools import chain, combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -115,10 +115,8 @@ class Page:
         frame = pd.DataFrame(rows)
         if len(frame):
             shown = frame.astype(object).where(frame.notna() & (frame != ""), "\N{EN DASH}").astype(str)
-            columns = list(map(str, frame))
-            self._add(
-                kind="table", caption=caption, columns=columns, rows=shown.to_numpy().tolist(), fold=fold
-            )
+            content = {"columns": list(map(str, frame)), "rows": shown.to_numpy().tolist()}
+            self._add(kind="table", caption=caption, fold=fold, **content)
 
     def figure(self, name: str, caption: str, figure: Any) -> None:
         """Write a figure and show it; the same numbers give the same file."""
@@ -205,29 +203,15 @@ def _needed(key: str, jobs: pd.DataFrame, *kinds: str) -> list[str]:
     while waiting:
         if (one := waiting.pop(0)) not in found and one in jobs.index:
             found[one] = None
-            waiting += jobs.loc[one, "needs"] or []
+            waiting += jobs.loc[one, "needs"]
     return [key for key in found if not kinds or jobs.loc[key, "kind"] in kinds]
 
 
-NOT_TOLD_APART = set(
-    [
-        "seed",
-        "task",
-        "colors",
-        "device",
-        "precision",
-        "compile",
-        "cuda_graph",
-        "eval_workers",
-        "render_ahead",
-        "features",
-        "video_episodes",
-        "checkpoint_interval_env_steps",
-        "log_interval_env_steps",
-        "eval_interval_env_steps",
-        "eval_episodes",
-    ]
-)
+NOT_TOLD_APART = [
+    "seed", "task", "colors", "device", "precision", "compile", "cuda_graph", "eval_workers", "render_ahead",
+    "features", "video_episodes", "checkpoint_interval_env_steps", "log_interval_env_steps",
+    "eval_interval_env_steps", "eval_episodes",
+]  # fmt: skip
 """Settings that do not make a run another method's: its seed, where it stands, how it computed, when it wrote."""
 
 
@@ -250,16 +234,13 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
             logger.warning("Left out: %s is no downstream run that can be read (%s).", path, reason)
             continue
         cells.append(cell | {"colors": facts.get("colors", "")})
-        made = {"machine": records.machine(content.get("hardware") or {}), "device": facts.get("device")}
-        jobs[key] = {
-            **content,
-            **made,
-            "kind": "run",
+        made = {name: content.get(name) for name in records.MADE} | {"device": facts.get("device")}
+        made |= {
+            "machine": records.machine(content.get("hardware") or {}),
             "path": path,
             "done": cell["done"],
-            "facts": facts,
-            "needs": [],
         }
+        jobs[key] = {"kind": "run", "facts": facts, "needs": [], "command": None, **made}
     table = pd.DataFrame(cells)
     if not len(table) or not table["done"].any():
         raise RecordError(
@@ -271,8 +252,7 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
         counts = told.loc[own.index].groupby([own["task"], own["colors"]]).nunique().max()
         for name in counts.index[counts > 1].difference(NOT_TOLD_APART):
             table.loc[own.index, "label"] += f", {name} " + told[name]
-    columns = [*records.DESCRIBED, *records.MADE, "path", "done", "machine"]
-    return table, pd.DataFrame.from_dict(jobs, orient="index").reindex(columns=columns)
+    return table, pd.DataFrame.from_dict(jobs, orient="index")
 
 
 # --- words ----------------------------------------------------------------------------------------------------------
@@ -365,9 +345,8 @@ def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     table = pd.DataFrame(index=[*BUDGETS, "downstream runs per encoder"])
     for scale, own in cells[cells["scale"] != "paper"].groupby("scale", sort=False):
         here = jobs.loc[list({key: 0 for job in own["job"].unique() for key in _needed(job, jobs)})]
-        told = here["facts"].map(lambda facts: facts or {})
-        facts = pd.json_normalize(told.tolist()).set_index(here.index)
-        methods = told.map(lambda facts: facts.get("method", "")).astype(str)
+        facts = pd.json_normalize(here["facts"].tolist()).set_index(here.index)
+        methods = here["facts"].map(lambda told: str(told.get("method", "")))
         values = []
         for fact, kinds, method, _ in BUDGETS.values():
             is_meant = here["kind"].isin(kinds) & methods.str.match(method)
@@ -445,13 +424,10 @@ def _scores(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> N
     runs, points = _runs(page, cells, jobs)
     if runs.empty:
         return
-    below = " Scores of a smaller budget do not compare with the paper's."
     page.text(
         f"Runs of {_or(runs['budget'])} env steps here. n is the number of runs that a number stands on; “paper” is "
-        f"what it printed, after {published.ENV_STEPS:,} env steps (DrQ: {published.DRQ_ENV_STEPS:,}). It has numbers "
-        "for CRPTpro, ATC, APT(C), Proto-RL(C), BeCL and, on seen domains, DrQ."
-        + below
-        * bool(runs["budget"].min() < published.ENV_STEPS),
+        f"what it printed, after {published.ENV_STEPS:,} env steps (DrQ: {published.DRQ_ENV_STEPS:,}): scores of a "
+        "smaller budget do not compare with it.",
         "note",
     )
     for varied, part in runs.groupby("varied", sort=False):
@@ -510,15 +486,17 @@ def _score_table(page: Page, runs: pd.DataFrame, score: str, caption: str) -> No
         page.table(caption, table.T.reset_index(names="task"))
 
 
+NORMALIZED = {"mean / DrQ": mean, "IQM / DrQ": iqm, "median / DrQ": median, "optimality gap": optimality_gap}
+
+
 def _aggregates(page: Page, runs: pd.DataFrame) -> None:
     """Aggregate over the tasks on which every method has runs."""
     labels = in_order(runs["label"])
     has_run = runs.groupby(["task", "label"], sort=False).size().unstack().notna()[labels]
     shared = has_run.index[has_run.all(axis=1)]
     for task, row in has_run[~has_run.all(axis=1)].iterrows():
-        page.text(
-            f"Left out of what compares methods: {task} (no run of {', '.join(row.index[~row])}).", "note"
-        )
+        lacking = ", ".join(row.index[~row])
+        page.text(f"Left out of what compares methods: {task} (no run of {lacking}).", "note")
     if shared.empty:
         page.text("There is no task on which every method has a run: nothing to aggregate.", "note")
         return
@@ -529,19 +507,18 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
     rows = []
     for label in labels:
         own, own_normal = (frame[frame["label"] == label] for frame in (kept, normal))
-        found = estimate(mean, own)
-        row: dict[str, Any] = {"method": label, "tasks": len(shared), "runs": found.runs}
-        row["encoders"] = own.loc[own["encoder"] != own["run"], "encoder"].nunique()
+        found, encoders = estimate(mean, own), own.loc[own["encoder"] != own["run"], "encoder"].nunique()
+        row: dict[str, Any] = {
+            "method": label,
+            "tasks": len(shared),
+            "runs": found.runs,
+            "encoders": encoders,
+        }
         row["mean score"] = _beside(f"{found:.0f}", _paper_mean(label, places))
+        for title, statistic in NORMALIZED.items() if len(normal) else ():
+            row[title] = f"{estimate(statistic, own_normal):.3f}"
         if len(normal):
-            normalized = f"{estimate(mean, own_normal):.3f}"
-            row["mean / DrQ"] = _beside(normalized, _paper_mean(label, places, normalized=True))
-            for title, of in (
-                ("IQM / DrQ", iqm),
-                ("median / DrQ", median),
-                ("optimality gap", optimality_gap),
-            ):
-                row[title] = f"{estimate(of, own_normal):.3f}"
+            row["mean / DrQ"] = _beside(row["mean / DrQ"], _paper_mean(label, places, normalized=True))
         if (drq["score"] > 0).all() and len(drq):
             row["mean / DrQ here"] = "1" if label == "drq" else f"{estimate(relative_mean, own, drq):.3f}"
         rows.append(row)
@@ -573,9 +550,8 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
     for label in in_order(normal["label"]) if len(ours) else ():
         if label != "crptpro":
             found = estimate(probability_of_improvement, ours, normal[normal["label"] == label])
-            rows.append(
-                {"other method": label, "runs of both": found.runs, "P(crptpro > other)": f"{found:.2f}"}
-            )
+            told = {"other method": label, "runs of both": found.runs}
+            rows.append({**told, "P(crptpro > other)": f"{found:.2f}"})
     page.table(
         "Probability that a run of crptpro scores higher than one of the other method on the same task; 0.5 is no "
         "difference. Of two runs against two it can only be 0, 0.25, 0.5, 0.75 or 1.",
@@ -585,14 +561,13 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
 
 def _paper_mean(label: str, places: Sequence[Sequence[str]], normalized: bool = False) -> str:
     """Return what the paper printed for all of its seen tasks; for a part of them, what its cells give."""
-    means = published.SEEN_NORMALIZED_MEAN if normalized else published.SEEN_MEAN
-    digits = 3 if normalized else 0
+    digits, means = (3, published.SEEN_NORMALIZED_MEAN) if normalized else (0, published.SEEN_MEAN)
     if {(*place[:2],) for place in places} == {row[:2] for row in published.SEEN} and label in means:
         return f"{means[label]:.{digits}f}"
-    scores = {tuple(place): published.published_score(label, *place) for place in places}
-    experts = {place: published.EXPERT_SCORES.get(place[1]) if normalized else 1.0 for place in scores}
-    asked = [place for place, expert in experts.items() if expert]
-    values = [score.mean / (experts[place] or 1) for place in asked if (score := scores[place])]
+    asked = [place for place in places if not normalized or place[1] in published.EXPERT_SCORES]
+    scores = [published.published_score(label, *place) for place in asked]
+    experts = [published.EXPERT_SCORES[place[1]] if normalized else 1.0 for place in asked]
+    values = [score.mean / expert for score, expert in zip(scores, experts) if score]
     return f"{np.mean(values):.{digits}f}" if values and len(values) == len(asked) else ""
 
 
@@ -606,18 +581,14 @@ def _learning_curves(page: Page, name: str, points: pd.DataFrame) -> None:
     """Draw mean episode return along training, a panel per task."""
     drawn = []
     for (task, label), own in points.groupby(["task", "label"], sort=False):
-        runs = own.pivot_table(index=["task", "encoder", "run"], columns="env_steps", values="score").dropna(
-            axis=1
-        )
+        runs = own.pivot_table("score", ["task", "encoder", "run"], "env_steps").dropna(axis=1)
         if runs.empty:  # no evaluation that all runs have
             continue
         found = estimate(mean, runs.reset_index(), columns=list(runs))
         curve = pd.DataFrame({"x": runs.columns, "y": found.value, **_ends(found)})
         drawn.append(curve.assign(panel=task, label=label, n=str(len(runs)), line="mean", thin=False))
         if found.low is None and len(runs) > 1:  # too few for an interval: the runs themselves
-            own = own.rename(columns={"env_steps": "x", "score": "y", "run": "line"})[
-                ["x", "y", "line", "label"]
-            ]
+            own = own.rename(columns={"env_steps": "x", "score": "y", "run": "line"})
             drawn.append(own.assign(panel=task, n=str(len(runs)), low=math.nan, high=math.nan, thin=True))
     page.figure(
         f"{name}-curves",
@@ -635,18 +606,12 @@ def _sensitivity(page: Page, name: str, runs: pd.DataFrame, varied: str) -> None
     points = []
     for (_, value, method), own in runs.groupby(["size", "value", "method"], dropna=False):
         found = estimate(mean, own)
-        points.append(
-            {"label": method, "x": value, "y": found.value[0], "n": str(found.runs), **_ends(found)}
-        )
+        place = {"label": method, "x": value, "n": str(found.runs)}
+        points.append({**place, "y": found.value[0], **_ends(found)})
     what = {"alpha": "weight of the dispersion loss (alpha)", "b": "random transitions per domain (b)"}
     if points:
-        axis = what.get(varied, varied)
-        page.figure(
-            name,
-            f"Mean score divided by the paper's DrQ against {axis}; n is runs per value. Values with different tasks "
-            "finished do not compare.",
-            draw(pd.DataFrame(points), axis, "mean score / the paper's DrQ"),
-        )
+        figure = draw(pd.DataFrame(points), what.get(varied, varied), "mean score / the paper's DrQ")
+        page.figure(name, f"Mean score against {varied}; n is runs per value.", figure)
 
 
 def _spending(page: Page, runs: pd.DataFrame, jobs: pd.DataFrame) -> None:
@@ -654,16 +619,14 @@ def _spending(page: Page, runs: pd.DataFrame, jobs: pd.DataFrame) -> None:
     seconds, rows = jobs["seconds"].astype(float), []
     if seconds[runs["run"]].isna().all():
         return  # runs that nobody planned have no clock of their own
-    facts = pd.DataFrame([told or {} for told in jobs["facts"]], jobs.index).reindex(
-        columns=["updates", "env_steps"]
-    )
+    facts = pd.DataFrame(jobs["facts"].tolist(), jobs.index).reindex(columns=["updates", "env_steps"])
     updates = facts["updates"].mask(jobs["kind"] == "untrained", 0)
     env_steps = facts["env_steps"].where(jobs["kind"].isin(["dataset", "explored"]), 0)
     for label in in_order(runs["label"]):
         own = runs[runs["label"] == label].drop_duplicates("run")
-        chains = [list(chain) for chain in {(*_needed(run, jobs, *ENCODERS),) for run in own["run"]} if chain]
-        data = [_needed(chain[0], jobs, "dataset") for chain in chains]
-        every = [[*chain, *sets] for chain, sets in zip(chains, data)]
+        chains = list(filter(None, {(*_needed(run, jobs, *ENCODERS),) for run in own["run"]}))
+        data = [_needed(encoders[0], jobs, "dataset") for encoders in chains]
+        every = [[*encoders, *sets] for encoders, sets in zip(chains, data)]
         with_task = f"{own['updates'].mean():,.0f}\nwith the task"
         rows.append({
             "method": label, "encoders": len(chains),
@@ -672,13 +635,12 @@ def _spending(page: Page, runs: pd.DataFrame, jobs: pd.DataFrame) -> None:
             "collecting": _time([_sums(seconds, data)]) if any(data) else "",
             "pre-training": _time([_sums(seconds, chains)]),
             "runs": f"{len(own)} of {_or(own['budget'])} env steps", "one run": _time(seconds[own["run"]]),
-            "machine": _machines(jobs, [*own["run"], *sum(every, [])]),
+            "machine": _machines(jobs, [*own["run"], *chain.from_iterable(every)]),
         })  # fmt: skip
     page.table(
         "What scores took: means over the encoders and over the runs of a method, wall clock of all attempts. "
-        "Pre-training includes its exploring; an encoder that was fine-tuned counts with what it started from, and "
-        "data that methods share with each of them. Times compare only within one machine, and jobs that shared one "
-        "slowed each other.",
+        "Pre-training includes its exploring; a fine-tuned encoder counts with what it started from, shared data with "
+        "each method. Times compare only within one machine, and jobs that shared one slowed each other.",
         rows,
     )
 
@@ -812,8 +774,11 @@ def _coverage(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> 
     # Several explorers stand beside the same random data: what is equal is one curve.
     rows = rows.drop_duplicates(["domain", "label", "env_steps", "coverage", "samples"])
     numbers = ["env_steps", "samples", "coverage"]
-    ends = _last(rows, ["domain", "label"], numbers).round({"coverage": 4})
-    ends["mean of all windows"] = _last(rows, ["domain", "label"], numbers, 10)["coverage"].round(4)
+    ends, means = (_last(rows, ["domain", "label"], numbers, window) for window in (1, 10))
+    ends["coverage"], ends["mean of all windows"] = (
+        each["coverage"].map("{:.4f}".format) for each in (ends, means)
+    )
+    ends[["env_steps", "samples"]] = ends[["env_steps", "samples"]].map("{:,.0f}".format)
     page.table(
         "Coverage at the end: particle estimate over observations sampled from the last window of the training, which "
         "is cut into up to ten of equal length, and from as many decisions of the random policy; mean over n runs; "
