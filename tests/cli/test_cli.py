@@ -244,7 +244,7 @@ def test_collect_pretrain_downstream_and_evaluate_on_a_real_domain(call: Call, t
     (("pretrain", "absent"), r"absent"),
     (("pretrain", "walker", "--method", "proto-rl"), r"no method 'proto-rl'\. .*proto-rl-"),
     (("pretrain", "walker"), r"walker is no directory.*`crptpro collect walker`"),
-    (("pretrain", "data/walker", "--method", "proto-rl-c"), r"proto-rl-c explores.*data/walker is a path\. Name"),
+    (("pretrain", "data/walker", "--method", "proto-rl-c"), r"no domain or task 'data/walker'"),
     (("pretrain", "walkr", "--method", "apt-c"), r"'walkr'\. Nearest: walker"),
     (("pretrain", "--method", "becl"), r"at least one domain, task or group \(A, B, C, D\)"),
     (("pretrain", "A", "--method", "apt-s"), r"one domain, got 3 \(cheetah, walker, quadruped\)"),

@@ -8,20 +8,23 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium
 import psutil
 import pytest
 from filelock import FileLock
 
 import crptpro
+from crptpro import plugins
 from crptpro.artifact import read_json, write_json
+from crptpro.cli import main
 from crptpro.errors import CRPTproError, SubmissionError
-from crptpro.experiments import launch
+from crptpro.experiments import launch, matrix
 from crptpro.experiments.jobs import Job, describe, make_plan
 from crptpro.experiments.launch import (
     Failure,
@@ -34,7 +37,6 @@ from crptpro.experiments.launch import (
     slurm_parameters,
 )
 
-SLOW_WORLD = Path(__file__).with_name("slow_world.py")
 ROOT = Path(crptpro.__file__).parents[1]
 UNTRAINED = Job(
     "untrained", "u", ("pretrain", "--method", "random-encoder", "--out", "{out}", "--seed", "0"), {}
@@ -284,57 +286,63 @@ def test_a_slurm_job_asks_for_its_cores_and_a_refusal_is_said(
 # --- real processes -------------------------------------------------------------------------------------------------
 
 
-HEEDS_SIGINT = """
-import os, signal, sys
-signal.signal(signal.SIGINT, signal.SIG_DFL)
-os.execv(sys.argv[1], sys.argv[1:])
-"""
-
-
-def reproduce_slowly(root: Path) -> subprocess.Popen:
-    """Run the slow experiment of a plugin, in processes that find this source."""
-    words = [sys.executable, "-m", "crptpro", "--plugin", SLOW_WORLD, "reproduce", "slow", "--scale", "tiny"]
-    words += ["--jobs", 1, "--cores-per-job", 1, "--out", root]
-    # A shell's background job ignores Ctrl-C, and so would what it starts.
-    command = [sys.executable, "-c", HEEDS_SIGINT, *map(str, words)]
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    return subprocess.Popen(
-        command, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "PYTHONPATH": path},
-    )  # fmt: skip
-
-
 def _collected(root: Path) -> int:
     return sum(read_json(path)["episodes"] for path in root.glob("jobs/dataset-*/*/collection.json"))
 
 
-def _wait_for(condition: Callable[[], Any], process: subprocess.Popen) -> None:
+def _wait_for_episodes(root: Path, count: int) -> None:
     deadline = time.monotonic() + 300
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
+    while _collected(root) < count and time.monotonic() < deadline:
         time.sleep(0.05)
 
 
+@pytest.fixture
+def plugin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A file with an experiment of some seconds; what it registers is forgotten afterwards."""
+    monkeypatch.setattr(plugins, "_loaded", [])
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    monkeypatch.setattr(matrix, "EXPERIMENTS", matrix.EXPERIMENTS.copy())
+    monkeypatch.setattr("crptpro.cli.reproduce.EXPERIMENTS", matrix.EXPERIMENTS)
+    yield Path(__file__).with_name("slow_world.py")
+    gymnasium.registry.pop("SlowWorld-v0", None)
+    sys.modules.pop("slow_world", None)
+
+
 @pytest.mark.slow
-def test_a_command_that_is_interrupted_and_then_killed_continues(tmp_path: Path) -> None:
-    root, collected = tmp_path / "root", 0
-    for by in (signal.SIGINT, signal.SIGKILL):
-        command = reproduce_slowly(root)
-        _wait_for(lambda before=collected: _collected(root) > before + 1, command)
-        processes = psutil.Process(command.pid).children(recursive=True)
-        assert processes
-        os.killpg(command.pid, by)  # as a terminal does
-        _, err = command.communicate(timeout=120)
-        assert command.returncode == (130 if by == signal.SIGINT else -9), err
-        assert not psutil.wait_procs(processes, timeout=60)[1]
-        assert collected + 2 <= _collected(root) < 15
-        assert not list(root.glob("jobs/*/done.json"))
-        collected = _collected(root)
-    again = reproduce_slowly(root)
-    out, err = again.communicate(timeout=300)
-    assert again.returncode == 0, err
-    assert "All of it is there" in out
+def test_a_command_that_is_killed_and_then_interrupted_continues(
+    tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    root = tmp_path / "root"
+    words = ("reproduce", "slow", "--scale", "tiny", "--jobs", 1, "--cores-per-job", 1, "--out", root)
+    arguments = ["--plugin", *map(str, (plugin, *words))]
+    command = subprocess.Popen([sys.executable, "-m", "crptpro", *arguments], start_new_session=True)
+    _wait_for_episodes(root, 2)
+    processes = psutil.Process(command.pid).children(recursive=True)
+    assert processes
+    os.killpg(command.pid, signal.SIGKILL)
+    command.wait()
+    assert not psutil.wait_procs(processes, timeout=60)[1]
+    before = _collected(root)
+    assert 2 <= before < 15
+    assert not list(root.glob("jobs/*/done.json"))
+
+    monkeypatch.setattr(sys, "argv", ["crptpro", *arguments])
+
+    def interrupt() -> None:
+        _wait_for_episodes(root, before + 2)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 130
+    assert before + 2 <= _collected(root) < 15
+    children = psutil.Process().children()
+    assert not [child for child in children if "crptpro.experiments.launch" in child.cmdline()]
+
+    main()
+    assert "All of it is there" in capsys.readouterr().out
     [done] = root.glob("jobs/*/done.json")
     assert read_json(done)["attempts"] == 3
     [card] = root.glob("jobs/dataset-*/*/card.json")
@@ -345,14 +353,10 @@ def test_a_command_that_is_interrupted_and_then_killed_continues(tmp_path: Path)
 def test_a_slurm_job_runs_as_submitit_runs_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launch, "POLL_S", 0.2)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
-    wanted = UNTRAINED
-    broken = Job("run", "b", ("evaluate", "{out}/nothing"), {})
     launcher = SlurmLauncher({"timeout_min": 60}, cluster="local")
-    failures = run_jobs(make_plan([wanted, broken], tmp_path), tmp_path, launcher, jobs=2, attempts=1)
-    assert (tmp_path / "jobs" / wanted.key / "encoder" / "weights.safetensors").exists()
-    assert read_json(tmp_path / "jobs" / wanted.key / "done.json")["threads"] == 1
-    assert [failure.key for failure in failures] == [broken.key]
-    assert failures[0].reason == (tmp_path / "jobs" / broken.key / "log.txt").read_text().splitlines()[-1][7:]
+    assert run_jobs(make_plan([UNTRAINED], tmp_path), tmp_path, launcher, attempts=1) == []
+    assert (tmp_path / "jobs" / UNTRAINED.key / "encoder" / "weights.safetensors").exists()
+    assert read_json(tmp_path / "jobs" / UNTRAINED.key / "done.json")["threads"] == 1
     assert not list((tmp_path / "submitted").iterdir())
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from crptpro.analysis.coordinates import Joint, joints_of, position_coordinates, velocity_coordinates
+from crptpro.analysis.coordinates import joints_of, position_coordinates, velocity_coordinates
 from crptpro.analysis.embeddings import effective_rank, embed_pixels, gram_matrix, mean_cosine
 from crptpro.data import FrameDataset
 from crptpro.data.storage import gather_stacks, stack_rows
@@ -49,12 +49,8 @@ class ProbeSamples:
 class ProbeResult:
     """How well the state is predicted from one kind of embedding of one domain.
 
-    Attributes:
-        positions: R2 on held-out episodes by coordinate.
-        velocities: likewise.
-        left_out: coordinates that hardly vary, in the training or in the held-out episodes.
-        effective_rank: of the embeddings, see :func:`~crptpro.analysis.embeddings.effective_rank`.
-        mean_cosine: of different observations' embeddings, see :func:`~crptpro.analysis.embeddings.mean_cosine`.
+    Positions and velocities are R2 on held-out episodes by coordinate, but for those ``left_out``, which hardly vary in
+    the training or in the held-out episodes. Rank and cosine are those of :mod:`crptpro.analysis.embeddings`.
     """
 
     positions: dict[str, float]
@@ -75,12 +71,7 @@ class ProbeResult:
 
 
 def probe_samples(
-    dataset: FrameDataset,
-    *,
-    samples: int = 2_000,
-    seed: int = 0,
-    frame_stack: int | None = None,
-    joints: tuple[Joint, ...] | None = None,
+    dataset: FrameDataset, *, samples: int = 2_000, seed: int = 0, frame_stack: int | None = None
 ) -> ProbeSamples:
     """Draw observations and states of a dataset, and divide its episodes.
 
@@ -91,7 +82,6 @@ def probe_samples(
         samples: N, drawn without replacement; all transitions if there are fewer.
         seed: which ones, and which episodes are held out.
         frame_stack: frames per observation; the dataset's if ``None``.
-        joints: what ``qpos`` and ``qvel`` are; of :func:`~crptpro.analysis.coordinates.joints_of` if ``None``.
 
     Raises:
         DatasetError: there is no physical state, or too few episodes or samples to split.
@@ -114,14 +104,11 @@ def probe_samples(
             f"A probe of {dataset.path} has {len(chosen)} samples of {len(episodes)} episodes; it "
             "needs two in each of three parts that share no episode. Collect more episodes, or draw more samples."
         )
-    if joints is None:
-        joints = joints_of(dataset.card.get("task", dataset.domain))
+    joints = joints_of(dataset.card.get("task", dataset.domain))
     position_names, positions = position_coordinates(qpos, joints)
     velocity_names, velocities = velocity_coordinates(qvel, joints)
-    names = [
-        *(("position", name) for name in position_names),
-        *(("velocity", name) for name in velocity_names),
-    ]
+    kinds = {"position": position_names, "velocity": velocity_names}
+    names = [(kind, name) for kind, own in kinds.items() for name in own]
     rows = stack_rows(row, step, frame_stack or dataset.frame_stack)
     pixels = gather_stacks(dataset.frames["pixels"], rows)
     targets = torch.cat([positions, velocities], 1)

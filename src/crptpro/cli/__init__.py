@@ -14,7 +14,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Union
 
 import tyro
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
@@ -23,15 +23,7 @@ from crptpro import training
 from crptpro.cli.reproduce import Reproduce
 from crptpro.console import run_main
 from crptpro.data import FrameDataset, collect_group
-from crptpro.domains import (
-    GROUPS,
-    GYMNASIUM_PREFIX,
-    PAPER_DOMAINS,
-    TASKS,
-    expand_groups,
-    get_domain,
-    known_names,
-)
+from crptpro.domains import GROUPS, PAPER_DOMAINS, TASKS, expand_groups, get_domain
 from crptpro.envs import make_env
 from crptpro.errors import CRPTproError, DatasetError
 from crptpro.logging import RunLogger, WandbOptions
@@ -72,10 +64,9 @@ class Logging:
         """Return the record of a run with its mirrors; without mirrors the run makes its own."""
         if self.wandb == "off" and not self.tensorboard:
             return contextlib.nullcontext()
-        options = None
-        if self.wandb != "off":
-            options = WandbOptions(self.wandb_project, self.wandb_group, None, self.wandb_tags, self.wandb)
-        return RunLogger(run_dir, config=config, wandb=options, tensorboard=self.tensorboard)
+        options: Any = (self.wandb_project, self.wandb_group, None, self.wandb_tags, self.wandb)
+        wandb = None if self.wandb == "off" else WandbOptions(*options)
+        return RunLogger(run_dir, config=config, wandb=wandb, tensorboard=self.tensorboard)
 
 
 @dataclass(frozen=True)
@@ -196,7 +187,7 @@ class Explore(Pretraining):
 
     def run(self) -> None:
         """Pre-train, or continue, and write the artifact."""
-        domains = explored_domains(self.sources, self.method)
+        domains = expand_groups(self.sources)
         loss = self.build(self.config.seed)
         with self.logging.records(self.out, self) as records:
             result = training.pretrain_active(
@@ -435,18 +426,6 @@ def named_values(option: str, words: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-def explored_domains(names: Sequence[str], method: str) -> list[str]:
-    """Expand the domains that a method is to explore; it collects its own data, so that a path is refused."""
-    for name in names:
-        is_path = Path(name).is_dir() or ("/" in name and not name.startswith(GYMNASIUM_PREFIX))
-        if is_path and name not in (*GROUPS, *known_names()):  # a folder may be called walker
-            raise CRPTproError(
-                f"{method} explores and collects its own data; {name} is a path. Name domains, tasks or groups "
-                f"({', '.join(GROUPS)}), or choose a method that learns from datasets."
-            )
-    return expand_groups(names)
-
-
 def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
     """Open every dataset and return the image size and frames per stack, which all must share."""
     if not datasets:
@@ -482,10 +461,8 @@ def pretrain_command(arguments: Sequence[str]) -> type[Pretrain] | type[Explore]
     """Return which settings ``pretrain`` has: those of the method that the command line names."""
     words = " ".join(arguments).replace("=", " ").split()
     names = [after for word, after in itertools.pairwise(words) if word == "--method"]
-    if not names or "pretrain" not in arguments:
-        return Pretrain
-
-    return Pretrain if get_method(names[-1]).exploration is None else Explore
+    explores = names and "pretrain" in arguments and get_method(names[-1]).exploration is not None
+    return Explore if explores else Pretrain
 
 
 def main() -> None:
@@ -502,11 +479,8 @@ def main() -> None:
             "doctor": Doctor, "collect": Collect, "pretrain": pretrain_command(arguments), "finetune": Finetune,
             "downstream": Downstream, "evaluate": Evaluate, "probe": Probe, "reproduce": Reproduce, "report": Report,
         }  # fmt: skip
-        union: Any = None
-        for name, command in commands.items():
-            each: Any = Annotated[command, subcommand(name)]
-            union = each if union is None else union | each
-        stage: Any = OmitSubcommandPrefixes[union]  # type: ignore[misc]
-        tyro.cli(stage, prog="crptpro", description=DESCRIPTION, args=arguments).run()
+        stages: Any = Union[tuple(Annotated[stage, subcommand(name)] for name, stage in commands.items())]  # noqa: UP007
+        config = (OmitSubcommandPrefixes,)
+        tyro.cli(stages, prog="crptpro", description=DESCRIPTION, args=arguments, config=config).run()
 
     run_main(run)

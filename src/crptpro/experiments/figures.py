@@ -65,20 +65,18 @@ def draw(
     kind: str = "line",
     columns: int = 3,
     marks: Mapping[str, float] | None = None,
-    log: bool = False,
 ) -> Any:
     """Draw panels with one legend below.
 
     Args:
-        points: columns ``label``, ``x`` and ``y``, numbers or names of places in order; and, if there are such,
+        points: columns ``label``, ``x`` (numbers, or names of places in order) and ``y``; and, if there are such,
             ``panel`` (its title), ``line`` (which of a label's curves), ``n`` (runs, for the legend), ``low`` and
             ``high`` (an interval), ``thin``.
         x: name and unit of the horizontal axis; empty where the titles say it.
         y: of the vertical one.
-        kind: ``"line"``, or ``"dot"`` for marks, with names of places from top to bottom.
+        kind: ``"line"``, or ``"cloud"`` of points.
         columns: panels side by side.
         marks: heights of dashed lines of the first panel, by what they say.
-        log: whether the horizontal axis is logarithmic.
     """
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -88,9 +86,8 @@ def draw(
     points = points.assign(**{name: value for name, value in optional.items() if name not in points})
     panels = list(dict.fromkeys(points["panel"]))
     columns = min(len(panels), columns)
-    rows, width = math.ceil(len(panels) / columns), {1: 7.4, 2: 5.2, 3: 3.9}.get(columns, 3.4)
-    has_names = points["y"].dtype == object
-    height = 0.9 + 0.24 * points["y"].nunique() if has_names else 2.9
+    rows, height = math.ceil(len(panels) / columns), 2.9
+    width = {1: 7.4, 2: 5.2}.get(columns, 3.9)
     look, handles = styles(points["label"]), dict[str, Any]()
     counts = {label: " or ".join(map(str, sorted(set(own)))) for label, own in points.groupby("label")["n"]}
     with mpl.rc_context({"text.parse_math": False}):  # a user's name in dollars is a name
@@ -104,8 +101,8 @@ def draw(
                 if own["thin"].all():
                     axis.plot(own["x"], own["y"], color=style["color"], linewidth=0.5, alpha=0.7)
                     continue
-                if kind == "dot":
-                    style = {**style, "linestyle": "none", "alpha": 0.8}
+                if kind == "cloud":
+                    style = {**style, "linestyle": "none", "alpha": 0.6}
                 spaced = max(1, len(own) // 12) if kind == "line" else 1
                 (handle,) = axis.plot(
                     own["x"], own["y"], **style, linewidth=1.5, markersize=4, markevery=spaced
@@ -119,12 +116,6 @@ def draw(
             axis.grid(visible=True, color=RULE, linewidth=0.6)
             axis.tick_params(labelsize=8)
             axis.spines[["top", "right"]].set_visible(False)
-            if has_names:
-                axis.invert_yaxis()
-            if log:
-                axis.set_xscale("log")
-                axis.xaxis.set_major_formatter("{x:g}")
-                axis.xaxis.set_minor_formatter("")
         for name, at in (marks or {}).items():
             handles[name] = axes[0].axhline(at, color=GREY, linestyle=(0, (4, 3)), linewidth=0.9)
         for axis in axes[len(panels) :]:

@@ -129,7 +129,7 @@ def _lock(directory: Path) -> Any:
         return lock.acquire(timeout=0)
     except Timeout:
         logger.warning("Another process runs %s; waiting until it ends.", directory.name)
-        return lock.acquire(poll_interval=1)
+        return lock.acquire(timeout=1e9, poll_interval=1)
 
 
 def _clock(directory: Path) -> dict[str, float]:

@@ -590,8 +590,8 @@ def _domain_sets(request: Request, group: str, system: str) -> list[tuple[str, .
     """The domains of each encoder of a system: the group's, or, of an (S) method, one for each of those asked for."""
     if not is_single_domain(system):
         return [GROUPS[group]]
-    asked = [(domain,) for domain in request.domains if domain in GROUPS[group]]
-    return asked or [(SINGLE_DOMAIN[group],)]
+    asked = [domain for domain in request.domains if domain in GROUPS[group]]
+    return [(domain,) for domain in asked or (SINGLE_DOMAIN[group],)]
 
 
 def _measured(label: str, job: Job, group: str, seed: int, domains: Sequence[str]) -> Cell:

@@ -17,7 +17,6 @@ import torch.nn.functional as F
 import tyro
 from tyro.conf import Positional, UseAppendAction
 
-from crptpro.analysis.coordinates import joints_of
 from crptpro.analysis.coverage import coverage as particle_estimate
 from crptpro.analysis.embeddings import embed_pixels, principal_components, sample_pixels
 from crptpro.analysis.probe import probe, probe_samples
@@ -83,8 +82,8 @@ def probe_rows(
     Raises:
         DatasetError: there is no physical state, or too little data to split.
     """
-    joints, frame_stack = joints_of(dataset.card["task"]), pretrained.encoder.in_channels // 3
-    observed = probe_samples(dataset, samples=samples, seed=seed, joints=joints, frame_stack=frame_stack)
+    frame_stack = pretrained.encoder.in_channels // 3
+    observed = probe_samples(dataset, samples=samples, seed=seed, frame_stack=frame_stack)
     is_control = pretrained.method.startswith("random-encoder")
     projector = _untrained_projector(pretrained) if is_control else pretrained.projector
     about = {"method": pretrained.label, "domain": dataset.domain}
@@ -303,10 +302,10 @@ class _Timed:
 
         words = shlex.split(text)
         arguments = [*words[1:], "--out", str(out), "--device", device]
-        self.stage: Any = tyro.cli(pretrain_command(words), args=arguments)
-        method, config = get_method(self.stage.method), self.stage.config
-        self.plan = plan_exploration(method, self.stage.sources, config) if method.exploration else None
-        self.updates = self.plan.encoder_updates if self.plan else config.updates
+        stage: Any = tyro.cli(pretrain_command(words), args=arguments)
+        self.stage, method, config = stage, get_method(stage.method), stage.config
+        self.plan = plan_exploration(method, stage.sources, config) if method.exploration else None
+        self.updates: int = self.plan.encoder_updates if self.plan else config.updates
         self.decisions = self.plan.decisions if self.plan else 0
 
     def time(self, updates: int) -> tuple[int, float, float]:

@@ -14,7 +14,7 @@ import math
 import re
 import shlex
 from collections.abc import Iterable, Sequence
-from itertools import chain, combinations, product
+from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
@@ -73,14 +73,14 @@ def build_report(root: str | Path, *, out: str | Path | None = None) -> Path:
     cells = cells.assign(**{name: "" for name in PLACES if name not in cells})
     cells = cells.where(cells.notna(), "").astype({name: str for name in cells if name != "done"})
     jobs["where"] = [_where(job) for job in jobs.to_dict("records")]
-    number = {where: str(count) for count, where in enumerate(filter(None, jobs["where"].unique()), 1)}
-    jobs["machine"] = jobs["where"].map(number).fillna("")
+    numbers = {where: str(count) for count, where in enumerate(filter(None, jobs["where"].unique()), 1)}
+    jobs["machine"] = [numbers.get(where, "") for where in jobs["where"]]
+    order = {name: place for place, name in enumerate(dict.fromkeys([*EXPERIMENTS, *cells["experiment"]]))}
+    cells = cells.sort_values("experiment", key=lambda names: names.map(order), kind="stable")
     page = Page(root / "report" if out is None else as_path(out, "out"))
     _contents(page, cells, jobs)
     _limits(page, cells, jobs)
-    order = {name: place for place, name in enumerate(dict.fromkeys([*EXPERIMENTS, *cells["experiment"]]))}
-    sections = dict(iter(cells.groupby(["experiment", "scale"], sort=False)))
-    for (experiment, scale), own in sorted(sections.items(), key=lambda item: order[item[0][0]]):
+    for (experiment, scale), own in cells.groupby(["experiment", "scale"], sort=False):
         labels = {label: place for place, label in enumerate(in_order(own["label"]))}
         own = own.sort_values("label", key=lambda names, labels=labels: names.map(labels), kind="stable")
         _experiment(page, experiment, scale, own, jobs)
@@ -111,11 +111,12 @@ class Page:
         self._add(kind="text", text=text, style=style)
 
     def table(self, caption: str, rows: pd.DataFrame | Sequence[dict[str, Any]], fold: bool = False) -> None:
-        """Add a table, or nothing for no rows; empty cells become dashes. A reader opens it if it is to ``fold``."""
+        """Add a table, which a reader opens if it is to ``fold``. Empty cells become dashes, empty columns go."""
         frame = pd.DataFrame(rows)
-        if len(frame):
-            shown = frame.astype(object).where(frame.notna() & (frame != ""), "\N{EN DASH}").astype(str)
-            content = {"columns": list(map(str, frame)), "rows": shown.to_numpy().tolist()}
+        is_known = frame.notna() & (frame != "")
+        shown = frame.astype(object).where(is_known, "\N{EN DASH}").astype(str).loc[:, is_known.any()]
+        if len(shown):
+            content = {"columns": list(map(str, shown)), "rows": shown.to_numpy().tolist()}
             self._add(kind="table", caption=caption, fold=fold, **content)
 
     def figure(self, name: str, caption: str, figure: Any) -> None:
@@ -221,7 +222,7 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     Runs of one method on one task are seeds of each other only if they agree in everything else: where they do not, the
     label names what differs, as in ``"crptpro, env_steps 20000"``.
     """
-    cells, jobs = [], {}
+    cells, jobs = [], dict[str, dict[str, Any]]()
     for path in sorted(path.parent for path in root.rglob("eval.csv")):
         try:
             content, key = read_json(path / "config.json", error=RecordError), str(path.relative_to(root))
@@ -235,12 +236,15 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
             continue
         cells.append(cell | {"colors": facts.get("colors", "")})
         made = {name: content.get(name) for name in records.MADE} | {"device": facts.get("device")}
-        made |= {
-            "machine": records.machine(content.get("hardware") or {}),
-            "path": path,
+        made |= {"machine": records.machine(content.get("hardware") or {}), "path": path}
+        jobs[key] = {
+            "kind": "run",
+            "facts": facts,
+            "needs": [],
+            "command": None,
             "done": cell["done"],
+            **made,
         }
-        jobs[key] = {"kind": "run", "facts": facts, "needs": [], "command": None, **made}
     table = pd.DataFrame(cells)
     if not len(table) or not table["done"].any():
         raise RecordError(
@@ -272,12 +276,6 @@ def _machines(jobs: pd.DataFrame, keys: Iterable[str]) -> str:
 
 def _count(number: int, noun: str) -> str:
     return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"
-
-
-def _time(seconds: Iterable[float]) -> str:
-    """Return a mean duration in words; nothing where one is not known."""
-    average = float(np.mean([math.nan if value is None else value for value in seconds] or [math.nan]))
-    return "" if math.isnan(average) else duration(average)
 
 
 def _number(value: float, spec: str) -> str:
@@ -352,13 +350,15 @@ def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
             is_meant = here["kind"].isin(kinds) & methods.str.match(method)
             found = facts.loc[is_meant, fact].dropna() if fact in facts else pd.Series()
             words = [v if isinstance(v, str) else f"{v:,}".removesuffix(".0") for v in sorted(found.unique())]
-            values.append(" or ".join(words + ["the paper's"] * bool(0 < len(found) < is_meant.sum())))
+            values.append(" or ".join(words + ["the paper's"] * bool(len(found) < is_meant.sum())))
         runs = own[own["job"].map(jobs["kind"]) == "run"].drop_duplicates("job")
         table[scale or "here"] = [*values, _or(runs.groupby(["label", *PLACES]).size())]
     table = table[(table != "").any(axis=1)]
     if len(table):
         paper = {budget: told for budget, (*_, told) in BUDGETS.items()}
-        table["the paper's"] = table.index.map(paper).fillna("not printed (at least 6 evaluations)")
+        table["the paper's"] = [
+            paper.get(name, "not printed, at least 6 evaluations") for name in table.index
+        ]
         page.table("Budgets beside the paper's.", table.reset_index(names="budget"))
         page.text(
             "What this cannot show: which method is ahead after all of the budget, for methods that learn late look "
@@ -372,9 +372,20 @@ def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
 def _provenance(page: Page, jobs: pd.DataFrame) -> None:
     page.section("Machines and versions", "provenance")
     done = jobs[jobs["done"]]
-    machines = done[done["machine"] != ""].groupby(["machine", "where"]).size()
-    page.table("Machines, as tables number them", machines.reset_index(name="jobs"))
-    page.table("Source revisions", done["git_revision"].value_counts().reset_index(name="jobs"))
+    made = done[["machine", "where", "git_revision"]].value_counts(sort=False)
+    page.table("Machines, as tables number them, and source revisions", made.reset_index(name="jobs"))
+    facts = pd.DataFrame(done["facts"].tolist(), done.index)
+    facts = facts.reindex(columns=["method", "domain", "updates", "env_steps"])
+    spent = done[["kind", "machine", "seconds"]].join(facts).dropna(subset="seconds")
+    spent["of"] = spent["method"].fillna(spent["domain"])
+    groups = spent.groupby(["kind", "of", "machine"], sort=False)
+    costs = groups[["updates", "env_steps"]].mean().map("{:,.0f}".format, na_action="ignore")
+    costs["wall clock"] = groups["seconds"].mean().map(duration)
+    costs.insert(0, "jobs", groups.size())
+    page.table(
+        "What jobs took, means. Times compare only within one machine, and jobs that shared one slowed each other.",
+        costs.reset_index(),
+    )
     sets = done["versions"].dropna().map(lambda told: tuple(sorted(told.items()))).value_counts()
     versions = pd.DataFrame({f"version ({_count(n, 'job')})": dict(told) for told, n in sets.items()})
     page.table("Versions", versions.rename_axis("package").reset_index())
@@ -382,7 +393,7 @@ def _provenance(page: Page, jobs: pd.DataFrame) -> None:
     has_begun = jobs["path"].map(lambda path: (path / records.LOG).exists())
     table = pd.DataFrame({
         "job": jobs.index, "state": np.select([jobs["done"], has_begun], ["finished", "begun"], "not begun"),
-        "wall clock": [_time([each]) for each in jobs["seconds"]], "attempts": jobs["attempts"],
+        "wall clock": jobs["seconds"].map(duration, na_action="ignore"), "attempts": jobs["attempts"],
         "machine": jobs["machine"], "revision": jobs["git_revision"],
         "command": [shlex.join(["crptpro", *told]) if isinstance(told, list) else "" for told in jobs["command"]],
     })  # fmt: skip
@@ -408,16 +419,13 @@ def _experiment(page: Page, experiment: str, scale: str, cells: pd.DataFrame, jo
     if len(missing):
         page.text(f"Missing: {_missing(cells)}. Nothing stands in for what is missing.", "warning")
         places = missing.drop(columns=["experiment", "scale", "done"])
-        page.table(f"The {len(missing)} that are missing", places.loc[:, (places != "").any()], fold=True)
+        page.table(f"The {len(missing)} that are missing", places, fold=True)
     _measurements(page, name, cells, jobs)
     _efficiency(page, name, cells, jobs)
     _scores(page, name, cells, jobs)
 
 
 # --- downstream scores ----------------------------------------------------------------------------------------------
-
-LAST = 10
-"""Evaluations at the end that a steadier score averages over."""
 
 
 def _scores(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
@@ -432,14 +440,11 @@ def _scores(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> N
     )
     for varied, part in runs.groupby("varied", sort=False):
         of = f", mean ± standard deviation over runs (n).{f' {varied} varied.' if varied else ''}"
-        _score_table(page, part, "score", f"Episode return at the final evaluation{of}")
-        long = part[part["evaluations"] >= LAST]
-        _score_table(page, long, "last_score", f"Episode return over the last {LAST} evaluations{of}")
+        _score_table(page, part, f"Episode return at the final evaluation{of}")
         if varied:
             _sensitivity(page, f"{name}-{varied}", part, str(varied))
     _aggregates(page, runs)
     _learning_curves(page, name, points)
-    _spending(page, runs, jobs)
 
 
 def _runs(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -449,7 +454,7 @@ def _runs(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> tuple[pd.DataF
     for cell in own.sort_values("group", kind="stable").to_dict("records"):
         job, path, place = cell["job"], jobs.loc[cell["job"], "path"], {**cell, "task_name": cell["task"]}
         try:
-            episodes = _read(path / "eval.csv", "env_steps", "episode_return", "updates")
+            episodes = _read(path / "eval.csv", "env_steps", "episode_return")
         except RecordError as reason:
             page.text(f"Left out: {reason}", "warning")
             continue
@@ -461,8 +466,7 @@ def _runs(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> tuple[pd.DataF
         encoder = encoders[-1] if encoders else _json(path / "agent" / "card.json").get("pretrained") or job
         curve = episodes.groupby("env_steps")["episode_return"].mean()
         runs.append({
-            **place, "run": job, "encoder": encoder, "score": curve.iloc[-1], "last_score": curve.iloc[-LAST:].mean(),
-            "evaluations": len(curve), "budget": episodes["env_steps"].max(), "updates": episodes["updates"].max(),
+            **place, "run": job, "encoder": encoder, "score": curve.iloc[-1], "budget": episodes["env_steps"].max(),
             "expert": published.EXPERT_SCORES.get(cell["task"], math.nan),
         })  # fmt: skip
         about = {key: runs[-1][key] for key in ("label", "task", "run", "encoder")}
@@ -470,12 +474,12 @@ def _runs(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> tuple[pd.DataF
     return pd.DataFrame(runs), pd.concat(points, ignore_index=True) if points else pd.DataFrame()
 
 
-def _score_table(page: Page, runs: pd.DataFrame, score: str, caption: str) -> None:
+def _score_table(page: Page, runs: pd.DataFrame, caption: str) -> None:
     """Show a row per task as the paper does, or per method where few tasks have many methods."""
-    if runs.empty:
-        return
     cells = {}
-    for (label, task, *place), own in runs.groupby(["label", "task", "group", "task_name", "colors"])[score]:
+    for (label, task, *place), own in runs.groupby(["label", "task", "group", "task_name", "colors"])[
+        "score"
+    ]:
         text = _spread(own, 0 if abs(own.mean()) >= 10 else 1)
         cells[label, task] = _beside(text, published.published_score(label, *place))
     labels, tasks = in_order(runs["label"]), list(runs["task"].unique())
@@ -504,24 +508,19 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
     normal = kept.assign(score=kept["score"] / kept["expert"]).dropna(subset="expert")
     drq = kept[kept["label"] == "drq"]
     places = kept[["group", "task_name", "colors"]].drop_duplicates().to_numpy().tolist()
-    rows = []
+    rows = list[dict[str, Any]]()
     for label in labels:
         own, own_normal = (frame[frame["label"] == label] for frame in (kept, normal))
         found, encoders = estimate(mean, own), own.loc[own["encoder"] != own["run"], "encoder"].nunique()
-        row: dict[str, Any] = {
-            "method": label,
-            "tasks": len(shared),
-            "runs": found.runs,
-            "encoders": encoders,
-        }
-        row["mean score"] = _beside(f"{found:.0f}", _paper_mean(label, places))
+        line = {"method": label, "tasks": len(shared), "runs": found.runs, "encoders": encoders}
+        line["mean score"] = _beside(f"{found:.0f}", _paper_mean(label, places))
         for title, statistic in NORMALIZED.items() if len(normal) else ():
-            row[title] = f"{estimate(statistic, own_normal):.3f}"
+            line[title] = f"{estimate(statistic, own_normal):.3f}"
         if len(normal):
-            row["mean / DrQ"] = _beside(row["mean / DrQ"], _paper_mean(label, places, normalized=True))
+            line["mean / DrQ"] = _beside(line["mean / DrQ"], _paper_mean(label, places, normalized=True))
         if (drq["score"] > 0).all() and len(drq):
-            row["mean / DrQ here"] = "1" if label == "drq" else f"{estimate(relative_mean, own, drq):.3f}"
-        rows.append(row)
+            line["mean / DrQ here"] = "1" if label == "drq" else f"{estimate(relative_mean, own, drq):.3f}"
+        rows.append(line)
     page.table(
         f"Over the {_count(len(shared), 'task')} that all methods share. A task counts once per group and colours, a "
         "run of several once. Normalised scores are divided by the paper's DrQ; “paper” is what it printed for all of "
@@ -571,10 +570,10 @@ def _paper_mean(label: str, places: Sequence[Sequence[str]], normalized: bool = 
     return f"{np.mean(values):.{digits}f}" if values and len(values) == len(asked) else ""
 
 
-def _ends(found: Any) -> dict[str, Any]:
-    """Return an interval as columns of points; NaN where there is none."""
-    ends = {end: getattr(found, end) for end in ("low", "high")}
-    return {end: math.nan if at is None else at if len(at) > 1 else at[0] for end, at in ends.items()}
+def _estimated(found: Any, **about: Any) -> pd.DataFrame:
+    """Return an estimate and its interval, if there is one, as points of a figure."""
+    ends = {end: math.nan if at is None else at for end, at in (("low", found.low), ("high", found.high))}
+    return pd.DataFrame({"y": found.value, **ends}).assign(**about)
 
 
 def _learning_curves(page: Page, name: str, points: pd.DataFrame) -> None:
@@ -585,11 +584,11 @@ def _learning_curves(page: Page, name: str, points: pd.DataFrame) -> None:
         if runs.empty:  # no evaluation that all runs have
             continue
         found = estimate(mean, runs.reset_index(), columns=list(runs))
-        curve = pd.DataFrame({"x": runs.columns, "y": found.value, **_ends(found)})
-        drawn.append(curve.assign(panel=task, label=label, n=str(len(runs)), line="mean", thin=False))
+        about = {"panel": task, "label": label, "n": str(len(runs))}
+        drawn.append(_estimated(found, x=runs.columns, **about, line="mean", thin=False))
         if found.low is None and len(runs) > 1:  # too few for an interval: the runs themselves
             own = own.rename(columns={"env_steps": "x", "score": "y", "run": "line"})
-            drawn.append(own.assign(panel=task, n=str(len(runs)), low=math.nan, high=math.nan, thin=True))
+            drawn.append(own.assign(**about, low=math.nan, high=math.nan, thin=True))
     page.figure(
         f"{name}-curves",
         f"Episode return along training: mean over runs, with {CONFIDENCE:.0%} bootstrap intervals from {MIN_RUNS} "
@@ -606,48 +605,11 @@ def _sensitivity(page: Page, name: str, runs: pd.DataFrame, varied: str) -> None
     points = []
     for (_, value, method), own in runs.groupby(["size", "value", "method"], dropna=False):
         found = estimate(mean, own)
-        place = {"label": method, "x": value, "n": str(found.runs)}
-        points.append({**place, "y": found.value[0], **_ends(found)})
+        points.append(_estimated(found, label=method, x=value, n=str(found.runs)))
     what = {"alpha": "weight of the dispersion loss (alpha)", "b": "random transitions per domain (b)"}
     if points:
-        figure = draw(pd.DataFrame(points), what.get(varied, varied), "mean score / the paper's DrQ")
+        figure = draw(pd.concat(points), what.get(varied, varied), "mean score / the paper's DrQ")
         page.figure(name, f"Mean score against {varied}; n is runs per value.", figure)
-
-
-def _spending(page: Page, runs: pd.DataFrame, jobs: pd.DataFrame) -> None:
-    """Report what scores took: encoder updates, env steps and wall clock of every method."""
-    seconds, rows = jobs["seconds"].astype(float), []
-    if seconds[runs["run"]].isna().all():
-        return  # runs that nobody planned have no clock of their own
-    facts = pd.DataFrame(jobs["facts"].tolist(), jobs.index).reindex(columns=["updates", "env_steps"])
-    updates = facts["updates"].mask(jobs["kind"] == "untrained", 0)
-    env_steps = facts["env_steps"].where(jobs["kind"].isin(["dataset", "explored"]), 0)
-    for label in in_order(runs["label"]):
-        own = runs[runs["label"] == label].drop_duplicates("run")
-        chains = list(filter(None, {(*_needed(run, jobs, *ENCODERS),) for run in own["run"]}))
-        data = [_needed(encoders[0], jobs, "dataset") for encoders in chains]
-        every = [[*encoders, *sets] for encoders, sets in zip(chains, data)]
-        with_task = f"{own['updates'].mean():,.0f}\nwith the task"
-        rows.append({
-            "method": label, "encoders": len(chains),
-            "encoder updates": _number(_sums(updates, chains), ",.0f") if chains else with_task,
-            "env steps before": _number(_sums(env_steps, every), ",.0f") if chains else "0",
-            "collecting": _time([_sums(seconds, data)]) if any(data) else "",
-            "pre-training": _time([_sums(seconds, chains)]),
-            "runs": f"{len(own)} of {_or(own['budget'])} env steps", "one run": _time(seconds[own["run"]]),
-            "machine": _machines(jobs, [*own["run"], *chain.from_iterable(every)]),
-        })  # fmt: skip
-    page.table(
-        "What scores took: means over the encoders and over the runs of a method, wall clock of all attempts. "
-        "Pre-training includes its exploring; a fine-tuned encoder counts with what it started from, shared data with "
-        "each method. Times compare only within one machine, and jobs that shared one slowed each other.",
-        rows,
-    )
-
-
-def _sums(values: pd.Series, groups: Sequence[Sequence[str]]) -> float:
-    """Return the mean over groups of the sum over their jobs; NaN if one is not known."""
-    return float(np.mean([values[list(keys)].sum(skipna=False) for keys in groups])) if groups else math.nan
 
 
 # --- cost of pre-training -------------------------------------------------------------------------------------------
@@ -662,12 +624,11 @@ def _efficiency(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) 
     rows["hours"] = rows["paper_projected_hours"] + (rows["collecting"] * rows["job"].map(
         lambda job: _papers_data(job, jobs)
     )).fillna(0)  # fmt: skip
-    table, points = [], []
+    table = []
     for (device, threads, method, count), own in rows.groupby(
         ["device", "threads", "method", "domains"], sort=False
     ):
-        average, machine = own.mean(numeric_only=True), _machines(jobs, own["job"])
-        hours = updates = math.nan
+        average, hours, updates = own.mean(numeric_only=True), math.nan, math.nan
         if method in published.EFFICIENCY and count in (1, 2, 3):
             hours, updates = (told[count - 1] for told in published.EFFICIENCY[method])
         paper_updates = _number(average["paper_updates"], ",.0f")
@@ -681,29 +642,15 @@ def _efficiency(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) 
             "hours of collecting": _number(average["collecting"], ".3g"),
             "encoder updates, paper's budget": _beside(paper_updates, _number(updates, ",.0f")),
             "hours, paper's budget": _beside(paper_hours, _number(hours, "g")),
-            "the same and collecting": _number(average["hours"], ".3g"), "machine": machine,
+            "the same and collecting": _number(average["hours"], ".3g"),
+            "machine": _machines(jobs, own["job"]),
         })  # fmt: skip
-        here = {"pre-training here": average["paper_projected_hours"], "and collecting": average["hours"]}
-        for label, x in {**here, "the paper's": hours}.items():
-            points.append(
-                {"label": label, "x": x, "y": f"{method} [{machine}]", "panel": _count(count, "domain")}
-            )
     page.table(
         "Pre-training by number of domains: some updates timed here (n timings), projected to whole budgets; the "
-        "paper's hours are those of an NVIDIA Tesla P100. Times compare only within one machine.",
+        "paper's hours are those of an NVIDIA Tesla P100. Times compare only within one machine. Hours include the "
+        "environments of methods that explore. Random data is collected once for all methods that learn from it: its "
+        "hours are those of this scale, and for the paper's budget in proportion to its transitions.",
         table,
-    )
-    page.figure(
-        f"{name}-hours",
-        "Hours of the paper's budget, without and with collecting the random data, projected; in brackets the machine.",
-        draw(pd.DataFrame(points), "hours, paper's budget", kind="dot", log=True),
-    )
-    page.text(
-        "Hours are those of pre-training proper, in which environments that explore have their part. Random data is "
-        "collected once for all methods that learn from it; its hours are those that it took at this scale, and for "
-        "the paper's budget as many times more as the paper has transitions. Updates with the paper's batches and "
-        "decisions were timed for themselves.",
-        "note",
     )
 
 
@@ -736,17 +683,14 @@ SPREAD = {"kne_3": "KNE, k = 3", "kne_half": "KNE, k = M/2", "ane": "ANE", "intr
 
 def _last(rows: pd.DataFrame, keys: Sequence[str], numbers: Sequence[str], window: int = 1) -> pd.DataFrame:
     """Return, by keys, how many jobs there are, and the mean over them of each number's last values."""
-    ends = rows.groupby([*keys, "job"], sort=False)[[*numbers]].agg(
-        lambda own: own.dropna().tail(window).mean()
-    )
-    own = ends.groupby(list(keys), sort=False)
-    return own.mean().assign(n=own.size()).reset_index()
+    by_job = rows.groupby([*keys, "job"], sort=False)[[*numbers]]
+    ends = by_job.agg(lambda own: own.dropna().tail(window).mean()).groupby(list(keys), sort=False)
+    return ends.mean().assign(n=ends.size()).reset_index()
 
 
 def _prototypes(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> None:
-    rows["label"] = rows["method"] + rows["has_dispersion"].map(
-        {True: " with L_intr", False: " without L_intr"}
-    )
+    variants = {True: " with L_intr", False: " without L_intr"}
+    rows["label"] = rows["method"] + rows["has_dispersion"].map(variants)
     table = []
     for end in _last(rows, ["label", "method", "has_dispersion"], [*SPREAD, "updates"]).to_dict("records"):
         paper = published.PROTOTYPE_METRICS.get((end["method"], end["has_dispersion"]))
@@ -768,17 +712,20 @@ def _prototypes(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -
 
 def _coverage(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> None:
     """How much of a domain the data covers along pre-training: random policy against explorers."""
-    rows["label"] = (rows["method"].astype(str) + " explorer").mask(
-        rows["source"] == "random", "random policy"
-    )
+    explorers = rows["method"].astype(str) + " explorer"
+    rows["label"] = explorers.mask(rows["source"] == "random", "random policy")
     # Several explorers stand beside the same random data: what is equal is one curve.
     rows = rows.drop_duplicates(["domain", "label", "env_steps", "coverage", "samples"])
     numbers = ["env_steps", "samples", "coverage"]
-    ends, means = (_last(rows, ["domain", "label"], numbers, window) for window in (1, 10))
-    ends["coverage"], ends["mean of all windows"] = (
-        each["coverage"].map("{:.4f}".format) for each in (ends, means)
-    )
-    ends[["env_steps", "samples"]] = ends[["env_steps", "samples"]].map("{:,.0f}".format)
+    ends = _last(rows, ["domain", "label"], numbers)
+    ends["all windows"] = _last(rows, ["domain", "label"], numbers, window=10)["coverage"]
+    for column, form in {
+        "env_steps": "{:,.0f}",
+        "samples": "{:,.0f}",
+        "coverage": "{:.4f}",
+        "all windows": "{:.4f}",
+    }.items():
+        ends[column] = ends[column].map(form.format)
     page.table(
         "Coverage at the end: particle estimate over observations sampled from the last window of the training, which "
         "is cut into up to ten of equal length, and from as many decisions of the random policy; mean over n runs; "
@@ -786,9 +733,7 @@ def _coverage(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> 
         ends.rename(columns={"label": "data"}),
     )
     points = rows.rename(columns={"domain": "panel", "job": "line", "env_steps": "x", "coverage": "y"})
-    caption = (
-        "Coverage along pre-training, a line per run; estimates of other numbers of samples do not compare."
-    )
+    caption = "Coverage along pre-training, a line per run; other numbers of samples do not compare."
     steps = "env steps of the explorer, all domains"
     page.figure(f"{name}-curves", caption, draw(points, steps, "particle estimate"))
 
@@ -797,17 +742,14 @@ def _embeddings(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -
     for place, (job, own) in enumerate(rows.groupby("job", sort=False), 1):
         shares = _json(jobs.loc[job, "path"] / "explained.json").get("explained_variance_ratio", ())
         axes = {f"pc{i}": f"component {i} ({share:.0%})" for i, share in enumerate(shares, 1)}
+        points = pd.DataFrame({"label": own["source"]})
         pairs = [
-            pd.DataFrame(
-                {"label": own["source"], "x": own[x], "y": own[y], "panel": f"{axes[y]} over {axes[x]}"}
-            )
+            points.assign(x=own[x], y=own[y], panel=f"{axes[y]} over {axes[x]}")
             for x, y in combinations(axes, 2)
         ]
         about = "{}, group {}, encoder seed {}".format(*own[["label", "group", "encoder_seed"]].iloc[0])
-        caption = (
-            f"{about}: first principal components of {len(own)} embeddings, with their share of the variance."
-        )
-        page.figure(f"{name}-{place}", caption, draw(pd.concat(pairs), kind="dot"))
+        caption = f"{about}: principal components of {len(own)} embeddings, with their share of the variance."
+        page.figure(f"{name}-{place}", caption, draw(pd.concat(pairs), kind="cloud"))
 
 
 DIAGNOSTICS = {
@@ -849,23 +791,20 @@ def _diagnostics(page: Page, name: str, what: str, rows: pd.DataFrame) -> None:
     shown = {column: title for column, title in DIAGNOSTICS.items() if column in rows}
     points = rows.rename(columns={"job": "line", "updates": "x", **shown})
     points["n"] = points.groupby("label")["line"].transform("nunique").astype(str)
-    points = points.melt(["label", "line", "x", "n"], list(shown.values())[:3], "panel", "y").dropna(
-        subset="y"
-    )
+    drawn = list(shown.values())[:3]
+    points = points.melt(["label", "line", "x", "n"], drawn, "panel", "y").dropna(subset="y")
     if len(points):
         logs = rows["ln_num_prototypes"].dropna().unique() if "comp" in shown else ()
         marks = {f"ln M = {value:.3f}": value for value in logs}
         caption = f"{what} along pre-training, a line per encoder (n in the legend)."
         page.figure(name, caption, draw(points, "encoder updates", marks=marks))
     ends = _last(rows, ["label"], list(shown), WINDOW).rename(columns={"n": "encoders", **shown})
-    records = {label: [own for _, own in each.groupby("job")] for label, each in rows.groupby("label")}
-    ends.insert(
-        1, "updates", [_or(own["updates"].max() for own in records[label]) for label in ends["label"]]
-    )
-    ends.insert(
-        2, "left the plateau at", [_plateau(map(left_plateau, records[each])) for each in ends["label"]]
-    )
     ends[list(shown.values())] = ends[list(shown.values())].map(lambda value: _number(value, ".4g"))
+    by_label = {label: [own for _, own in each.groupby("job")] for label, each in rows.groupby("label")}
+    updates = {label: _or(own["updates"].max() for own in each) for label, each in by_label.items()}
+    left = {label: _plateau(map(left_plateau, each)) for label, each in by_label.items()}
+    for place, (title, told) in enumerate({"updates": updates, "left the plateau at": left}.items(), 1):
+        ends.insert(place, title, ends["label"].map(told))
     page.table(
         f"{what} at the end of pre-training. Mean of the last {WINDOW} rows of a record, then over encoders. The "
         f"plateau is left where the comparative loss stays below {PLATEAU:.0%} of ln M from then on: at ln M, or with "
@@ -875,14 +814,8 @@ def _diagnostics(page: Page, name: str, what: str, rows: pd.DataFrame) -> None:
 
 
 def _plateau(updates: Iterable[float]) -> str:
-    """Say when encoders left their plateau, and how many did."""
-    there = [at for at in updates if not math.isnan(at)]
-    known = sorted(at for at in there if math.isfinite(at))
-    if not known:
-        return "not left" if there else ""
-    spread = f"\n{known[0]:,.0f} to {known[-1]:,.0f}" if known[0] < known[-1] else ""
-    among = f"\n{len(known)} of {len(there)} encoders" if len(known) < len(there) else ""
-    return f"{np.mean(known):,.0f}{among}{spread}"
+    known = sorted({at for at in updates if not math.isnan(at)})
+    return " or ".join("not left" if math.isinf(at) else f"{at:,.0f}" for at in known)
 
 
 MEASURES = {
@@ -895,7 +828,7 @@ MEASURES = {
 
 
 def _probes(page: Page, name: str, rows: pd.DataFrame) -> None:
-    """Report state probes: a figure, and a table per measure and embedding, a column per domain and colours."""
+    """Show a table per measure and embedding, with a column per domain and colours."""
     page.text(
         f"R2 is that of held-out episodes: {_or(rows['samples'])} observations per probe, "
         f"{_or(rows['held_out_episodes'])} episodes of them held out. A mean over coordinates counts a negative one as "
@@ -904,29 +837,12 @@ def _probes(page: Page, name: str, rows: pd.DataFrame) -> None:
         "domains none has.",
         "note",
     )
-    means = (
-        rows[rows["coordinate"].isna()]
-        .dropna(subset="value")
-        .sort_values(["domain", "colors"], kind="stable")
-    )
+    means = rows[rows["coordinate"].isna()].dropna(subset="value")
+    means = means.sort_values(["domain", "colors"], kind="stable")
     colors = (", " + means["colors"].str.replace("_", " ")).mask(means["colors"] == "normal", "")
     groups = ", " + means["group"] if means["group"].nunique() > 1 else ""
     means = means.assign(at=means["domain"] + colors, encoder=means["label"] + groups)
     means["seen"] = means["seen"].map({"yes": "seen", "no": "unseen"})
-    is_drawn = (means["embedding"] == "features") & means["measure"].isin(["r2_position", "r2_velocity"])
-    points = (
-        means[is_drawn]
-        .groupby(["measure", "at", "encoder"], sort=False)["value"]
-        .mean()
-        .reset_index(name="x")
-    )
-    points["panel"] = points["measure"].map({measure: title for measure, (title, _) in MEASURES.items()})
-    page.figure(
-        f"{name}-features",
-        "What a linear model reads from the features of the frozen encoder: R2 on held-out episodes, mean over "
-        "coordinates and encoders.",
-        draw(points.rename(columns={"at": "y", "encoder": "label"}), kind="dot"),
-    )
     for embedding, measure in product(means["embedding"].unique(), MEASURES):
         own = means[(means["embedding"] == embedding) & (means["measure"] == measure)]
         (title, digits), places = MEASURES[measure], own.groupby(["encoder", "group", "at"], sort=False)
