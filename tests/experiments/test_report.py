@@ -22,7 +22,6 @@ from crptpro.experiments.report import Page, build_report, left_plateau
 
 RESULTS = Path(__file__).parents[2] / "results"
 HARDWARE = {"cpu": "A CPU", "cpu_cores": 2, "ram_bytes": 24 * 2**30, "gpus": []}
-START_S = 1_795_000_000.0
 
 
 class Report:
@@ -64,20 +63,11 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Report:
 
 def test_every_experiment_is_counted_and_every_job(seen: Report) -> None:
     counts = seen.table("Experiments: numbers that were asked for").set_index("experiment")
-    assert counts["finished"].to_dict() == {
-        "seen": "22", "efficiency": "24", "prototypes": "7", "coverage": "1", "stability": "4", "visualize": "1",
-        "probe": "90",
-    }  # fmt: skip
+    assert list(counts["finished"].items()) == [
+        ("seen", "22"), ("efficiency", "24"), ("prototypes", "7"), ("coverage", "1"), ("stability", "4"),
+        ("visualize", "1"), ("probe", "90"),
+    ]  # fmt: skip
     assert (counts["finished"] == counts["asked for"]).all()
-    assert list(counts.index) == [
-        "seen",
-        "efficiency",
-        "prototypes",
-        "coverage",
-        "stability",
-        "visualize",
-        "probe",
-    ]
     assert "22 of 22 run" in seen.text
     assert "24.9 h of work in all" in seen.text
     assert len(seen.table("probe: 90 jobs")) == 90
@@ -96,10 +86,8 @@ def test_budgets_stand_beside_the_papers(seen: Report) -> None:
 
 
 def test_returns_stand_beside_the_papers_without_intervals_of_two_runs(seen: Report) -> None:
-    returns = (
-        seen.table("Episode return at the final evaluation").set_index("method")["A walker_run"].to_dict()
-    )
-    assert returns == {
+    returns = seen.table("Episode return at the final evaluation").set_index("method")["A walker_run"]
+    assert returns.to_dict() == {
         "crptpro": "56 ± 2 (n = 2) · paper 513 ± 33", "crptpro-fast": "64 ± 8 (n = 2)",
         "crptpro-finetune": "39 ± 17 (n = 2)", "proto-rl-c": "53 ± 1 (n = 2) · paper 431 ± 83",
         "proto-rl-s": "69 ± 6 (n = 2)", "atc": "48 ± 1 (n = 2) · paper 271 ± 16",
@@ -112,9 +100,7 @@ def test_returns_stand_beside_the_papers_without_intervals_of_two_runs(seen: Rep
         "1", "2", "1", "56 · paper 513", "0.116 · paper 1.058", "0.116", "0.116", "0.884",
     ]  # fmt: skip
     assert over["mean / DrQ here"].to_dict()["proto-rl-s"] == "1.447"
-    improvement = seen.table("Probability that a run of crptpro").set_index("other method")[
-        "P(crptpro &gt; other)"
-    ]
+    improvement = seen.table("Probability that a run of crptpro").set_index("other method").iloc[:, -1]
     assert improvement[["crptpro-fast", "apt-c", "random-encoder"]].tolist() == ["0.00", "0.50", "1.00"]
     assert not re.search(r"\\\[-?\d+(\.\d+)?, ", seen.text)  # an interval
     assert "here some have as few as 2." in seen.text
@@ -192,17 +178,13 @@ def write_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     pd.DataFrame(list(rows)).to_csv(path, index=False)
 
 
-def evaluations(score: float, *, method: str = "crptpro", places: int = 11) -> list[dict]:
-    """An hour in which the return rises from 0 to a score, with a pause before the last evaluation."""
-    shares = np.linspace(0, 1, places)
+def evaluations(score: float, *, method: str = "crptpro") -> list[dict]:
+    """Eleven evaluations of two episodes, in which the return rises from 0 to a score."""
     return [
-        {
-            "episode": episode, "env_steps": int(500_000 * share), "agent_steps": int(250_000 * share),
-            "updates": int(249_000 * share), "unix_time_s": START_S + 3600 * share,
-            "episode_return": score * share + 2 * episode - 1, "episode_agent_steps": 500, "seed": 7, "method": method,
-        }
-        for share in shares for episode in (0, 1)
-    ]  # fmt: skip
+        {"env_steps": int(500_000 * share), "episode_return": score * share + other, "method": method}
+        for share in np.linspace(0, 1, 11)
+        for other in (-1, 1)
+    ]
 
 
 class Reproduction:
@@ -250,9 +232,7 @@ class Reproduction:
         """Runs of a method, each on an encoder of its own."""
         cells = []
         for seed, score in enumerate(scores):
-            encoder = self.job(
-                f"encoder-{label}-{seed}", "encoder", facts={"method": label, "updates": 50_000}
-            )
+            encoder = self.job(f"encoder-{label}-{seed}", "encoder", facts={"method": label})
             key = f"run-{label}-{task}-{seed}-{'-'.join(map(str, place.values()))}"
             job = self.job(key, "run", [encoder], facts={"method": label}, eval=evaluations(score))
             cells.append((label, job, {"group": "A", "task": task, "encoder_seed": seed, "seed": 0, **place}))
@@ -274,10 +254,8 @@ def test_from_five_runs_on_every_task_aggregates_have_intervals(made: Reproducti
     cells += made.runs("atc", "walker_run", [200, 210, 220, 230, 240])
     made.ask("seen", cells)
     report = made.report()
-    assert (
-        report.cell("Episode return at the final", "crptpro", "A cheetah_run")
-        == "600 ± 79 (n = 5) · paper 611 ± 44"
-    )
+    final = report.table("Episode return at the final").set_index("task")["crptpro"]
+    assert final["A cheetah_run"] == "600 ± 79 (n = 5) · paper 611 ± 44"
     over = report.table("Over the 2 tasks").set_index("method").loc["crptpro"]
     assert over[["runs", "encoders"]].tolist() == ["10", "5"]
     assert re.fullmatch(r"550 \\\[\d{3}, \d{3}\\\] · paper 562", over["mean score"])
@@ -295,9 +273,7 @@ def test_a_partial_reproduction_says_what_is_missing(made: Reproduction) -> None
     cells += [("crptpro", begun, {"group": "A", "task": "walker_run", "encoder_seed": 0, "seed": 1})]
     cells += [("atc", "run-none", {"group": "A", "task": "walker_run", "encoder_seed": 0, "seed": 0})]
     made.ask("seen", cells)
-    made.ask(
-        "unseen", [("atc", "run-other", {"group": "A", "task": "finger_spin", "encoder_seed": 0, "seed": 0})]
-    )
+    made.ask("unseen", [("atc", "run-other", {"group": "A", "task": "finger_spin", "encoder_seed": 0})])
     report = made.report()
     assert "1 of 3 numbers are there." in report.text
     assert "Missing: crptpro 1, atc 1. Nothing stands in for what is missing." in report.text
@@ -305,10 +281,8 @@ def test_a_partial_reproduction_says_what_is_missing(made: Reproduction) -> None
     states = report.table("run: 2 jobs").set_index("job")["state"]
     assert states.tolist() == ["begun", "finished"]
     assert "Nothing is finished yet: 1 number asked for." in report.text
-    assert (
-        report.cell("Episode return at the final", "crptpro", "A walker_run")
-        == "500 (n = 1) · paper 513 ± 33"
-    )
+    final = report.cell("Episode return at the final", "crptpro", "A walker_run")
+    assert final == "500 (n = 1) · paper 513 ± 33"
 
 
 def test_methods_are_compared_on_the_tasks_that_all_have(made: Reproduction) -> None:
@@ -336,11 +310,8 @@ def test_colours_and_what_is_varied_have_rows_of_their_own(made: Reproduction) -
     made.ask("colors", reversed_colors)
     cells = []
     for value, score in (("0.05", 300.0), ("0", 200.0)):
-        place = {"varied": "alpha", "value": value}
-        cells += [
-            (f"crptpro, alpha {value}", *rest)
-            for _, *rest in made.runs("crptpro", "walker_run", [score], **place)
-        ]
+        runs = made.runs("crptpro", "walker_run", [score], varied="alpha", value=value)
+        cells += [(f"crptpro, alpha {value}", *rest) for _, *rest in runs]
     made.ask("sensitivity", cells)
     report = made.report()
     captions = [caption for caption in report.tables if caption.startswith("Episode return at the final")]

@@ -719,12 +719,8 @@ def _coverage(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> 
     numbers = ["env_steps", "samples", "coverage"]
     ends = _last(rows, ["domain", "label"], numbers)
     ends["all windows"] = _last(rows, ["domain", "label"], numbers, window=10)["coverage"]
-    for column, form in {
-        "env_steps": "{:,.0f}",
-        "samples": "{:,.0f}",
-        "coverage": "{:.4f}",
-        "all windows": "{:.4f}",
-    }.items():
+    for column in (*numbers, "all windows"):
+        form = "{:.4f}" if column in ("coverage", "all windows") else "{:,.0f}"
         ends[column] = ends[column].map(form.format)
     page.table(
         "Coverage at the end: particle estimate over observations sampled from the last window of the training, which "
