@@ -10,8 +10,9 @@ import contextlib
 import itertools
 import logging
 import os
+import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
@@ -60,13 +61,23 @@ class Logging:
     tensorboard: bool = False
     """also write TensorBoard event files"""
 
-    def records(self, run_dir: Path, config: Any) -> contextlib.AbstractContextManager[RunLogger | None]:
-        """Return the record of a run with its mirrors; without mirrors the run makes its own."""
+    @contextlib.contextmanager
+    def records(self, run_dir: Path, config: Any) -> Iterator[RunLogger | None]:
+        """Hold the record of a run with its mirrors; without mirrors the run makes its own."""
         if self.wandb == "off" and not self.tensorboard:
-            return contextlib.nullcontext()
+            yield None
+            return
         options: Any = (self.wandb_project, self.wandb_group, None, self.wandb_tags, self.wandb)
-        wandb = None if self.wandb == "off" else WandbOptions(*options)
-        return RunLogger(run_dir, config=config, wandb=wandb, tensorboard=self.tensorboard)
+        wandb, is_new = None if self.wandb == "off" else WandbOptions(*options), not run_dir.exists()
+        with RunLogger(run_dir, config=config, wandb=wandb, tensorboard=self.tensorboard) as logger:
+            try:
+                yield logger
+            except Exception:
+                if is_new and [path.name for path in run_dir.iterdir()] == [
+                    ".lock"
+                ]:  # the request was refused
+                    shutil.rmtree(run_dir)
+                raise
 
 
 @dataclass(frozen=True)

@@ -221,12 +221,7 @@ class _Process:
 class SlurmLauncher:
     """A Slurm cluster, whose nodes share ROOT and the environment of this process.
 
-    Args:
-        parameters: of submitit's executor.
-        cluster: submitit's name of it; tests have ``"local"``.
-
-    Raises:
-        CRPTproError: without submitit, or where there is no Slurm.
+    The parameters are those of submitit's executor; ``cluster`` is its name of it, ``"local"`` in tests.
     """
 
     is_one_machine = False
@@ -311,14 +306,9 @@ class _SlurmJob:
 
 
 class RayLauncher:
-    """A Ray cluster whose nodes share ROOT; without one, Ray on this machine.
+    """A Ray cluster whose nodes share ROOT; each job has a number, or a fraction, of its GPUs.
 
-    Args:
-        address: of the cluster's head; ``None`` for ``RAY_ADDRESS``, a cluster that runs here, or a new one.
-        gpus: of each job, a whole number or a fraction of one.
-
-    Raises:
-        CRPTproError: without Ray, or if the cluster cannot be reached.
+    Without an address it is that of ``RAY_ADDRESS``, one that runs here, or a new one on this machine.
     """
 
     is_one_machine = False
@@ -394,18 +384,9 @@ def run_jobs(
 ) -> list[Failure]:
     """Run every missing job of a plan as soon as all that it needs is finished.
 
-    A job that must be alone on its machine starts when nothing else can. Ctrl-C, SIGTERM and SIGHUP stop all jobs at
-    their next checkpoint, a second one at once.
-
-    Args:
-        plan: what is wanted; its finished jobs are left alone.
-        root: of the reproduction.
-        launcher: where jobs run.
-        jobs: most jobs at a time.
-        cores: of each.
-        device: of networks.
-        plugins: modules that jobs load first.
-        attempts: how often a job is tried; each attempt continues the one before.
+    At most ``jobs`` run at a time, with ``cores`` each; one that must be alone on its machine starts when nothing else
+    can. Each of the ``attempts`` at a job continues the one before. Ctrl-C, SIGTERM and SIGHUP stop all jobs at their
+    next checkpoint, a second one at once.
 
     Returns:
         What was not finished: failures first, then what depends on them.

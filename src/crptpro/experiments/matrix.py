@@ -478,12 +478,11 @@ def _table(
     request: Request, rows: Mapping[str, Sequence[str]], systems: Iterable[str], colors: str = "normal"
 ) -> list[Cell]:
     """Return the runs of systems on the tasks of each group."""
+    places = [(group, task) for group, tasks in rows.items() for task in tasks]
     return [
         cell
-        for group, tasks in rows.items()
-        for task in tasks
-        for system in systems
-        for cell in _scores(request, group, task, system, colors=colors)
+        for place, system in product(places, list(systems))
+        for cell in _scores(request, *place, system, colors=colors)
     ]
 
 
