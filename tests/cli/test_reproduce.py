@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import sys
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
@@ -109,16 +108,6 @@ def test_failures_are_listed_with_their_logs(
     assert status == 1
     assert f"1 failed:\n  run-a (tried 3 times)\n    it will never do\n    log: {tmp_path}/log.txt\n" in out
     assert "1 not started, because they need one that failed:\n  run-b" in out
-
-
-def test_what_a_terminal_cannot_show_degrades(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    terminal = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
-    monkeypatch.setattr(sys, "stdout", terminal)
-    arguments = ("reproduce", "seen", "--scale", "tiny", *PART, "--dry-run", "--out", str(tmp_path / "Läufe"))
-    monkeypatch.setattr(sys, "argv", ["crptpro", *arguments])
-    main()
-    terminal.flush()
-    assert rb"L\xe4ufe" in terminal.buffer.getvalue()  # type: ignore[attr-defined]
 
 
 # --- a reproduction -------------------------------------------------------------------------------------------------

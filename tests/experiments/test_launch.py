@@ -247,11 +247,7 @@ def test_gpus_are_shared_evenly_and_jobs_have_their_threads(
     assert sorted(environments) == [("0", "3"), ("0", "3"), ("1", "3"), ("1", "3")]
 
 
-def test_what_slurm_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    usual = {"partition": None, "hours": 1.0, "memory_gb": 2.0, "sbatch": (), "has_gpu": False}
-    assert slurm_parameters(**usual) == {"time": 60, "mem": "2048M"}  # type: ignore[arg-type]
-    gpu = slurm_parameters(**{**usual, "has_gpu": True, "sbatch": ("--qos=high",)})  # type: ignore[arg-type]
-    assert (gpu["gpus_per_node"], gpu["additional_parameters"]) == (1, {"qos": "high"})
+def test_slurm_needs_its_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.which", lambda name: None)
     with pytest.raises(CRPTproError, match="needs sbatch and srun"):
         SlurmLauncher({})
@@ -266,8 +262,9 @@ def test_a_slurm_job_asks_for_its_cores_and_a_refusal_is_said(
         (folder / name).write_text("#!/bin/sh\necho Submitted batch job 12\n")
         (folder / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
-    parameters = {"time": 5, "mem": "2048M", "gpus_per_node": 1, "additional_parameters": {"qos": "high"}}
-    launcher, work = SlurmLauncher(parameters), Work(str(tmp_path), "key", threads=4)
+    asked: dict[str, Any] = {"partition": None, "hours": 1 / 12, "memory_gb": 2.0, "sbatch": ("--qos=high",)}
+    launcher = SlurmLauncher(slurm_parameters(**asked, has_gpu=True))
+    work = Work(str(tmp_path), "key", threads=4)
     launcher.start(work, is_exclusive=True)
     [script] = (tmp_path / "submitted").rglob("12_submission.sh")
     lines = script.read_text().splitlines()

@@ -11,7 +11,7 @@ import pytest
 
 import crptpro.objectives.methods as registry
 from crptpro import plugins
-from crptpro.domains import GROUPS, get_domain
+from crptpro.domains import GROUPS
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.experiments.jobs import KINDS, Job, is_finished, make_plan
 from crptpro.experiments.matrix import EXPERIMENTS, METHODS, PAPER, SMALL, TINY, Cell, Request
@@ -123,12 +123,8 @@ def test_experiments_share_what_they_have_in_common() -> None:
 
 def test_the_ablation_has_the_papers_weights_and_budgets() -> None:
     found = cells("ablation", PAPER)
-    single = [
-        (c.label, get_domain(c.place["task"]).name, c.job.needs[0].facts)
-        for c in found
-        if "-s" in c.label[:10]
-    ]
-    weights = {(label, domain): (facts["loss"], facts["explore"]) for label, domain, facts in single}
+    single = [(c.label, c.job.needs[0].facts) for c in found if c.label.startswith("proto-rl-s")]
+    weights = {(label, *facts["domains"]): (facts["loss"], facts["explore"]) for label, facts in single}
     short = {"env_steps": 200_000}
     assert weights == {
         ("proto-rl-s", "cheetah"): ({}, short), ("proto-rl-s", "hopper"): ({}, short),
@@ -140,11 +136,10 @@ def test_the_ablation_has_the_papers_weights_and_budgets() -> None:
     assert of(found, "proto-rl-c with dispersion")[0].needs[0].facts["loss"] == {"intr_loss_coef": 5e-3}
 
 
-def test_other_colours_are_drawn_downstream() -> None:
-    for colors in ("reversed_background", "reversed_image"):
-        found = cells("colors", SMALL, colors=colors)
-        assert {option(cell.job, "--colors") for cell in found} == {colors}
-        assert {cell.place["colors"] for cell in found} == {colors}
+@pytest.mark.parametrize("colors", ["reversed_background", "reversed_image"])
+def test_other_colours_are_drawn_downstream(colors: str) -> None:
+    found = cells("colors", SMALL, colors=colors)
+    assert {(option(c.job, "--colors"), c.place["colors"]) for c in found} == {(colors, colors)}
 
 
 def test_timings_count_every_encoder_of_a_single_domain_method_and_need_only_data() -> None:
@@ -201,13 +196,9 @@ def test_a_request_refuses_what_nobody_knows(
         Request(SMALL, **part)
 
 
-def test_seeds_are_the_plain_numbers_that_they_mean() -> None:
+def test_seeds_are_the_plain_numbers_that_they_mean_and_a_domain_stands_for_its_task() -> None:
     plain = cells("seen", SMALL, encoder_seeds=(1,), seeds=(2,), **PART)
-    given = cells("seen", SMALL, encoder_seeds=(np.int64(1),), seeds=(2.0,), **PART)
+    asked = {**PART, "tasks": ("walker", "walker_run")}
+    given = cells("seen", SMALL, encoder_seeds=(np.int64(1),), seeds=(2.0,), **asked)
     assert [(c.job.key, c.place) for c in given] == [(c.job.key, c.place) for c in plain]
     assert type(given[0].place["seed"]) is int
-
-
-def test_a_domains_name_stands_for_its_task() -> None:
-    assert Request(SMALL, tasks=("walker", "walker_run")).tasks == ("walker_run",)
-    assert cells("seen", SMALL, groups=("A",), tasks=("walker",)) == cells("seen", SMALL, **PART)

@@ -30,9 +30,8 @@ class ProbeSamples:
     Attributes:
         pixels: uint8 ``[N, C, H, W]``.
         targets: float64 ``[N, T]``, positions and velocities.
-        names: of the targets, each ``"position"`` or ``"velocity"`` and the coordinate, for two may share its name.
-        train: int64, rows to fit; likewise ``validation`` (to choose the penalty) and ``test`` (to judge). No episode
-            contributes to two of them.
+        names: of the targets: ``"position"`` or ``"velocity"``, and the coordinate.
+        train: rows to fit, ``validation`` to choose the penalty, ``test`` to judge; no episode is in two of them.
         held_out_episodes: how many episodes ``test`` comes from.
     """
 
@@ -124,11 +123,6 @@ def probe(
     Ridge regression on standardised features, in float64; nothing of the held-out episodes takes part in fitting,
     standardising, or choosing the penalty. Images are not augmented.
 
-    Args:
-        samples: of :func:`probe_samples`.
-        encoder: maps uint8 ``[B, C, H, W]`` to features ``[B, D]``.
-        projector: maps features to latents ``[B, d]``.
-
     Returns:
         By ``"features"`` and, with a projector, ``"z"``.
     """
@@ -168,9 +162,8 @@ def probe_embeddings(samples: ProbeSamples, embeddings: Tensor) -> ProbeResult:
 def _standardized_gram(features: Tensor, fitted: Tensor) -> np.ndarray:
     """Return the inner products ``[N, N]`` of all samples' standardised features.
 
-    A feature's scale is its deviation plus the root mean square of all features' deviations. Without that summand, a
-    ReLU feature that is active in a handful of samples became a large number that identifies the sample, and the R2 of
-    velocities from 39,200 features fell from 0.6 to 0.
+    A feature's scale is its deviation plus the root mean square of all features' deviations: otherwise a ReLU feature
+    that is active in a handful of samples identifies them, and the R2 of velocities fell from 0.6 to 0.
     """
     deviation, mean = torch.std_mean(features[fitted].double(), 0, correction=0)
     usual = deviation.square().mean().sqrt()
