@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import html
 import os
 import re
 import shutil
 import subprocess
 from collections.abc import Iterable, Mapping
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +35,9 @@ class Report:
             r"^(?:\*\*|<details><summary>)(.+?)(?:\*\*|</summary>)\n\n((?:\|.*\n)+)", self.text, re.M
         )
         for caption, table in blocks:
-            head, _, *rows = [
-                re.split(r" (?<!\\)\| ", f" {line[1:-1]} ") for line in table.strip().split("\n")
-            ]
-            cells = [[cell.strip() for cell in row] for row in rows]
-            self.tables[caption] = pd.DataFrame(cells, columns=[name.strip() for name in head])
+            lines = [re.split(r"(?<!\\)\|", line)[1:-1] for line in table.strip().split("\n")]
+            head, _, *rows = [[cell.strip() for cell in line] for line in lines]
+            self.tables[caption] = pd.DataFrame(rows, columns=head)
 
     def table(self, caption: str) -> pd.DataFrame:
         (found,) = [table for name, table in self.tables.items() if name.startswith(caption)]
@@ -330,29 +328,12 @@ def test_names_of_users_break_neither_page(made: Reproduction) -> None:
     place = {"group": HOSTILE, "task": HOSTILE, "encoder_seed": 0, "seed": 0}
     made.ask(HOSTILE, [(HOSTILE, job, place), ("other", "run-none", place)], scale="<b>huge</b>")
     report = made.report()
-    seen = Tags()
-    seen.feed(report.html)
-    assert not {"script", "b"} & set(seen.tags)
-    assert HOSTILE.replace("\n", "") in re.sub(r"\n", "", seen.text)
+    assert not {"script", "b"} & set(re.findall(r"<(\w+)", report.html))
+    assert HOSTILE.replace("\n", "") in html.unescape(report.html).replace("\n", "")
     assert "<script" not in report.text
     assert "[x](javascript" not in report.text
     assert report.cell("Experiments: numbers", "finished").startswith("1")
     assert len(list((report.folder / "figures").iterdir())) == 1
-
-
-class Tags(HTMLParser):
-    """Elements and text of a page."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.text = ""
-
-    def handle_starttag(self, tag: str, attrs: Any) -> None:
-        self.tags.append(tag)
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
 
 
 def test_the_same_records_give_the_same_files(made: Reproduction) -> None:
@@ -431,7 +412,7 @@ BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-c
 def test_a_browser_shows_the_page_and_it_never_scrolls_sideways(
     seen: Report, tmp_path: Path, width: int
 ) -> None:
-    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         pytest.skip(f"no browser was found ({', '.join(BROWSERS)})")
     page = seen.folder / f"measured-{width}.html"
@@ -444,7 +425,4 @@ def test_a_browser_shows_the_page_and_it_never_scrolls_sideways(
         f"--window-size={width},1400", "--dump-dom", page.as_uri(),
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
-    found = re.search(r"<title>said (\w+) (\d+)</title>", done.stdout)
-    assert found is not None
-    assert found[1] == "true"
-    assert int(found[2]) == seen.html.count("<img")
+    assert f"<title>said true {seen.html.count('<img')}</title>" in done.stdout
