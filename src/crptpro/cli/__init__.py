@@ -45,6 +45,9 @@ Or `crptpro reproduce` a whole experiment of the paper.
 With `--plugin FILE.py` (or a module) any command runs a file of yours first: methods and domains that it registers
 then have names here."""
 
+_NAMED = arg(metavar="[NAME=VALUE ...]", help_behavior_hint="(default: the method's)")
+NamedValues = Annotated[tuple[str, ...], _NAMED]
+
 
 @dataclass(frozen=True)
 class Logging:
@@ -138,13 +141,9 @@ class Pretraining:
     method: str = "crptpro"
     """crptpro, atc or random-encoder (on datasets), proto-rl-c, proto-rl-s, apt-c, apt-s or becl (exploring), a preset
     such as crptpro-fast, or one of your own with --plugin FILE.py; settings: see --method NAME --help"""
-    loss: Annotated[
-        tuple[str, ...], arg(metavar="[NAME=VALUE ...]", help_behavior_hint="(default: the method's)")
-    ] = ()
+    loss: NamedValues = ()
     """options of the method's loss, e.g. num_prototypes=128 intr_loss_coef=0"""
-    encoder: Annotated[
-        tuple[str, ...], arg(metavar="[NAME=VALUE ...]", help_behavior_hint="(default: the method's)")
-    ] = ()
+    encoder: NamedValues = ()
     """options of the encoder, e.g. pixel_offset=0.5"""
     logging: Logging = field(default_factory=Logging)
     """mirrors"""
@@ -291,8 +290,8 @@ class Evaluate:
         """Write what was asked for, and print mean and deviation."""
         if self.agent == "random-policy" and self.task is None:
             raise CRPTproError("The random policy has no task of its own; name one, e.g. --task walker_run.")
-        for path, option in ((self.csv, "--csv"), (self.video, "--video")):
-            require_writable(path, option)  # before an hour of episodes
+        require_writable(self.csv, "--csv")  # before an hour of episodes
+        require_writable(self.video, "--video")
         agent, card = (None, {}) if self.agent == "random-policy" else training.load_agent(self.agent)
         task, trained_with = self.task or card["task"], card.get("config", {})
         settings: dict[str, Any] = {

@@ -145,7 +145,6 @@ def _clock(directory: Path) -> dict[str, float]:
 
 
 def _command(arguments: Sequence[str], log: Path) -> str:
-    """Call ``crptpro`` and return what went wrong."""
     from crptpro.cli import main
 
     sys.argv = ["crptpro", *arguments]
@@ -262,8 +261,6 @@ class SlurmLauncher:
 
 @dataclass(frozen=True)
 class _Submitted:
-    """The function that submitit pickles."""
-
     work: Work
 
     def __call__(self) -> None:
@@ -467,7 +464,6 @@ class _Queue:
         return bool(chosen)
 
     def look(self) -> None:
-        """Take in what has ended; give up or try again what has failed."""
         for job, (handle, began) in list(self.running.items()):
             lost = handle.poll()
             if lost is None:
@@ -493,7 +489,6 @@ class _Queue:
                 self._skip({job.key})
 
     def _skip(self, lost: set[str]) -> None:
-        """Give up what needs something that failed; the plan's order has needs first."""
         for job in list(self.waiting):
             if failed := [needed.key for needed in job.needs if needed.key in lost]:
                 self.waiting.remove(job)

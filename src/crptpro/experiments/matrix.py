@@ -80,17 +80,13 @@ class Scale:
     # settings of exploring, with the encoder update interval of a method that makes one update each time
     explore: Settings = field(default_factory=dict)
     explore_single: Settings = field(default_factory=dict)  # the same of the (S) methods
-    # settings of exploring that an (S) method has in ``ablation`` besides
-    single_ablation: Settings = field(default_factory=dict)
+    single_ablation: Settings = field(default_factory=dict)  # what these have in ``ablation`` besides
     run: Settings = field(default_factory=dict)  # settings of every downstream run
-    seeds: int = 3  # number of downstream runs on each encoder unless the caller says otherwise
-    # weights of the dispersion loss in ``sensitivity``, besides none and the method's own
-    alphas: tuple[float, ...] = (5e-4, 5e-2, 5e-1)
-    # random transitions per domain in ``sensitivity``
-    capacities: tuple[int, ...] = (10_000, 50_000, 100_000)
+    seeds: int = 3  # downstream runs on each encoder unless the caller says otherwise
+    alphas: tuple[float, ...] = (5e-4, 5e-2, 5e-1)  # of ``sensitivity``, besides none and the method's own
+    capacities: tuple[int, ...] = (10_000, 50_000, 100_000)  # likewise, random transitions per domain
     probe_samples: int = 4_000  # observations of a state probe
-    # of a dataset that is probed, which needs several episodes, if not ``transitions``
-    probe_transitions: int | None = None
+    probe_transitions: int | None = None  # of a dataset that is probed, if not ``transitions``
     timing_updates: int = 100  # encoder updates that ``efficiency`` times, after as many to warm up
     paper_timing_updates: int = 0  # the same with the paper's batches and intervals; 0 for none
     coverage_samples: int = 1_024  # observations of a coverage estimate
@@ -477,7 +473,6 @@ def _scores(
 def _table(
     request: Request, rows: Mapping[str, Sequence[str]], systems: Iterable[str], colors: str = "normal"
 ) -> list[Cell]:
-    """Return the runs of systems on the tasks of each group."""
     places = [(group, task) for group, tasks in rows.items() for task in tasks]
     return [
         cell
@@ -600,7 +595,6 @@ def _measured(label: str, job: Job, group: str, seed: int, domains: Sequence[str
 def _trained(
     request: Request, variants: Mapping[str, Sequence[tuple[str, Settings]]], measure: Callable[[Job], Job]
 ) -> list[Cell]:
-    """Encoders of methods with prototypes, or what is measured of them."""
     return [
         _measured(
             label, measure(encoder(request.scale, system, domains, seed, loss=loss)), group, seed, domains

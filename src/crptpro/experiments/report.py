@@ -98,7 +98,6 @@ class Page:
     """A page of sections, each with texts, tables and figures in the order in which they are added."""
 
     def __init__(self, folder: Path) -> None:
-        """Start an empty page, of which ``folder`` gets the files."""
         self.folder = folder
         self.sections: list[dict[str, Any]] = []
 
@@ -150,7 +149,6 @@ def _markdown(text: Any) -> str:
 
 
 def _plain(name: str) -> str:
-    """For anchors and files, whatever a user calls an experiment."""
     return re.sub(r"[^a-zA-Z0-9]+", "-", name).strip("-")
 
 
@@ -263,14 +261,12 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def _where(job: dict[str, Any]) -> str:
-    """Return machine and device, or threads, as far as they are recorded."""
     has_threads = job["device"] == "cpu" and not pd.isna(job["threads"])
     device = _count(int(job["threads"]), "thread") if has_threads else job["device"]
     return f"{job['machine']}, {device}" if job["done"] and job["machine"] else ""
 
 
 def _machines(jobs: pd.DataFrame, keys: Iterable[str]) -> str:
-    """Return the numbers of machines, as the end of the page explains them."""
     return ", ".join(sorted(set(jobs.loc[list(keys), "machine"]) - {""}))
 
 
@@ -287,7 +283,6 @@ def _or(values: Iterable[float]) -> str:
 
 
 def _beside(text: str, paper: Any) -> str:
-    """Put the paper's number below one's own."""
     return f"{text}\npaper {paper}" if paper not in (None, "") else text
 
 
@@ -301,7 +296,6 @@ def _spread(values: pd.Series, digits: int, n: bool = True) -> str:
 
 
 def _missing(cells: pd.DataFrame) -> str:
-    """Count what is missing by label."""
     counts = cells.loc[~cells["done"], "label"].value_counts(sort=False)
     return ", ".join(f"{label} {count}" for label, count in counts.items())
 
@@ -405,7 +399,6 @@ def _provenance(page: Page, jobs: pd.DataFrame) -> None:
 
 
 def _experiment(page: Page, experiment: str, scale: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
-    """Report an experiment by the kinds of its jobs."""
     name = _plain(f"{experiment}-{scale}")
     known = EXPERIMENTS.get(experiment)  # a plugin's own may not be loaded here
     page.section(f"{known.title if known else experiment}{f' ({scale})' if scale else ''}", name)
@@ -477,9 +470,8 @@ def _runs(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> tuple[pd.DataF
 def _score_table(page: Page, runs: pd.DataFrame, caption: str) -> None:
     """Show a row per task as the paper does, or per method where few tasks have many methods."""
     cells = {}
-    for (label, task, *place), own in runs.groupby(["label", "task", "group", "task_name", "colors"])[
-        "score"
-    ]:
+    groups = runs.groupby(["label", "task", "group", "task_name", "colors"])["score"]
+    for (label, task, *place), own in groups:
         text = _spread(own, 0 if abs(own.mean()) >= 10 else 1)
         cells[label, task] = _beside(text, published.published_score(label, *place))
     labels, tasks = in_order(runs["label"]), list(runs["task"].unique())
@@ -494,7 +486,6 @@ NORMALIZED = {"mean / DrQ": mean, "IQM / DrQ": iqm, "median / DrQ": median, "opt
 
 
 def _aggregates(page: Page, runs: pd.DataFrame) -> None:
-    """Aggregate over the tasks on which every method has runs."""
     labels = in_order(runs["label"])
     has_run = runs.groupby(["task", "label"], sort=False).size().unstack().notna()[labels]
     shared = has_run.index[has_run.all(axis=1)]
@@ -577,7 +568,6 @@ def _estimated(found: Any, **about: Any) -> pd.DataFrame:
 
 
 def _learning_curves(page: Page, name: str, points: pd.DataFrame) -> None:
-    """Draw mean episode return along training, a panel per task."""
     drawn = []
     for (task, label), own in points.groupby(["task", "label"], sort=False):
         runs = own.pivot_table("score", ["task", "encoder", "run"], "env_steps").dropna(axis=1)
@@ -598,7 +588,6 @@ def _learning_curves(page: Page, name: str, points: pd.DataFrame) -> None:
 
 
 def _sensitivity(page: Page, name: str, runs: pd.DataFrame, varied: str) -> None:
-    """Draw the normalised mean score against what was varied."""
     runs = runs.assign(score=runs["score"] / runs["expert"]).dropna(subset="score")
     runs["method"] = runs["label"].str.split(f", {varied} ").str[0]
     runs["size"] = pd.to_numeric(runs["value"], errors="coerce")
@@ -616,7 +605,6 @@ def _sensitivity(page: Page, name: str, runs: pd.DataFrame, varied: str) -> None
 
 
 def _efficiency(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
-    """Hours and encoder updates of pre-training by number of domains, beside the paper's on a P100."""
     rows = _records(page, cells, jobs, ["timing"], "timing")
     if rows.empty:
         return
@@ -625,9 +613,8 @@ def _efficiency(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) 
         lambda job: _papers_data(job, jobs)
     )).fillna(0)  # fmt: skip
     table = []
-    for (device, threads, method, count), own in rows.groupby(
-        ["device", "threads", "method", "domains"], sort=False
-    ):
+    groups = rows.groupby(["device", "threads", "method", "domains"], sort=False)
+    for (device, threads, method, count), own in groups:
         average, hours, updates = own.mean(numeric_only=True), math.nan, math.nan
         if method in published.EFFICIENCY and count in (1, 2, 3):
             hours, updates = (told[count - 1] for told in published.EFFICIENCY[method])
@@ -655,7 +642,6 @@ def _efficiency(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) 
 
 
 def _papers_data(job: str, jobs: pd.DataFrame) -> float:
-    """Return how many times the transitions of a timing's data the paper's are."""
     sizes = [jobs.loc[key, "facts"]["transitions"] for key in _needed(job, jobs, "dataset")]
     return 100_000 / float(np.mean(sizes)) if sizes else math.nan
 
@@ -783,14 +769,14 @@ def left_plateau(record: pd.DataFrame) -> float:
 
 
 def _diagnostics(page: Page, name: str, what: str, rows: pd.DataFrame) -> None:
-    """Show where encoders ended and how they came there."""
     shown = {column: title for column, title in DIAGNOSTICS.items() if column in rows}
     points = rows.rename(columns={"job": "line", "updates": "x", **shown})
     points["n"] = points.groupby("label")["line"].transform("nunique").astype(str)
     drawn = list(shown.values())[:3]
     points = points.melt(["label", "line", "x", "n"], drawn, "panel", "y").dropna(subset="y")
     if len(points):
-        logs = rows["ln_num_prototypes"].dropna().unique() if "comp" in shown else ()
+        has_loss = points["panel"].iloc[0] == DIAGNOSTICS["comp"]
+        logs = rows["ln_num_prototypes"].dropna().unique() if has_loss else ()
         marks = {f"ln M = {value:.3f}": value for value in logs}
         caption = f"{what} along pre-training, a line per encoder (n in the legend)."
         page.figure(name, caption, draw(points, "encoder updates", marks=marks))
