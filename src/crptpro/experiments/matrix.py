@@ -8,7 +8,7 @@ from __future__ import annotations
 import inspect
 import re
 import shlex
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any, NamedTuple
@@ -433,12 +433,14 @@ EXPERIMENTS: dict[str, Experiment] = {}
 """In the order of the paper; what it does not have comes last."""
 
 
-def _experiment(title: str) -> Callable[[Callable[[Request], list[Cell]]], None]:
+def _experiment(title: str) -> Callable[[Callable[[Request], Iterator[Cell]]], None]:
     """Register a function as the experiment of its name; its docstring is the summary."""
 
-    def register(cells: Callable[[Request], list[Cell]]) -> None:
+    def register(cells: Callable[[Request], Iterator[Cell]]) -> None:
         summary = " ".join((cells.__doc__ or "").split())
-        EXPERIMENTS[cells.__name__.strip("_")] = Experiment(title, summary, cells)
+        EXPERIMENTS[cells.__name__.strip("_")] = Experiment(
+            title, summary, lambda request: list(cells(request))
+        )
 
     return register
 
@@ -453,36 +455,31 @@ def _scores(
     colors: str = "normal",
     place: Settings = NONE,
     **how: Any,
-) -> list[Cell]:
-    """Return the runs of a system on a task of, or after, a group: every downstream seed on every encoder.
+) -> Iterator[Cell]:
+    """Yield the runs of a system on a task of, or after, a group: every downstream seed on every encoder.
 
     Where there is no encoder to share (DrQ), the encoder seeds count as further seeds of the run, so that every
     system has as many runs.
     """
-    found = []
     where = {"group": group, "task": task, **({} if colors == "normal" else {"colors": colors}), **place}
     for encoder_seed in request.encoder_seeds:
         base = encoder_for_task(request.scale, system, GROUPS[group], task, encoder_seed, **how)
         for seed in request.seeds:
             own = seed if base is not None else seed + SEEDS * encoder_seed
             job = run(request.scale, system, task, base, own, colors=colors)
-            found.append(Cell(label or system, job, {**where, "encoder_seed": encoder_seed, "seed": seed}))
-    return found
+            yield Cell(label or system, job, {**where, "encoder_seed": encoder_seed, "seed": seed})
 
 
 def _table(
     request: Request, rows: Mapping[str, Sequence[str]], systems: Iterable[str], colors: str = "normal"
-) -> list[Cell]:
-    places = [(group, task) for group, tasks in rows.items() for task in tasks]
-    return [
-        cell
-        for place, system in product(places, list(systems))
-        for cell in _scores(request, *place, system, colors=colors)
-    ]
+) -> Iterator[Cell]:
+    for group, tasks in rows.items():
+        for task, system in product(tasks, list(systems)):
+            yield from _scores(request, group, task, system, colors=colors)
 
 
 @_experiment("Tasks of seen domains")
-def _seen(request: Request) -> list[Cell]:
+def _seen(request: Request) -> Iterator[Cell]:
     """Tasks of the domains that the encoder was pre-trained on, for every method (section IV.B)."""
     rows = {group: request.tasks_in(GROUPS[group]) for group in request.groups or GROUPS}
     return _table(request, rows, request.methods or METHODS)
@@ -498,7 +495,7 @@ def _elsewhere(request: Request, rows: Mapping[str, Sequence[str]]) -> dict[str,
 
 
 @_experiment("Tasks of unseen domains")
-def _unseen(request: Request) -> list[Cell]:
+def _unseen(request: Request) -> Iterator[Cell]:
     """Tasks of domains that the encoder never saw, without fine-tuning (section IV.C)."""
     systems = [each for each in request.methods or CROSS_DOMAIN if each != FINETUNE]
     several = [system for system in systems if not is_single_domain(system)]
@@ -506,7 +503,7 @@ def _unseen(request: Request) -> list[Cell]:
 
 
 @_experiment("Reversed background colours")
-def _colors(request: Request) -> list[Cell]:
+def _colors(request: Request) -> Iterator[Cell]:
     """Tasks with the colours of the background reversed, without fine-tuning (section IV.C).
 
     The paper does not say how it reverses them; whole images are the option.
@@ -516,17 +513,16 @@ def _colors(request: Request) -> list[Cell]:
 
 
 @_experiment("Fine-tuning on one domain")
-def _finetune(request: Request) -> list[Cell]:
+def _finetune(request: Request) -> Iterator[Cell]:
     """The encoder of group A trained further on one domain, beside single-domain methods and DrQ (section IV.D)."""
     rows = {group: request.tasks_in(FINETUNE_UPDATES) for group in request.groups or "A"}
     return _table(request, rows, request.methods or ("crptpro", FAST, FINETUNE, "proto-rl-s", "apt-s", DRQ))
 
 
 @_experiment("Ablation: dispersion loss, decoupled collection")
-def _ablation(request: Request) -> list[Cell]:
+def _ablation(request: Request) -> Iterator[Cell]:
     """With and without the dispersion loss, with and without decoupled collection (section IV.F)."""
     # Proto-RL(C) with the dispersion loss is CRPTpro without its decoupled collection.
-    found: list[Cell] = []
     for group in request.groups or ("A", "C"):
         for task in request.tasks_in(GROUPS[group]):
             for system in request.methods or VARIANTS:
@@ -538,37 +534,35 @@ def _ablation(request: Request) -> list[Cell]:
                     explore, weight = request.scale.single_ablation, SINGLE_DISPERSION.get(domain, weight)
                 for label, loss in VARIANTS.get(system, ((system, NONE),)):
                     own = {"intr_loss_coef": weight} if loss == DISPERSION else loss
-                    found += _scores(request, group, task, system, label=label, loss=own, explore=explore)
-    return found
+                    how: dict[str, Any] = {"label": label, "loss": own, "explore": explore}
+                    yield from _scores(request, group, task, system, **how)
 
 
 @_experiment("Sensitivity: weight of the dispersion loss, amount of data")
-def _sensitivity(request: Request) -> list[Cell]:
+def _sensitivity(request: Request) -> Iterator[Cell]:
     """The weight alpha of the dispersion loss, and the capacity b of the random datasets (section IV.F)."""
     # The weight of the dispersion loss; methods without one have nothing to vary. Then the size of the datasets.
-    scale, found = request.scale, list[Cell]()
+    scale = request.scale
     for group in request.groups or "A":
         for task in request.tasks_in(GROUPS[group]):
             for system in request.methods or ("crptpro", "proto-rl-c"):
                 has_weight = "intr_loss_coef" in _loss_defaults(pretraining_of(system))
                 for weight in sorted({0.0, 5e-3, *scale.alphas}) if has_weight else ():
-                    found += _scores(
+                    yield from _scores(
                         request, group, task, system, label=f"{system}, alpha {weight:g}",
                         loss={"intr_loss_coef": weight}, place={"varied": "alpha", "value": f"{weight:g}"},
                     )  # fmt: skip
             sizes = sorted({*scale.capacities, scale.transitions})
             for size in sizes if "crptpro" in (request.methods or ("crptpro",)) else ():
-                found += _scores(
+                yield from _scores(
                     request, group, task, "crptpro", label=f"crptpro, b {size:,}", transitions=size,
                     place={"varied": "b", "value": str(size)},
                 )  # fmt: skip
-    return found
 
 
 @_experiment("Cost of pre-training")
-def _efficiency(request: Request) -> list[Cell]:
+def _efficiency(request: Request) -> Iterator[Cell]:
     """Time and encoder updates of pre-training for one, two and three domains (section IV.E), from a timed part."""
-    found = []
     for group, seed in product(request.groups or "A", request.encoder_seeds):
         for system in (name for name in request.methods or PRETRAINED if name in PRETRAINED):
             for count in range(1, len(GROUPS[group]) + 1):
@@ -576,8 +570,7 @@ def _efficiency(request: Request) -> list[Cell]:
                 sets = [(domain,) for domain in domains] if is_single_domain(system) else [domains]
                 place = {"group": group, "domains": count, "encoder_seed": seed}
                 place |= {"device": request.device, "threads": request.threads}
-                found.append(Cell(system, timing(request, system, sets, seed), place))
-    return found
+                yield Cell(system, timing(request, system, sets, seed), place)
 
 
 def _domain_sets(request: Request, group: str, system: str) -> list[tuple[str, ...]]:
@@ -594,27 +587,26 @@ def _measured(label: str, job: Job, group: str, seed: int, domains: Sequence[str
 
 def _trained(
     request: Request, variants: Mapping[str, Sequence[tuple[str, Settings]]], measure: Callable[[Job], Job]
-) -> list[Cell]:
-    return [
-        _measured(
-            label, measure(encoder(request.scale, system, domains, seed, loss=loss)), group, seed, domains
-        )
-        for group, seed in product(request.groups or "A", request.encoder_seeds)
-        for system in request.methods or variants
-        for domains in _domain_sets(request, group, system)
-        for label, loss in variants.get(system, ())
-    ]
+) -> Iterator[Cell]:
+    """Encoders of methods with prototypes, or what is measured of them."""
+    for group, seed in product(request.groups or "A", request.encoder_seeds):
+        for system in request.methods or variants:
+            for domains, (label, loss) in product(
+                _domain_sets(request, group, system), variants.get(system, ())
+            ):
+                trained = encoder(request.scale, system, domains, seed, loss=loss)
+                yield _measured(label, measure(trained), group, seed, domains)
 
 
 @_experiment("Spread of the prototypes")
-def _prototypes(request: Request) -> list[Cell]:
+def _prototypes(request: Request) -> Iterator[Cell]:
     """How far prototypes spread, along pre-training and at its end, with and without the dispersion loss (IV.G)."""
     return _trained(request, VARIANTS, spread)
 
 
-def _compared(request: Request, kind: str, groups: str, system: str, samples: int) -> list[Cell]:
+def _compared(request: Request, kind: str, groups: str, system: str, samples: int) -> Iterator[Cell]:
     """Random data beside an explorer's, as CRPTpro's encoder sees both: it was trained on all domains."""
-    scale, found = request.scale, []
+    scale = request.scale
     for group, seed in product(request.groups or groups, request.encoder_seeds):
         base = encoder(scale, "crptpro", GROUPS[group], seed)
         for explorer in request.methods or (system,):
@@ -624,18 +616,17 @@ def _compared(request: Request, kind: str, groups: str, system: str, samples: in
                 data = [dataset(scale, d, seed) for d in (domains if kind == "coverage" else GROUPS[group])]
                 exploring = encoder(scale, explorer, domains, seed)
                 job = comparison(kind, base, exploring, data, samples=samples, seed=seed)
-                found.append(_measured(explorer, job, group, seed, domains))
-    return found
+                yield _measured(explorer, job, group, seed, domains)
 
 
 @_experiment("Coverage of the data")
-def _coverage(request: Request) -> list[Cell]:
+def _coverage(request: Request) -> Iterator[Cell]:
     """How widely random data and an explorer's are spread along pre-training (section IV.H)."""
     return _compared(request, "coverage", "A", "proto-rl-c", request.scale.coverage_samples)
 
 
 @_experiment("Stability of pre-training")
-def _stability(request: Request) -> list[Cell]:
+def _stability(request: Request) -> Iterator[Cell]:
     """The comparative loss along pre-training on random data and on an explorer's (section IV.H)."""
     # Without the dispersion loss CRPTpro differs from Proto-RL(C) in its data alone.
     variants = {"crptpro": VARIANTS["crptpro"], FAST: VARIANTS[FAST], "proto-rl-c": (("proto-rl-c", NONE),)}
@@ -643,16 +634,16 @@ def _stability(request: Request) -> list[Cell]:
 
 
 @_experiment("Embeddings of random data and of an explorer's")
-def _visualize(request: Request) -> list[Cell]:
+def _visualize(request: Request) -> Iterator[Cell]:
     """Principal components of random data of three domains and of an explorer's in one of them (section IV.H)."""
     return _compared(request, "embeddings", "BC", "proto-rl-s", request.scale.embedded_samples)
 
 
 @_experiment("State probe")
-def _probe(request: Request) -> list[Cell]:
+def _probe(request: Request) -> Iterator[Cell]:
     """What a linear model reads of the simulator's state from frozen features. Not in the paper."""
     # Tasks of the request choose the domains; an (S) method's one encoder is probed on all of them, too.
-    scale, found = request.scale, []
+    scale = request.scale
     for group, seed in product(request.groups or "A", request.encoder_seeds):
         for system in request.methods or (*PRETRAINED, RANDOM):
             for domain in request.domains or (*GROUPS[group], *PROBED_UNSEEN[group]):
@@ -662,5 +653,4 @@ def _probe(request: Request) -> list[Cell]:
                     continue  # no encoder of its own
                 job = probe(scale, trained, dataset(scale, domain, seed, scale.probe_transitions))
                 place = {"group": group, "domain": domain, "colors": "normal", "encoder_seed": seed}
-                found.append(Cell(system, job, place))
-    return found
+                yield Cell(system, job, place)
