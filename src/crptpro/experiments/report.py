@@ -25,22 +25,10 @@ from crptpro.artifact import read_json, write_whole
 from crptpro.errors import RecordError
 from crptpro.experiments import jobs as records
 from crptpro.experiments import published
+from crptpro.experiments import statistics as stats
 from crptpro.experiments.figures import draw, in_order
 from crptpro.experiments.launch import duration
 from crptpro.experiments.matrix import EXPERIMENTS
-from crptpro.experiments.statistics import (
-    CONFIDENCE,
-    COVERAGE,
-    MIN_RUNS,
-    REPLICATES,
-    estimate,
-    iqm,
-    mean,
-    median,
-    optimality_gap,
-    probability_of_improvement,
-    relative_mean,
-)
 from crptpro.values import as_path
 
 logger = logging.getLogger(__name__)
@@ -49,6 +37,8 @@ ENCODERS = ("encoder", "explored", "finetuned", "untrained")
 """Kinds of jobs that make an encoder."""
 PLACES = ("group", "task", "colors", "encoder_seed", "varied", "value")
 """Columns of cells that tables read."""
+EPISODES = ("env_steps", "episode_return")
+"""Columns of ``eval.csv`` that they read."""
 
 
 def build_report(root: str | Path, *, out: str | Path | None = None) -> Path:
@@ -174,14 +164,12 @@ def _read(path: Path, *columns: str) -> pd.DataFrame:
 def _records(
     page: Page, cells: pd.DataFrame, jobs: pd.DataFrame, kinds: Sequence[str], name: str, *columns: str
 ) -> pd.DataFrame:
-    """Read ``<name>.csv`` of every finished job of these kinds, beside label, job and place of the cells."""
+    """Read ``<name>.csv`` of every finished job of these kinds, with what its cell says besides."""
     found = []
     for cell in cells[cells["done"] & cells["job"].map(jobs["kind"]).isin(kinds)].to_dict("records"):
         try:
             table = _read(jobs.loc[cell["job"], "path"] / f"{name}.csv", *columns)
-            found.append(
-                table.assign(**{key: cell[key] for key in ("label", "job", "group", "encoder_seed")})
-            )
+            found.append(table.assign(**{key: value for key, value in cell.items() if key not in table}))
         except RecordError as reason:
             page.text(f"Left out: {reason}", "warning")
     return pd.concat(found, ignore_index=True) if found else pd.DataFrame()
@@ -226,7 +214,7 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
             content, key = read_json(path / "config.json", error=RecordError), str(path.relative_to(root))
             told = content["config"]
             facts = {"task": told["task"], **told.get("config", told)}
-            episodes = _read(path / "eval.csv", "env_steps", "episode_return")
+            episodes = _read(path / "eval.csv", *EPISODES)
             cell = {"experiment": "runs", "scale": "", "label": episodes["method"].iloc[0], "job": key}
             cell |= {"done": bool(episodes["env_steps"].max() >= facts["env_steps"]), "task": facts["task"]}
         except (RecordError, KeyError, TypeError, AttributeError) as reason:
@@ -235,14 +223,8 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
         cells.append(cell | {"colors": facts.get("colors", "")})
         made = {name: content.get(name) for name in records.MADE} | {"device": facts.get("device")}
         made |= {"machine": records.machine(content.get("hardware") or {}), "path": path}
-        jobs[key] = {
-            "kind": "run",
-            "facts": facts,
-            "needs": [],
-            "command": None,
-            "done": cell["done"],
-            **made,
-        }
+        made |= {"kind": "run", "facts": facts, "needs": [], "command": None, "done": cell["done"]}
+        jobs[key] = made
     table = pd.DataFrame(cells)
     if not len(table) or not table["done"].any():
         raise RecordError(
@@ -358,7 +340,7 @@ def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
             "What this cannot show: which method is ahead after all of the budget, for methods that learn late look "
             "worse here than they are; what an encoder learns after the plateau near ln M, which lasts for over a "
             "thousand updates at batch 512; the method itself, where a smaller batch, replay or dataset changes it. "
-            f"With fewer than {MIN_RUNS} runs on a task there are no intervals, and two or three rank nothing.",
+            f"With fewer than {stats.MIN_RUNS} runs on a task there are no intervals, and two or three rank nothing.",
             "warning",
         )
 
@@ -442,27 +424,21 @@ def _scores(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> N
 
 def _runs(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return a row per run with its place and scores, and one per evaluation with env steps and mean return."""
+    rows = _records(page, cells.sort_values("group", kind="stable"), jobs, ["run"], "eval", *EPISODES)
     runs, points = [], []
-    own = cells[cells["done"] & (cells["job"].map(jobs["kind"]) == "run")]
-    for cell in own.sort_values("group", kind="stable").to_dict("records"):
-        job, path, place = cell["job"], jobs.loc[cell["job"], "path"], {**cell, "task_name": cell["task"]}
-        try:
-            episodes = _read(path / "eval.csv", "env_steps", "episode_return")
-        except RecordError as reason:
-            page.text(f"Left out: {reason}", "warning")
-            continue
-        place["colors"] = cell["colors"] or "normal"
-        place["task"] = f"{cell['group']} {cell['task']}".strip()
-        place["task"] += f", {place['colors']}" if place["colors"] != "normal" else ""
+    for _, own in rows.groupby(["group", "label", "job"], sort=False) if len(rows) else ():
+        place = own[[*PLACES, "label"]].iloc[0].to_dict()
+        job, task, colors = own["job"].iloc[0], place["task"], place["colors"] or "normal"
+        where = f"{place['group']} {task}".strip() + (f", {colors}" if colors != "normal" else "")
+        place |= {"task": where, "task_name": task, "colors": colors, "run": job}
         # Runs on encoders that were fine-tuned from one base share it: it is their one draw of a pre-training.
         encoders = _needed(job, jobs, *ENCODERS)
-        encoder = encoders[-1] if encoders else _json(path / "agent" / "card.json").get("pretrained") or job
-        curve = episodes.groupby("env_steps")["episode_return"].mean()
-        runs.append({
-            **place, "run": job, "encoder": encoder, "score": curve.iloc[-1], "budget": episodes["env_steps"].max(),
-            "expert": published.EXPERT_SCORES.get(cell["task"], math.nan),
-        })  # fmt: skip
-        about = {key: runs[-1][key] for key in ("label", "task", "run", "encoder")}
+        card = jobs.loc[job, "path"] / "agent" / "card.json"
+        place["encoder"] = encoders[-1] if encoders else _json(card).get("pretrained") or job
+        curve = own.groupby("env_steps")["episode_return"].mean()
+        place |= {"score": curve.iloc[-1], "budget": curve.index[-1]}
+        runs.append({**place, "expert": published.EXPERT_SCORES.get(task, math.nan)})
+        about = {key: place[key] for key in ("label", "task", "run", "encoder")}
         points.append(curve.reset_index(name="score").assign(**about))
     return pd.DataFrame(runs), pd.concat(points, ignore_index=True) if points else pd.DataFrame()
 
@@ -482,7 +458,10 @@ def _score_table(page: Page, runs: pd.DataFrame, caption: str) -> None:
         page.table(caption, table.T.reset_index(names="task"))
 
 
-NORMALIZED = {"mean / DrQ": mean, "IQM / DrQ": iqm, "median / DrQ": median, "optimality gap": optimality_gap}
+NORMALIZED = {
+    "mean / DrQ": stats.mean, "IQM / DrQ": stats.iqm, "median / DrQ": stats.median,
+    "optimality gap": stats.optimality_gap,
+}  # fmt: skip
 
 
 def _aggregates(page: Page, runs: pd.DataFrame) -> None:
@@ -502,15 +481,20 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
     rows = list[dict[str, Any]]()
     for label in labels:
         own, own_normal = (frame[frame["label"] == label] for frame in (kept, normal))
-        found, encoders = estimate(mean, own), own.loc[own["encoder"] != own["run"], "encoder"].nunique()
+        found, encoders = (
+            stats.estimate(stats.mean, own),
+            own.loc[own["encoder"] != own["run"], "encoder"].nunique(),
+        )
         line = {"method": label, "tasks": len(shared), "runs": found.runs, "encoders": encoders}
         line["mean score"] = _beside(f"{found:.0f}", _paper_mean(label, places))
         for title, statistic in NORMALIZED.items() if len(normal) else ():
-            line[title] = f"{estimate(statistic, own_normal):.3f}"
+            line[title] = f"{stats.estimate(statistic, own_normal):.3f}"
         if len(normal):
             line["mean / DrQ"] = _beside(line["mean / DrQ"], _paper_mean(label, places, normalized=True))
         if (drq["score"] > 0).all() and len(drq):
-            line["mean / DrQ here"] = "1" if label == "drq" else f"{estimate(relative_mean, own, drq):.3f}"
+            line["mean / DrQ here"] = (
+                "1" if label == "drq" else f"{stats.estimate(stats.relative_mean, own, drq):.3f}"
+            )
         rows.append(line)
     page.table(
         f"Over the {_count(len(shared), 'task')} that all methods share. A task counts once per group and colours, a "
@@ -519,17 +503,17 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
         rows,
     )
     fewest = kept.groupby(["label", "task"]).size().groupby("label").min()
-    if fewest.max() >= MIN_RUNS:
-        held = "; ".join(f"{count}: {share:.0%}" for count, share in COVERAGE.items())
+    if fewest.max() >= stats.MIN_RUNS:
+        held = "; ".join(f"{count}: {share:.0%}" for count, share in stats.COVERAGE.items())
         page.text(
-            f"Brackets are {CONFIDENCE:.0%} intervals ({REPLICATES:,} stratified bootstrap replicates, which redraw "
-            "encoders and then their runs). On one encoder they speak of that encoder, not of the method that made it. "
+            f"Brackets are {stats.CONFIDENCE:.0%} intervals ({stats.REPLICATES:,} stratified bootstrap replicates, which "
+            "redraw encoders and then their runs). On one encoder they speak of that encoder, not of the method that made it. "
             f"Where runs follow a normal law, those of a single task's mean hold the truth, by number of runs, {held}.",
             "warning",
         )
-    if fewest.min() < MIN_RUNS:
+    if fewest.min() < stats.MIN_RUNS:
         page.text(
-            f"Intervals stand where a method has {MIN_RUNS} runs or more on every task; here some have as few as "
+            f"Intervals stand where a method has {stats.MIN_RUNS} runs or more on every task; here some have as few as "
             f"{fewest.min()}. The standard deviations above say how far runs lie apart.",
             "warning",
         )
@@ -539,7 +523,7 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
     rows = []
     for label in in_order(normal["label"]) if len(ours) else ():
         if label != "crptpro":
-            found = estimate(probability_of_improvement, ours, normal[normal["label"] == label])
+            found = stats.estimate(stats.probability_of_improvement, ours, normal[normal["label"] == label])
             told = {"other method": label, "runs of both": found.runs}
             rows.append({**told, "P(crptpro > other)": f"{found:.2f}"})
     page.table(
@@ -573,7 +557,7 @@ def _learning_curves(page: Page, name: str, points: pd.DataFrame) -> None:
         runs = own.pivot_table("score", ["task", "encoder", "run"], "env_steps").dropna(axis=1)
         if runs.empty:  # no evaluation that all runs have
             continue
-        found = estimate(mean, runs.reset_index(), columns=list(runs))
+        found = stats.estimate(stats.mean, runs.reset_index(), columns=list(runs))
         about = {"panel": task, "label": label, "n": str(len(runs))}
         drawn.append(_estimated(found, x=runs.columns, **about, line="mean", thin=False))
         if found.low is None and len(runs) > 1:  # too few for an interval: the runs themselves
@@ -581,8 +565,8 @@ def _learning_curves(page: Page, name: str, points: pd.DataFrame) -> None:
             drawn.append(own.assign(**about, low=math.nan, high=math.nan, thin=True))
     page.figure(
         f"{name}-curves",
-        f"Episode return along training: mean over runs, with {CONFIDENCE:.0%} bootstrap intervals from {MIN_RUNS} "
-        "runs up, below that with a thin line per run.",
+        f"Episode return along training: mean over runs, with {stats.CONFIDENCE:.0%} bootstrap intervals from "
+        f"{stats.MIN_RUNS} runs up, below that with a thin line per run.",
         draw(pd.concat(drawn, ignore_index=True), "env steps", "episode return"),
     )
 
@@ -593,7 +577,7 @@ def _sensitivity(page: Page, name: str, runs: pd.DataFrame, varied: str) -> None
     runs["size"] = pd.to_numeric(runs["value"], errors="coerce")
     points = []
     for (_, value, method), own in runs.groupby(["size", "value", "method"], dropna=False):
-        found = estimate(mean, own)
+        found = stats.estimate(stats.mean, own)
         points.append(_estimated(found, label=method, x=value, n=str(found.runs)))
     what = {"alpha": "weight of the dispersion loss (alpha)", "b": "random transitions per domain (b)"}
     if points:
