@@ -506,9 +506,9 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
     if fewest.max() >= stats.MIN_RUNS:
         held = "; ".join(f"{count}: {share:.0%}" for count, share in stats.COVERAGE.items())
         page.text(
-            f"Brackets are {stats.CONFIDENCE:.0%} intervals ({stats.REPLICATES:,} stratified bootstrap replicates, which "
-            "redraw encoders and then their runs). On one encoder they speak of that encoder, not of the method that made it. "
-            f"Where runs follow a normal law, those of a single task's mean hold the truth, by number of runs, {held}.",
+            f"Brackets are {stats.CONFIDENCE:.0%} intervals ({stats.REPLICATES:,} stratified bootstrap replicates that "
+            "redraw encoders and then their runs). On one encoder they speak of that encoder, not of its method. Where "
+            f"runs follow a normal law, those of a single task's mean hold the truth, by number of runs, {held}.",
             "warning",
         )
     if fewest.min() < stats.MIN_RUNS:

@@ -129,35 +129,22 @@ def estimate(
     rng = np.random.default_rng(seed)
     redrawn = []
     for sample, scores in zip(samples, arrays):
-        names = ([task[name].tolist() for task in sample.values()] for name in ("encoder", "run"))
-        indices = resample(*names, replicates=replicates, rng=rng)
+        indices = _resample(list(sample.values()), replicates, rng)
         redrawn.append([task[:, index] for task, index in zip(scores, indices)])  # [K, B, R_t] each
     tail = 50 * (1 - CONFIDENCE)
     low, high = np.percentile(statistic(*redrawn), [tail, 100 - tail], axis=-1)
     return Estimate(value, low, high, runs, encoders)
 
 
-def resample(
-    encoders: Sequence[Sequence[str]],
-    runs: Sequence[Sequence[str]],
-    *,
-    replicates: int,
-    rng: np.random.Generator,
+def _resample(
+    tasks: Sequence[pd.DataFrame], replicates: int, rng: np.random.Generator
 ) -> list[NDArray[np.int64]]:
     """Draw encoders with replacement, jointly for the tasks that share them, and then runs of those drawn.
 
     A task keeps its places: the first encoder's ``n`` runs become ``n`` runs of the first encoder drawn, redrawn with
-    replacement, and so on. Tasks with the same runs are redrawn alike.
-
-    Args:
-        encoders: per task, the encoder of each of its runs.
-        runs: per task, the name of each.
-        replicates: how many resamples, ``B``.
-        rng: where chance comes from.
-
-    Returns:
-        One ``[B, R_t]`` of indices into its runs per task.
+    replacement, and so on. Tasks with the same runs are redrawn alike. Returns indices ``[B, R_t]`` per task.
     """
+    encoders = [task["encoder"].tolist() for task in tasks]
     names = [np.unique(labels) for labels in encoders]
     strata = _strata(names)
     ranks = {
@@ -166,8 +153,8 @@ def resample(
     }
     drawn: dict[tuple, NDArray[np.int64]] = {}
     found = []
-    for labels, of_task, own, stratum in zip(encoders, runs, names, strata):
-        same = (tuple(labels), tuple(of_task))
+    for task, labels, own, stratum in zip(tasks, encoders, names, strata):
+        same = (tuple(labels), tuple(task["run"]))
         if same not in drawn:
             place = np.searchsorted(own, labels)  # [R] which encoder a run stands on
             counts = np.bincount(place)
