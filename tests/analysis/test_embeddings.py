@@ -19,23 +19,14 @@ from crptpro.analysis.embeddings import (
 from crptpro.objectives.functional import mean_pairwise_cosine
 
 
-def dataset(brightness: int) -> ReplayBuffer:
-    """Ten observations, each a constant of its own: the i-th is ``brightness + i``."""
-    buffer = ReplayBuffer(storage=LazyTensorStorage(10), batch_size=4)
-    pixels = (brightness + torch.arange(10)).to(torch.uint8).view(10, 1, 1, 1).expand(10, 9, 8, 8)
-    buffer.extend(TensorDict({"pixels": pixels.clone()}, [10]))
-    return buffer
-
-
 class Brightness(nn.Module):
-    """An encoder whose feature is the mean pixel; says where its pixels were."""
+    """An encoder whose feature is the mean pixel."""
 
     def __init__(self) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.ones(1))
 
     def forward(self, pixels: Tensor) -> Tensor:
-        self.seen = pixels.device.type
         return self.weight * pixels.flatten(1).double().mean(1, keepdim=True)
 
 
@@ -46,12 +37,14 @@ def test_embeddings_are_features_or_projections_encoded_where_the_encoder_lives_
     assert (points.dtype, points.requires_grad) == (torch.float32, False)
     head = nn.Linear(1, 3, dtype=torch.float64)
     assert embed_pixels(Brightness(), pixels, projector=head).shape == (150, 3)
-    encoder = Brightness().to("meta")
-    assert embed_pixels(encoder, pixels).device.type == encoder.seen == "meta"
+    assert embed_pixels(Brightness().to("meta"), pixels).device.type == "meta"
 
 
 def test_the_seed_chooses_the_observations_whatever_was_sampled_before() -> None:
-    buffer = dataset(10)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(10))
+    buffer.extend(
+        TensorDict({"pixels": torch.arange(10).view(10, 1, 1, 1).expand(10, 9, 8, 8).clone()}, [10])
+    )
     first, second, other = (sample_pixels(buffer, 50, seed=seed) for seed in (1, 1, 2))
     assert first.shape == (50, 9, 8, 8)
     assert torch.equal(first, second)

@@ -61,9 +61,8 @@ def test_a_method_of_the_users_explores_for_a_reward_of_its_own(
     loaded = load_pretrained(out / "encoder")
     assert (loaded.method, loaded.card["loss"]["config"]["margin"]) == ("slowness-active", 0.5)
     explored = rows(out / "explore.csv")
-    rewards = [
-        float(row["intrinsic_reward/toy-fixed"]) for row in explored if row["intrinsic_reward/toy-fixed"]
-    ]
+    told = [row["intrinsic_reward/toy-fixed"] for row in explored]
+    rewards = [float(reward) for reward in told if reward]
     assert len(rewards) >= len(explored) - 1  # the first row may come before the agent's first update
     assert min(rewards) > 0
 
@@ -116,21 +115,9 @@ def test_a_plugins_world_is_collected_and_learned_with_evaluating_processes(
     (path,) = (tmp_path / "data").iterdir()
     assert len(FrameDataset.open(path)) == 15
 
-    learn = (
-        "downstream",
-        task,
-        "--pretrained",
-        "random-encoder",
-        "--out",
-        tmp_path / "run",
-        "--env-steps",
-        24,
-    )
-    few = (
-        "--random-agent-steps", 4, "--batch-size", 4, "--replay-capacity", 20, "--eval-episodes", 1,
-        "--eval-interval-env-steps", 24, "--hidden-dim", 8, "--queue-size", 16, "--eval-workers", 1,
-    )  # fmt: skip
-    status, _, err = call("--plugin", world, *learn, *few)
+    learn = ("downstream", task, "--pretrained", "random-encoder", "--out", tmp_path / "run")
+    few = ("--env-steps", 24, "--random-agent-steps", 4, "--eval-interval-env-steps", 24, "--eval-workers", 1)
+    status, _, err = call("--plugin", world, *learn, *SMALL, *few)
     assert status == 0, err
     assert "MUJOCO" not in err
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from types import SimpleNamespace
 
+import pandas as pd
 import pytest
 import torch
 from command import SIZE, Call, rows
 from toy_world import collect_toy, random_episode, write_dataset
 
-from crptpro.data import collect_random
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import save_pretrained
@@ -41,27 +41,23 @@ def test_an_encoder_and_the_control_are_probed_with_table_and_csv(
     file = tmp_path / "new" / "probe.csv"
     status, out, _ = call("probe", encoder, dataset, "--csv", file)
     assert status == 0
-    embeddings = ("features", "z")
     assert [line[:5] for line in table(out)] == [
-        ["crptpro", "toy", "yes", "normal", each] for each in embeddings
+        ["crptpro", "toy", "yes", "normal", z] for z in ("features", "z")
     ]
-    found = rows(file)
-    own = [row for row in found if row["embedding"] == "z"]
-    assert [(row["measure"], row["coordinate"]) for row in own] == [
+    found = pd.read_csv(file)
+    own = found[found["embedding"] == "z"].fillna("")
+    assert list(zip(own["measure"], own["coordinate"])) == [
         *(("r2_position", f"qpos[{index}]") for index in range(4)),
         *(("r2_velocity", f"qvel[{index}]") for index in range(3)),
         *((name, "") for name in ("r2_position", "r2_velocity", "effective_rank", "mean_cosine")),
     ]
-    assert {(row["encoder"], row["method"], row["samples"], row["held_out_episodes"]) for row in found} == {
-        (str(encoder), "crptpro", "60", "2")
-    }
-    assert table(out)[1][5] == f"{float(own[-4]['value']):.3f}"
+    about = found[["encoder", "method", "samples", "held_out_episodes"]].drop_duplicates()
+    assert about.to_numpy().tolist() == [[str(encoder), "crptpro", 60, 2]]
+    assert table(out)[1][5] == f"{own['value'].iloc[-4]:.3f}"
 
     status, out, _ = call("probe", "random-encoder", dataset, "--samples", 40)
     assert status == 0
-    assert [line[:5] for line in table(out)] == [
-        ["random-encoder", "toy", "no", "normal", embedding] for embedding in embeddings
-    ]
+    assert [line[:3] for line in table(out)] == [["random-encoder", "toy", "no"]] * 2
 
 
 @pytest.mark.parametrize(("arguments", "message"), [
@@ -95,14 +91,3 @@ def test_an_encoder_of_other_images_and_data_without_state_are_refused(
     assert "no physical state" in err
     assert [line[:2] for line in table(out)] == [["random-encoder", "toy"]] * 2
     assert len(rows(file)) > 4
-
-
-@pytest.mark.gl
-def test_a_real_domain_is_probed(call: Call, tmp_path: Path) -> None:
-    settings = {"image_size": 24, "action_repeat": 20, "quality": "fast", "progress": False}
-    collect_random("pendulum", tmp_path, transitions=300, **settings)
-    file = tmp_path / "probe.csv"
-    status, out, err = call("probe", "random-encoder", tmp_path / "pendulum", "--samples", 150, "--csv", file)
-    assert status == 0, err
-    assert {row["coordinate"] for row in rows(file)} == {"", "hinge", "sin hinge", "cos hinge"}
-    assert float(table(out)[0][5]) > 0.2  # even a random encoder sees where the pole is

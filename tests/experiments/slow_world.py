@@ -46,7 +46,7 @@ gymnasium.register(WORLD, SlowWorld, max_episode_steps=20)
 
 def slow(request: Request) -> list[Cell]:
     """A collection of some seconds."""
-    return [Cell("slow", dataset(request.scale, f"gymnasium:{WORLD}", 0, 400), {"seed": 0})]
+    return [Cell("slow", dataset(request.scale, f"gymnasium:{WORLD}", 0, 300), {"seed": 0})]
 
 
 EXPERIMENTS["slow"] = Experiment("Slow", "A collection of some seconds.", slow)

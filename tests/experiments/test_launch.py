@@ -8,18 +8,23 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import gymnasium
 import psutil
 import pytest
 from filelock import FileLock
 
 import crptpro
+from crptpro import plugins
 from crptpro.artifact import read_json, write_json
+from crptpro.cli import main
 from crptpro.errors import CRPTproError, SubmissionError
-from crptpro.experiments import launch
+from crptpro.experiments import launch, matrix
 from crptpro.experiments.jobs import Job, describe, make_plan
 from crptpro.experiments.launch import (
     Failure,
@@ -32,7 +37,6 @@ from crptpro.experiments.launch import (
     slurm_parameters,
 )
 
-SLOW_WORLD = Path(__file__).with_name("slow_world.py")
 ROOT = Path(crptpro.__file__).parents[1]
 UNTRAINED = Job(
     "untrained", "u", ("pretrain", "--method", "random-encoder", "--out", "{out}", "--seed", "0"), {}
@@ -51,8 +55,7 @@ class FakeLauncher:
     def __init__(self, *, lost: dict[str, int] | None = None, refuses: int = 0) -> None:
         self.started: list[Work] = []
         self.at_once: list[set[str]] = []
-        self.lost = dict(lost or {})
-        self.refuses, self.running = refuses, set[str]()
+        self.lost, self.refuses, self.running = dict(lost or {}), refuses, set[str]()
 
     def start(self, work: Work, *, is_exclusive: bool) -> Any:
         if self.started and self.refuses:
@@ -61,26 +64,20 @@ class FakeLauncher:
         self.started.append(work)
         self.running.add(work.key)
         self.at_once.append(set(self.running))
-        return FakeHandle(self, work)
+        looks = iter([None])
 
+        def poll() -> str | None:
+            for look in looks:
+                return look
+            name = work.key.split("-")[1]
+            self.running.discard(work.key)
+            if self.lost.get(name, 0):
+                self.lost[name] -= 1
+                return "it was lost"
+            write_json(work.directory / "done.json", {})
+            return ""
 
-class FakeHandle:
-    def __init__(self, launcher: FakeLauncher, work: Work) -> None:
-        self.launcher, self.work, self.looks = launcher, work, 0
-
-    def poll(self) -> str | None:
-        self.looks += 1
-        if self.looks < 2:
-            return None
-        name = self.work.key.split("-")[1]
-        self.launcher.running.discard(self.work.key)
-        if self.launcher.lost.get(name, 0):
-            self.launcher.lost[name] -= 1
-            return "it was lost"
-        write_json(self.work.directory / "done.json", {})
-        return ""
-
-    def stop(self) -> None: ...
+        return SimpleNamespace(poll=poll, stop=lambda: None)
 
 
 @pytest.fixture(autouse=True)
@@ -113,10 +110,9 @@ def test_what_measures_time_is_alone_and_has_all_cores(tmp_path: Path) -> None:
     launcher = FakeLauncher()
     wanted = [job("t", kind="timing"), job("a"), job("b"), job("u", kind="timing")]
     launched(tmp_path, *wanted, launcher=launcher, jobs=2, cores=3)
-    alone = {
-        work.key: (len(at_once), work.threads) for work, at_once in zip(launcher.started, launcher.at_once)
-    }
-    assert [alone[each.key] for each in wanted] == [(1, 6), (1, 3), (2, 3), (1, 6)]
+    threads = {work.key: work.threads for work in launcher.started}
+    assert [threads[each.key] for each in wanted] == [6, 3, 3, 6]
+    assert sorted(map(len, launcher.at_once)) == [1, 1, 1, 2]
 
 
 def test_a_lost_job_is_tried_again_and_what_needs_a_failed_one_is_not_started(tmp_path: Path) -> None:
@@ -145,6 +141,28 @@ def test_a_queue_that_is_full_for_a_while_loses_nothing_but_one_that_takes_no_jo
         launched(tmp_path / "b", job("a"), launcher=Closed())
 
 
+@pytest.mark.parametrize(("number", "error"), [
+    (signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit), (signal.SIGHUP, SystemExit),
+])  # fmt: skip
+def test_a_signal_stops_all_jobs_at_a_checkpoint_and_a_second_one_at_once(
+    tmp_path: Path, number: signal.Signals, error: type[BaseException]
+) -> None:
+    stopped: list[str] = []
+
+    class Interrupted(FakeLauncher):
+        def start(self, work: Work, *, is_exclusive: bool) -> Any:
+            def poll() -> str | None:
+                if len(stopped) < 4:
+                    signal.raise_signal(number)
+                return ""
+
+            return SimpleNamespace(poll=poll, stop=lambda: stopped.append(work.key))
+
+    with pytest.raises(error):
+        launched(tmp_path, job("a"), job("b"), job("c", job("a")), launcher=Interrupted(), jobs=2)
+    assert stopped == [job("a").key, job("b").key] * 2
+
+
 def test_a_job_has_its_whole_command(tmp_path: Path) -> None:
     data = Job("dataset", "d", ("collect", "walker", "--out", "{out}"), {})
     trained = Job("encoder", "e", ("pretrain", f"{{{data.key}}}/walker", "--out", "{out}"), {}, (data,))
@@ -171,20 +189,19 @@ def test_an_attempt_says_in_its_log_why_it_failed_and_the_time_of_earlier_ones_c
             raise ending
 
     monkeypatch.setattr("crptpro.cli.main", main)
-    wanted = job("a")
+    monkeypatch.setattr(sys, "argv", sys.argv)
+    wanted, earlier = job("a"), time.time() - 1_000
     describe(tmp_path, make_plan([wanted], tmp_path))
     directory = tmp_path / "jobs" / wanted.key
-    earlier = time.time() - 1_000
     write_json(directory / "clock.json", {"seconds": 100.0, "attempts": 2, "began": earlier})
     (directory / "train.csv").touch()
-    os.utime(directory / "train.csv", (earlier + 50, earlier + 50))
-    os.utime(directory / "clock.json", (earlier, earlier))
-    os.utime(directory / "job.json", (earlier, earlier))
-    with launch._output_to(directory / "log.txt"):
+    for name, at in (("train.csv", earlier + 50), ("clock.json", earlier), ("job.json", earlier)):
+        os.utime(directory / name, (at, at))
+    log = open(directory / "log.txt", "w", buffering=1)  # noqa: SIM115
+    with log, redirect_stdout(log), redirect_stderr(log):
         assert Work(str(tmp_path), wanted.key).run() == reason
-    assert (directory / "log.txt").read_text().splitlines()[-1] == (
-        f"error: {reason}" if reason else "finished"
-    )
+    last = (directory / "log.txt").read_text().splitlines()[-1]
+    assert last == (f"error: {reason}" if reason else "finished")
     if reason:
         assert read_json(directory / "clock.json")["attempts"] == 3
     else:
@@ -220,11 +237,8 @@ def test_a_machine_is_divided_among_jobs(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0,1")
     monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
 
-    def divided(
-        launcher: str = "local", device: str = "cpu", **given: Any
-    ) -> tuple[int, int, tuple[str, ...]]:
-        found = divide(launcher, device=device, **{"jobs": None, "cores": None, **given})
-        return found.jobs, found.cores, found.gpus
+    def divided(launcher: str = "local", device: str = "cpu", **given: Any) -> tuple:
+        return divide(launcher, device=device, **{"jobs": None, "cores": None, **given})
 
     assert divided() == (8, 1, ())
     assert divided(jobs=3) == (3, 2, ())
@@ -233,8 +247,7 @@ def test_a_machine_is_divided_among_jobs(monkeypatch: pytest.MonkeyPatch) -> Non
     assert divided(device="cuda:1") == (1, 8, ())
     assert divided("slurm") == (16, 1, ())
     assert divided("ray", "cuda", jobs=5) == (5, 4, ())
-    with pytest.raises(CRPTproError, match="more than the 2 that the GPUs take"):
-        divided(device="cuda", jobs=3)
+    assert divided(device="cuda", jobs=3) == (2, 4, ("0", "1"))  # more would not find room
 
 
 def test_gpus_are_shared_evenly_and_jobs_have_their_threads(
@@ -256,11 +269,7 @@ def test_gpus_are_shared_evenly_and_jobs_have_their_threads(
     assert sorted(environments) == [("0", "3"), ("0", "3"), ("1", "3"), ("1", "3")]
 
 
-def test_what_slurm_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    usual = {"partition": None, "hours": 1.0, "memory_gb": 2.0, "sbatch": (), "has_gpu": False}
-    assert slurm_parameters(**usual) == {"time": 60, "mem": "2048M"}  # type: ignore[arg-type]
-    gpu = slurm_parameters(**{**usual, "has_gpu": True, "sbatch": ("--qos=high",)})  # type: ignore[arg-type]
-    assert (gpu["gpus_per_node"], gpu["additional_parameters"]) == (1, {"qos": "high"})
+def test_slurm_needs_its_commands(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.which", lambda name: None)
     with pytest.raises(CRPTproError, match="needs sbatch and srun"):
         SlurmLauncher({})
@@ -275,8 +284,9 @@ def test_a_slurm_job_asks_for_its_cores_and_a_refusal_is_said(
         (folder / name).write_text("#!/bin/sh\necho Submitted batch job 12\n")
         (folder / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
-    parameters = {"time": 5, "mem": "2048M", "gpus_per_node": 1, "additional_parameters": {"qos": "high"}}
-    launcher, work = SlurmLauncher(parameters), Work(str(tmp_path), "key", threads=4)
+    asked: dict[str, Any] = {"partition": None, "hours": 1 / 12, "memory_gb": 2.0, "sbatch": ("--qos=high",)}
+    launcher = SlurmLauncher(slurm_parameters(**asked, has_gpu=True))
+    work = Work(str(tmp_path), "key", threads=4)
     launcher.start(work, is_exclusive=True)
     [script] = (tmp_path / "submitted").rglob("12_submission.sh")
     lines = script.read_text().splitlines()
@@ -291,58 +301,45 @@ def test_a_slurm_job_asks_for_its_cores_and_a_refusal_is_said(
 # --- real processes -------------------------------------------------------------------------------------------------
 
 
-HEEDS_SIGINT = """
-import os, signal, sys
-signal.signal(signal.SIGINT, signal.SIG_DFL)
-os.execv(sys.argv[1], sys.argv[1:])
-"""
-
-
-def reproduce_slowly(root: Path) -> subprocess.Popen:
-    """Run the slow experiment of a plugin, in processes that find this source."""
-    words = [sys.executable, "-m", "crptpro", "--plugin", SLOW_WORLD, "reproduce", "slow", "--scale", "tiny"]
-    words += ["--jobs", 1, "--cores-per-job", 1, "--out", root]
-    # A shell's background job ignores Ctrl-C, and so would what it starts.
-    command = [sys.executable, "-c", HEEDS_SIGINT, *map(str, words)]
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    return subprocess.Popen(
-        command, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "PYTHONPATH": path},
-    )  # fmt: skip
-
-
 def _collected(root: Path) -> int:
     return sum(read_json(path)["episodes"] for path in root.glob("jobs/dataset-*/*/collection.json"))
 
 
-def _wait_for(condition: Callable[[], Any], process: subprocess.Popen) -> None:
-    deadline = time.monotonic() + 300
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
+@pytest.fixture
+def plugin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A file with an experiment of some seconds; what it registers is forgotten afterwards."""
+    monkeypatch.setattr(plugins, "_loaded", [])
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    monkeypatch.setattr(matrix, "EXPERIMENTS", matrix.EXPERIMENTS.copy())
+    monkeypatch.setattr("crptpro.cli.reproduce.EXPERIMENTS", matrix.EXPERIMENTS)
+    yield Path(__file__).with_name("slow_world.py")
+    gymnasium.registry.pop("SlowWorld-v0", None)
+    sys.modules.pop("slow_world", None)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGKILL])
-def test_a_command_that_is_stopped_or_killed_continues(tmp_path: Path, by: signal.Signals) -> None:
+def test_a_command_that_is_killed_continues(
+    tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
     root = tmp_path / "root"
-    first = reproduce_slowly(root)
-    _wait_for(lambda: _collected(root) >= 3, first)
-    processes = psutil.Process(first.pid).children(recursive=True)
+    words = ("reproduce", "slow", "--scale", "tiny", "--jobs", 1, "--cores-per-job", 1, "--out", root)
+    arguments = ["--plugin", *map(str, (plugin, *words))]
+    command = subprocess.Popen([sys.executable, "-m", "crptpro", *arguments], start_new_session=True)
+    deadline = time.monotonic() + 300
+    while _collected(root) < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    processes = psutil.Process(command.pid).children(recursive=True)
     assert processes
-    os.killpg(first.pid, by)  # as a terminal does
-    _, err = first.communicate(timeout=120)
-    assert first.returncode == (130 if by == signal.SIGINT else -9), err
-    _, alive = psutil.wait_procs(processes, timeout=60)
-    assert not alive
-    assert 3 <= _collected(root) < 20
+    os.killpg(command.pid, signal.SIGKILL)
+    command.wait()
+    assert not psutil.wait_procs(processes, timeout=60)[1]
+    assert 2 <= _collected(root) < 15
     assert not list(root.glob("jobs/*/done.json"))
 
-    again = reproduce_slowly(root)
-    out, err = again.communicate(timeout=300)
-    assert again.returncode == 0, err
-    assert "All of it is there" in out
+    monkeypatch.setattr(sys, "argv", ["crptpro", *arguments])
+    main()
+    assert "All of it is there" in capsys.readouterr().out
     [done] = root.glob("jobs/*/done.json")
     assert read_json(done)["attempts"] == 2
     [card] = root.glob("jobs/dataset-*/*/card.json")
@@ -353,14 +350,10 @@ def test_a_command_that_is_stopped_or_killed_continues(tmp_path: Path, by: signa
 def test_a_slurm_job_runs_as_submitit_runs_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launch, "POLL_S", 0.2)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
-    wanted = UNTRAINED
-    broken = Job("run", "b", ("evaluate", "{out}/nothing"), {})
     launcher = SlurmLauncher({"timeout_min": 60}, cluster="local")
-    failures = run_jobs(make_plan([wanted, broken], tmp_path), tmp_path, launcher, jobs=2, attempts=1)
-    assert (tmp_path / "jobs" / wanted.key / "encoder" / "weights.safetensors").exists()
-    assert read_json(tmp_path / "jobs" / wanted.key / "done.json")["threads"] == 1
-    assert [failure.key for failure in failures] == [broken.key]
-    assert failures[0].reason == (tmp_path / "jobs" / broken.key / "log.txt").read_text().splitlines()[-1][7:]
+    assert run_jobs(make_plan([UNTRAINED], tmp_path), tmp_path, launcher, attempts=1) == []
+    assert (tmp_path / "jobs" / UNTRAINED.key / "encoder" / "weights.safetensors").exists()
+    assert read_json(tmp_path / "jobs" / UNTRAINED.key / "done.json")["threads"] == 1
     assert not list((tmp_path / "submitted").iterdir())
 
 
@@ -373,21 +366,21 @@ def test_ray_runs_jobs_and_one_whose_worker_died_is_tried_again(
     monkeypatch.setenv("RAY_ADDRESS", "local")
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     ray = pytest.importorskip("ray")
-    wanted = UNTRAINED
-    plan = make_plan([wanted], tmp_path)
+    plan = make_plan([UNTRAINED], tmp_path)
     describe(tmp_path, plan)
-    log = tmp_path / "jobs" / wanted.key / "log.txt"
-    launcher = RayLauncher()
-    killed: list[int] = []
+    directory = tmp_path / "jobs" / UNTRAINED.key
+    launcher, killed = RayLauncher(), list[int]()
     start = launcher.start
 
     def start_and_kill(work: Work, *, is_exclusive: bool) -> Any:
-        handle = start(work, is_exclusive=is_exclusive)
-        deadline = time.monotonic() + 120
+        handle, deadline = start(work, is_exclusive=is_exclusive), time.monotonic() + 120
         while not killed and time.monotonic() < deadline:
-            if log.exists() and "process " in log.read_text():
-                killed.append(int(log.read_text().split("process ")[1].split(",")[0]))
-                os.kill(killed[0], signal.SIGKILL)
+            if (directory / "log.txt").exists() and "process " in (directory / "log.txt").read_text():
+                process = psutil.Process(
+                    int((directory / "log.txt").read_text().split("process ")[1].split(",")[0])
+                )
+                killed.append(process.ppid())
+                os.kill(process.ppid(), signal.SIGKILL)
             time.sleep(0.01)
         return handle
 
@@ -397,7 +390,7 @@ def test_ray_runs_jobs_and_one_whose_worker_died_is_tried_again(
     finally:
         ray.shutdown()
     assert killed
-    assert (tmp_path / "jobs" / wanted.key / "encoder" / "weights.safetensors").exists()
+    assert (directory / "encoder" / "weights.safetensors").exists()
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1"])

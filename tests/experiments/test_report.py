@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import html
 import os
 import re
 import shutil
 import subprocess
 from collections.abc import Iterable, Mapping
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from crptpro.experiments.report import Page, build_report, left_plateau
 
 RESULTS = Path(__file__).parents[2] / "results"
 HARDWARE = {"cpu": "A CPU", "cpu_cores": 2, "ram_bytes": 24 * 2**30, "gpus": []}
-START_S = 1_795_000_000.0
 
 
 class Report:
@@ -36,11 +35,9 @@ class Report:
             r"^(?:\*\*|<details><summary>)(.+?)(?:\*\*|</summary>)\n\n((?:\|.*\n)+)", self.text, re.M
         )
         for caption, table in blocks:
-            head, _, *rows = [
-                re.split(r" (?<!\\)\| ", f" {line[1:-1]} ") for line in table.strip().split("\n")
-            ]
-            cells = [[cell.strip() for cell in row] for row in rows]
-            self.tables[caption] = pd.DataFrame(cells, columns=[name.strip() for name in head])
+            lines = [re.split(r"(?<!\\)\|", line)[1:-1] for line in table.strip().split("\n")]
+            head, _, *rows = [[cell.strip() for cell in line] for line in lines]
+            self.tables[caption] = pd.DataFrame(rows, columns=head)
 
     def table(self, caption: str) -> pd.DataFrame:
         (found,) = [table for name, table in self.tables.items() if name.startswith(caption)]
@@ -64,11 +61,11 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Report:
 
 def test_every_experiment_is_counted_and_every_job(seen: Report) -> None:
     counts = seen.table("Experiments: numbers that were asked for").set_index("experiment")
-    assert counts["finished"].to_dict() == {
-        "seen": "22", "efficiency": "24", "prototypes": "7", "coverage": "1", "stability": "4", "visualize": "1",
-        "probe": "90",
-    }  # fmt: skip
-    assert set(counts["missing"]) == {"nothing"}
+    assert list(counts["finished"].items()) == [
+        ("seen", "22"), ("efficiency", "24"), ("prototypes", "7"), ("coverage", "1"), ("stability", "4"),
+        ("visualize", "1"), ("probe", "90"),
+    ]  # fmt: skip
+    assert (counts["finished"] == counts["asked for"]).all()
     assert "22 of 22 run" in seen.text
     assert "24.9 h of work in all" in seen.text
     assert len(seen.table("probe: 90 jobs")) == 90
@@ -81,16 +78,14 @@ def test_budgets_stand_beside_the_papers(seen: Report) -> None:
         "prototypes": "128", "env steps of exploration (C)": "40,000", "decisions per encoder update (C)": "6",
         "downstream env steps": "20,000", "DrQ's env steps": "20,000", "downstream batch": "128",
         "downstream learning rate": "0.001", "downstream replay": "12,000", "render quality": "exact",
-        "downstream seeds per encoder": "2",
+        "downstream runs per encoder": "2",
     }  # fmt: skip
     assert "What this cannot show" in seen.text
 
 
 def test_returns_stand_beside_the_papers_without_intervals_of_two_runs(seen: Report) -> None:
-    returns = (
-        seen.table("Episode return at the final evaluation").set_index("method")["A walker_run"].to_dict()
-    )
-    assert returns == {
+    returns = seen.table("Episode return at the final evaluation").set_index("method")["A walker_run"]
+    assert returns.to_dict() == {
         "crptpro": "56 ± 2 (n = 2) · paper 513 ± 33", "crptpro-fast": "64 ± 8 (n = 2)",
         "crptpro-finetune": "39 ± 17 (n = 2)", "proto-rl-c": "53 ± 1 (n = 2) · paper 431 ± 83",
         "proto-rl-s": "69 ± 6 (n = 2)", "atc": "48 ± 1 (n = 2) · paper 271 ± 16",
@@ -103,53 +98,49 @@ def test_returns_stand_beside_the_papers_without_intervals_of_two_runs(seen: Rep
         "1", "2", "1", "56 · paper 513", "0.116 · paper 1.058", "0.116", "0.116", "0.884",
     ]  # fmt: skip
     assert over["mean / DrQ here"].to_dict()["proto-rl-s"] == "1.447"
-    improvement = seen.table("Probability that a run of crptpro").set_index("other method")[
-        "P(crptpro &gt; other)"
-    ]
+    improvement = seen.table("Probability that a run of crptpro").set_index("other method").iloc[:, -1]
     assert improvement[["crptpro-fast", "apt-c", "random-encoder"]].tolist() == ["0.00", "0.50", "1.00"]
     assert not re.search(r"\\\[-?\d+(\.\d+)?, ", seen.text)  # an interval
     assert "here some have as few as 2." in seen.text
     assert "Brackets are" not in seen.text
 
 
-def test_what_scores_took_is_told_with_the_machine(seen: Report) -> None:
-    took = seen.table("What scores took").set_index("method")
-    assert took.loc["crptpro"].tolist() == [
-        "1", "3,000", "120,000", "38 min", "20 min", "2 of 20,000 env steps", "27 min", "1",
-    ]  # fmt: skip
-    assert took["encoder updates"][["crptpro-finetune", "becl", "drq", "random-encoder"]].tolist() == [
-        "3,030", "2,997", "9,000 · with the task", "0",
-    ]  # fmt: skip
-    assert took.loc["becl", ["pre-training", "one run", "made on"]].tolist() == ["2.6 h", "16 min", "1, 4"]
-    assert "4: Intel(R) Xeon(R) Processor, 2 cores, 24 GiB, no GPU, 1 thread" in seen.text
+def test_what_jobs_took_is_told_with_the_machine(seen: Report) -> None:
+    took = seen.table("What jobs took").set_index(["kind", "of", "machine"])
+    assert took.loc[("explored", "becl", "2")].tolist() == ["1", "2,997", "40,002", "2.6 h"]
+    assert took.loc[("encoder", "atc", "1"), ["updates", "wall clock"]].tolist() == ["3,000", "20 min"]
+    assert took.loc[("dataset", "walker", "1"), ["env_steps", "wall clock"]].tolist() == ["40,000", "10 min"]
+    assert took.loc[("run", "drq", "1"), ["jobs", "wall clock"]].tolist() == ["2", "85 min"]
+    machines = seen.table("Machines").set_index("machine")["where"].to_dict()
+    assert machines["2"] == "Intel(R) Xeon(R) Processor, 2 cores, 24 GiB, no GPU, 1 thread"
     assert "Times compare only within one machine" in seen.text
 
 
 def test_hours_of_the_papers_budget_include_collecting(seen: Report) -> None:
-    hours = seen.table("Pre-training by number of domains on cpu, 2 threads").set_index(["method", "domains"])
+    hours = seen.table("Pre-training by number of domains").set_index(["method", "domains"])
     crptpro, explorer = hours.loc[("crptpro", "3")], hours.loc[("proto-rl-c", "3")]
     assert crptpro[["s per encoder update", "hours at this scale"]].tolist() == ["0.133 (n = 1)", "0.111"]
     assert crptpro[["hours of collecting", "hours, paper's budget"]].tolist() == ["0.435", "5.73 · paper 4.8"]
     assert (crptpro["the same and collecting"], explorer["the same and collecting"]) == ("7.91", "12.7")
     assert hours.loc[("apt-s", "3"), "hours, paper's budget"] == "158 · paper 61.8"
     assert hours.loc[("becl", "2"), "encoder updates, paper's budget"] == "144,000 · paper 50,000"
-    assert hours.loc[("crptpro-fast", "1"), "made on"] == "2"
+    assert hours.loc[("crptpro-fast", "1"), ["on", "machine"]].tolist() == ["2 threads", "7"]
 
 
 def test_measurements_of_encoders_and_data_are_those_of_their_records(seen: Report) -> None:
     spread = seen.table("Spread of the prototypes at the end").set_index("variant")
     assert spread.loc["crptpro with L_intr"].tolist() == [
-        "A", "1", "3,000", "125.156 · paper -26.545", "3.513", "2.848 · paper 7.996", "1.726 · paper -31.080",
+        "1", "3,000", "125.156 · paper -26.545", "3.513", "2.848 · paper 7.996", "1.726 · paper -31.080",
     ]  # fmt: skip
     assert spread.loc["crptpro-fast with L_intr", "KNE, k = 3"] == "3028.036"
     assert spread.loc["proto-rl-s without L_intr", "ANE"] == "6.620 · paper 48.774"
     assert seen.cell("Coverage at the end", "coverage", "walker", "proto-rl-c explorer") == "0.2630"
-    assert seen.cell("Coverage at the end", "mean of all windows", "walker", "random policy") == "0.2467"
-    finals = seen.table("Group A: diagnostics at the end").set_index("encoder")
+    assert seen.cell("Coverage at the end", "all windows", "walker", "random policy") == "0.2467"
+    finals = seen.table("Group A: diagnostics at the end").set_index("label")
     assert finals["left the plateau at"].to_dict() == {
         "crptpro": "1,700", "crptpro without dispersion": "1,700", "crptpro-fast": "600", "proto-rl-c": "1,250",
     }  # fmt: skip
-    assert finals.loc["crptpro", r"comparative loss \[nats\]"] == "4.744 · wobble 0.0053"
+    assert finals.loc["crptpro", r"comparative loss \[nats\]"] == "4.744"
 
 
 @pytest.mark.parametrize(("table", "encoder", "column", "number"), [
@@ -174,7 +165,7 @@ def test_both_files_show_every_table_and_figures_that_are_there(seen: Report) ->
     assert {path.name for path in (seen.folder / "figures").iterdir()} == {Path(file).name for file in shown}
     for file in shown:
         assert len(np.unique(imread(seen.folder / file)[..., 0])) > 20, file
-    assert len(shown) == 7
+    assert len(shown) == 5
 
 
 # --- made-up records ------------------------------------------------------------------------------------------------
@@ -185,17 +176,13 @@ def write_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     pd.DataFrame(list(rows)).to_csv(path, index=False)
 
 
-def evaluations(score: float, *, method: str = "crptpro", places: int = 11) -> list[dict]:
-    """An hour in which the return rises from 0 to a score, with a pause before the last evaluation."""
-    shares = np.linspace(0, 1, places)
+def evaluations(score: float, *, method: str = "crptpro") -> list[dict]:
+    """Eleven evaluations of two episodes, in which the return rises from 0 to a score."""
     return [
-        {
-            "episode": episode, "env_steps": int(500_000 * share), "agent_steps": int(250_000 * share),
-            "updates": int(249_000 * share), "unix_time_s": START_S + 3600 * share,
-            "episode_return": score * share + 2 * episode - 1, "episode_agent_steps": 500, "seed": 7, "method": method,
-        }
-        for share in shares for episode in (0, 1)
-    ]  # fmt: skip
+        {"env_steps": int(500_000 * share), "episode_return": score * share + other, "method": method}
+        for share in np.linspace(0, 1, 11)
+        for other in (-1, 1)
+    ]
 
 
 class Reproduction:
@@ -243,9 +230,7 @@ class Reproduction:
         """Runs of a method, each on an encoder of its own."""
         cells = []
         for seed, score in enumerate(scores):
-            encoder = self.job(
-                f"encoder-{label}-{seed}", "encoder", facts={"method": label, "updates": 50_000}
-            )
+            encoder = self.job(f"encoder-{label}-{seed}", "encoder", facts={"method": label})
             key = f"run-{label}-{task}-{seed}-{'-'.join(map(str, place.values()))}"
             job = self.job(key, "run", [encoder], facts={"method": label}, eval=evaluations(score))
             cells.append((label, job, {"group": "A", "task": task, "encoder_seed": seed, "seed": 0, **place}))
@@ -267,11 +252,8 @@ def test_from_five_runs_on_every_task_aggregates_have_intervals(made: Reproducti
     cells += made.runs("atc", "walker_run", [200, 210, 220, 230, 240])
     made.ask("seen", cells)
     report = made.report()
-    assert (
-        report.cell("Episode return at the final", "crptpro", "A cheetah_run")
-        == "600 ± 79 (n = 5) · paper 611 ± 44"
-    )
-    assert report.cell("Episode return over the last 10", "atc", "A walker_run").startswith("121 ± 9 (n = 5)")
+    final = report.table("Episode return at the final").set_index("task")["crptpro"]
+    assert final["A cheetah_run"] == "600 ± 79 (n = 5) · paper 611 ± 44"
     over = report.table("Over the 2 tasks").set_index("method").loc["crptpro"]
     assert over[["runs", "encoders"]].tolist() == ["10", "5"]
     assert re.fullmatch(r"550 \\\[\d{3}, \d{3}\\\] · paper 562", over["mean score"])
@@ -289,28 +271,23 @@ def test_a_partial_reproduction_says_what_is_missing(made: Reproduction) -> None
     cells += [("crptpro", begun, {"group": "A", "task": "walker_run", "encoder_seed": 0, "seed": 1})]
     cells += [("atc", "run-none", {"group": "A", "task": "walker_run", "encoder_seed": 0, "seed": 0})]
     made.ask("seen", cells)
-    made.ask(
-        "unseen", [("atc", "run-other", {"group": "A", "task": "finger_spin", "encoder_seed": 0, "seed": 0})]
-    )
+    made.ask("unseen", [("atc", "run-other", {"group": "A", "task": "finger_spin", "encoder_seed": 0})])
     report = made.report()
-    assert (
-        "1 of 3 numbers are there; missing: crptpro 1, atc 1. Nothing stands in for what is missing."
-        in report.text
-    )
-    states = report.table("The 2 that are missing").set_index("job")["state"].to_dict()
-    assert states == {"run-begun": "begun, not finished", "run-none": "not begun"}
+    assert "1 of 3 numbers are there." in report.text
+    assert "Missing: crptpro 1, atc 1. Nothing stands in for what is missing." in report.text
+    assert report.table("The 2 that are missing")["job"].tolist() == ["run-begun", "run-none"]
+    states = report.table("run: 2 jobs").set_index("job")["state"]
+    assert states.tolist() == ["begun", "finished"]
     assert "Nothing is finished yet: 1 number asked for." in report.text
-    assert (
-        report.cell("Episode return at the final", "crptpro", "A walker_run")
-        == "500 (n = 1) · paper 513 ± 33"
-    )
+    final = report.cell("Episode return at the final", "crptpro", "A walker_run")
+    assert final == "500 (n = 1) · paper 513 ± 33"
 
 
 def test_methods_are_compared_on_the_tasks_that_all_have(made: Reproduction) -> None:
     cells = made.runs("crptpro", "walker_run", [500.0, 510.0]) + made.runs("crptpro", "cheetah_run", [600.0])
     made.ask("seen", [*cells, *made.runs("atc", "walker_run", [200.0])])
     report = made.report()
-    assert "Left out of everything that compares methods: A cheetah_run (no run of atc)." in report.text
+    assert "Left out of what compares methods: A cheetah_run (no run of atc)." in report.text
     assert report.cell("Over the 1 task", "mean score", "crptpro").startswith("505")
 
 
@@ -331,11 +308,8 @@ def test_colours_and_what_is_varied_have_rows_of_their_own(made: Reproduction) -
     made.ask("colors", reversed_colors)
     cells = []
     for value, score in (("0.05", 300.0), ("0", 200.0)):
-        place = {"varied": "alpha", "value": value}
-        cells += [
-            (f"crptpro, alpha {value}", *rest)
-            for _, *rest in made.runs("crptpro", "walker_run", [score], **place)
-        ]
+        runs = made.runs("crptpro", "walker_run", [score], varied="alpha", value=value)
+        cells += [(f"crptpro, alpha {value}", *rest) for _, *rest in runs]
     made.ask("sensitivity", cells)
     report = made.report()
     captions = [caption for caption in report.tables if caption.startswith("Episode return at the final")]
@@ -354,29 +328,12 @@ def test_names_of_users_break_neither_page(made: Reproduction) -> None:
     place = {"group": HOSTILE, "task": HOSTILE, "encoder_seed": 0, "seed": 0}
     made.ask(HOSTILE, [(HOSTILE, job, place), ("other", "run-none", place)], scale="<b>huge</b>")
     report = made.report()
-    seen = Tags()
-    seen.feed(report.html)
-    assert not {"script", "b"} & set(seen.tags)
-    assert HOSTILE.replace("\n", "") in re.sub(r"\n", "", seen.text)
+    assert not {"script", "b"} & set(re.findall(r"<(\w+)", report.html))
+    assert HOSTILE.replace("\n", "") in html.unescape(report.html).replace("\n", "")
     assert "<script" not in report.text
     assert "[x](javascript" not in report.text
     assert report.cell("Experiments: numbers", "finished").startswith("1")
     assert len(list((report.folder / "figures").iterdir())) == 1
-
-
-class Tags(HTMLParser):
-    """Elements and text of a page."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.text = ""
-
-    def handle_starttag(self, tag: str, attrs: Any) -> None:
-        self.tags.append(tag)
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
 
 
 def test_the_same_records_give_the_same_files(made: Reproduction) -> None:
@@ -429,6 +386,11 @@ def test_runs_that_nobody_planned_are_told_apart_by_what_differs(tmp_path: Path)
     assert row["task"] == "walker_run"
     assert row["crptpro, learning_rate 0.001"] == "100 ± 1 (n = 2)"
     assert row["crptpro, learning_rate 0.0001"] == "102 (n = 1)"
+    assert report.cell("Budgets beside", "here", "downstream runs per encoder") == "1 or 2"
+    # What is not known is not there.
+    assert list(report.table("run: 3 jobs")) == ["job", "state"]
+    assert "h of work" not in report.text
+    assert "Machines, as tables" not in report.text
 
 
 def test_a_disk_that_is_full_is_named_and_the_older_page_kept(tmp_path: Path) -> None:
@@ -450,7 +412,7 @@ BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-c
 def test_a_browser_shows_the_page_and_it_never_scrolls_sideways(
     seen: Report, tmp_path: Path, width: int
 ) -> None:
-    browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         pytest.skip(f"no browser was found ({', '.join(BROWSERS)})")
     page = seen.folder / f"measured-{width}.html"
@@ -463,7 +425,4 @@ def test_a_browser_shows_the_page_and_it_never_scrolls_sideways(
         f"--window-size={width},1400", "--dump-dom", page.as_uri(),
     ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=True)
-    found = re.search(r"<title>said (\w+) (\d+)</title>", done.stdout)
-    assert found is not None
-    assert found[1] == "true"
-    assert int(found[2]) == seen.html.count("<img")
+    assert f"<title>said true {seen.html.count('<img')}</title>" in done.stdout

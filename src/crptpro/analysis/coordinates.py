@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,26 +11,21 @@ from torch import Tensor
 from crptpro.domains import GYMNASIUM_PREFIX, Domain, get_domain
 from crptpro.errors import UnknownNameError
 
-JointKind = Literal["free", "ball", "slide", "hinge", "turning"]
-
-#: Length in ``qpos`` and in ``qvel`` of each kind of joint.
-_SIZES: dict[JointKind, tuple[int, int]] = {
-    "free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1), "turning": (1, 1),
-}  # fmt: skip
+_SIZES = {"free": (7, 6), "ball": (4, 3), "slide": (1, 1), "hinge": (1, 1), "turning": (1, 1)}
+"""Length in ``qpos`` and in ``qvel`` of each kind of joint, the first four in the order of ``mjtJoint``."""
 
 
 class Joint(NamedTuple):
     """One joint of a MuJoCo model; a ``"hinge"`` has limits, ``"turning"`` is a hinge without any."""
 
     name: str
-    kind: JointKind
+    kind: str
 
 
 def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
-    """Return the joints behind a domain's ``qpos`` and ``qvel``, in order; nothing is rendered.
+    """Return the joints behind a domain's ``qpos`` and ``qvel``, in order.
 
-    Returns:
-        ``None`` where they are not known: worlds of your own, and those without a MuJoCo model.
+    ``None`` where they are not known: worlds of your own, and those without a MuJoCo model.
 
     Raises:
         RenderingError: dm_control's worlds cannot be loaded where nothing renders.
@@ -63,10 +58,9 @@ def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
 def _joints(model: Any) -> tuple[Joint, ...]:
     import mujoco
 
-    kinds: tuple[JointKind, ...] = ("free", "ball", "slide", "hinge")  # in the order of mjtJoint
     joints = []
     for index in range(model.njnt):
-        kind = kinds[model.jnt_type[index]]
+        kind = list(_SIZES)[model.jnt_type[index]]
         if kind == "hinge" and not model.jnt_limited[index]:
             kind = "turning"
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, index)
@@ -75,17 +69,11 @@ def _joints(model: Any) -> tuple[Joint, ...]:
 
 
 def position_coordinates(qpos: Tensor, joints: Sequence[Joint] | None) -> tuple[list[str], Tensor]:
-    """Return positions as numbers that are continuous where the picture is.
+    """Return names, and positions as float64 ``[N, len(names)]`` that are continuous where the picture is.
 
     Slides and limited hinges are kept. A hinge without limits becomes its sine and cosine. The orientation of a ball or
-    free joint becomes the first two columns of its rotation matrix, which determine it.
-
-    Args:
-        qpos: ``[N, nq]``, metres, radians, and quaternions (w, x, y, z).
-        joints: of :func:`joints_of`; with ``None``, or joints of another model, ``qpos`` is returned as it is.
-
-    Returns:
-        Names, and float64 ``[N, len(names)]``.
+    free joint becomes the first two columns of its rotation matrix, which determine it. With ``None`` for the joints,
+    or those of another model, ``qpos`` (``[N, nq]``: metres, radians, quaternions w, x, y, z) is returned as it is.
     """
     qpos = qpos.double()
     if joints is None or sum(_SIZES[joint.kind][0] for joint in joints) != qpos.shape[1]:
@@ -108,24 +96,12 @@ def position_coordinates(qpos: Tensor, joints: Sequence[Joint] | None) -> tuple[
 
 
 def velocity_coordinates(qvel: Tensor, joints: Sequence[Joint] | None) -> tuple[list[str], Tensor]:
-    """Return velocities with their names.
-
-    Args:
-        qvel: ``[N, nv]``, m/s and rad/s.
-        joints: of :func:`joints_of`.
-
-    Returns:
-        Names, and float64 ``[N, nv]``.
-    """
+    """Return names, and velocities ``[N, nv]`` (m/s and rad/s) as float64."""
     if joints is None or sum(_SIZES[joint.kind][1] for joint in joints) != qvel.shape[1]:
         return [f"qvel[{index}]" for index in range(qvel.shape[1])], qvel.double()
     turns = {"free": ("vx", "vy", "vz", "wx", "wy", "wz"), "ball": ("wx", "wy", "wz")}
-    names = [
-        name
-        for joint in joints
-        for name in ([f"{joint.name}.{part}" for part in turns.get(joint.kind, ())] or [joint.name])
-    ]
-    return names, qvel.double()
+    parts = [(joint.name, turns.get(joint.kind, ("",))) for joint in joints]
+    return [f"{name}.{axis}" if axis else name for name, axes in parts for axis in axes], qvel.double()
 
 
 def _two_columns(quaternions: Tensor) -> Tensor:

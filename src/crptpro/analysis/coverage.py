@@ -16,16 +16,13 @@ def coverage(embeddings: Tensor, *, k: int = 12) -> float:
 
     :math:`z_i^{(j)}` is the j-th nearest other embedding, as in the rewards of APT (arXiv 2103.04551) and Proto-RL
     (arXiv 2102.11271). The paper plots "a particle-based estimator" and states neither k, nor the number of
-    observations, nor the encoder: these are this project's choice.
-
-    The value falls with the number of observations, whose neighbours then come closer: compare equal numbers.
+    observations, nor the encoder: these are this project's choice. The value falls with the number of observations,
+    whose neighbours then come closer: compare equal numbers. It is 0 where all look alike, and at most log 3 between
+    unit vectors.
 
     Args:
         embeddings: ``[N, D]``, N above ``k``.
         k: neighbours, the observation itself not counted.
-
-    Returns:
-        Non-negative; at most log 3 between unit vectors, 0 where all observations look alike.
 
     Raises:
         ValueError: too few observations.

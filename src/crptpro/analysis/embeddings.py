@@ -13,31 +13,19 @@ _BATCH = 64
 
 
 def sample_pixels(dataset: ReplayBuffer, samples: int, *, seed: int) -> Tensor:
-    """Draw observations, the same for the same seed, whatever was sampled before.
-
-    Args:
-        dataset: its samples hold ``pixels``; later samples continue from this seed.
-        samples: B, how many.
-        seed: which ones.
-
-    Returns:
-        ``[B, C, H, W]``, dtype and device as the dataset has them.
-    """
+    """Draw observations ``[samples, C, H, W]``, the same for the same seed, whatever was sampled before."""
     dataset.set_rng(torch.Generator().manual_seed(seed))
     return dataset.sample(samples)["pixels"]
 
 
 @torch.no_grad()
 def embed_pixels(encoder: nn.Module, pixels: Tensor, *, projector: nn.Module | None = None) -> Tensor:
-    """Encode observations without augmentation, in batches, on the encoder's device.
+    """Encode observations without augmentation, in batches: float32 ``[N, D]`` on the encoder's device.
 
     Args:
         encoder: maps uint8 ``[B, C, H, W]`` to features ``[B, D]``.
         pixels: ``[N, C, H, W]``, on any device.
         projector: if given, embeddings are its outputs, else the features themselves.
-
-    Returns:
-        float32 ``[N, D]`` on the encoder's device.
     """
     device = device_of(encoder) or pixels.device
     parts = []
@@ -48,18 +36,11 @@ def embed_pixels(encoder: nn.Module, pixels: Tensor, *, projector: nn.Module | N
 
 
 def principal_components(points: Tensor, *, components: int = 3) -> tuple[Tensor, Tensor]:
-    """Project centred points on their leading principal directions (scikit-learn's ``PCA``).
-
-    Args:
-        points: float ``[N, D]`` on the CPU, not all equal.
-        components: how many directions, at most ``min(N, D)``.
+    """Project centred points ``[N, D]`` on their leading principal directions (scikit-learn's ``PCA``).
 
     Returns:
         Coordinates ``[N, components]`` and the fraction of the total variance that each explains ``[components]``, in
         decreasing order.
-
-    Raises:
-        ValueError: ``components`` outside ``1..min(N, D)``.
     """
     from sklearn.decomposition import PCA
 
@@ -69,13 +50,7 @@ def principal_components(points: Tensor, *, components: int = 3) -> tuple[Tensor
 
 
 def gram_matrix(features: Tensor, mean: Tensor, scale: Tensor) -> np.ndarray:
-    """Return the inner products, float64 ``[N, N]``, of ``(features - mean) / scale``.
-
-    Args:
-        features: ``[N, D]``, any floating dtype, on the CPU.
-        mean: ``[D]``.
-        scale: ``[D]``.
-    """
+    """Return the inner products, float64 ``[N, N]``, of ``(features - mean) / scale``; features on the CPU."""
     standardized = features.to(torch.float64, copy=True).sub_(mean).div_(scale).numpy()
     return standardized @ standardized.T
 
@@ -83,11 +58,8 @@ def gram_matrix(features: Tensor, mean: Tensor, scale: Tensor) -> np.ndarray:
 def effective_rank(features: Tensor) -> float:
     """Return the exponential of the entropy of the centred samples' normalised singular values.
 
-    Between 1 (all on a line) and min(N - 1, D); 0 if all samples coincide. Source: Roy and Vetterli, "The effective
-    rank: a measure of effective dimensionality", 2007.
-
-    Args:
-        features: ``[N, D]``.
+    Between 1 (all on a line) and min(N - 1, D) of features ``[N, D]``; 0 if all samples coincide. Source: Roy and
+    Vetterli, "The effective rank: a measure of effective dimensionality", 2007.
 
     Examples:
         >>> round(effective_rank(torch.tensor([[1.0, 0], [-1, 0], [0, 1], [0, -1]])), 6)
@@ -105,12 +77,9 @@ def effective_rank(features: Tensor) -> float:
 
 
 def mean_cosine(features: Tensor) -> float:
-    """Return the mean cosine between different samples' features; 1 if all point the same way, 0 for one sample.
+    """Return the mean cosine between different samples' features ``[N, D]``; 1 if all point the same way.
 
-    A sample whose features are all 0 has the cosine 0 with every other.
-
-    Args:
-        features: ``[N, D]``, any floating dtype.
+    A sample whose features are all 0 has the cosine 0 with every other; a single one gives 0.
     """
     count = len(features)
     if count < 2:

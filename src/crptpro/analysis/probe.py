@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from crptpro.analysis.coordinates import Joint, joints_of, position_coordinates, velocity_coordinates
+from crptpro.analysis.coordinates import joints_of, position_coordinates, velocity_coordinates
 from crptpro.analysis.embeddings import effective_rank, embed_pixels, gram_matrix, mean_cosine
 from crptpro.data import FrameDataset
 from crptpro.data.storage import gather_stacks, stack_rows
@@ -30,9 +30,8 @@ class ProbeSamples:
     Attributes:
         pixels: uint8 ``[N, C, H, W]``.
         targets: float64 ``[N, T]``, positions and velocities.
-        names: of the targets, each ``"position"`` or ``"velocity"`` and the coordinate, for two may share its name.
-        train: int64, rows to fit; likewise ``validation`` (to choose the penalty) and ``test`` (to judge). No episode
-            contributes to two of them.
+        names: of the targets: ``"position"`` or ``"velocity"``, and the coordinate.
+        train: rows to fit, ``validation`` to choose the penalty, ``test`` to judge; no episode is in two of them.
         held_out_episodes: how many episodes ``test`` comes from.
     """
 
@@ -49,12 +48,8 @@ class ProbeSamples:
 class ProbeResult:
     """How well the state is predicted from one kind of embedding of one domain.
 
-    Attributes:
-        positions: R2 on held-out episodes by coordinate.
-        velocities: likewise.
-        left_out: coordinates that hardly vary, in the training or in the held-out episodes.
-        effective_rank: of the embeddings, see :func:`~crptpro.analysis.embeddings.effective_rank`.
-        mean_cosine: of different observations' embeddings, see :func:`~crptpro.analysis.embeddings.mean_cosine`.
+    Positions and velocities are R2 on held-out episodes by coordinate, but for those ``left_out``, which hardly vary in
+    the training or in the held-out episodes. Rank and cosine are those of :mod:`crptpro.analysis.embeddings`.
     """
 
     positions: dict[str, float]
@@ -75,12 +70,7 @@ class ProbeResult:
 
 
 def probe_samples(
-    dataset: FrameDataset,
-    *,
-    samples: int = 2_000,
-    seed: int = 0,
-    frame_stack: int | None = None,
-    joints: tuple[Joint, ...] | None = None,
+    dataset: FrameDataset, *, samples: int = 2_000, seed: int = 0, frame_stack: int | None = None
 ) -> ProbeSamples:
     """Draw observations and states of a dataset, and divide its episodes.
 
@@ -91,7 +81,6 @@ def probe_samples(
         samples: N, drawn without replacement; all transitions if there are fewer.
         seed: which ones, and which episodes are held out.
         frame_stack: frames per observation; the dataset's if ``None``.
-        joints: what ``qpos`` and ``qvel`` are; of :func:`~crptpro.analysis.coordinates.joints_of` if ``None``.
 
     Raises:
         DatasetError: there is no physical state, or too few episodes or samples to split.
@@ -114,14 +103,11 @@ def probe_samples(
             f"A probe of {dataset.path} has {len(chosen)} samples of {len(episodes)} episodes; it "
             "needs two in each of three parts that share no episode. Collect more episodes, or draw more samples."
         )
-    if joints is None:
-        joints = joints_of(dataset.card.get("task", dataset.domain))
+    joints = joints_of(dataset.card.get("task", dataset.domain))
     position_names, positions = position_coordinates(qpos, joints)
     velocity_names, velocities = velocity_coordinates(qvel, joints)
-    names = [
-        *(("position", name) for name in position_names),
-        *(("velocity", name) for name in velocity_names),
-    ]
+    kinds = {"position": position_names, "velocity": velocity_names}
+    names = [(kind, name) for kind, own in kinds.items() for name in own]
     rows = stack_rows(row, step, frame_stack or dataset.frame_stack)
     pixels = gather_stacks(dataset.frames["pixels"], rows)
     targets = torch.cat([positions, velocities], 1)
@@ -136,11 +122,6 @@ def probe(
 
     Ridge regression on standardised features, in float64; nothing of the held-out episodes takes part in fitting,
     standardising, or choosing the penalty. Images are not augmented.
-
-    Args:
-        samples: of :func:`probe_samples`.
-        encoder: maps uint8 ``[B, C, H, W]`` to features ``[B, D]``.
-        projector: maps features to latents ``[B, d]``.
 
     Returns:
         By ``"features"`` and, with a projector, ``"z"``.
@@ -181,9 +162,8 @@ def probe_embeddings(samples: ProbeSamples, embeddings: Tensor) -> ProbeResult:
 def _standardized_gram(features: Tensor, fitted: Tensor) -> np.ndarray:
     """Return the inner products ``[N, N]`` of all samples' standardised features.
 
-    A feature's scale is its deviation plus the root mean square of all features' deviations. Without that summand, a
-    ReLU feature that is active in a handful of samples became a large number that identifies the sample, and the R2 of
-    velocities from 39,200 features fell from 0.6 to 0.
+    A feature's scale is its deviation plus the root mean square of all features' deviations: otherwise a ReLU feature
+    that is active in a handful of samples identifies them, and the R2 of velocities fell from 0.6 to 0.
     """
     deviation, mean = torch.std_mean(features[fitted].double(), 0, correction=0)
     usual = deviation.square().mean().sqrt()

@@ -10,25 +10,31 @@ import contextlib
 import itertools
 import logging
 import os
+import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Union
 
 import tyro
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
+from crptpro import training
 from crptpro.cli.reproduce import Reproduce
 from crptpro.console import run_main
-from crptpro.domains import GROUPS, GYMNASIUM_PREFIX, PAPER_DOMAINS, TASKS, expand_groups, known_names
+from crptpro.data import FrameDataset, collect_group
+from crptpro.domains import GROUPS, PAPER_DOMAINS, TASKS, expand_groups, get_domain
+from crptpro.envs import make_env
 from crptpro.errors import CRPTproError, DatasetError
 from crptpro.logging import RunLogger, WandbOptions
+from crptpro.modules import usable_device
+from crptpro.objectives import get_method
 from crptpro.plugins import load_plugins
+from crptpro.pretrained import load_pretrained, random_pretrained, save_pretrained
 from crptpro.provenance import cpu_cores
-from crptpro.training.downstream import DownstreamConfig
-from crptpro.training.explore import ExploreConfig
-from crptpro.training.pretrain import PretrainConfig
+from crptpro.seeding import seed_everything
+from crptpro.training.evaluate import episode_seed, run_episode
 from crptpro.values import Colors, Quality, as_path
 
 logger = logging.getLogger(__name__)
@@ -38,6 +44,9 @@ Start with `crptpro doctor`, then collect, pretrain and downstream; each stage c
 Or `crptpro reproduce` a whole experiment of the paper.
 With `--plugin FILE.py` (or a module) any command runs a file of yours first: methods and domains that it registers
 then have names here."""
+
+_NAMED = arg(metavar="[NAME=VALUE ...]", help_behavior_hint="(default: the method's)")
+NamedValues = Annotated[tuple[str, ...], _NAMED]
 
 
 @dataclass(frozen=True)
@@ -55,31 +64,23 @@ class Logging:
     tensorboard: bool = False
     """also write TensorBoard event files"""
 
-    def records(self, run_dir: Path, config: Any) -> Records:
-        """Return the record of a run and its mirrors; without mirrors the run opens a record of its own."""
-        options = None
-        if self.wandb != "off":
-            options = WandbOptions(self.wandb_project, self.wandb_group, None, self.wandb_tags, self.wandb)
-        is_mirrored = options is not None or self.tensorboard
-        make = lambda: RunLogger(run_dir, config=config, wandb=options, tensorboard=self.tensorboard)  # noqa: E731
-        return Records(make if is_mirrored else None)
-
-
-class Records(contextlib.ExitStack):
-    """A run's record that is opened when the run first uses it: a request that is refused leaves none behind."""
-
-    def __init__(self, make: Callable[[], RunLogger] | None) -> None:
-        super().__init__()
-        self.make: Any = make
-        self.logger: RunLogger | None = None
-
-    def __enter__(self) -> Any:
-        return None if self.make is None else super().__enter__()
-
-    def __getattr__(self, name: str) -> Any:
-        if self.logger is None:
-            self.logger = self.enter_context(self.make())
-        return getattr(self.logger, name)
+    @contextlib.contextmanager
+    def records(self, run_dir: Path, config: Any) -> Iterator[RunLogger | None]:
+        """Hold the record of a run with its mirrors; without mirrors the run makes its own."""
+        if self.wandb == "off" and not self.tensorboard:
+            yield None
+            return
+        options: Any = (self.wandb_project, self.wandb_group, None, self.wandb_tags, self.wandb)
+        wandb, is_new = None if self.wandb == "off" else WandbOptions(*options), not run_dir.exists()
+        with RunLogger(run_dir, config=config, wandb=wandb, tensorboard=self.tensorboard) as logger:
+            try:
+                yield logger
+            except Exception:
+                if is_new and [path.name for path in run_dir.iterdir()] == [
+                    ".lock"
+                ]:  # the request was refused
+                    shutil.rmtree(run_dir)
+                raise
 
 
 @dataclass(frozen=True)
@@ -124,8 +125,6 @@ class Collect:
 
     def run(self) -> None:
         """Collect, or continue collecting."""
-        from crptpro.data import collect_group
-
         settings = {k: v for k, v in vars(self).items() if k not in ("domains", "out")}
         for name, path in collect_group(expand_groups(self.domains), self.out, **settings).items():
             logger.info("%s: %s", name, path)
@@ -142,33 +141,22 @@ class Pretraining:
     method: str = "crptpro"
     """crptpro, atc or random-encoder (on datasets), proto-rl-c, proto-rl-s, apt-c, apt-s or becl (exploring), a preset
     such as crptpro-fast, or one of your own with --plugin FILE.py; settings: see --method NAME --help"""
-    loss: Annotated[
-        tuple[str, ...], arg(metavar="[NAME=VALUE ...]", help_behavior_hint="(default: the method's)")
-    ] = ()
+    loss: NamedValues = ()
     """options of the method's loss, e.g. num_prototypes=128 intr_loss_coef=0"""
-    encoder: Annotated[
-        tuple[str, ...], arg(metavar="[NAME=VALUE ...]", help_behavior_hint="(default: the method's)")
-    ] = ()
+    encoder: NamedValues = ()
     """options of the encoder, e.g. pixel_offset=0.5"""
     logging: Logging = field(default_factory=Logging)
     """mirrors"""
 
-    def build(self, seed: int, *, image_size: int = 84, frame_stack: int = 3) -> Any:
+    def build(self, seed: int, image_size: int = 84, frame_stack: int = 3) -> Any:
         """Return the method's loss on a fresh encoder."""
-        from crptpro.objectives import get_method
-        from crptpro.seeding import seed_everything
-
-        method = get_method(self.method)
+        method, options = get_method(self.method), named_values("--encoder", self.encoder)
         seed_everything(seed)
-        encoder = method.build_encoder(
-            in_channels=3 * frame_stack, image_size=image_size, **named_values("--encoder", self.encoder)
-        )
+        encoder = method.build_encoder(in_channels=3 * frame_stack, image_size=image_size, **options)
         return method.build(encoder, **named_values("--loss", self.loss))
 
     def keep(self, result: Any, records: RunLogger | None) -> None:
         """Write the encoder, and copy it to the mirrors."""
-        from crptpro.pretrained import save_pretrained
-
         path = save_pretrained(result, self.out / "encoder")
         if records is not None:
             records.artifact(path, name=f"encoder_{self.out.name}", kind="encoder")
@@ -179,31 +167,22 @@ class Pretraining:
 class Pretrain(Pretraining):
     """Pre-train one encoder for several domains on their datasets, one update per domain in turn."""
 
-    config: Annotated[PretrainConfig, arg(name="")] = field(default_factory=PretrainConfig)
+    config: Annotated[training.PretrainConfig, arg(name="")] = field(default_factory=training.PretrainConfig)
     """every number of the stage"""
 
     def run(self) -> None:
         """Pre-train, or continue, and write the artifact."""
-        from crptpro.objectives import get_method
-        from crptpro.pretrained import random_pretrained, save_pretrained
-        from crptpro.training import pretrain
-
         datasets = [as_path(source, "sources") for source in self.sources]
         is_control = get_method(self.method).loss_class is None
         image_size, frame_stack = image_format(datasets) if datasets or not is_control else (84, 3)
         if is_control:
-            encoder = random_pretrained(
-                self.config.seed,
-                method=self.method,
-                datasets=datasets,
-                image_size=image_size,
-                in_channels=3 * frame_stack,
-            )
+            images: dict[str, Any] = {"image_size": image_size, "in_channels": 3 * frame_stack}
+            encoder = random_pretrained(self.config.seed, method=self.method, datasets=datasets, **images)
             logger.info("untrained encoder: %s", save_pretrained(encoder, self.out / "encoder"))
             return
-        loss = self.build(self.config.seed, image_size=image_size, frame_stack=frame_stack)
+        loss = self.build(self.config.seed, image_size, frame_stack)
         with self.logging.records(self.out, self) as records:
-            result = pretrain(
+            result = training.pretrain(
                 loss, datasets, method=self.method, run_dir=self.out, config=self.config, records=records
             )
             self.keep(result, records)
@@ -213,17 +192,15 @@ class Pretrain(Pretraining):
 class Explore(Pretraining):
     """Pre-train one encoder on what exploring agents see: one decision per domain in turn."""
 
-    config: Annotated[ExploreConfig, arg(name="")] = field(default_factory=ExploreConfig)
+    config: Annotated[training.ExploreConfig, arg(name="")] = field(default_factory=training.ExploreConfig)
     """every number of the stage"""
 
     def run(self) -> None:
         """Pre-train, or continue, and write the artifact."""
-        from crptpro.training import pretrain_active
-
-        domains = explored_domains(self.sources, self.method)
+        domains = expand_groups(self.sources)
         loss = self.build(self.config.seed)
         with self.logging.records(self.out, self) as records:
-            result = pretrain_active(
+            result = training.pretrain_active(
                 loss, domains, method=self.method, run_dir=self.out, config=self.config, records=records
             )
             self.keep(result, records)
@@ -239,7 +216,7 @@ class Finetune:
     """dataset directory of the one domain"""
     out: Path
     """run directory: records and checkpoints, and the encoder in OUT/encoder"""
-    config: Annotated[PretrainConfig, arg(name="")] = field(default_factory=PretrainConfig)
+    config: Annotated[training.PretrainConfig, arg(name="")] = field(default_factory=training.PretrainConfig)
     """every number of the stage; the paper's updates: pendulum and manipulation 2,000, cartpole 3,000, cheetah 1,000,
     walker 500"""
     logging: Logging = field(default_factory=Logging)
@@ -247,16 +224,14 @@ class Finetune:
 
     def run(self) -> None:
         """Fine-tune, or continue, and write the artifact."""
-        from crptpro.objectives import get_method
-        from crptpro.pretrained import load_pretrained
-        from crptpro.training import finetune
-
         image_size, frame_stack = image_format([self.dataset])
         pretrained = load_pretrained(self.pretrained).require(image_size=image_size, frame_stack=frame_stack)
         with self.logging.records(self.out, self) as records:
             updates = self.config.updates or get_method("crptpro-finetune").updates
             config = replace(self.config, updates=updates)
-            result = finetune(pretrained, self.dataset, run_dir=self.out, config=config, records=records)
+            result = training.finetune(
+                pretrained, self.dataset, run_dir=self.out, config=config, records=records
+            )
             Pretraining.keep(self, result, records)  # type: ignore[arg-type]
 
 
@@ -271,19 +246,18 @@ class Downstream:
     `drq` to learn the encoder with the task"""
     out: Path
     """run directory: eval.csv, train.csv, checkpoints, and the agent in OUT/agent"""
-    config: Annotated[DownstreamConfig, arg(name="")] = field(default_factory=DownstreamConfig)
+    config: Annotated[training.DownstreamConfig, arg(name="")] = field(
+        default_factory=training.DownstreamConfig
+    )
     """every number of the stage"""
     logging: Logging = field(default_factory=Logging)
     """mirrors"""
 
     def run(self) -> None:
         """Train, or continue."""
-        from crptpro.domains import get_domain
-        from crptpro.training import train_downstream
-
         get_domain(self.task)  # an unknown name is refused before the run directory is made
         with self.logging.records(self.out, self) as records:
-            result = train_downstream(
+            result = training.train_downstream(
                 self.task, self.pretrained, run_dir=self.out, config=self.config, records=records
             )
         logger.info("agent: %s", result.agent_path)
@@ -314,17 +288,11 @@ class Evaluate:
 
     def run(self) -> None:
         """Write what was asked for, and print mean and deviation."""
-        from crptpro.envs import make_env
-        from crptpro.training import evaluate, load_agent, summarize, uniform_policy
-        from crptpro.training.evaluate import episode_seed, run_episode
-
-        is_random = self.agent == "random-policy"
-        if is_random and self.task is None:
+        if self.agent == "random-policy" and self.task is None:
             raise CRPTproError("The random policy has no task of its own; name one, e.g. --task walker_run.")
-        for path, option in ((self.csv, "--csv"), (self.video, "--video")):
-            if path is not None:
-                require_writable(path, option)  # before an hour of episodes
-        agent, card = (None, {}) if is_random else load_agent(self.agent)
+        require_writable(self.csv, "--csv")  # before an hour of episodes
+        require_writable(self.video, "--video")
+        agent, card = (None, {}) if self.agent == "random-policy" else training.load_agent(self.agent)
         task, trained_with = self.task or card["task"], card.get("config", {})
         settings: dict[str, Any] = {
             "quality": self.quality or trained_with.get("quality", "exact"),
@@ -344,24 +312,22 @@ class Evaluate:
                     f"The agent was trained for {agent.actor.config['action_dim']} actions ({card['task']}), {task} "
                     f"has {action_dim}; choose a task of the agent's own domain."
                 )
-            policy = agent or uniform_policy(env, seed=self.seed)
-            episodes = evaluate(policy, env, episodes=self.episodes, seed=self.seed)
+            policy = agent or training.uniform_policy(env, seed=self.seed)
+            episodes = training.evaluate(policy, env, episodes=self.episodes, seed=self.seed)
             if self.csv is not None:
-                import pandas
+                from crptpro.experiments import measure
 
-                from crptpro.artifact import write_whole
-
-                rows = [{"task": task, "agent": self.agent, **vars(episode)} for episode in episodes]
-                write_whole(self.csv, pandas.DataFrame(rows).to_csv(index=False))
+                measure.write_rows(
+                    self.csv, [{"task": task, "agent": self.agent, **vars(each)} for each in episodes]
+                )
             if self.video is not None:
                 frames: list[Any] = []
-                seed = episode_seed(self.seed, 0)
-                run_episode(uniform_policy(env, seed=self.seed) if agent is None else agent, env, episode=0, seed=seed,
-                            on_frame=frames.append)  # fmt: skip
+                policy = agent or training.uniform_policy(env, seed=self.seed)
+                run_episode(policy, env, episode=0, seed=episode_seed(self.seed, 0), on_frame=frames.append)
                 write_video(frames, self.video)
         finally:
             env.close()
-        scores = summarize(episodes)
+        scores = training.summarize(episodes)
         print(
             f"{task}: {scores['mean']:.1f} ± {scores['std']:.1f} "
             f"({scores['min']:.1f} to {scores['max']:.1f}) over {len(episodes)} episodes"
@@ -387,33 +353,28 @@ class Probe:
 
     def run(self) -> None:
         """Print a table, and write what was asked for."""
-        from crptpro.data import FrameDataset
-        from crptpro.experiments.measure import PROBE_COLUMNS, probe_rows, write_rows
-        from crptpro.modules import usable_device
-        from crptpro.pretrained import load_pretrained, random_pretrained
+        from crptpro.experiments import measure
 
         if self.samples < 1:
             raise CRPTproError(f"--samples must be at least 1, got {self.samples}.")
-        if self.csv is not None:
-            require_writable(self.csv)  # before minutes of probing
+        require_writable(self.csv, "--csv")  # before minutes of probing
         usable_device(self.device)
         image_size, frame_stack = image_format(self.datasets)
         if self.encoder == "random-encoder":
             pretrained = random_pretrained(self.seed, image_size=image_size, in_channels=3 * frame_stack)
         else:
             pretrained = load_pretrained(self.encoder).require(image_size=image_size)
-        for network in (pretrained.encoder, pretrained.projector):
-            if network is not None:
-                network.to(self.device)
-        table, measures = [], []
-        settings: dict[str, Any] = {"encoder": self.encoder, "samples": self.samples, "seed": self.seed}
+        for network in filter(None, (pretrained.encoder, pretrained.projector)):
+            network.to(self.device)
+        table, measures, settings = [], [], {"samples": self.samples, "seed": self.seed}
         try:
             for path in self.datasets:
-                rows, numbers = probe_rows(pretrained, FrameDataset.open(path), **settings)
+                dataset = FrameDataset.open(path)
+                rows, numbers = measure.probe_rows(pretrained, dataset, encoder=self.encoder, **settings)
                 table += rows
                 measures += numbers
                 if self.csv is not None:
-                    write_rows(self.csv, measures, PROBE_COLUMNS)
+                    measure.write_rows(self.csv, measures, measure.PROBE_COLUMNS)
         finally:  # a later dataset may be refused, and writing may fail
             if table:
                 lines = [list(table[0]), ["---"] * len(table[0]), *(list(row.values()) for row in table)]
@@ -475,22 +436,8 @@ def named_values(option: str, words: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-def explored_domains(names: Sequence[str], method: str) -> list[str]:
-    """Expand the domains that a method is to explore; it collects its own data, so that a path is refused."""
-    for name in names:
-        is_path = Path(name).is_dir() or ("/" in name and not name.startswith(GYMNASIUM_PREFIX))
-        if is_path and name not in (*GROUPS, *known_names()):  # a folder may be called walker
-            raise CRPTproError(
-                f"{method} explores and collects its own data; {name} is a path. Name domains, tasks or groups "
-                f"({', '.join(GROUPS)}), or choose a method that learns from datasets."
-            )
-    return expand_groups(names)
-
-
 def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
     """Open every dataset and return the image size and frames per stack, which all must share."""
-    from crptpro.data import FrameDataset
-
     if not datasets:
         raise DatasetError(
             "Name at least one dataset directory, e.g. data/walker (made by `crptpro collect`)."
@@ -502,15 +449,17 @@ def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
                 "data/... by default."
             )
     opened = {path: FrameDataset.open(path) for path in datasets}
-    sizes = {path: (dataset.image_size, dataset.frame_stack) for path, dataset in opened.items()}
-    if len(set(sizes.values())) > 1:
-        listed = ", ".join(f"{path} has {size} px, {stack} frames" for path, (size, stack) in sizes.items())
+    formats = {path: (dataset.image_size, dataset.frame_stack) for path, dataset in opened.items()}
+    if len(set(formats.values())) > 1:
+        listed = ", ".join(f"{path} has {size} px, {stack} frames" for path, (size, stack) in formats.items())
         raise DatasetError(f"One encoder needs images of one size and stack: {listed}.")
-    return next(iter(sizes.values()))
+    return next(iter(formats.values()))
 
 
-def require_writable(path: Path, option: str = "--csv") -> None:
+def require_writable(path: Path | None, option: str) -> None:
     """Refuse what no file can become, and make nothing yet."""
+    if path is None:
+        return
     if path.exists() and not path.is_file():  # a finished file takes its place: /dev/stdout would be gone
         raise CRPTproError(f"{option} {path} is no ordinary file; name one.")
     there = next(parent for parent in path.absolute().parents if parent.exists())
@@ -522,11 +471,8 @@ def pretrain_command(arguments: Sequence[str]) -> type[Pretrain] | type[Explore]
     """Return which settings ``pretrain`` has: those of the method that the command line names."""
     words = " ".join(arguments).replace("=", " ").split()
     names = [after for word, after in itertools.pairwise(words) if word == "--method"]
-    if not names or "pretrain" not in arguments:
-        return Pretrain
-    from crptpro.objectives import get_method
-
-    return Pretrain if get_method(names[-1]).exploration is None else Explore
+    explores = names and "pretrain" in arguments and get_method(names[-1]).exploration is not None
+    return Explore if explores else Pretrain
 
 
 def main() -> None:
@@ -535,19 +481,16 @@ def main() -> None:
     def run() -> None:
         arguments = load_plugins(sys.argv[1:])
         if arguments[:1] == ["measure"]:  # what jobs of `reproduce` call
-            from crptpro.experiments.measure import main as measure
+            from crptpro.experiments import measure
 
-            measure(arguments[1:])
+            measure.main(arguments[1:])
             return
         commands: dict[str, Any] = {
             "doctor": Doctor, "collect": Collect, "pretrain": pretrain_command(arguments), "finetune": Finetune,
             "downstream": Downstream, "evaluate": Evaluate, "probe": Probe, "reproduce": Reproduce, "report": Report,
         }  # fmt: skip
-        union: Any = None
-        for name, command in commands.items():
-            each: Any = Annotated[command, subcommand(name)]
-            union = each if union is None else union | each
-        stage: Any = OmitSubcommandPrefixes[union]  # type: ignore[misc]
-        tyro.cli(stage, prog="crptpro", description=DESCRIPTION, args=arguments).run()
+        stages: Any = Union[tuple(Annotated[stage, subcommand(name)] for name, stage in commands.items())]  # noqa: UP007
+        config = (OmitSubcommandPrefixes,)
+        tyro.cli(stages, prog="crptpro", description=DESCRIPTION, args=arguments, config=config).run()
 
     run_main(run)

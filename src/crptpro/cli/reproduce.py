@@ -7,16 +7,18 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from crptpro.artifact import read_json, require_disk
 from crptpro.errors import CRPTproError, UnknownNameError
-
-if TYPE_CHECKING:
-    from crptpro.experiments.jobs import Plan
-    from crptpro.experiments.launch import Failure, Launcher, Resources
-    from crptpro.experiments.matrix import Cell, Request
+from crptpro.experiments import launch
+from crptpro.experiments.jobs import DONE, JOBS, KINDS, Plan, bytes_of, make_plan, write_cells
+from crptpro.experiments.matrix import EXPERIMENTS, SCALES, Cell, Request
+from crptpro.modules import usable_device
+from crptpro.plugins import loaded_plugins
+from crptpro.values import as_path
 
 ALL = "all"
 _ITS_OWN = arg(help_behavior_hint="(default: the experiment's)")
@@ -89,53 +91,52 @@ class Reproduce:
 
     def run(self) -> None:
         """Print the plan, run what is missing, list what failed."""
-        from crptpro.artifact import require_disk
-        from crptpro.experiments.jobs import bytes_of, make_plan, write_cells
-        from crptpro.experiments.launch import divide, run_jobs
-        from crptpro.plugins import loaded_plugins
-        from crptpro.values import as_path
-
         root = as_path(self.out, "out")
-        self._refuse_options()
-        given: dict[str, Any] = {"device": self.device, "jobs": self.jobs, "cores": self.cores_per_job}
-        resources = divide(self.launcher, **given, jobs_per_gpu=self.jobs_per_gpu)
-        request = self._request(resources)
+        slurm = self._checked_options()
+        jobs, cores, gpus = launch.divide(
+            self.launcher, device=self.device, jobs=self.jobs, cores=self.cores_per_job, jobs_per_gpu=self.jobs_per_gpu
+        )  # fmt: skip
+        names = ("methods", "groups", "tasks", "encoder_seeds", "seeds", "device")
+        request = Request(
+            SCALES[self.scale],
+            **{name: getattr(self, name) for name in names},
+            colors=f"reversed_{self.colors_by}",
+            threads=cores * (jobs if self.launcher == "local" else 1),
+        )
         wanted = self._wanted(request)
         plan = make_plan([cell.job for cells in wanted.values() for cell in cells], root)
         sizes = [bytes_of(job) for job in plan.missing]
-        working = sorted((during for _, during in sizes), reverse=True)[: resources.jobs]
+        working = sorted((during for _, during in sizes), reverse=True)[:jobs]
         disk = sum(after for after, _ in sizes) + sum(working)
         print(f"{', '.join(wanted)} at scale {self.scale} in {root}\n")
-        print(plan_text(plan, root, disk, resources.jobs), flush=True)
-        evaluations = len(request.encoder_seeds) * len(request.downstream_seeds)
-        if any(job.kind == "run" for job in plan.jobs) and evaluations < PAPER_RUNS:
-            print(
-                f"\nRuns behind each score: {evaluations}; the paper has {PAPER_RUNS} (--seeds, --encoder-seeds)."
-            )
+        print(plan_text(plan, root, disk, jobs), flush=True)
+        runs = len(request.encoder_seeds) * len(request.seeds)
+        if any(job.kind == "run" for job in plan.jobs) and runs < PAPER_RUNS:
+            print(f"\nRuns behind each score: {runs}; the paper has {PAPER_RUNS} (--seeds, --encoder-seeds).")
         if self.dry_run:
             return
         require_disk(root, disk, "What this plan has yet to make")
         # What a launcher lacks is said before anything is written.
-        launcher = self._launcher(resources) if plan.missing else None
+        launcher = self._launcher(slurm, gpus) if plan.missing else None
         asked = {**dataclasses.asdict(request), "scale": self.scale}
         for name, cells in wanted.items():
             rows = [(cell.label, cell.job.key, cell.place) for cell in cells]
             write_cells(root, name, self.scale, asked, rows)
         if launcher is not None:
-            failures = run_jobs(
-                plan, root, launcher, jobs=resources.jobs, cores=resources.cores, device=self.device,
-                plugins=loaded_plugins(), attempts=self.attempts,
-            )  # fmt: skip
+            how: dict[str, Any] = {
+                "jobs": jobs,
+                "cores": cores,
+                "device": self.device,
+                "attempts": self.attempts,
+            }
+            failures = launch.run_jobs(plan, root, launcher, plugins=loaded_plugins(), **how)
             if failures:
                 print(failures_text(failures), flush=True)
                 raise SystemExit(1)
         print(f"\nAll of it is there. Tables and figures: crptpro report {root}", flush=True)
 
-    def _refuse_options(self) -> None:
+    def _checked_options(self) -> dict[str, Any]:
         """Refuse what cannot be met, and an option that the launcher does not read: it was meant for another one."""
-        from crptpro.experiments.launch import slurm_parameters
-        from crptpro.modules import usable_device
-
         if self.attempts < 1:
             raise CRPTproError(f"--attempts must be at least 1, got {self.attempts}.")
         for each in dataclasses.fields(self):
@@ -153,30 +154,14 @@ class Reproduce:
             raise CRPTproError(
                 f"--launcher {self.launcher} gives each job a GPU of its own: write --device cuda, not {self.device}."
             )
-        slurm_parameters(**self._slurm())
-
-    def _slurm(self) -> dict[str, Any]:
-        options = {name: getattr(self, name) for name in ("partition", "hours", "memory_gb", "sbatch")}
-        return {**options, "has_gpu": self.device.startswith("cuda")}
-
-    def _request(self, resources: Resources) -> Request:
-        from crptpro.experiments.matrix import SCALES, Request
-
-        names = ("methods", "groups", "tasks", "encoder_seeds", "seeds", "device")
-        return Request(
-            SCALES[self.scale],
-            **{name: getattr(self, name) for name in names},
-            colors="reversed_image" if self.colors_by == "image" else "reversed_background",
-            threads=resources.cores * (resources.jobs if self.launcher == "local" else 1),
-        )
+        return launch.slurm_parameters(
+            partition=self.partition, hours=self.hours, memory_gb=self.memory_gb, sbatch=self.sbatch,
+            has_gpu=self.device.startswith("cuda"),
+        )  # fmt: skip
 
     def _wanted(self, request: Request) -> dict[str, list[Cell]]:
         """Cells by experiment. One that was named must have some; of all, those that have are meant."""
-        from crptpro.experiments.matrix import EXPERIMENTS
-
-        if not self.experiments:
-            raise UnknownNameError(f"Name an experiment: {', '.join(EXPERIMENTS)}, or {ALL}.")
-        for name in self.experiments:
+        for name in self.experiments or ("",):
             if name not in (*EXPERIMENTS, ALL):
                 raise UnknownNameError(
                     f"There is no experiment {name!r}; choose from {', '.join(EXPERIMENTS)}, or {ALL}."
@@ -191,24 +176,18 @@ class Reproduce:
             )
         return {name: cells for name, cells in wanted.items() if cells}
 
-    def _launcher(self, resources: Resources) -> Launcher:
-        from crptpro.experiments.launch import LocalLauncher, RayLauncher, SlurmLauncher, slurm_parameters
-
-        if self.launcher == "ray":
-            gpus = 1 / self.jobs_per_gpu if self.device.startswith("cuda") else 0
-            return RayLauncher(self.ray_address, cores=resources.cores, gpus=gpus)
+    def _launcher(self, slurm: dict[str, Any], gpus: Sequence[str]) -> Any:
         if self.launcher == "slurm":
-            return SlurmLauncher(slurm_parameters(**self._slurm()))
-        return LocalLauncher(resources.gpus)
+            return launch.SlurmLauncher(slurm)
+        if self.launcher == "ray":
+            share = 1 / self.jobs_per_gpu if self.device.startswith("cuda") else 0
+            return launch.RayLauncher(self.ray_address, gpus=share)
+        return launch.LocalLauncher(gpus)
 
 
 def plan_text(plan: Plan, root: Path, disk: int, jobs: int) -> str:
     """Return how many jobs of each kind are needed, done and to do, with their env steps, and what they take."""
     import pandas as pd
-
-    from crptpro.artifact import read_json
-    from crptpro.experiments.jobs import DONE, JOBS, KINDS
-    from crptpro.experiments.launch import duration
 
     spent: dict[str, list[float]] = {}
     for path in root.glob(f"{JOBS}/*/{DONE}"):
@@ -219,7 +198,7 @@ def plan_text(plan: Plan, root: Path, disk: int, jobs: int) -> str:
         if needed:
             counts = {"needed": len(needed), "done": len(needed) - len(left), "to do": len(left)}
             counts["env steps"] = sum(job.facts.get("env_steps", 0) for job in left)
-            took = duration(statistics.median(spent[kind])) if kind in spent else ""
+            took = launch.duration(statistics.median(spent[kind])) if kind in spent else ""
             rows.append({"jobs": name, **{key: f"{n:,}" for key, n in counts.items()}, "took each": took})
     text = pd.DataFrame(rows).to_string(index=False)
     if plan.missing:
@@ -228,7 +207,7 @@ def plan_text(plan: Plan, root: Path, disk: int, jobs: int) -> str:
     return text
 
 
-def failures_text(failures: Sequence[Failure]) -> str:
+def failures_text(failures: Sequence[launch.Failure]) -> str:
     """List what is not finished, and where to look."""
     failed = [failure for failure in failures if failure.log is not None]
     skipped = [failure for failure in failures if failure.log is None]

@@ -1,9 +1,8 @@
-"""A job is a ``crptpro`` command with a directory: its key, what it needs, what there is to do, and its results.
+"""A job is a ``crptpro`` command with a directory, ``ROOT/jobs/KEY``.
 
-The directory of a job is ``ROOT/jobs/KEY``. ``job.json`` describes it, ``log.txt`` holds what its command printed,
-``done.json`` says that it is finished and what it took; the command's own records lie beside them. The key ends in a
-hash of the command, which names the directories of needed jobs by their keys. So experiments share whatever they
-have in common, and a changed number makes another job. ``ROOT/experiments`` says which jobs an experiment asked for.
+``job.json`` describes it, ``log.txt`` has what its command printed, ``done.json`` says that it is finished and what it
+took. The key ends in a hash of the command, which names needed jobs by their keys: experiments share what they have in
+common, and a changed number makes another job. ``ROOT/experiments`` says which jobs an experiment asked for.
 """
 
 from __future__ import annotations
@@ -110,7 +109,7 @@ def options(**values: Any) -> list[str]:
     return words
 
 
-# --- what there is, and what there is to do --------------------------------------------------------------------------
+# --- what there is to do --------------------------------------------------------------------------------------------
 
 
 def directory_of(root: Path, key: str) -> Path:
@@ -124,30 +123,23 @@ def is_finished(root: Path, job: Job) -> bool:
 
 
 def _has_what(root: Path, job: Job, reader: Job) -> bool:
-    """Whether the directories of a job that another one's command names are there."""
+    """Whether the directories of a job that another one's command names are there, with weights or pixels."""
     named = re.findall(rf"\{{{re.escape(job.key)}\}}/([^\s'\"]*)", " ".join(reader.command))
-    for path in (directory_of(root, job.key) / name for name in named):
-        is_slim = (path / "card.json").exists() and not any(
-            (path / f).exists() for f in (WEIGHTS_FILE, PIXELS_FILE)
-        )
-        if is_slim or not path.exists():
-            return False
-    return True
+    paths = [directory_of(root, job.key) / name for name in named]
+    content = (WEIGHTS_FILE, PIXELS_FILE)
+    return all(
+        path.exists()
+        and (not (path / "card.json").exists() or any((path / file).exists() for file in content))
+        for path in paths
+    )
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What experiments need.
-
-    Args:
-        jobs: without repeats, each after all that it needs.
-        missing: those that have to run, in order.
-        emptied: those of them that were finished, but whose dataset or weights are gone.
-    """
+    """What experiments need: ``jobs`` without repeats, and those ``missing`` that have to run, in order."""
 
     jobs: tuple[Job, ...]
     missing: tuple[Job, ...]
-    emptied: tuple[Job, ...] = ()
 
 
 def make_plan(wanted: Iterable[Job], root: Path) -> Plan:
@@ -155,10 +147,6 @@ def make_plan(wanted: Iterable[Job], root: Path) -> Plan:
 
     A finished job is left alone, whatever has become of what it needed. What an unfinished one reads must be there: a
     job whose encoder was removed since runs again.
-
-    Args:
-        wanted: jobs that experiments ask for.
-        root: where finished ones are found.
     """
     there: dict[str, Job] = {}
     missing: dict[str, Job] = {}
@@ -174,55 +162,26 @@ def make_plan(wanted: Iterable[Job], root: Path) -> Plan:
     for job in wanted:
         require(job)
     kept = [job for key, job in there.items() if key not in missing]
-    emptied = tuple(job for job in missing.values() if is_finished(root, job))
-    return Plan((*kept, *missing.values()), tuple(missing.values()), emptied)
+    return Plan((*kept, *missing.values()), tuple(missing.values()))
 
 
 def describe(root: Path, plan: Plan) -> None:
-    """Write ``job.json`` of every job; one that has to run again loses what it had."""
-    for job in plan.emptied:
-        with FileLock(directory_of(root, job.key) / LOCK):
-            for entry in directory_of(root, job.key).iterdir():
-                if entry.is_dir():
-                    shutil.rmtree(entry)
-                elif entry.name != LOCK:
-                    entry.unlink()
+    """Write ``job.json`` of every job; one that was finished and has to run again loses what it had."""
+    for job in plan.missing:
+        directory = directory_of(root, job.key)
+        if is_finished(root, job):
+            with FileLock(directory / LOCK):
+                for entry in directory.iterdir():
+                    if entry.is_dir():
+                        shutil.rmtree(entry)
+                    elif entry.name != LOCK:
+                        entry.unlink()
     for job in plan.jobs:
         path = directory_of(root, job.key) / DESCRIPTION
         if not path.exists():
             needs = [needed.key for needed in job.needs]
             about = {"kind": job.kind, "command": list(job.command), "needs": needs, "facts": dict(job.facts)}
             write_json(path, about)
-
-
-def write_cells(
-    root: Path,
-    experiment: str,
-    scale: str,
-    request: Mapping[str, Any],
-    cells: Iterable[tuple[str, str, Mapping]],
-) -> None:
-    """Write down what an experiment asks for: it is added to what was asked for before, or takes its place.
-
-    Args:
-        root: of the reproduction.
-        experiment: its name.
-        scale: name of the scale.
-        request: which part of the experiment.
-        cells: label, key of the job and place of each.
-
-    Raises:
-        RecordError: the file is there and cannot be read.
-    """
-    path = root / EXPERIMENTS / f"{experiment}-{scale}.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    new = [{"label": label, "job": key, "place": dict(place)} for label, key, place in cells]
-    with FileLock(path.parent / ".lock"):
-        before = read_json(path, error=RecordError).get("cells", []) if path.exists() else []
-        taken = [(cell["label"], cell["place"]) for cell in new]
-        kept = [cell for cell in before if (cell["label"], cell["place"]) not in taken]
-        content = {"experiment": experiment, "scale": scale, "request": dict(request), "cells": [*new, *kept]}
-        write_json(path, content)
 
 
 FRAME_BYTES = 3 * 84 * 84
@@ -246,6 +205,34 @@ def bytes_of(job: Job) -> tuple[int, int]:
     return 1_000_000, 0
 
 
+# --- what there is --------------------------------------------------------------------------------------------------
+
+
+def write_cells(
+    root: Path,
+    experiment: str,
+    scale: str,
+    request: Mapping[str, Any],
+    cells: Iterable[tuple[str, str, Mapping[str, Any]]],
+) -> None:
+    """Write down what an experiment asks for: label, key of the job and place of each number.
+
+    It is added to what was asked for before, or takes its place.
+
+    Raises:
+        RecordError: the file is there and cannot be read.
+    """
+    path = root / EXPERIMENTS / f"{experiment}-{scale}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    new = [{"label": label, "job": key, "place": dict(place)} for label, key, place in cells]
+    with FileLock(path.parent / ".lock"):
+        before = read_json(path, error=RecordError).get("cells", []) if path.exists() else []
+        taken = [(cell["label"], cell["place"]) for cell in new]
+        kept = [cell for cell in before if (cell["label"], cell["place"]) not in taken]
+        content = {"experiment": experiment, "scale": scale, "request": dict(request), "cells": [*new, *kept]}
+        write_json(path, content)
+
+
 @dataclass(frozen=True)
 class Results:
     """What a reproduction has so far.
@@ -261,10 +248,10 @@ class Results:
     jobs: pandas.DataFrame
 
 
+DESCRIBED = ("kind", "command", "facts", "needs")
+"""What tables read of ``job.json``."""
 MADE = ("seconds", "attempts", "threads", "device", "git_revision", "versions")
-"""What ``done.json`` has besides the hardware."""
-JOB_COLUMNS = ("kind", "facts", "needs", "path", "done", "machine", *MADE)
-CELL_COLUMNS = ("experiment", "scale", "label", "job", "done")
+"""What they read of ``done.json``, besides the hardware."""
 
 
 def load_results(root: str | Path) -> Results:
@@ -284,23 +271,34 @@ def load_results(root: str | Path) -> Results:
     for path in sorted((root / EXPERIMENTS).glob("*.json")):
         content = read_json(path, error=RecordError)
         try:
+            about = {name: content[name] for name in ("experiment", "scale")}
             for cell in content["cells"]:
-                about = {name: content[name] for name in ("experiment", "scale")}
-                about |= {"label": cell["label"], "job": cell["job"]}
-                cells.append(about | {"done": rows.get(cell["job"], {}).get("done", False)} | cell["place"])
-        except (KeyError, TypeError, AttributeError) as reason:
+                done = rows.get(cell["job"], {}).get("done", False)
+                cells.append(
+                    {**about, "label": cell["label"], "job": cell["job"], "done": done} | cell["place"]
+                )
+        except (KeyError, TypeError) as reason:
             raise RecordError(f"{path} does not say what was asked for ({reason!r}); remove it.") from None
-    jobs = pd.DataFrame.from_dict(rows, orient="index", columns=list(JOB_COLUMNS))
-    table = pd.DataFrame(cells, dtype=object, columns=None if cells else list(CELL_COLUMNS))
-    return Results(table.astype({"done": bool}), jobs.rename_axis("key"))
+    columns = None if cells else ["experiment", "scale", "label", "job", "done"]
+    table = pd.DataFrame(cells, columns=columns, dtype=object).astype({"done": bool})
+    jobs = pd.DataFrame.from_dict(
+        rows, orient="index", columns=[*DESCRIBED, *MADE, "path", "done", "machine"]
+    )
+    return Results(table, jobs.rename_axis("key"))
 
 
 def _job_row(path: Path) -> dict[str, Any]:
     content, done_path = read_json(path, error=RecordError), path.with_name(DONE)
     done = read_json(done_path, error=RecordError) if done_path.exists() else {}
-    row = {name: content.get(name) for name in ("kind", "facts", "needs")}
-    row |= {"path": path.parent, "done": done_path.exists(), "machine": machine(done.get("hardware") or {})}
-    return row | {name: done.get(name) for name in MADE}
+    try:
+        row = {name: content[name] for name in DESCRIBED} | {name: done.get(name) for name in MADE}
+    except KeyError as reason:
+        raise RecordError(f"{path} does not describe a job: it has no {reason}.") from None
+    return row | {
+        "path": path.parent,
+        "done": done_path.exists(),
+        "machine": machine(done.get("hardware") or {}),
+    }
 
 
 def machine(hardware: Mapping[str, Any]) -> str:

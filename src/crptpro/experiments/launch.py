@@ -1,4 +1,7 @@
-"""Run the missing jobs of a plan: in processes of this machine, on a Slurm cluster, or on Ray."""
+"""Run the missing jobs of a plan: in processes of this machine, on a Slurm cluster, or on Ray.
+
+Everywhere a job is a process of its own (:meth:`Work.process`), which ends with the process that started it.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +23,10 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from filelock import FileLock, Timeout
@@ -47,10 +51,8 @@ logger = logging.getLogger(__name__)
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 """What numpy and torch read when they are loaded."""
-LEFTOVERS = {"run": ("checkpoints", "replay")} | dict.fromkeys(
-    ("encoder", "explored", "finetuned"), ("checkpoints",)
-)
-"""Directories that only an unfinished job needs."""
+LEFTOVERS = {"run": ("checkpoints", "replay")}
+"""Directories that only an unfinished job needs, other than ``checkpoints`` alone: an explorer's replay is kept."""
 WITH_DEVICE = ("encoder", "explored", "finetuned", "run", "probe", "coverage", "embeddings")
 CLUSTER_JOBS, CLUSTER_GPU_CORES = 16, 4
 MAX_REQUEUES = 1_000
@@ -58,25 +60,19 @@ MAX_REQUEUES = 1_000
 POLL_S, REFUSED_S, LAST_WAIT_S, SLURM_LOOK_S = 0.2, 60.0, 10.0, 10.0
 
 
+# --- one job --------------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Work:
-    """One job to run; all that travels to where it runs. None of it but root and key is part of what the job is.
-
-    Args:
-        root: of the reproduction, absolute.
-        key: of the job, which is described there.
-        device: of networks.
-        threads: of torch.
-        workers: processes of a job that collects.
-        plugins: modules that are loaded first, for methods and domains of the user's own.
-    """
+    """One job to run, and how; all that travels to where it runs. Only ``root`` and ``key`` say what it is."""
 
     root: str
     key: str
     device: str = "cpu"
     threads: int = 1
     workers: int = 1
-    plugins: tuple[str, ...] = ()
+    plugins: Sequence[str] = ()
 
     @property
     def directory(self) -> Path:
@@ -96,16 +92,20 @@ class Work:
             words += ["--workers", str(self.workers)]
         return words + (["--device", self.device] if content["kind"] in WITH_DEVICE else [])
 
-    def run(self) -> str:
-        """Run the job in this process, or continue it, unless another process has finished it meanwhile.
+    def process(self, **environment: str) -> subprocess.Popen:
+        """Start a process that runs the job; what it prints goes to the job's log, and Ctrl-C does not reach it."""
+        variables = os.environ | dict.fromkeys(THREAD_VARIABLES, str(self.threads)) | environment
+        command = [sys.executable, "-m", "crptpro.experiments.launch"]
+        command += [json.dumps(dataclasses.asdict(self)), str(os.getpid())]
+        with open(self.directory / LOG, "ab") as log:
+            return subprocess.Popen(command, env=variables, start_new_session=True, stdout=log, stderr=log)
 
-        Returns:
-            Why it is not finished; empty if it is.
-        """
+    def run(self) -> str:
+        """Run the job in this process, or continue it; returns why it is not finished, or an empty text."""
         now = datetime.datetime.now(datetime.UTC).isoformat(sep=" ", timespec="seconds")
         where = f"{socket.gethostname()}, process {os.getpid()}, {self.device}, {self.threads} threads"
         print(f"--- {now}: {where}", flush=True)
-        with _locked(self.directory):
+        with _lock(self.directory):
             if (self.directory / DONE).exists():
                 return ""
             torch.set_num_threads(self.threads)
@@ -116,36 +116,20 @@ class Work:
                 how = {"device": self.device, "threads": self.threads, "attempts": clock["attempts"]}
                 write_json(self.directory / DONE, {"seconds": seconds, **how, **provenance()})
                 (self.directory / CLOCK).unlink(missing_ok=True)
-                for name in LEFTOVERS.get(self.key.split("-")[0], ()):
+                for name in LEFTOVERS.get(self.key.split("-")[0], ("checkpoints",)):
                     shutil.rmtree(self.directory / name, ignore_errors=True)
         print(f"error: {reason}" if reason else "finished", flush=True)
         return reason
 
-    def run_alone(self) -> str:
-        """Do the same in a process that has nothing else to do: all that it prints goes to the job's log."""
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGTERM, _leave)
-        with _output_to(self.directory / LOG):
-            return self.run()
 
-
-def _leave(number: int, frame: object) -> None:
-    raise SystemExit(128 + number)
-
-
-@contextlib.contextmanager
-def _locked(directory: Path) -> Iterator[None]:
+def _lock(directory: Path) -> Any:
     """Hold a job; another command, or the job of a killed one that runs to its next checkpoint, may hold it first."""
     lock = FileLock(directory / LOCK)
     try:
-        lock.acquire(timeout=0)
+        return lock.acquire(timeout=0)
     except Timeout:
         logger.warning("Another process runs %s; waiting until it ends.", directory.name)
-        lock.acquire(timeout=1e9, poll_interval=1)
-    try:
-        yield
-    finally:
-        lock.release()
+        return lock.acquire(timeout=1e9, poll_interval=1)
 
 
 def _clock(directory: Path) -> dict[str, float]:
@@ -161,74 +145,66 @@ def _clock(directory: Path) -> dict[str, float]:
 
 
 def _command(arguments: Sequence[str], log: Path) -> str:
-    """Call ``crptpro`` and return what went wrong."""
     from crptpro.cli import main
 
-    before, sys.argv = sys.argv, ["crptpro", *arguments]
+    sys.argv = ["crptpro", *arguments]
     try:
         main()
     except SystemExit as end:
         if end.code in (130, 143):  # it was stopped
             raise
-        return "" if not end.code else _last_line(log).removeprefix("error: ")
+        return _last_line(log) if end.code else ""
     except Exception as error:  # a defect keeps its traceback
         traceback.print_exc()
         return f"{type(error).__name__}: {error}"
-    finally:
-        sys.argv = before
     return ""
 
 
 def _last_line(path: Path) -> str:
     lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
-    words = (line.strip(" │╭╮╰╯─") for line in reversed(lines))  # without the frame of a usage message
-    return next(filter(None, words), "")
+    return next((line for line in reversed(lines) if line.strip()), "").removeprefix("error: ")
 
 
-@contextlib.contextmanager
-def _output_to(path: Path) -> Iterator[None]:
-    """Append standard output and error to a file, those of child processes too."""
-    kept, before = [os.dup(number) for number in (1, 2)], (sys.stdout, sys.stderr)
-    with open(path, "ab") as file:
-        for number in (1, 2):
-            os.dup2(file.fileno(), number)
-    # What stands in for the streams may write elsewhere: Ray's copies go to its own files.
-    sys.stdout, sys.stderr = (os.fdopen(n, "w", buffering=1, closefd=False, encoding="utf-8") for n in (1, 2))
+def _run_here(work: Work) -> None:
+    """Run a job as the function that a cluster calls; one that is cancelled stops at its next checkpoint."""
+    process = work.process()
     try:
-        yield
+        process.wait()
     finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        sys.stdout, sys.stderr = before
-        for number, copy in zip((1, 2), kept):
-            os.dup2(copy, number)
-            os.close(copy)
+        process.terminate()
+        process.wait()
 
 
 # --- where jobs run -------------------------------------------------------------------------------------------------
+#
+# A launcher's `start(work, is_exclusive=)` raises SubmissionError if a queue does not take the job now. What it returns
+# has `poll()`: None while the job runs or is queued, then why it was lost, or an empty text; and `stop()`: to end at
+# the next checkpoint, and asked again at once. `is_one_machine` says whether all jobs share this machine's cores.
 
 
-class Handle(Protocol):
-    """A job that was started: ``poll`` is ``None`` while it runs or is queued, then why it was lost, or nothing."""
+class LocalLauncher:
+    """Processes of this machine, which share its GPUs evenly (indices or UUIDs)."""
 
-    def poll(self) -> str | None: ...  # noqa: D102
+    is_one_machine = True
 
-    def stop(self) -> None: ...  # noqa: D102 - ask it to write a checkpoint and end; asked again, to end at once
+    def __init__(self, gpus: Sequence[str] = ()) -> None:
+        self.gpus, self._running = tuple(gpus), list[_Process]()
 
-
-class Launcher(Protocol):
-    """A place where jobs run; a queue that does not take one now raises ``SubmissionError``."""
-
-    is_one_machine: bool
-    """Whether all jobs share this machine's cores."""
-
-    def start(self, work: Work, *, is_exclusive: bool) -> Handle: ...  # noqa: D102
+    def start(self, work: Work, *, is_exclusive: bool) -> _Process:
+        """Start a job on the GPU that has the fewest."""
+        self._running = [each for each in self._running if each.process.poll() is None]
+        loads = Counter(each.gpu for each in self._running)
+        gpu = min(self.gpus, key=lambda name: loads[name], default="")
+        process = work.process(**({"CUDA_VISIBLE_DEVICES": gpu} if gpu else {}))
+        self._running.append(_Process(process, gpu))
+        return self._running[-1]
 
 
 @dataclass
 class _Process:
     process: subprocess.Popen
-    gpu: str | None
+    gpu: str
+    is_stopping: bool = False
 
     def poll(self) -> str | None:
         status = self.process.poll()
@@ -237,49 +213,58 @@ class _Process:
         return f"its process was ended by {signal.Signals(-status).name}" if status < 0 else ""
 
     def stop(self) -> None:
-        with contextlib.suppress(OSError):
-            self.process.send_signal(signal.SIGTERM)
+        self.process.send_signal(signal.SIGINT if self.is_stopping else signal.SIGTERM)
+        self.is_stopping = True
 
 
-class LocalLauncher:
-    """Processes of this machine.
+class SlurmLauncher:
+    """A Slurm cluster, whose nodes share ROOT and the environment of this process.
 
-    Args:
-        gpus: that jobs share evenly, by index or UUID; without any, jobs see what this process sees.
+    The parameters are those of submitit's executor; ``cluster`` is its name of it, ``"local"`` in tests.
     """
 
-    is_one_machine = True
+    is_one_machine = False
 
-    def __init__(self, gpus: Sequence[str] = ()) -> None:
-        self.gpus, self._running = tuple(gpus), list[_Process]()
-
-    def start(self, work: Work, *, is_exclusive: bool) -> Handle:
-        """Start a process that ends with this one; Ctrl-C in the terminal does not reach it."""
-        self._running = [each for each in self._running if each.poll() is None]
-        environment, gpu = os.environ | dict.fromkeys(THREAD_VARIABLES, str(work.threads)), None
-        if self.gpus:
-            gpu = min(self.gpus, key=lambda name: sum(each.gpu == name for each in self._running))
-            environment["CUDA_VISIBLE_DEVICES"] = gpu
-        order = json.dumps(dataclasses.asdict(work))
-        command = [sys.executable, "-m", "crptpro.experiments.launch", order, str(os.getpid())]
-        with open(work.directory / LOG, "ab") as log:
-            process = subprocess.Popen(
-                command, env=environment, start_new_session=True, stdout=log, stderr=log
+    def __init__(self, parameters: Mapping[str, Any], cluster: str = "slurm") -> None:
+        if find_spec("submitit") is None:
+            raise CRPTproError("--launcher slurm needs submitit: pip install 'crptpro[launch]'.")
+        if cluster == "slurm" and (shutil.which("srun") is None or shutil.which("sbatch") is None):
+            raise CRPTproError(
+                "--launcher slurm needs sbatch and srun, which are not here: call it on a login node of the cluster, "
+                "or choose --launcher local."
             )
-        self._running.append(_Process(process, gpu))
-        return self._running[-1]
+        self.parameters, self.cluster = dict(parameters), cluster
+
+    def start(self, work: Work, *, is_exclusive: bool) -> _SlurmJob:
+        """Queue a job; an exclusive one asks for a node of its own."""
+        from submitit import AutoExecutor
+        from submitit.core.utils import FailedJobError
+
+        parent = Path(work.root) / "submitted"
+        parent.mkdir(exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=f"{work.key}-", dir=parent))
+        # Since Slurm 22.05 srun does not ask for the cores that sbatch was given, and would run the job on one.
+        setup = [f"export {name}={work.threads}" for name in (*THREAD_VARIABLES, "SRUN_CPUS_PER_TASK")]
+        own = {"job_name": work.key, "cpus_per_task": work.threads, "setup": setup, "exclusive": is_exclusive}
+        asked = {f"slurm_{name}": value for name, value in {**own, **self.parameters}.items() if value}
+        executor = AutoExecutor(folder, cluster=self.cluster, slurm_max_num_timeout=MAX_REQUEUES)
+        executor.update_parameters(**asked)
+        try:
+            return _SlurmJob(executor.submit(_Submitted(work)), folder, work.directory / LOG)
+        except FailedJobError as reason:
+            shutil.rmtree(folder, ignore_errors=True)
+            said = (str(reason).strip().splitlines() or ["it gave no reason"])[-1]
+            raise SubmissionError(
+                f"sbatch refused a job: {said} Change --partition, --hours or --sbatch."
+            ) from reason
 
 
 @dataclass(frozen=True)
 class _Submitted:
-    """The function that submitit pickles."""
-
     work: Work
 
-    def __call__(self) -> str:
-        with contextlib.suppress(OSError):  # Ctrl-C is the command's to pass on
-            os.setsid()
-        return self.work.run_alone()
+    def __call__(self) -> None:
+        _run_here(self.work)
 
     def checkpoint(self) -> Any:
         """Have Slurm queue the job again when its time is up; it continues from its own checkpoint."""
@@ -317,73 +302,50 @@ class _SlurmJob:
         self.is_stopping = True
 
 
-class SlurmLauncher:
-    """A Slurm cluster, whose nodes share ROOT and the environment of this process.
+class RayLauncher:
+    """A Ray cluster whose nodes share ROOT; each job has a number, or a fraction, of its GPUs.
 
-    Args:
-        parameters: of submitit's executor.
-        cluster: submitit's name of it; tests have ``"local"``.
-
-    Raises:
-        CRPTproError: without submitit, or where there is no Slurm.
+    Without an address it is that of ``RAY_ADDRESS``, one that runs here, or a new one on this machine.
     """
 
     is_one_machine = False
 
-    def __init__(self, parameters: Mapping[str, Any], cluster: str = "slurm") -> None:
+    def __init__(self, address: str | None = None, *, gpus: float = 0) -> None:
         try:
-            import submitit  # noqa: F401
+            import ray
         except ImportError as reason:
-            raise CRPTproError(
-                f"--launcher slurm needs submitit ({reason}): pip install 'crptpro[launch]', or choose another one."
-            ) from None
-        if cluster == "slurm" and (shutil.which("srun") is None or shutil.which("sbatch") is None):
-            raise CRPTproError(
-                "--launcher slurm needs sbatch and srun, which are not here: call it on a login node of the cluster, "
-                "or choose --launcher local."
-            )
-        self.parameters, self.cluster = dict(parameters), cluster
-
-    def start(self, work: Work, *, is_exclusive: bool) -> Handle:
-        """Queue a job; an exclusive one asks for a node of its own."""
-        from submitit import AutoExecutor
-        from submitit.core.utils import FailedJobError
-
-        parent = Path(work.root) / "submitted"
-        parent.mkdir(exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=f"{work.key}-", dir=parent))
-        executor = AutoExecutor(folder, cluster=self.cluster, slurm_max_num_timeout=MAX_REQUEUES)
-        executor.update_parameters(**self.job_parameters(work, is_exclusive=is_exclusive))
+            raise CRPTproError(f"--launcher ray needs Ray ({reason}): pip install 'crptpro[ray]'.") from None
+        address = address or os.environ.get("RAY_ADDRESS") or None
         try:
-            return _SlurmJob(executor.submit(_Submitted(work)), folder, work.directory / LOG)
-        except FailedJobError as reason:
-            shutil.rmtree(folder, ignore_errors=True)
-            said = (str(reason).strip().splitlines() or ["it gave no reason"])[-1]
-            raise SubmissionError(
-                f"sbatch refused a job: {said} Change --partition, --hours or --sbatch."
+            host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
+            if colon and port.isdigit():  # Ray itself would ask for minutes where nobody listens
+                socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+        except (OSError, RuntimeError, ValueError) as reason:
+            said = (str(reason).strip().splitlines() or [type(reason).__name__])[0]
+            raise CRPTproError(
+                f"The Ray cluster {address or 'of this machine'} cannot be used: {said}. Give the address that "
+                "`ray start --head` printed, as --ray-address HOST:6379, or ray://HOST:10001."
             ) from reason
+        # A worker ends with its job: nothing of it is left for the next.
+        self._ray, self._run = ray, ray.remote(max_retries=0, max_calls=1, num_gpus=gpus)(_run_here)
 
-    def job_parameters(self, work: Work, *, is_exclusive: bool) -> dict[str, Any]:
-        """Return what submitit is told of one job."""
-        # Since Slurm 22.05 srun does not ask for the cores that sbatch was given, and would run the job on one.
-        setup = [f"export {name}={work.threads}" for name in (*THREAD_VARIABLES, "SRUN_CPUS_PER_TASK")]
-        own = {"job_name": work.key, "cpus_per_task": work.threads, "setup": setup, "exclusive": is_exclusive}
-        return {f"slurm_{name}": value for name, value in {**own, **self.parameters}.items() if value}
+    def start(self, work: Work, *, is_exclusive: bool) -> _RayJob:
+        """Queue a job; Ray starts it where cores and GPUs are free."""
+        return _RayJob(self._ray, self._run.options(name=work.key, num_cpus=work.threads).remote(work))
 
 
 @dataclass
 class _RayJob:
     ray: Any
     task: Any
-    is_stopping: bool = field(default=False, init=False)
+    is_stopping: bool = False
 
     def poll(self) -> str | None:
         if not self.ray.wait([self.task], timeout=0)[0]:
             return None
         try:
             self.ray.get(self.task)
-        except self.ray.exceptions.RayTaskError:
-            return ""
         except self.ray.exceptions.RayError as reason:  # its worker or its node is gone, or it was stopped
             return f"the job was lost ({type(reason).__name__})"
         return ""
@@ -391,68 +353,6 @@ class _RayJob:
     def stop(self) -> None:
         self.ray.cancel(self.task, force=self.is_stopping)
         self.is_stopping = True
-
-
-class RayLauncher:
-    """A Ray cluster whose nodes share ROOT; without one, Ray on this machine.
-
-    Args:
-        address: of the cluster's head; ``None`` for ``RAY_ADDRESS``, a cluster that runs here, or a new one.
-        cores: of each job.
-        gpus: of each job, a whole number or a fraction of one.
-
-    Raises:
-        CRPTproError: without Ray, or if the cluster cannot be reached.
-    """
-
-    is_one_machine = False
-
-    def __init__(self, address: str | None = None, *, cores: int = 1, gpus: float = 0) -> None:
-        try:
-            import ray
-        except ImportError as reason:
-            raise CRPTproError(
-                f"--launcher ray needs Ray ({reason}): pip install 'crptpro[ray]', or choose --launcher local."
-            ) from None
-        options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
-        address = address or os.environ.get("RAY_ADDRESS") or None
-        try:
-            host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
-            if colon and port.isdigit():  # Ray itself would ask for minutes where nobody listens
-                socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
-            try:
-                ray.init(address=address or "auto", **options)
-            except ConnectionError:
-                if address is not None:
-                    raise
-                ray.init(address="local", include_dashboard=False, **options)
-        except (OSError, RuntimeError, ValueError) as reason:
-            said = (str(reason).strip().splitlines() or [type(reason).__name__])[0]
-            raise CRPTproError(
-                f"The Ray cluster {address or 'of this machine'} cannot be used: {said}. Give the address that "
-                "`ray start --head` printed, as --ray-address HOST:6379, or ray://HOST:10001."
-            ) from reason
-        sizes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-        if not any(size.get("CPU", 0) >= cores and size.get("GPU", 0) >= gpus for size in sizes):
-            asked = f"{cores} cores and {gpus:g} GPUs"
-            logger.warning(
-                "No node of the Ray cluster has the %s that a job asks for: jobs wait for one.", asked
-            )
-        self._ray, self._gpus = ray, gpus
-        # A worker ends with its job, as a process of its own would: nothing of a job is left for the next.
-        self._run = ray.remote(max_retries=0, max_calls=1)(_run_alone)
-
-    def start(self, work: Work, *, is_exclusive: bool) -> Handle:
-        """Queue a job; Ray starts it where cores and GPUs are free."""
-        variables = dict.fromkeys(THREAD_VARIABLES, str(work.threads))
-        task = self._run.options(
-            name=work.key, num_cpus=work.threads, num_gpus=self._gpus, runtime_env={"env_vars": variables}
-        ).remote(work)
-        return _RayJob(self._ray, task)
-
-
-def _run_alone(work: Work) -> str:
-    return work.run_alone()
 
 
 # --- which jobs, when -----------------------------------------------------------------------------------------------
@@ -471,106 +371,73 @@ class Failure:
 def run_jobs(
     plan: Plan,
     root: Path,
-    launcher: Launcher,
+    launcher: Any,
     *,
     jobs: int = 1,
     cores: int = 1,
     device: str = "cpu",
-    plugins: tuple[str, ...] = (),
+    plugins: Sequence[str] = (),
     attempts: int = 3,
 ) -> list[Failure]:
     """Run every missing job of a plan as soon as all that it needs is finished.
 
-    A job that must be alone on its machine starts when nothing else can. Ctrl-C, SIGTERM and SIGHUP stop all jobs at
-    their next checkpoint, a second one at once.
-
-    Args:
-        plan: what is wanted; its finished jobs are left alone.
-        root: of the reproduction.
-        launcher: where jobs run.
-        jobs: most jobs at a time.
-        cores: of each.
-        device: of networks.
-        plugins: modules that jobs load first.
-        attempts: how often a job is tried; each attempt continues the one before.
+    At most ``jobs`` run at a time, with ``cores`` each; one that must be alone on its machine starts when nothing else
+    can. Each of the ``attempts`` at a job continues the one before. Ctrl-C, SIGTERM and SIGHUP stop all jobs at their
+    next checkpoint, a second one at once.
 
     Returns:
         What was not finished: failures first, then what depends on them.
 
     Raises:
         SubmissionError: a queue refuses the first job.
-        KeyboardInterrupt: after Ctrl-C, when all jobs have ended.
-        SystemExit: likewise after SIGTERM.
+        KeyboardInterrupt: after Ctrl-C, when all jobs have ended; likewise SystemExit.
     """
     describe(root, plan)
-    usual = Work(str(root.resolve()), "", device, cores, cores, plugins)
-    loop = _Loop(plan, usual, launcher, jobs, attempts)
-    heeded = 0
-    with _signals() as received:
+    queue = _Queue(
+        plan, Work(str(root.resolve()), "", device, cores, cores, plugins), launcher, jobs, attempts
+    )
+    with _signals_end_it():
         try:
-            while loop.waiting or loop.running:
-                if len(received) > heeded:
-                    heeded += 1
-                    loop.stop()
-                loop.look()
-                if heeded and not loop.running:
-                    raise KeyboardInterrupt if received[0] == signal.SIGINT else SystemExit(128 + received[0])
-                if heeded or not loop.start():
+            while queue.waiting or queue.running:
+                queue.look()
+                if not queue.start():
                     time.sleep(POLL_S)
         except BaseException:
-            loop.stop()
-            deadline = time.monotonic() + LAST_WAIT_S
-            while loop.running and time.monotonic() < deadline:
-                loop.look()
-                time.sleep(POLL_S)
+            queue.stop()
             raise
-    return loop.failures
+    return queue.failures
+
+
+def _leave(number: int, frame: object) -> None:
+    raise SystemExit(128 + number)
 
 
 @contextlib.contextmanager
-def _signals() -> Iterator[list[int]]:
-    """Note signals that ask to stop, instead of being interrupted by them; a third one interrupts."""
-    received: list[int] = []
-
-    def note(number: int, frame: object) -> None:
-        if len(received) > 1:
-            raise KeyboardInterrupt
-        if not received:
-            logger.warning("Stopping at the next checkpoints; press Ctrl-C again to stop at once.")
-        received.append(number)
-
+def _signals_end_it() -> Iterator[None]:
+    """Have SIGTERM and SIGHUP interrupt as Ctrl-C does; what the caller ignores (nohup) stays ignored."""
+    numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN]
     is_main = threading.current_thread() is threading.main_thread()
-    # What the caller ignores (nohup) stays ignored.
-    numbers = [
-        n for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN
-    ]
-    before = {number: signal.signal(number, note) for number in numbers if is_main}
+    before = {number: signal.signal(number, _leave) for number in numbers if is_main}
     try:
-        yield received
+        yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
-@dataclass
-class _Loop:
-    plan: Plan
-    usual: Work
-    launcher: Launcher
-    jobs: int
-    attempts: int
-
-    def __post_init__(self) -> None:
-        self.waiting = list(self.plan.missing)
-        self.finished = {job.key for job in self.plan.jobs} - {job.key for job in self.waiting}
-        self.running: list[tuple[Job, Handle, float]] = []
+class _Queue:
+    def __init__(self, plan: Plan, usual: Work, launcher: Any, jobs: int, attempts: int) -> None:
+        self.usual, self.launcher, self.jobs, self.attempts = usual, launcher, jobs, attempts
+        self.waiting, self.count = list(plan.missing), len(plan.jobs)
+        self.finished = {job.key for job in plan.jobs} - {job.key for job in plan.missing}
+        self.running: dict[Job, tuple[Any, float]] = {}
         self.failures: list[Failure] = []
         self.tried: Counter[str] = Counter()
         self.is_stopping, self.resumes = False, -math.inf
 
     def start(self) -> bool:
         """Start what can be started, and return whether anything was."""
-        if time.monotonic() < self.resumes or any(job.is_exclusive for job, *_ in self.running):
+        if time.monotonic() < self.resumes or any(job.is_exclusive for job in self.running):
             return False
         ready = [job for job in self.waiting if all(needed.key in self.finished for needed in job.needs)]
         shared = [job for job in ready if not job.is_exclusive]
@@ -593,40 +460,35 @@ class _Loop:
             logger.info("%s: started", job.key)
             self.waiting.remove(job)
             self.tried[job.key] += 1
-            self.running.append((job, handle, time.monotonic()))
+            self.running[job] = handle, time.monotonic()
         return bool(chosen)
 
     def look(self) -> None:
-        """Take in what has ended; give up or try again what has failed."""
-        for entry in list(self.running):
-            job, handle, began = entry
+        for job, (handle, began) in list(self.running.items()):
             lost = handle.poll()
             if lost is None:
                 continue
-            self.running.remove(entry)
-            took, directory = duration(time.monotonic() - began), directory_of(Path(self.usual.root), job.key)
-            log, tried = directory / LOG, self.tried[job.key]
+            del self.running[job]
+            directory = directory_of(Path(self.usual.root), job.key)
+            took, log, tried = duration(time.monotonic() - began), directory / LOG, self.tried[job.key]
             # The job's own record decides: it may have been lost after its work was done.
             if (directory / DONE).exists():
                 self.finished.add(job.key)
-                count = f"{len(self.finished)} of {len(self.plan.jobs)}"
-                logger.info("%s: finished in %s (%s)", job.key, took, count)
+                logger.info("%s: finished in %s (%d of %d)", job.key, took, len(self.finished), self.count)
                 continue
+            reason = lost or _last_line(log) or "it ended unfinished"
             if self.is_stopping:
                 logger.info("%s: stopped after %s", job.key, took)
-                continue
-            reason = lost or _last_line(log).removeprefix("error: ") or "it ended unfinished"
-            if tried < self.attempts:
+            elif tried < self.attempts:
                 self.waiting.insert(0, job)
                 again = f"attempt {tried + 1} of {self.attempts}"
                 logger.warning("%s: %s after %s; %s (log: %s)", job.key, reason, took, again, log)
-                continue
-            logger.error("%s: failed after %s: %s (log: %s)", job.key, took, reason, log)
-            self.failures.append(Failure(job.key, reason, log, tried))
-            self._skip({job.key})
+            else:
+                logger.error("%s: failed after %s: %s (log: %s)", job.key, took, reason, log)
+                self.failures.append(Failure(job.key, reason, log, tried))
+                self._skip({job.key})
 
     def _skip(self, lost: set[str]) -> None:
-        """Give up what needs something that failed; the plan's order has needs first."""
         for job in list(self.waiting):
             if failed := [needed.key for needed in job.needs if needed.key in lost]:
                 self.waiting.remove(job)
@@ -634,10 +496,18 @@ class _Loop:
                 self.failures.append(Failure(job.key, f"needs {failed[0]}"))
 
     def stop(self) -> None:
-        """Ask all jobs to stop."""
+        """Stop all jobs at their next checkpoint and wait for them; interrupted once more, stop them at once."""
         self.is_stopping = True
-        for _, handle, _ in self.running:
-            handle.stop()
+        if self.running:
+            logger.warning("Stopping at the next checkpoints; press Ctrl-C again to stop at once.")
+        for seconds in (math.inf, LAST_WAIT_S):
+            for handle, _ in self.running.values():
+                handle.stop()
+            deadline = time.monotonic() + seconds
+            with contextlib.suppress(KeyboardInterrupt, SystemExit):
+                while self.running and time.monotonic() < deadline:
+                    self.look()
+                    time.sleep(POLL_S)
 
 
 def duration(seconds: float) -> str:
@@ -655,33 +525,25 @@ def duration(seconds: float) -> str:
 # --- what jobs have -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Resources:
-    """What jobs have: how many at a time, cores of each, and the GPUs of this machine that they share."""
-
-    jobs: int
-    cores: int
-    gpus: tuple[str, ...] = ()
-
-
 def divide(
     launcher: str, *, device: str, jobs: int | None, cores: int | None, jobs_per_gpu: int = 1
-) -> Resources:
+) -> tuple[int, int, tuple[str, ...]]:
     """Fill in what the user left open.
 
-    On one machine there is a job per core, or, with ``device="cuda"``, per GPU times ``jobs_per_gpu``. The cores are
-    divided among them. On a cluster there are 16 jobs, with a core each, or four beside a GPU.
+    On one machine there is a job per core, or, with ``device="cuda"``, per GPU times ``jobs_per_gpu``, which is also
+    the most. The cores are divided among them. On a cluster there are 16 jobs, with a core each, or four beside a GPU.
+
+    Returns:
+        How many jobs at a time, the cores of each, and the GPUs of this machine that they share.
 
     Raises:
-        CRPTproError: a number below 1, no GPU where one is asked for, or more jobs than this machine's GPUs take.
+        CRPTproError: a number below 1, or no GPU where one is asked for.
     """
     for name, value in (("jobs", jobs), ("cores-per-job", cores), ("jobs-per-gpu", jobs_per_gpu)):
         if value is not None and value < 1:
             raise CRPTproError(f"--{name} must be at least 1, got {value}.")
     if launcher != "local":
-        return Resources(
-            jobs or CLUSTER_JOBS, cores or (CLUSTER_GPU_CORES if device.startswith("cuda") else 1)
-        )
+        return jobs or CLUSTER_JOBS, cores or (CLUSTER_GPU_CORES if device.startswith("cuda") else 1), ()
     gpus: tuple[str, ...] = ()
     if device == "cuda":
         listed = os.environ.get("CUDA_VISIBLE_DEVICES")
@@ -691,14 +553,11 @@ def divide(
             raise CRPTproError(
                 "--device cuda: this machine has no GPU that torch can use; --device cpu always works."
             )
-    room = jobs_per_gpu * (len(gpus) or int(device.startswith("cuda")))
-    if room and (jobs or 0) > room:
-        raise CRPTproError(
-            f"--jobs {jobs} are more than the {room} that the GPUs take with --jobs-per-gpu {jobs_per_gpu}: ask for "
-            f"fewer, or let more share a GPU."
-        )
-    jobs = jobs or room or max(1, cpu_cores() // (cores or 1))
-    return Resources(jobs, cores or max(1, cpu_cores() // jobs), gpus)
+    if device.startswith("cuda"):
+        room = jobs_per_gpu * max(1, len(gpus))
+        jobs = min(jobs or room, room)
+    jobs = jobs or max(1, cpu_cores() // (cores or 1))
+    return jobs, cores or max(1, cpu_cores() // jobs), gpus
 
 
 def slurm_parameters(
@@ -713,20 +572,19 @@ def slurm_parameters(
         >>> slurm_parameters(partition="short", hours=2, memory_gb=8, sbatch=("qos=high",), has_gpu=False)
         {'time': 120, 'mem': '8192M', 'partition': 'short', 'additional_parameters': {'qos': 'high'}}
     """
-    if not hours * 60 >= 1:
-        raise CRPTproError(f"--hours must be at least a minute (0.017), got {hours:g}.")
-    if not memory_gb >= 1:
-        raise CRPTproError(f"--memory-gb must be at least 1, got {memory_gb:g}.")
-    further = {}
+    if not (hours * 60 >= 1 and memory_gb >= 1):
+        raise CRPTproError(
+            f"--hours {hours:g} --memory-gb {memory_gb:g}: a job needs a minute and 1 GB at least."
+        )
+    found: dict[str, Any] = {"time": round(hours * 60), "mem": f"{round(memory_gb * 1024)}M"}
+    found |= {} if partition is None else {"partition": partition}
+    found |= {"gpus_per_node": 1} if has_gpu else {}
     for option in sbatch:
         key, equals, value = option.partition("=")
         if not key or not equals:
             raise CRPTproError(f"--sbatch {option}: write key=value, e.g. qos=high or account=robots.")
-        further[key.lstrip("-")] = value
-    found: dict[str, Any] = {"time": round(hours * 60), "mem": f"{round(memory_gb * 1024)}M"}
-    found |= {} if partition is None else {"partition": partition}
-    found |= {"gpus_per_node": 1} if has_gpu else {}
-    return found | ({"additional_parameters": further} if further else {})
+        found.setdefault("additional_parameters", {})[key.lstrip("-")] = value
+    return found
 
 
 def _end_with(parent: int) -> None:
@@ -738,6 +596,8 @@ def _end_with(parent: int) -> None:
 
 
 if __name__ == "__main__":
-    order = json.loads(sys.argv[1])
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+    signal.signal(signal.SIGTERM, _leave)
+    signal.signal(signal.SIGUSR2, signal.SIG_IGN)  # it tells submitit that the time is up
     threading.Thread(target=_end_with, args=(int(sys.argv[2]),), daemon=True).start()
-    raise SystemExit(bool(Work(**{**order, "plugins": tuple(order["plugins"])}).run_alone()))
+    raise SystemExit(bool(Work(**json.loads(sys.argv[1])).run()))

@@ -1,4 +1,7 @@
-"""What each experiment of the paper asks for, at which scale: cells of its tables, and the job behind each."""
+"""What each experiment of the paper asks for, at which scale: cells of its tables, and the job behind each.
+
+From top to bottom: systems and scales, what a user may ask for, the job of each kind, and then the experiments.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,8 @@ import re
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from itertools import product
+from typing import Any, NamedTuple
 
 from crptpro.domains import GROUPS, get_domain
 from crptpro.envs import resolve_action_repeat
@@ -76,17 +80,13 @@ class Scale:
     # settings of exploring, with the encoder update interval of a method that makes one update each time
     explore: Settings = field(default_factory=dict)
     explore_single: Settings = field(default_factory=dict)  # the same of the (S) methods
-    # settings of exploring that an (S) method has in ``ablation`` besides
-    single_ablation: Settings = field(default_factory=dict)
+    single_ablation: Settings = field(default_factory=dict)  # what these have in ``ablation`` besides
     run: Settings = field(default_factory=dict)  # settings of every downstream run
-    seeds: int = 3  # number of downstream runs on each encoder unless the caller says otherwise
-    # weights of the dispersion loss in ``sensitivity``, besides none and the method's own
-    alphas: tuple[float, ...] = (5e-4, 5e-2, 5e-1)
-    # random transitions per domain in ``sensitivity``
-    capacities: tuple[int, ...] = (10_000, 50_000, 100_000)
+    seeds: int = 3  # downstream runs on each encoder unless the caller says otherwise
+    alphas: tuple[float, ...] = (5e-4, 5e-2, 5e-1)  # of ``sensitivity``, besides none and the method's own
+    capacities: tuple[int, ...] = (10_000, 50_000, 100_000)  # likewise, random transitions per domain
     probe_samples: int = 4_000  # observations of a state probe
-    # of a dataset that is probed, which needs several episodes, if not ``transitions``
-    probe_transitions: int | None = None
+    probe_transitions: int | None = None  # of a dataset that is probed, if not ``transitions``
     timing_updates: int = 100  # encoder updates that ``efficiency`` times, after as many to warm up
     paper_timing_updates: int = 0  # the same with the paper's batches and intervals; 0 for none
     coverage_samples: int = 1_024  # observations of a coverage estimate
@@ -162,14 +162,10 @@ TINY = Scale(
 SCALES: dict[str, Scale] = {scale.name: scale for scale in (TINY, SMALL, PAPER)}
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One number that an experiment asks for.
+class Cell(NamedTuple):
+    """One number that an experiment asks for, what gives it, and where it stands: ``{"group": "A", ...}``.
 
-    Args:
-        label: the system or variant, a row of the tables: ``"crptpro"``, ``"proto-rl-c with dispersion"``.
-        job: what gives the number.
-        place: where it stands otherwise: ``{"group": "A", "task": "walker_run"}``.
+    The label is the system or variant, a row of the tables: ``"crptpro"``, ``"proto-rl-c with dispersion"``.
     """
 
     label: str
@@ -179,18 +175,10 @@ class Cell:
 
 @dataclass(frozen=True)
 class Request:
-    """What part of an experiment is wanted, at which scale.
+    """What part of an experiment is wanted, at which scale; what is empty is the experiment's own choice.
 
-    Args:
-        scale: every budget.
-        methods: systems, by name; the experiment's own if empty.
-        groups: letters of :data:`crptpro.domains.GROUPS`; the experiment's own if empty.
-        tasks: by name, or a domain's, which stands for its task; the experiment's own if empty.
-        encoder_seeds: the first seed level: collection, exploration and pre-training.
-        seeds: the second: downstream runs on each encoder; as many as the scale has if empty.
-        colors: what "other colours" are, where an experiment has them.
-        device: of networks; only timings depend on it, and on ``threads``.
-        threads: of a job that is alone on its machine.
+    Encoder seeds are the first level (collection, exploration, pre-training), seeds the second: downstream runs on each
+    encoder. Device and threads, of a job that is alone on its machine, matter to timings only.
 
     Raises:
         UnknownNameError: for a method, a group or a task.
@@ -218,33 +206,24 @@ class Request:
         named = [(task, get_domain(task)) for task in self.tasks]
         tasks = (d.task if task == d.name or d.source == "manipulation" else task for task, d in named)
         object.__setattr__(self, "tasks", tuple(dict.fromkeys(tasks)))
+        object.__setattr__(self, "seeds", tuple(self.seeds) or tuple(range(self.scale.seeds)))
         for name in ("encoder_seeds", "seeds"):
-            object.__setattr__(self, name, tuple(as_int(seed, name) for seed in getattr(self, name)))
-        for name, given in (("encoder_seeds", self.encoder_seeds), ("seeds", self.downstream_seeds)):
+            given = tuple(as_int(seed, name) for seed in getattr(self, name))
             if not given or len(set(given)) != len(given) or not all(0 <= seed < SEEDS for seed in given):
                 raise CRPTproError(f"`{name}` must be different numbers from 0 to {SEEDS - 1}, got {given}.")
+            object.__setattr__(self, name, given)
 
     @property
-    def downstream_seeds(self) -> tuple[int, ...]:
-        """Seeds of the second level."""
-        return self.seeds or tuple(range(self.scale.seeds))
+    def domains(self) -> tuple[str, ...]:
+        """Domains of the tasks asked for."""
+        return tuple(dict.fromkeys(get_domain(task).name for task in self.tasks))
 
-    def chosen(self, usual: Iterable[str]) -> tuple[str, ...]:
-        """Return the methods asked for, or the experiment's usual ones."""
-        return self.methods or tuple(usual)
-
-    def tasks_of(self, domains: Iterable[str]) -> list[str]:
+    def tasks_in(self, domains: Iterable[str]) -> list[str]:
         """Return the tasks asked for that are in these domains, or one of each domain."""
         domains = list(domains)
         if self.tasks:
             return [task for task in self.tasks if get_domain(task).name in domains]
         return [get_domain(domain).task for domain in domains]
-
-    def groups_and_seeds(self, *usual: str) -> Iterator[tuple[str, int]]:
-        """Yield every encoder seed of every group."""
-        for group in self.groups or usual:
-            for seed in self.encoder_seeds:
-                yield group, seed
 
 
 # --- jobs at a scale ------------------------------------------------------------------------------------------------
@@ -254,11 +233,6 @@ def pretraining_of(system: str) -> Method:
     """Return the method that trains a system's encoder, or whose encoder it starts from."""
     method = get_method(system)
     return method if method.starts_from is None else get_method(method.starts_from)
-
-
-def explores(system: str) -> bool:
-    """Whether a system's encoder is trained on what its own agents see."""
-    return pretraining_of(system).exploration is not None
 
 
 def is_single_domain(system: str) -> bool:
@@ -318,8 +292,7 @@ def encoder(
     if method.loss_class is None:
         data = [dataset(scale, name, seed, transitions) for name in names] if system == STANDARDISED else []
         command = ["pretrain", *map(_dataset_of, data), *command, *options(seed=seed)]
-        title = title if data else f"seed {seed}"
-        return Job("untrained", title, tuple(command), facts, tuple(data))
+        return Job("untrained", title if data else f"seed {seed}", tuple(command), facts, tuple(data))
     # What the method's loss has anyway is no option: it would make the same encoder another job.
     usual = {**_loss_defaults(method), **method.loss_options}
     asked = {**scale.loss.get(method.loss_class.__name__, {}), **loss}
@@ -390,13 +363,9 @@ def probe(scale: Scale, base: Job, data: Job) -> Job:
     """Return the state probe of an encoder on a domain, ``<job>/probe.csv``."""
     command = ["probe", _encoder_of(base), _dataset_of(data), "--csv", f"{OWN}/probe.csv"]
     command += options(samples=scale.probe_samples, seed=0)
-    facts = {
-        "method": base.facts["method"],
-        "encoder_seed": base.facts["seed"],
-        "domain": data.facts["domain"],
-    }
-    title = f"{facts['method']} seed {facts['encoder_seed']} on {facts['domain']}"
-    return Job("probe", title, tuple(command), facts, (base, data))
+    method, seed, domain = base.facts["method"], base.facts["seed"], data.facts["domain"]
+    facts = {"method": method, "encoder_seed": seed, "domain": domain}
+    return Job("probe", f"{method} seed {seed} on {domain}", tuple(command), facts, (base, data))
 
 
 def _about(job: Job) -> tuple[str, dict[str, Any]]:
@@ -407,9 +376,8 @@ def _about(job: Job) -> tuple[str, dict[str, Any]]:
 def spread(base: Job) -> Job:
     """Return how far an encoder's prototypes have spread, along its training and at its end."""
     title, facts = _about(base)
-    return Job(
-        "prototypes", title, ("measure", "prototypes", _encoder_of(base), "--out", OWN), facts, (base,)
-    )
+    command = ("measure", "prototypes", _encoder_of(base), "--out", OWN)
+    return Job("prototypes", title, command, facts, (base,))
 
 
 def comparison(
@@ -427,19 +395,17 @@ def comparison(
 
 def timing(request: Request, system: str, domain_sets: Sequence[Sequence[str]], seed: int) -> Job:
     """Return the timing of encoders' training, ``<job>/timing.csv``: of one, or of several whose costs add up."""
-    scale, device, threads = request.scale, request.device, request.threads
+    scale, where = request.scale, {"device": request.device, "threads": request.threads}
     here, paper = ([encoder(at, system, domains, seed) for domains in domain_sets] for at in (scale, PAPER))
-    command = ["measure", "timing", "--out", OWN, *options(
-        updates=scale.timing_updates, paper_updates=scale.paper_timing_updates, device=device, threads=threads,
-    )]  # fmt: skip
+    command = ["measure", "timing", "--out", OWN]
+    command += options(updates=scale.timing_updates, paper_updates=scale.paper_timing_updates, **where)
     for trained, whole in zip(here, paper):
         # What is in the data does not change the time: both are timed on this scale's.
         command += ["--training", _as_word(trained, trained), "--paper-training", _as_word(whole, trained)]
     domains = [domain for job in here for domain in job.facts["domains"]]
-    facts = {"method": here[0].facts["method"], "domains": domains, "seed": seed}
-    facts |= {"device": device, "threads": threads}
+    facts = {"method": here[0].facts["method"], "domains": domains, "seed": seed, **where}
     needs = tuple(dict.fromkeys(needed for job in here for needed in job.needs))
-    title = f"{facts['method']} {'+'.join(domains)} {device} {threads}"
+    title = f"{facts['method']} {'+'.join(domains)} {request.device} {request.threads}"
     return Job("timing", title, tuple(command), facts, needs)
 
 
@@ -452,7 +418,31 @@ def _as_word(job: Job, like: Job) -> str:
     return shlex.join(command[:at] + command[at + 2 :])
 
 
-# --- experiments in downstream scores -------------------------------------------------------------------------------
+# --- experiments ----------------------------------------------------------------------------------------------------
+
+
+class Experiment(NamedTuple):
+    """One of the commands ``crptpro reproduce NAME``: heading, what it asks, and the cells of a request."""
+
+    title: str
+    summary: str
+    cells: Callable[[Request], list[Cell]]
+
+
+EXPERIMENTS: dict[str, Experiment] = {}
+"""In the order of the paper; what it does not have comes last."""
+
+
+def _experiment(title: str) -> Callable[[Callable[[Request], Iterator[Cell]]], None]:
+    """Register a function as the experiment of its name; its docstring is the summary."""
+
+    def register(cells: Callable[[Request], Iterator[Cell]]) -> None:
+        summary = " ".join((cells.__doc__ or "").split())
+        EXPERIMENTS[cells.__name__.strip("_")] = Experiment(
+            title, summary, lambda request: list(cells(request))
+        )
+
+    return register
 
 
 def _scores(
@@ -465,73 +455,77 @@ def _scores(
     colors: str = "normal",
     place: Settings = NONE,
     **how: Any,
-) -> list[Cell]:
-    """Return the runs of a system on a task of, or after, a group: every downstream seed on every encoder.
+) -> Iterator[Cell]:
+    """Yield the runs of a system on a task of, or after, a group: every downstream seed on every encoder.
 
     Where there is no encoder to share (DrQ), the encoder seeds count as further seeds of the run, so that every
     system has as many runs.
     """
-    found = []
     where = {"group": group, "task": task, **({} if colors == "normal" else {"colors": colors}), **place}
     for encoder_seed in request.encoder_seeds:
         base = encoder_for_task(request.scale, system, GROUPS[group], task, encoder_seed, **how)
-        for seed in request.downstream_seeds:
+        for seed in request.seeds:
             own = seed if base is not None else seed + SEEDS * encoder_seed
             job = run(request.scale, system, task, base, own, colors=colors)
-            found.append(Cell(label or system, job, {**where, "encoder_seed": encoder_seed, "seed": seed}))
-    return found
+            yield Cell(label or system, job, {**where, "encoder_seed": encoder_seed, "seed": seed})
 
 
-def _seen(request: Request) -> list[Cell]:
-    return [
-        cell
-        for group in request.groups or GROUPS
-        for task in request.tasks_of(GROUPS[group])
-        for system in request.chosen(METHODS)
-        for cell in _scores(request, group, task, system)
-    ]
+def _table(
+    request: Request, rows: Mapping[str, Sequence[str]], systems: Iterable[str], colors: str = "normal"
+) -> Iterator[Cell]:
+    for group, tasks in rows.items():
+        for task, system in product(tasks, list(systems)):
+            yield from _scores(request, group, task, system, colors=colors)
 
 
-def _elsewhere(
-    request: Request, rows: Mapping[str, Sequence[str]], colors: str = "normal", *, has_single: bool = False
-) -> list[Cell]:
-    """Encoders of groups on further tasks. Nothing is fine-tuned, and no encoder has seen a task's own domain."""
-    return [
-        cell
+@_experiment("Tasks of seen domains")
+def _seen(request: Request) -> Iterator[Cell]:
+    """Tasks of the domains that the encoder was pre-trained on, for every method (section IV.B)."""
+    rows = {group: request.tasks_in(GROUPS[group]) for group in request.groups or GROUPS}
+    return _table(request, rows, request.methods or METHODS)
+
+
+def _elsewhere(request: Request, rows: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
+    """Return the tasks asked for, by group. Nothing is fine-tuned, and no encoder has seen a task's own domain."""
+    return {
+        group: [task for task in tasks if task in (request.tasks or tasks)]
         for group, tasks in rows.items()
         if group in (request.groups or rows)
-        for task in tasks
-        if task in (request.tasks or tasks)
-        for system in request.chosen(CROSS_DOMAIN)
-        if system != FINETUNE and (has_single or not is_single_domain(system))
-        for cell in _scores(request, group, task, system, colors=colors)
-    ]
+    }
 
 
-def _unseen(request: Request) -> list[Cell]:
-    return _elsewhere(request, UNSEEN_TASKS)
+@_experiment("Tasks of unseen domains")
+def _unseen(request: Request) -> Iterator[Cell]:
+    """Tasks of domains that the encoder never saw, without fine-tuning (section IV.C)."""
+    systems = [each for each in request.methods or CROSS_DOMAIN if each != FINETUNE]
+    several = [system for system in systems if not is_single_domain(system)]
+    return _table(request, _elsewhere(request, UNSEEN_TASKS), several)
 
 
-def _colors(request: Request) -> list[Cell]:
-    return _elsewhere(request, COLORS_TASKS, request.colors, has_single=True)
+@_experiment("Reversed background colours")
+def _colors(request: Request) -> Iterator[Cell]:
+    """Tasks with the colours of the background reversed, without fine-tuning (section IV.C).
+
+    The paper does not say how it reverses them; whole images are the option.
+    """
+    systems = [each for each in request.methods or CROSS_DOMAIN if each != FINETUNE]
+    return _table(request, _elsewhere(request, COLORS_TASKS), systems, request.colors)
 
 
-def _finetune(request: Request) -> list[Cell]:
-    return [
-        cell
-        for group in request.groups or ("A",)
-        for task in request.tasks_of(FINETUNE_UPDATES)
-        for system in request.chosen(("crptpro", FAST, FINETUNE, "proto-rl-s", "apt-s", DRQ))
-        for cell in _scores(request, group, task, system)
-    ]
+@_experiment("Fine-tuning on one domain")
+def _finetune(request: Request) -> Iterator[Cell]:
+    """The encoder of group A trained further on one domain, beside single-domain methods and DrQ (section IV.D)."""
+    rows = {group: request.tasks_in(FINETUNE_UPDATES) for group in request.groups or "A"}
+    return _table(request, rows, request.methods or ("crptpro", FAST, FINETUNE, "proto-rl-s", "apt-s", DRQ))
 
 
-def _ablation(request: Request) -> list[Cell]:
-    """Proto-RL(C) with the dispersion loss is CRPTpro without its decoupled collection."""
-    found: list[Cell] = []
+@_experiment("Ablation: dispersion loss, decoupled collection")
+def _ablation(request: Request) -> Iterator[Cell]:
+    """With and without the dispersion loss, with and without decoupled collection (section IV.F)."""
+    # Proto-RL(C) with the dispersion loss is CRPTpro without its decoupled collection.
     for group in request.groups or ("A", "C"):
-        for task in request.tasks_of(GROUPS[group]):
-            for system in request.chosen(VARIANTS):
+        for task in request.tasks_in(GROUPS[group]):
+            for system in request.methods or VARIANTS:
                 explore, weight = NONE, DISPERSION["intr_loss_coef"]
                 if is_single_domain(system):
                     domain = get_domain(task).name
@@ -540,202 +534,123 @@ def _ablation(request: Request) -> list[Cell]:
                     explore, weight = request.scale.single_ablation, SINGLE_DISPERSION.get(domain, weight)
                 for label, loss in VARIANTS.get(system, ((system, NONE),)):
                     own = {"intr_loss_coef": weight} if loss == DISPERSION else loss
-                    found += _scores(request, group, task, system, label=label, loss=own, explore=explore)
-    return found
+                    how: dict[str, Any] = {"label": label, "loss": own, "explore": explore}
+                    yield from _scores(request, group, task, system, **how)
 
 
-def _sensitivity(request: Request) -> list[Cell]:
-    """The weight of the dispersion loss; methods without one have nothing to vary. Then the size of the datasets."""
-    scale, found = request.scale, list[Cell]()
-    for group in request.groups or ("A",):
-        for task in request.tasks_of(GROUPS[group]):
-            for system in request.chosen(("crptpro", "proto-rl-c")):
+@_experiment("Sensitivity: weight of the dispersion loss, amount of data")
+def _sensitivity(request: Request) -> Iterator[Cell]:
+    """The weight alpha of the dispersion loss, and the capacity b of the random datasets (section IV.F)."""
+    # The weight of the dispersion loss; methods without one have nothing to vary. Then the size of the datasets.
+    scale = request.scale
+    for group in request.groups or "A":
+        for task in request.tasks_in(GROUPS[group]):
+            for system in request.methods or ("crptpro", "proto-rl-c"):
                 has_weight = "intr_loss_coef" in _loss_defaults(pretraining_of(system))
                 for weight in sorted({0.0, 5e-3, *scale.alphas}) if has_weight else ():
-                    found += _scores(
+                    yield from _scores(
                         request, group, task, system, label=f"{system}, alpha {weight:g}",
                         loss={"intr_loss_coef": weight}, place={"varied": "alpha", "value": f"{weight:g}"},
                     )  # fmt: skip
             sizes = sorted({*scale.capacities, scale.transitions})
-            for size in sizes if "crptpro" in request.chosen(("crptpro",)) else ():
-                found += _scores(
+            for size in sizes if "crptpro" in (request.methods or ("crptpro",)) else ():
+                yield from _scores(
                     request, group, task, "crptpro", label=f"crptpro, b {size:,}", transitions=size,
                     place={"varied": "b", "value": str(size)},
                 )  # fmt: skip
-    return found
 
 
-# --- experiments that measure encoders ------------------------------------------------------------------------------
+@_experiment("Cost of pre-training")
+def _efficiency(request: Request) -> Iterator[Cell]:
+    """Time and encoder updates of pre-training for one, two and three domains (section IV.E), from a timed part."""
+    for group, seed in product(request.groups or "A", request.encoder_seeds):
+        for system in (name for name in request.methods or PRETRAINED if name in PRETRAINED):
+            for count in range(1, len(GROUPS[group]) + 1):
+                domains = GROUPS[group][:count]
+                sets = [(domain,) for domain in domains] if is_single_domain(system) else [domains]
+                place = {"group": group, "domains": count, "encoder_seed": seed}
+                place |= {"device": request.device, "threads": request.threads}
+                yield Cell(system, timing(request, system, sets, seed), place)
 
 
 def _domain_sets(request: Request, group: str, system: str) -> list[tuple[str, ...]]:
     """The domains of each encoder of a system: the group's, or, of an (S) method, one for each of those asked for."""
     if not is_single_domain(system):
         return [GROUPS[group]]
-    asked = dict.fromkeys(get_domain(task).name for task in request.tasks)
-    return [(domain,) for domain in asked if domain in GROUPS[group]] or [(SINGLE_DOMAIN[group],)]
+    asked = [domain for domain in request.domains if domain in GROUPS[group]]
+    return [(domain,) for domain in asked or (SINGLE_DOMAIN[group],)]
 
 
 def _measured(label: str, job: Job, group: str, seed: int, domains: Sequence[str]) -> Cell:
     return Cell(label, job, {"group": group, "domains": "+".join(domains), "encoder_seed": seed})
 
 
-def _efficiency(request: Request) -> list[Cell]:
-    found = []
-    for group, seed in request.groups_and_seeds("A"):
-        for system in (name for name in request.chosen(PRETRAINED) if name in PRETRAINED):
-            for count in range(1, len(GROUPS[group]) + 1):
-                domains = GROUPS[group][:count]
-                sets = [(domain,) for domain in domains] if is_single_domain(system) else [domains]
-                place = {"group": group, "domains": count, "encoder_seed": seed}
-                place |= {"device": request.device, "threads": request.threads}
-                found.append(Cell(system, timing(request, system, sets, seed), place))
-    return found
-
-
 def _trained(
     request: Request, variants: Mapping[str, Sequence[tuple[str, Settings]]], measure: Callable[[Job], Job]
-) -> list[Cell]:
+) -> Iterator[Cell]:
     """Encoders of methods with prototypes, or what is measured of them."""
-    return [
-        _measured(
-            label, measure(encoder(request.scale, system, domains, seed, loss=loss)), group, seed, domains
-        )
-        for group, seed in request.groups_and_seeds("A")
-        for system in request.chosen(variants)
-        for domains in _domain_sets(request, group, system)
-        for label, loss in variants.get(system, ())
-    ]
+    for group, seed in product(request.groups or "A", request.encoder_seeds):
+        for system in request.methods or variants:
+            for domains, (label, loss) in product(
+                _domain_sets(request, group, system), variants.get(system, ())
+            ):
+                trained = encoder(request.scale, system, domains, seed, loss=loss)
+                yield _measured(label, measure(trained), group, seed, domains)
 
 
-def _prototypes(request: Request) -> list[Cell]:
+@_experiment("Spread of the prototypes")
+def _prototypes(request: Request) -> Iterator[Cell]:
+    """How far prototypes spread, along pre-training and at its end, with and without the dispersion loss (IV.G)."""
     return _trained(request, VARIANTS, spread)
 
 
-def _stability(request: Request) -> list[Cell]:
-    """Without the dispersion loss CRPTpro differs from Proto-RL(C) in its data alone."""
-    variants = {"crptpro": VARIANTS["crptpro"], FAST: VARIANTS[FAST], "proto-rl-c": (("proto-rl-c", NONE),)}
-    return _trained(request, variants, lambda trained: trained)
-
-
-def _compared(request: Request, kind: str, groups: tuple[str, ...], system: str, samples: int) -> list[Cell]:
+def _compared(request: Request, kind: str, groups: str, system: str, samples: int) -> Iterator[Cell]:
     """Random data beside an explorer's, as CRPTpro's encoder sees both: it was trained on all domains."""
-    scale, found = request.scale, []
-    for group, seed in request.groups_and_seeds(*groups):
+    scale = request.scale
+    for group, seed in product(request.groups or groups, request.encoder_seeds):
         base = encoder(scale, "crptpro", GROUPS[group], seed)
-        for explorer in filter(explores, request.chosen((system,))):
+        for explorer in request.methods or (system,):
+            if pretraining_of(explorer).exploration is None:
+                continue
             for domains in _domain_sets(request, group, explorer):
                 data = [dataset(scale, d, seed) for d in (domains if kind == "coverage" else GROUPS[group])]
                 exploring = encoder(scale, explorer, domains, seed)
                 job = comparison(kind, base, exploring, data, samples=samples, seed=seed)
-                found.append(_measured(explorer, job, group, seed, domains))
-    return found
+                yield _measured(explorer, job, group, seed, domains)
 
 
-def _coverage(request: Request) -> list[Cell]:
-    return _compared(request, "coverage", ("A",), "proto-rl-c", request.scale.coverage_samples)
+@_experiment("Coverage of the data")
+def _coverage(request: Request) -> Iterator[Cell]:
+    """How widely random data and an explorer's are spread along pre-training (section IV.H)."""
+    return _compared(request, "coverage", "A", "proto-rl-c", request.scale.coverage_samples)
 
 
-def _visualize(request: Request) -> list[Cell]:
-    return _compared(request, "embeddings", ("B", "C"), "proto-rl-s", request.scale.embedded_samples)
+@_experiment("Stability of pre-training")
+def _stability(request: Request) -> Iterator[Cell]:
+    """The comparative loss along pre-training on random data and on an explorer's (section IV.H)."""
+    # Without the dispersion loss CRPTpro differs from Proto-RL(C) in its data alone.
+    variants = {"crptpro": VARIANTS["crptpro"], FAST: VARIANTS[FAST], "proto-rl-c": (("proto-rl-c", NONE),)}
+    return _trained(request, variants, lambda trained: trained)
 
 
-def _probe(request: Request) -> list[Cell]:
-    """Tasks of the request choose the domains; an (S) method's one encoder is probed on all of them, too."""
-    scale, found = request.scale, []
-    for group, seed in request.groups_and_seeds("A"):
-        asked = tuple(dict.fromkeys(get_domain(task).name for task in request.tasks))
-        for system in request.chosen((*PRETRAINED, RANDOM)):
-            for domain in asked or (*GROUPS[group], *PROBED_UNSEEN[group]):
+@_experiment("Embeddings of random data and of an explorer's")
+def _visualize(request: Request) -> Iterator[Cell]:
+    """Principal components of random data of three domains and of an explorer's in one of them (section IV.H)."""
+    return _compared(request, "embeddings", "BC", "proto-rl-s", request.scale.embedded_samples)
+
+
+@_experiment("State probe")
+def _probe(request: Request) -> Iterator[Cell]:
+    """What a linear model reads of the simulator's state from frozen features. Not in the paper."""
+    # Tasks of the request choose the domains; an (S) method's one encoder is probed on all of them, too.
+    scale = request.scale
+    for group, seed in product(request.groups or "A", request.encoder_seeds):
+        for system in request.methods or (*PRETRAINED, RANDOM):
+            for domain in request.domains or (*GROUPS[group], *PROBED_UNSEEN[group]):
                 home = domain if system == FINETUNE else SINGLE_DOMAIN[group]
                 trained = encoder_for_task(scale, system, GROUPS[group], get_domain(home).task, seed)
                 if trained is None or system == NO_BONUS:
                     continue  # no encoder of its own
                 job = probe(scale, trained, dataset(scale, domain, seed, scale.probe_transitions))
                 place = {"group": group, "domain": domain, "colors": "normal", "encoder_seed": seed}
-                found.append(Cell(system, job, place))
-    return found
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """One of the commands ``crptpro reproduce NAME``.
-
-    Args:
-        title: heading.
-        summary: what it asks, and where the paper has it.
-        cells: what a request makes of it.
-    """
-
-    title: str
-    summary: str
-    cells: Callable[[Request], list[Cell]]
-
-
-EXPERIMENTS: dict[str, Experiment] = {
-    "seen": Experiment(
-        "Tasks of seen domains",
-        "Tasks of the domains that the encoder was pre-trained on, for every method (section IV.B).",
-        _seen,
-    ),
-    "unseen": Experiment(
-        "Tasks of unseen domains",
-        "Tasks of domains that the encoder never saw, without fine-tuning (section IV.C).",
-        _unseen,
-    ),
-    "colors": Experiment(
-        "Reversed background colours",
-        "Tasks with the colours of the background reversed, without fine-tuning (section IV.C). The paper does not say "
-        "how it reverses them; whole images are the option.",
-        _colors,
-    ),
-    "finetune": Experiment(
-        "Fine-tuning on one domain",
-        "The encoder of group A trained further on one domain, beside single-domain methods and DrQ (section IV.D).",
-        _finetune,
-    ),
-    "ablation": Experiment(
-        "Ablation: dispersion loss, decoupled collection",
-        "With and without the dispersion loss, with and without decoupled collection (section IV.F).",
-        _ablation,
-    ),
-    "sensitivity": Experiment(
-        "Sensitivity: weight of the dispersion loss, amount of data",
-        "The weight alpha of the dispersion loss, and the capacity b of the random datasets (section IV.F).",
-        _sensitivity,
-    ),
-    "efficiency": Experiment(
-        "Cost of pre-training",
-        "Wall clock and encoder updates of pre-training for one, two and three domains (section IV.E), projected from "
-        "a timed part.",
-        _efficiency,
-    ),
-    "prototypes": Experiment(
-        "Spread of the prototypes",
-        "How far prototypes spread, along pre-training and at its end, with and without the dispersion loss (section "
-        "IV.G).",
-        _prototypes,
-    ),
-    "coverage": Experiment(
-        "Coverage of the data",
-        "How widely random data and an explorer's are spread along pre-training (section IV.H).",
-        _coverage,
-    ),
-    "stability": Experiment(
-        "Stability of pre-training",
-        "The comparative loss along pre-training on random data and on an explorer's (section IV.H).",
-        _stability,
-    ),
-    "visualize": Experiment(
-        "Embeddings of random data and of an explorer's",
-        "Principal components of random data of three domains and of an explorer's in one of them (section IV.H).",
-        _visualize,
-    ),
-    "probe": Experiment(
-        "State probe",
-        "What a linear model reads of the simulator's state from frozen features, on seen and unseen domains. Not in "
-        "the paper.",
-        _probe,
-    ),
-}
-"""In the order of the paper; what it does not have comes last."""
+                yield Cell(system, job, place)

@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import shlex
 import shutil
-import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
+import pandas as pd
 import torch
 import torch.nn.functional as F
 import tyro
 from tyro.conf import Positional, UseAppendAction
 
+from crptpro.analysis.coverage import coverage as particle_estimate
+from crptpro.analysis.embeddings import embed_pixels, principal_components, sample_pixels
+from crptpro.analysis.probe import probe, probe_samples
 from crptpro.artifact import read_json, write_json, write_whole
+from crptpro.data import FrameDataset, StoredReplay
 from crptpro.errors import RecordError
+from crptpro.modules import Projector
+from crptpro.modules.precision import device_of
+from crptpro.objectives import get_method
+from crptpro.objectives.functional import prototype_metrics
+from crptpro.pretrained import Pretrained, load_pretrained
+from crptpro.seeding import derive_seed
+from crptpro.training.explore import plan_exploration
 
 PROTOTYPE_METRICS = {
-    "kne_3": "prototype_kne_3", "kne_half": "prototype_kne_half", "ane": "prototype_ane",
-    "intr": "prototype_dispersion",
+    "prototype_kne_3": "kne_3", "prototype_kne_half": "kne_half", "prototype_ane": "ane",
+    "prototype_dispersion": "intr",
 }  # fmt: skip
-"""Columns of ``prototypes.csv`` to the names of the training's record."""
+"""Names in the training's record to columns of ``prototypes.csv``."""
 WINDOWS = 5
 """Parts of a timing whose median counts, so that one hiccup of the machine does not."""
 RANDOM_AGENT_STEPS = 24
@@ -33,32 +44,14 @@ COVERAGE_WINDOWS = 10
 """Windows of the training, fewer where one would have less decisions of a domain than samples."""
 
 
-def write_rows(
-    path: str | Path, rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None
-) -> None:
+def write_rows(path: Path, rows: pd.DataFrame | Sequence[Mapping[str, Any]], columns: Any = None) -> None:
     """Write rows as a CSV file, whole or not at all; what was there before is replaced.
 
     Raises:
         DiskSpaceError: the disk is full.
     """
-    import pandas as pd
-
-    table = pd.DataFrame(list(rows), columns=columns, dtype=object)
+    table = pd.DataFrame(rows, columns=columns, dtype=object)
     write_whole(path, table.to_csv(index=False, lineterminator="\n"))
-
-
-def read_rows(path: str | Path) -> list[dict[str, str]]:
-    """Read a CSV file with a header, every cell as text.
-
-    Raises:
-        RecordError: there is no such file.
-    """
-    import pandas as pd
-
-    try:
-        return pd.read_csv(path, dtype=str, keep_default_na=False).to_dict("records")
-    except (OSError, ValueError) as reason:
-        raise RecordError(f"{path} cannot be read: {reason}.") from None
 
 
 # --- state probes ---------------------------------------------------------------------------------------------------
@@ -71,14 +64,14 @@ PROBE_COLUMNS = (
 
 
 def probe_rows(
-    pretrained: Any, dataset: Any, *, encoder: str, samples: int = 2_000, seed: int = 0
+    pretrained: Any, dataset: FrameDataset, *, encoder: str, samples: int = 2_000, seed: int = 0
 ) -> tuple[list[dict[str, str]], list[dict[str, Any]]]:
-    """Probe an encoder on a dataset.
+    """Probe an encoder on a dataset with physical state.
 
     Args:
         pretrained: a :class:`~crptpro.pretrained.Pretrained` whose features, and projections if it has a projector, are
             read. The untrained control is given an untrained projector, so that z has one too.
-        dataset: a :class:`~crptpro.data.FrameDataset` with physical state.
+        dataset: what is probed.
         encoder: what the encoder is called in the rows.
         samples: drawn from the dataset.
         seed: of the draw.
@@ -89,11 +82,8 @@ def probe_rows(
     Raises:
         DatasetError: there is no physical state, or too little data to split.
     """
-    from crptpro.analysis.coordinates import joints_of
-    from crptpro.analysis.probe import probe, probe_samples
-
-    joints, frame_stack = joints_of(dataset.card["task"]), pretrained.encoder.in_channels // 3
-    observed = probe_samples(dataset, samples=samples, seed=seed, joints=joints, frame_stack=frame_stack)
+    frame_stack = pretrained.encoder.in_channels // 3
+    observed = probe_samples(dataset, samples=samples, seed=seed, frame_stack=frame_stack)
     is_control = pretrained.method.startswith("random-encoder")
     projector = _untrained_projector(pretrained) if is_control else pretrained.projector
     about = {"method": pretrained.label, "domain": dataset.domain}
@@ -117,12 +107,8 @@ def probe_rows(
     return table, measures
 
 
-def _untrained_projector(pretrained: Any) -> Any:
+def _untrained_projector(pretrained: Pretrained) -> Projector:
     """A projector at its initialisation, which the encoder's seed decides."""
-    from crptpro.modules import Projector
-    from crptpro.modules.precision import device_of
-    from crptpro.seeding import derive_seed
-
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive_seed(int(pretrained.card.get("seed", 0)), "untrained_projector"))
         projector = Projector(pretrained.encoder.feature_dim)
@@ -149,22 +135,19 @@ def prototypes(encoder: Positional[Path], *, out: Path) -> None:
         encoder: in its run directory, whose record says how it came there.
         out: directory to write to.
     """
-    from crptpro.objectives.functional import prototype_metrics
-    from crptpro.pretrained import load_pretrained
-
     pretrained: Any = load_pretrained(encoder)
     if pretrained.prototypes is None:
         raise RecordError(f"{encoder} has no prototypes; its method is {pretrained.method}.")
     config, updates = pretrained.card["loss"]["config"], pretrained.card["training"]["updates"]
-    about = {"method": pretrained.method, "has_dispersion": config["intr_loss_coef"] > 0}
     # The record's own last row, if it is of the last update, is of weights that had not been normalised yet.
-    record = [row for row in read_rows(encoder.parent / "pretrain.csv") if int(row["updates"]) < updates]
+    record = pd.read_csv(encoder.parent / "pretrain.csv", dtype=str, keep_default_na=False)
+    rows = record.loc[record["updates"].astype(int) < updates, ["updates", *PROTOTYPE_METRICS]]
     metrics = prototype_metrics(pretrained.prototypes.weight, offset=config["offset"])
     end = {"updates": updates, **{name: float(value) for name, value in metrics.items()}}
-    rows = [
-        {**about, "updates": row["updates"], **{name: row[key] for name, key in PROTOTYPE_METRICS.items()}}
-        for row in [*record, end]
-    ]
+    rows = pd.concat([rows, pd.DataFrame([end], columns=rows.columns, dtype=object)])
+    rows = rows.rename(columns=PROTOTYPE_METRICS)
+    rows.insert(0, "method", pretrained.method)
+    rows.insert(1, "has_dispersion", config["intr_loss_coef"] > 0)
     write_rows(out / "prototypes.csv", rows)
 
 
@@ -189,15 +172,17 @@ class Comparison:
     device: str = "cpu"
     """where the encoder runs"""
 
-    def load(self) -> Any:
+    def load(self) -> Pretrained:
         """Return the artifact of the encoder, on its device."""
-        from crptpro.pretrained import load_pretrained
-
         pretrained = load_pretrained(self.encoder)
-        for network in (pretrained.encoder, pretrained.projector):
-            if network is not None:
-                network.to(self.device)
+        for network in filter(None, (pretrained.encoder, pretrained.projector)):
+            network.to(self.device)
         return pretrained
+
+    def draw(self, start: int, end: int, count: int, *stream: str | int) -> torch.Tensor:
+        """Return the sorted numbers of ``count`` of the observations from ``start`` to before ``end``."""
+        generator = torch.Generator().manual_seed(derive_seed(self.seed, *stream))
+        return start + torch.randperm(end - start, generator=generator)[:count].sort().values
 
 
 def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
@@ -205,12 +190,6 @@ def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
 
     A window has the same decisions of both sources. Where one does not have enough of them, it has no row.
     """
-    from crptpro.analysis import coverage as estimate
-    from crptpro.analysis.embeddings import embed_pixels
-    from crptpro.data import FrameDataset, StoredReplay
-    from crptpro.pretrained import load_pretrained
-    from crptpro.seeding import derive_seed
-
     pretrained, explored = of.load(), load_pretrained(of.explorer)
     frame_stack, training = pretrained.encoder.in_channels // 3, explored.card["training"]
     decisions = {entry["domain"]: int(entry["agent_steps"]) for entry in training["datasets"]}
@@ -221,7 +200,7 @@ def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
     for path, replay_path in zip(of.datasets, of.replays, strict=True):
         random = FrameDataset.open(path, frame_stack=frame_stack)
         replay = StoredReplay(replay_path, frame_stack=frame_stack)
-        total = decisions[random.domain]
+        total, domain = decisions[random.domain], random.domain
         lost = total - len(replay)  # the oldest decisions, of a ring that went round
         for window in range(windows):
             start, end = window * total // windows, (window + 1) * total // windows
@@ -229,27 +208,21 @@ def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
             for source, (first, last) in spans.items():
                 if last - first < samples:
                     continue  # estimates of fewer observations cannot be compared
-                draw = derive_seed(of.seed, "coverage", source, random.domain, window)
-                order = torch.randperm(last - first, generator=torch.Generator().manual_seed(draw))
-                chosen = first + order[:samples].sort().values
+                chosen = of.draw(first, last, samples, "coverage", source, domain, window)
                 is_random = source == "random"
                 pixels = random[chosen]["pixels"] if is_random else replay.observations(chosen - lost)
                 points = embed_pixels(pretrained.encoder, pixels, projector=pretrained.projector)
-                rows.append({
-                    "source": source, "method": "" if is_random else explored.method, "domain": random.domain,
-                    "env_steps": training["env_steps"] * end // total,
-                    "coverage": estimate.coverage(F.normalize(points, dim=-1)), "samples": samples,
-                })  # fmt: skip
+                found = {"source": source, "method": "" if is_random else explored.method, "domain": domain}
+                found["env_steps"] = training["env_steps"] * end // total
+                rows.append(
+                    {**found, "coverage": particle_estimate(F.normalize(points, dim=-1)), "samples": samples}
+                )
     columns = ("source", "method", "domain", "env_steps", "coverage", "samples")
     write_rows(of.out / "coverage.csv", rows, columns)
 
 
 def embeddings(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
     """Write principal components of random data and of an explorer's last quarter: OUT/embeddings.csv."""
-    from crptpro.analysis.embeddings import embed_pixels, principal_components, sample_pixels
-    from crptpro.data import FrameDataset, StoredReplay
-    from crptpro.seeding import derive_seed
-
     pretrained = of.load()
     frame_stack, pixels = pretrained.encoder.in_channels // 3, {}
     for path in of.datasets:
@@ -257,19 +230,14 @@ def embeddings(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
         pixels[f"{random.domain} random"] = sample_pixels(random, of.samples, seed=of.seed)
     for path in of.replays:
         replay = StoredReplay(path, frame_stack=frame_stack)
-        late = len(replay) - int(0.75 * len(replay))
-        draw = torch.Generator().manual_seed(derive_seed(of.seed, "embeddings", path.name))
-        chosen = torch.randperm(late, generator=draw)[: of.samples].sort().values
-        pixels[f"{path.name} explorer"] = replay.observations(len(replay) - late + chosen)
+        chosen = of.draw(int(0.75 * len(replay)), len(replay), of.samples, "embeddings", path.name)
+        pixels[f"{path.name} explorer"] = replay.observations(chosen)
     points = torch.cat([embed_pixels(pretrained.encoder, images) for images in pixels.values()]).cpu()
     coordinates, explained = principal_components(points)
     write_json(of.out / "explained.json", {"explained_variance_ratio": explained.tolist()})
-    sources = [source for source, images in pixels.items() for _ in images]
-    rows = [
-        {"source": source, **{f"pc{number}": value for number, value in enumerate(point, 1)}}
-        for source, point in zip(sources, coordinates.tolist())
-    ]
-    write_rows(of.out / "embeddings.csv", rows)
+    table = pd.DataFrame(coordinates.numpy(), columns=["pc1", "pc2", "pc3"])
+    table.insert(0, "source", [source for source, images in pixels.items() for _ in images])
+    write_rows(of.out / "embeddings.csv", table)
 
 
 # --- cost of pre-training -------------------------------------------------------------------------------------------
@@ -298,84 +266,72 @@ def timing(
     """
     torch.set_num_threads(threads)
     rows = []
-    for here, paper in zip(training, paper_training, strict=True):
-        stage, whole = _stage(here, out / "timed", device), _stage(paper, out / "timed", device)
-        timed, seconds, each = _time(stage, updates)
-        paper_each: float | None = each if here == paper else None
-        if here != paper and paper_updates:
-            paper_each = _time(whole, paper_updates)[-1]
-        plan, paper_plan = _plan(stage), _plan(whole)
-        decisions = timed * plan.encoder_update_interval // plan.encoder_updates_each if plan else 0
-        sources = [Path(source).parent / "done.json" for source in stage.sources]
+    for command, paper_command in zip(training, paper_training, strict=True):
+        here, paper = (_Timed(each, out / "timed", device) for each in (command, paper_command))
+        timed, seconds, each = here.time(updates)
+        paper_each = each if command == paper_command else math.nan
+        if command != paper_command and paper_updates:
+            paper_each = paper.time(paper_updates)[-1]
+        sources = [Path(source).parent / "done.json" for source in here.stage.sources]
         collected = [read_json(path, error=RecordError)["seconds"] for path in sources if path.exists()]
-        budget, paper_budget = _updates(stage), _updates(whole)
+        plan = here.plan
         rows.append({
-            "domains": len(stage.sources), "encoder_updates": timed, "decisions": decisions, "seconds": seconds,
-            "budget_updates": budget, "budget_decisions": plan.decisions if plan else 0,
-            "projected_hours": each * budget / 3600, "paper_updates": paper_budget,
-            "paper_decisions": paper_plan.decisions if paper_plan else 0,
-            "paper_projected_hours": None if paper_each is None else paper_each * paper_budget / 3600,
-            "collection_seconds": sum(collected) if collected else None,
+            "domains": len(sources), "encoder_updates": timed,
+            "decisions": timed * plan.encoder_update_interval // plan.encoder_updates_each if plan else 0,
+            "seconds": seconds, "budget_updates": here.updates, "budget_decisions": here.decisions,
+            "projected_hours": each * here.updates / 3600, "paper_updates": paper.updates,
+            "paper_decisions": paper.decisions, "paper_projected_hours": paper_each * paper.updates / 3600,
+            "collection_seconds": sum(collected) if collected else math.nan,
         })  # fmt: skip
-    total: dict[str, Any] = {"method": stage.method}
-    for name in rows[0]:
-        values = [row[name] for row in rows]
-        total[name] = None if None in values else sum(values)
-    hours, paper_hours = total["projected_hours"], total["paper_projected_hours"]
-    total["seconds_per_update"] = 3600 * hours / total["budget_updates"]
+    total: dict[str, Any] = {
+        "method": here.stage.method,
+        **pd.DataFrame(rows, dtype=object).sum(skipna=False),
+    }
+    total["seconds_per_update"] = 3600 * total["projected_hours"] / total["budget_updates"]
+    total["paper_seconds_per_update"] = 3600 * total["paper_projected_hours"] / total["paper_updates"]
     per_decision = total["seconds_per_update"] * total["encoder_updates"]
-    total["seconds_per_decision"] = per_decision / total["decisions"] if total["decisions"] else None
-    total["paper_seconds_per_update"] = paper_hours and 3600 * paper_hours / total["paper_updates"]
+    total["seconds_per_decision"] = per_decision / total["decisions"] if total["decisions"] else math.nan
     write_rows(out / "timing.csv", [{**total, "threads": threads, "device": device}])
 
 
-def _stage(text: str, out: Path, device: str) -> Any:
-    """Read a training's command as the command line does."""
-    from crptpro.cli import pretrain_command
+class _Timed:
+    """A training's command, read as the command line does, with the plan of an exploring method."""
 
-    words = shlex.split(text)
-    return tyro.cli(pretrain_command(words), args=[*words[1:], "--out", str(out), "--device", device])
+    def __init__(self, text: str, out: Path, device: str) -> None:
+        from crptpro.cli import pretrain_command
 
+        words = shlex.split(text)
+        arguments = [*words[1:], "--out", str(out), "--device", device]
+        stage: Any = tyro.cli(pretrain_command(words), args=arguments)
+        self.stage, method, config = stage, get_method(stage.method), stage.config
+        self.plan = plan_exploration(method, stage.sources, config) if method.exploration else None
+        self.updates: int = self.plan.encoder_updates if self.plan else config.updates
+        self.decisions = self.plan.decisions if self.plan else 0
 
-def _plan(stage: Any) -> Any | None:
-    """Return how often an exploring method decides and updates; nothing of one that learns from datasets."""
-    from crptpro.objectives import get_method
-    from crptpro.training.explore import plan_exploration
-
-    method = get_method(stage.method)
-    return None if method.exploration is None else plan_exploration(method, stage.sources, stage.config)
-
-
-def _updates(stage: Any) -> int:
-    plan = _plan(stage)
-    return stage.config.updates if plan is None else plan.encoder_updates
-
-
-def _time(stage: Any, updates: int) -> tuple[int, float, float]:
-    """Return timed updates, their seconds, and seconds per update by the median over windows."""
-    plan = _plan(stage)
-    # Updates after which all domains have had their turn.
-    period = len(stage.sources) * (plan.encoder_updates_each if plan else 1)
-    window = period * math.ceil(updates / (WINDOWS * period))
-    needed = 2 * WINDOWS * window
-    if plan is None:
-        settings = {"updates": needed}
-    else:
-        first, interval = min(plan.first_update, RANDOM_AGENT_STEPS), plan.encoder_update_interval
-        # The first update comes with the first multiple of the interval that is not random.
-        rounds = interval * (math.ceil(first / interval) + math.ceil(needed / period) - 1) + 1
-        env_steps = rounds * sum(plan.repeats)
-        settings = {"env_steps": env_steps, "random_agent_steps": first}
-        settings |= {"checkpoint_interval_env_steps": env_steps}
-    shutil.rmtree(stage.out, ignore_errors=True)
-    try:
-        replace(stage, config=replace(stage.config, log_interval=window, **settings)).run()
-        at = {int(row["updates"]): float(row["unix_time_s"]) for row in read_rows(stage.out / "pretrain.csv")}
-    finally:
+    def time(self, updates: int) -> tuple[int, float, float]:
+        """Return timed updates, their seconds, and seconds per update by the median over windows."""
+        stage, plan = self.stage, self.plan
+        # Updates after which all domains have had their turn.
+        period = len(stage.sources) * (plan.encoder_updates_each if plan else 1)
+        window = period * math.ceil(updates / (WINDOWS * period))
+        needed = 2 * WINDOWS * window
+        settings = {"updates": needed, "log_interval": window}
+        if plan is not None:
+            first, interval = min(plan.first_update, RANDOM_AGENT_STEPS), plan.encoder_update_interval
+            # The first update comes with the first multiple of the interval that is not random.
+            rounds = interval * (math.ceil(first / interval) + math.ceil(needed / period) - 1) + 1
+            env_steps = rounds * sum(plan.repeats)
+            settings = {"env_steps": env_steps, "random_agent_steps": first, "log_interval": window}
+            settings |= {"checkpoint_interval_env_steps": env_steps}
         shutil.rmtree(stage.out, ignore_errors=True)
-    times = [at[count * window] for count in range(WINDOWS, 2 * WINDOWS + 1)]
-    each = statistics.median(after - before for before, after in itertools.pairwise(times)) / window
-    return WINDOWS * window, times[-1] - times[0], each
+        try:
+            replace(stage, config=replace(stage.config, **settings)).run()
+            record = pd.read_csv(stage.out / "pretrain.csv").set_index("updates")["unix_time_s"]
+        finally:
+            shutil.rmtree(stage.out, ignore_errors=True)
+        times = record[[count * window for count in range(WINDOWS, 2 * WINDOWS + 1)]].to_numpy()
+        each = float(np.median(np.diff(times))) / window
+        return WINDOWS * window, float(times[-1] - times[0]), each
 
 
 def main(arguments: Sequence[str]) -> None:

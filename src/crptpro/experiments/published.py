@@ -1,8 +1,7 @@
-"""Every number that the paper prints, to stand next to one's own.
+"""Every number that the paper prints, to stand next to one's own (arXiv 2302.05614, tables of section IV).
 
-Source: CRPTpro, arXiv 2302.05614, the tables of its section IV. Scores are returns of whole
-episodes; "±" is printed without saying over what (results are "over at least 6 different evaluations (60 episodes)").
-Figures of the paper carry no numbers and are missing here for that reason.
+Scores are returns of whole episodes; "±" is printed without saying over what. Figures of the paper carry no numbers and
+are missing here for that reason.
 """
 
 from __future__ import annotations
@@ -28,13 +27,7 @@ class Score(NamedTuple):
 
 
 class ScoreRow(NamedTuple):
-    """One task of a score table.
-
-    Args:
-        group: whose domains the encoders were pre-trained on, a letter of :data:`crptpro.domains.GROUPS`.
-        task: what was learned downstream, a key of :data:`crptpro.domains.TASKS`.
-        scores: method to score.
-    """
+    """A task of a score table: whose domains encoders were pre-trained on, what was learned, scores by method."""
 
     group: str
     task: str
@@ -75,8 +68,7 @@ SEEN_MEAN: Mapping[str, float] = dict(zip(METHODS, (495, 225, 191, 400, 166)))
 SEEN_NORMALIZED_MEAN: Mapping[str, float] = dict(zip(METHODS, (1.956, 0.440, 0.412, 1.096, 0.993)))
 """The row "Mean Expert-Normalized Score" of :data:`SEEN`, as printed.
 
-The table's own rounded cells give 1.957, 0.441, 0.420, 1.097 and 0.994: rounding explains a thousandth, but not the
-0.412 of apt-c.
+The table's own cells give 1.957, 0.441, 0.420, 1.097 and 0.994: rounding does not explain the 0.412 of apt-c.
 """
 
 EXPERT_SCORES: Mapping[str, float] = {row.task: row.scores["drq"].mean for row in SEEN}
@@ -111,14 +103,7 @@ COLORS = _rows(
 def published_score(method: str, group: str, task: str, colors: str = "normal") -> Score | None:
     """Return what the paper printed for a method at a place; ``None`` where it printed nothing.
 
-    Its tables have no control, no (S) methods, no fine-tuned encoder and no preset. DrQ trains its own encoder, so that
-    its score belongs to a task whatever the group.
-
-    Args:
-        method: registered name.
-        group: whose domains the encoder was pre-trained on.
-        task: what was learned downstream.
-        colors: ``"normal"`` or ``"reversed_background"``; the paper has no others.
+    DrQ trains its own encoder, so that its score belongs to a task whatever the group.
 
     Examples:
         >>> print(published_score("crptpro", "A", "walker_run"))
@@ -156,13 +141,11 @@ FINETUNE_UPDATES: Mapping[str, int] = {
 
 
 class PrototypeMetrics(NamedTuple):
-    """How far prototypes spread after pre-training; lower is wider.
+    """How far prototypes spread after pre-training: K- and all-neighbour estimation, and L_intr; lower is wider.
 
-    Args:
-        kne_3: K-neighbour estimation. Its k and scale are not published; a 3-nearest-neighbour cosine of 512 unit
-            vectors in 128 dimensions is about +0.2, so these negative values are none.
-        ane: all-neighbour estimation, the sum of the pairwise cosines of different prototypes over M^2.
-        intr: value of L_intr, the mean over all M^2 entries.
+    The k and the scale of the first are not published; a 3-nearest-neighbour cosine of 512 unit vectors in 128
+    dimensions is about +0.2, so these negative values are none. ``ane`` is the sum of the pairwise cosines of different
+    prototypes over M^2, ``intr`` the mean over all M^2 entries.
     """
 
     kne_3: float

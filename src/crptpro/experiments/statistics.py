@@ -1,11 +1,8 @@
 """What to say of many runs in one number: aggregates over tasks, and bootstrap intervals that know of shared encoders.
 
-Aggregates take one array per task, ``[..., R]`` with a task's runs along the last axis, and reduce runs and tasks. Axes
-before it pass through, so that one call serves an estimate, a curve, or thousands of bootstrap replicates. Every task
-counts the same in all but the interquartile mean, where every run does.
-
-Source: Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, 2021, arXiv 2108.13264,
-and its code google-research/rliable, with which all agree where every task has the same number of runs.
+Aggregates take one array ``[..., R]`` per task, with its runs along the last axis, and reduce runs and tasks. Source:
+Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, 2021, arXiv 2108.13264; they agree
+with its code google-research/rliable where every task has the same number of runs.
 """
 
 from __future__ import annotations
@@ -56,11 +53,7 @@ def optimality_gap(scores: Sequence[Array]) -> Array:
 
 
 def probability_of_improvement(scores: Sequence[Array], others: Sequence[Array]) -> Array:
-    """Return how probably a run of one method beats one of another on the same task, averaged over tasks.
-
-    ``P(X > Y) + P(X = Y) / 2`` over all pairs of runs: the Mann-Whitney U statistic over their number. Half means no
-    difference. It says nothing about by how much.
-    """
+    """Return ``P(X > Y) + P(X = Y) / 2`` over all pairs of runs of two methods on the same task, mean over tasks."""
     # The p-value, which nobody reads here, divides by zero where all runs are alike.
     with np.errstate(all="ignore"):
         wins = [
@@ -76,15 +69,7 @@ def relative_mean(scores: Sequence[Array], others: Sequence[Array]) -> Array:
 
 
 class Estimate(NamedTuple):
-    """A number or a curve, its interval, and what it stands on.
-
-    Args:
-        value: ``[K]``, one per column asked for.
-        low: lower ends ``[K]``; ``None`` where a task has fewer than :data:`MIN_RUNS` runs.
-        high: upper ends, likewise.
-        runs: of all tasks together, of both methods where two are compared; one in several rows counts once.
-        encoders: different pre-trained encoders among them.
-    """
+    """A number or a curve ``[K]``, its interval (``None`` below :data:`MIN_RUNS` runs of a task), what it stands on."""
 
     value: Array
     low: Array | None
@@ -111,9 +96,7 @@ def estimate(
 
     A replicate redraws the encoders, once for all tasks that share them, and then, for each run's place, a downstream
     run of the encoder drawn; tasks are kept (Davison & Hinkley, Bootstrap Methods and their Application, 1997, section
-    3.8): runs that share an encoder are no independent draws of the method that made it. Where all runs stand on one
-    encoder intervals are over its runs, and speak of that encoder only. Percentile intervals of few draws are too
-    narrow (:data:`COVERAGE`).
+    3.8). Where all runs stand on one encoder intervals speak of that encoder only.
 
     Args:
         statistic: an aggregate of this module; of two methods one that takes both.
@@ -146,39 +129,22 @@ def estimate(
     rng = np.random.default_rng(seed)
     redrawn = []
     for sample, scores in zip(samples, arrays):
-        indices = resample(
-            [task["encoder"].tolist() for task in sample.values()],
-            [task["run"].tolist() for task in sample.values()],
-            replicates=replicates,
-            rng=rng,
-        )
+        indices = _resample(list(sample.values()), replicates, rng)
         redrawn.append([task[:, index] for task, index in zip(scores, indices)])  # [K, B, R_t] each
     tail = 50 * (1 - CONFIDENCE)
     low, high = np.percentile(statistic(*redrawn), [tail, 100 - tail], axis=-1)
     return Estimate(value, low, high, runs, encoders)
 
 
-def resample(
-    encoders: Sequence[Sequence[str]],
-    runs: Sequence[Sequence[str]],
-    *,
-    replicates: int,
-    rng: np.random.Generator,
+def _resample(
+    tasks: Sequence[pd.DataFrame], replicates: int, rng: np.random.Generator
 ) -> list[NDArray[np.int64]]:
     """Draw encoders with replacement, jointly for the tasks that share them, and then runs of those drawn.
 
-    A task keeps the places that it has: the first encoder's ``n`` runs become ``n`` runs of the first encoder drawn,
-    redrawn with replacement, and so on. A task on which an encoder has no run is resampled from those it has.
-
-    Args:
-        encoders: per task, the encoder of each of its runs.
-        runs: per task, the name of each; tasks with the same runs are redrawn alike.
-        replicates: how many resamples, ``B``.
-        rng: where chance comes from.
-
-    Returns:
-        One ``[B, R_t]`` of indices into its runs per task.
+    A task keeps its places: the first encoder's ``n`` runs become ``n`` runs of the first encoder drawn, redrawn with
+    replacement, and so on. Tasks with the same runs are redrawn alike. Returns indices ``[B, R_t]`` per task.
     """
+    encoders = [task["encoder"].tolist() for task in tasks]
     names = [np.unique(labels) for labels in encoders]
     strata = _strata(names)
     ranks = {
@@ -187,8 +153,8 @@ def resample(
     }
     drawn: dict[tuple, NDArray[np.int64]] = {}
     found = []
-    for labels, of_task, own, stratum in zip(encoders, runs, names, strata):
-        same = (tuple(labels), tuple(of_task))
+    for task, labels, own, stratum in zip(tasks, encoders, names, strata):
+        same = (tuple(labels), tuple(task["run"]))
         if same not in drawn:
             place = np.searchsorted(own, labels)  # [R] which encoder a run stands on
             counts = np.bincount(place)
