@@ -214,7 +214,7 @@ def test_a_standardisation_that_gives_no_numbers_is_refused(mean: Tensor, scale:
 def test_config_rebuilds_the_encoder_and_foreign_parameters_can_be_used() -> None:
     encoder, other = small(pixel_offset=0.5), small(pixel_offset=0.5)
     with torch.no_grad():
-        other.conv_layers[0].weight.mul_(2)
+        other.convs[0].weight.mul_(2)
     twin = PixelEncoder(**encoder.config)
     twin.load_state_dict(encoder.state_dict())
     own = encoder(pixels())
@@ -238,5 +238,5 @@ def test_double_parameters_compute_in_double_and_nan_parameters_show() -> None:
         encoder = small()
         encoder.compute_dtype = dtype
         with torch.no_grad():
-            encoder.conv_layers[0].weight.view(-1)[0] = float("nan")
+            encoder.convs[0].weight.view(-1)[0] = float("nan")
         assert encoder(pixels()).isnan().any(dim=1).all()

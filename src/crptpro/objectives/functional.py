@@ -49,7 +49,7 @@ def comparative_loss(
     temperature: float | Tensor = 0.1,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    r"""Cross-entropy between target assignments and predicted ones (CRPTpro Eq. 1 and 7).
+    r"""Cross-entropy between target assignments and predicted ones (CRPTpro Eq. 1 and 7), in nats.
 
     :math:`L_{comp} = -\frac1B\sum_i\sum_j q_{ij}\log\mathrm{softmax}_j(s_{ij}/\tau)`. At uniform prediction
     it equals ln M (6.238 for 512); a run that stays there has learned nothing.
@@ -58,10 +58,7 @@ def comparative_loss(
         student_scores: ``[B, M]`` cosine similarities, with gradient.
         assignments: ``[B, M]``, rows sum to 1.
         temperature: positive.
-        reduction: over the batch.
-
-    Returns:
-        Scalar, or ``[B]`` for ``"none"``; non-negative, nats.
+        reduction: over the batch; ``"none"`` gives ``[B]``.
     """
     log_p = F.log_softmax(_at_least_float32(student_scores) / temperature, dim=-1)
     return _reduced(-(assignments * log_p).sum(dim=-1), reduction)
@@ -73,7 +70,7 @@ def prototype_dispersion(
     r"""Intrinsic loss that pushes prototypes apart (CRPTpro Eq. 9).
 
     :math:`L_{intr} = \frac1{M^2}\sum_{j\ne k} \mathrm{sg}(c_j)\cdot c_k / (\mathrm{sg}(c_j\cdot c_k) + w)`, whose left
-    factor and denominator carry no gradient.
+    factor and denominator carry no gradient. About -0.0023 to -0.0028 at orthogonal initialisation of 512 x 128.
 
     Deviation: the paper prints a sum; its own table only fits the mean over all M x M entries, the default.
 
@@ -82,9 +79,6 @@ def prototype_dispersion(
         offset: w, larger than 1 so that the denominator stays positive.
         reduction: ``"mean_all"`` divides by M^2 (the zeroed diagonal counts), ``"mean_offdiag"`` by M(M-1),
             ``"sum"`` by nothing.
-
-    Returns:
-        Scalar; about -0.0023 to -0.0028 at orthogonal initialisation of 512 x 128.
 
     Raises:
         ValueError: unknown reduction.
@@ -99,26 +93,18 @@ def prototype_dispersion(
 
 
 def knn_distances(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
-    """Euclidean distances to the k nearest keys, ascending.
+    """Euclidean distances ``[N, k]`` of queries ``[N, D]`` to the k nearest of keys ``[K, D]``, ascending.
 
-    The neighbours are found with a matrix product, which cannot resolve distances near zero; the k distances
-    are then taken again from the differences, so that a key equal to the query is at exactly 0.
-
-    Args:
-        queries: ``[N, D]``.
-        keys: ``[K, D]``. A query that is itself among the keys is its own nearest neighbour.
-        k: number of neighbours.
-
-    Returns:
-        ``[N, k]``, non-negative, ascending along each row; at most 2 between unit vectors.
+    A query that is itself among the keys is its own nearest neighbour. The neighbours are found with a matrix product,
+    which cannot resolve distances near zero; the k distances are then taken again from the differences, so that a key
+    equal to the query is at exactly 0.
 
     Raises:
         ValueError: fewer keys than ``k``.
 
     Examples:
-        >>> z = torch.tensor([[1.0, 0.0]])
         >>> keys = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
-        >>> knn_distances(z, keys, k=3)
+        >>> knn_distances(torch.tensor([[1.0, 0.0]]), keys, k=3)
         tensor([[0.0000, 1.4142, 2.0000]])
     """
     if not 1 <= k <= keys.shape[0]:
@@ -145,7 +131,7 @@ def particle_reward(
     scale: float | Tensor = 1.0,
     clip: float = 0.0,
 ) -> Tensor:
-    r"""Particle entropy among the k nearest neighbours, :func:`particle_entropy` of their distances.
+    r"""Particle entropy ``[N]`` among the k nearest neighbours, :func:`particle_entropy` of their distances.
 
     Args:
         features: ``[N, D]``.
@@ -154,9 +140,6 @@ def particle_reward(
         average: mean over the k neighbours, otherwise the k-th alone.
         scale: running mean of the distances, kept by the caller.
         clip: subtracted before the relu.
-
-    Returns:
-        ``[N]``, non-negative.
 
     Raises:
         ValueError: fewer keys than ``k``.
@@ -183,21 +166,18 @@ def info_nce(
     valid: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Contrastive cross-entropy in which row i's positive is row i of the other side.
+    """Contrastive cross-entropy in nats, in which row i's positive is row i of the other side.
 
     Args:
         anchors: ``[B, D]``.
-        positives: ``[B, D]``. Normalise both beforehand where the method asks for cosines (SimCLR yes, ATC
-            no).
+        positives: ``[B, D]``. Normalise both beforehand where the method asks for cosines (SimCLR yes, ATC no).
         temperature: divides the inner products.
         negatives: ``"positives"`` compares each anchor with all B positives (ATC); ``"both"`` compares each
             of the 2B views with the other 2B - 1 (SimCLR).
         valid: ``[B]`` bool; rows that are False do not count, but their positives stay as negatives. Rows of
             both views for ``"both"``. Anchors of invalid rows may be NaN (not for ``"both"``: negatives too).
-        reduction: over the rows; the mean is over valid rows, 0 if there is none.
-
-    Returns:
-        Non-negative, nats: scalar, or for ``"none"`` ``[B]`` (``"both"``: ``[2B]``), zero where invalid.
+        reduction: over the rows; the mean is over valid rows, 0 if there is none; ``"none"`` gives ``[B]``
+            (``"both"``: ``[2B]``), zero where invalid.
 
     Raises:
         ValueError: unknown ``negatives``.
@@ -238,10 +218,7 @@ def becl_loss(
         skills: ``[B]`` integer skill indices.
         temperature: divides the cosines.
         eps: guard in the quotient and in the logarithm.
-        reduction: over the rows.
-
-    Returns:
-        Scalar, or ``[B]`` for ``"none"``.
+        reduction: over the rows; ``"none"`` gives ``[B]``.
 
     Raises:
         ValueError: fewer than two rows.
@@ -294,14 +271,10 @@ def prototype_ane(prototypes: Tensor) -> Tensor:
 
 @torch.no_grad()
 def prototype_kne(prototypes: Tensor, *, k: int = 3) -> Tensor:
-    """Mean over prototypes of the cosine to the k-th nearest other prototype (the paper's KNE).
+    """Mean over unit rows ``[M, D]`` of the cosine to the k-th nearest other one (the paper's KNE); k at most M - 1.
 
     The paper does not state k. With k = 3, 512 spread vectors in 128 dimensions give about +0.2; its negative
     values only fit a median-like k near M / 2.
-
-    Args:
-        prototypes: ``[M, D]`` unit rows.
-        k: which neighbour, the prototype itself not counted; at most M - 1.
 
     Raises:
         ValueError: ``k`` out of range.
@@ -315,11 +288,7 @@ def prototype_kne(prototypes: Tensor, *, k: int = 3) -> Tensor:
 
 @torch.no_grad()
 def prototype_metrics(prototypes: Tensor, *, offset: float = 1.5) -> dict[str, Tensor]:
-    """ANE, KNE at k = 3 and k = M / 2, and the dispersion (mean over all entries), as scalars.
-
-    Args:
-        prototypes: ``[M, D]``, rows of any length, M at least 4.
-        offset: w of the dispersion.
+    """ANE, KNE at k = 3 and k = M / 2, and the dispersion (mean over all entries), of rows ``[M, D]`` of any length.
 
     Examples:
         >>> sorted(prototype_metrics(torch.eye(8)))

@@ -19,6 +19,19 @@ from crptpro.objectives.base import NetworkLoss, require_positive
 from crptpro.values import as_float
 
 
+def squared_errors(values: Tensor, target: Tensor) -> TensorDict:
+    """Regression of the values ``[B, views, 2]`` of two heads on a target ``[B]``, and what a log tells of it."""
+    errors = values - target[..., None, None]
+    out = {
+        # Sum over the views and the two heads of the mean over the batch.
+        "loss_qvalue": errors.square().sum((-2, -1)).mean(),
+        "q_mean": values.detach().mean(-2).mean(),
+        "target_q_mean": target.mean(),
+        "td_error": errors.detach().abs().amax(-1).mean(-1).mean(),
+    }
+    return TensorDict(out, batch_size=[])
+
+
 class RADSACLoss(NetworkLoss, SACLoss):
     r"""RAD-SAC of CRPTpro (liuxin0824/CRPTpro and denisyarats/proto, ``proto.py``) on TorchRL's ``SACLoss``.
 
@@ -69,21 +82,14 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
     @dataclass
     class _AcceptedKeys(SACLoss._AcceptedKeys):
-        """``SACLoss``'s keys and one more.
-
-        Attributes:
-            observation: the features, at the root and under ``"next"``.
-        """
-
-        observation: NestedKey = "features"
+        observation: NestedKey = "features"  # at the root and under "next"
 
     default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
-    network_names = ("actor_network", "qvalue_network")
+    tensor_keys: Any
     view_names: ClassVar[tuple[str, ...]] = ("observation",)
     """Configurable keys of the views of an observation."""
 
-    default_out_keys = (
+    out_keys: Any = (
         "loss_actor",
         "loss_qvalue",
         "loss_alpha",
@@ -141,31 +147,20 @@ class RADSACLoss(NetworkLoss, SACLoss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute all three losses against the same critic; see the class."""
-        critic = self.critic_loss(tensordict)
-        return critic.update(self.actor_and_temperature_loss(tensordict)).select(*self.default_out_keys)
+        return self.critic_loss(tensordict).update(self.actor_and_temperature_loss(tensordict))
 
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not changed."""
         target = self._compute_target_v2(tensordict)  # (B,)
         action = tensordict.get(self.tensor_keys.action)
-        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
-            values = torch.stack([self._q_values(view, action) for view in self._views(tensordict)], -2)
-        errors = values - target[..., None, None]  # (B, views, 2)
-        out = {
-            # Sum over the views and the two heads of the mean over the batch.
-            "loss_qvalue": errors.square().sum((-2, -1)).mean(),
-            "q_mean": values.detach().mean(-2).mean(),
-            "target_q_mean": target.mean(),
-            "td_error": errors.detach().abs().amax(-1).mean(-1).mean(),
-        }
-        return TensorDict(out, batch_size=[])
+        with self._holding("qvalue_network"):
+            values = torch.stack([self.critic(view, action) for view in self._views(tensordict)], -2)
+        return squared_errors(values, target)
 
     def actor_and_temperature_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """``loss_actor`` and ``loss_alpha`` of one action draw, with ``alpha`` and ``entropy``."""
         features = self._policy_features(self._views(tensordict)[0])
-        noise = self._noise(features)
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            action, log_prob = self.actor.sample(features, noise=noise)
+        action, log_prob = self._act(features)
         # Detached weights: the gradient passes through Q to the action and to nothing else.
         with self._cached_detached_qvalue_params.to_module(self.qvalue_network, preserve_module_state=False):
             value = self._q_values_on_features(features, action).amin(-1)
@@ -186,14 +181,9 @@ class RADSACLoss(NetworkLoss, SACLoss):
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
         soft_values = []
         for view in self._views(tensordict.get("next")):
-            features = self._policy_features(view)
-            noise = self._noise(features)
-            with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-                action, log_prob = self.actor.sample(features, noise=noise)
-            with self.target_qvalue_network_params.to_module(
-                self.qvalue_network, preserve_module_state=False
-            ):
-                soft_values.append(self._q_values(view, action).amin(-1) - self._alpha * log_prob)
+            action, log_prob = self._act(self._policy_features(view))
+            with self._holding("qvalue_network", target=True):
+                soft_values.append(self.critic(view, action).amin(-1) - self._alpha * log_prob)
         soft_value = torch.stack(soft_values).mean(0).unsqueeze(-1)
         names = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
         keys = [unravel_key(("next", name)) for name in names]
@@ -202,23 +192,23 @@ class RADSACLoss(NetworkLoss, SACLoss):
         estimate.set(("next", self.value_estimator.tensor_keys.value), soft_value)
         return self.value_estimator.value_estimate(estimate).squeeze(-1)
 
-    def _noise(self, features: Tensor) -> Tensor:
-        # Drawn before the parameters are swapped in, where a compiler cannot pause for a generator.
+    def _act(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return an action of the policy, and its log-probability."""
+        # The noise is drawn before the parameters are swapped in, where a compiler cannot pause for a generator.
         like = features.new_empty(*features.shape[:-1], self.actor.action_dim, dtype=self.log_alpha.dtype)
-        return standard_normal_like(like, self.generator)
-
-    # What subclasses change: how many views there are of an observation, and what lies before the features.
+        noise = standard_normal_like(like, self.generator)
+        with self._holding("actor_network"):
+            return self.actor.sample(features, noise=noise)
 
     def _views(self, tensordict: TensorDictBase) -> list[Tensor]:
         """The views of the observation; the first is the one that the actor learns from."""
         return [tensordict.get(getattr(self.tensor_keys, name)).detach() for name in self.view_names]
 
+    # What lies before the features; DrQ has an encoder there.
+
     def _policy_features(self, view: Tensor) -> Tensor:
         """What the actor sees of a view, without gradient."""
         return view
-
-    def _q_values(self, view: Tensor, action: Tensor) -> Tensor:
-        return self.critic(view, action)
 
     def _q_values_on_features(self, features: Tensor, action: Tensor) -> Tensor:
         return self.critic(features, action)
@@ -252,31 +242,17 @@ class AveragedSACLoss(RADSACLoss):
       denisyarats/drq ``drq.py``;
     * ``loss_actor`` and ``loss_alpha`` on the first view.
 
-    The exploration agent of APT learns with it on detached features (forhaoliu/mini_apt averages likewise).
-
-    Args:
-        actor: on features.
-        critic: on features and actions; the target is a copy of all of it.
-        **options: of :class:`RADSACLoss`. A ``generator`` is asked for the next actions of the first view, of
-            the second, then for the actor's.
-
-    Returns (``forward``):
-        As :class:`RADSACLoss`; ``q_mean`` and ``td_error`` are means over the views too.
+    The exploration agent of APT learns with it on detached features (forhaoliu/mini_apt averages likewise). A
+    ``generator`` is asked for the next actions of the first view, of the second, then for the actor's. ``q_mean`` and
+    ``td_error`` are means over the views too.
     """
 
     @dataclass
     class _AcceptedKeys(RADSACLoss._AcceptedKeys):
-        """``RADSACLoss``'s keys and one more.
-
-        Attributes:
-            observation_view: features of the second view, at the root and under ``"next"``.
-        """
-
-        observation_view: NestedKey = "features_view"
+        observation_view: NestedKey = "features_view"  # of the second view, at the root and under "next"
 
     default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
-    view_names: ClassVar[tuple[str, ...]] = ("observation", "observation_view")
+    view_names = ("observation", "observation_view")
 
 
 class DrQLoss(AveragedSACLoss):
@@ -301,18 +277,10 @@ class DrQLoss(AveragedSACLoss):
 
     @dataclass
     class _AcceptedKeys(AveragedSACLoss._AcceptedKeys):
-        """The keys of :class:`AveragedSACLoss` with other defaults.
-
-        Attributes:
-            observation: images of the first view, at the root and under ``"next"``.
-            observation_view: images of the second view, likewise.
-        """
-
-        observation: NestedKey = "pixels"
-        observation_view: NestedKey = "pixels_view"
+        observation: NestedKey = "pixels"  # images of the first view, at the root and under "next"
+        observation_view: NestedKey = "pixels_view"  # of the second view, likewise
 
     default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
 
     def __init__(
         self, encoder: PixelEncoder, actor: SquashedGaussianActor, critic: TwinCritic, **options: Any
@@ -326,7 +294,7 @@ class DrQLoss(AveragedSACLoss):
 
     @torch.no_grad()
     def _policy_features(self, view: Tensor) -> Tensor:
-        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
+        with self._holding("qvalue_network"):
             return self.critic.encoder(view)
 
     def _q_values_on_features(self, features: Tensor, action: Tensor) -> Tensor:
