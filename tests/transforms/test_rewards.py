@@ -16,7 +16,7 @@ from torchrl.envs import Compose, SerialEnv, TransformedEnv
 
 from crptpro.modules import Projector, Prototypes
 from crptpro.transforms import ContrastiveReward, FrozenEncoder, ParticleReward, PrototypeReward
-from crptpro.transforms.prototype_reward import draw_candidates, warn_if_mostly_zero
+from crptpro.transforms.rewards import draw_candidates, warn_if_mostly_zero
 
 B, D, M, N = 24, 6, 8, 5
 

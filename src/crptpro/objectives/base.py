@@ -18,13 +18,14 @@ from crptpro.values import as_float
 class NetworkLoss(LossModule):
     """A loss whose networks hold its own parameters, also in a copy, and are re-initialised together with its targets.
 
-    A subclass converts its networks with ``convert_to_functional`` and lists in ``out_keys`` what ``forward`` returns.
+    A subclass converts its networks with ``convert_to_functional`` and lists what ``forward`` returns.
     """
 
-    out_keys: Any
+    default_out_keys: tuple[str, ...] = ()
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
+        self.out_keys = list(self.default_out_keys)  # of the instance, where select_out_keys can change them
         self._set_in_keys()
 
     @property

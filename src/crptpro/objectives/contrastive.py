@@ -24,7 +24,7 @@ class ContrastiveLoss(PretrainingLoss):
     already be augmented, each independently.
     """
 
-    out_keys = ("loss_contrast", "embedding_cosine")
+    default_out_keys = ("loss_contrast", "embedding_cosine")
 
     def _encode(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
         raise NotImplementedError

@@ -74,7 +74,7 @@ class ProtoLoss(PretrainingLoss):
     prototypes_params: Any
     target_prototypes_params: Any
 
-    out_keys = (
+    default_out_keys = (
         "loss_comp",
         "loss_intr",
         "comp",

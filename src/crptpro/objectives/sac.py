@@ -89,7 +89,7 @@ class RADSACLoss(NetworkLoss, SACLoss):
     view_names: ClassVar[tuple[str, ...]] = ("observation",)
     """Configurable keys of the views of an observation."""
 
-    out_keys: Any = (
+    default_out_keys = (
         "loss_actor",
         "loss_qvalue",
         "loss_alpha",

@@ -55,7 +55,7 @@ class SkillDDPGLoss(NetworkLoss):
 
     default_keys = _AcceptedKeys
     tensor_keys: Any
-    out_keys = ("loss_actor", "loss_qvalue", "q_mean", "target_q_mean", "td_error")
+    default_out_keys = ("loss_actor", "loss_qvalue", "q_mean", "target_q_mean", "td_error")
 
     actor_network: DeterministicActor
     actor_network_params: Any

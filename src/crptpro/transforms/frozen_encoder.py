@@ -23,10 +23,7 @@ class FrozenEncoder(PixelTransform):
     Args:
         encoder: maps ``[N, C, H, W]`` to ``[N, ...]``.
         in_keys: images ``[*, C, H, W]`` with any number of leading dimensions.
-        out_keys: features ``[*, ...]``, in the encoder's output dtype.
-
-    Raises:
-        ValueError: ``in_keys`` and ``out_keys`` of unequal length.
+        out_keys: features ``[*, ...]``, in the encoder's output dtype, one key per image.
 
     Examples:
         >>> from crptpro.modules import PixelEncoder
@@ -37,13 +34,7 @@ class FrozenEncoder(PixelTransform):
         torch.Size([2, 100])
     """
 
-    def __init__(
-        self,
-        encoder: nn.Module,
-        *,
-        in_keys: Keys = "pixels",
-        out_keys: Keys = "features",
-    ) -> None:
+    def __init__(self, encoder: nn.Module, *, in_keys: Keys = "pixels", out_keys: Keys = "features") -> None:
         super().__init__(in_keys, out_keys)
         self.encoder = encoder.eval()
 
