@@ -97,15 +97,9 @@ class SquashedGaussianActor(LinearNetwork):
     def sample(
         self, features: Tensor, *, noise: Tensor | None = None, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Draw reparameterised actions.
+        """Draw reparameterised actions ``[*, A]`` in [-1, 1], and their ``log_prob`` ``[*]`` (nats, summed over A).
 
-        Args:
-            features: ``[*, feature_dim]``.
-            noise: standard normal ``[*, A]``; drawn if None.
-            generator: source of the noise; torch's global generator if None.
-
-        Returns:
-            ``action`` ``[*, A]`` in [-1, 1] and ``log_prob`` ``[*]`` (nats, summed over A).
+        Of standard normal ``noise`` ``[*, A]``; drawn from ``generator``, or torch's global one, if None.
         """
         loc, scale = self(features)
         return squashed_gaussian(loc, scale, standard_normal_like(loc, generator) if noise is None else noise)
@@ -206,23 +200,14 @@ class DeterministicActor(LinearNetwork):
         return torch.tanh(self.mlp(self.trunk(inputs)))
 
     def sample(
-        self,
-        inputs: Tensor,
-        *,
-        noise_clip: float | None = None,
-        noise: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        self, inputs: Tensor, *, noise_clip: float | None = None, generator: torch.Generator | None = None
     ) -> Tensor:
         """Return a noisy action, ``[*, A]`` in [-1 + 1e-6, 1 - 1e-6]; the gradient passes as if nothing were clamped.
 
-        Args:
-            inputs: features and skill, ``[*, feature_dim + K]``.
-            noise_clip: largest absolute noise; not limited if None.
-            noise: standard normal ``[*, A]``; drawn if None.
-            generator: source of the noise; torch's global generator if None.
+        The noise is drawn from ``generator`` (torch's global one if None), and at most ``noise_clip`` in size.
         """
         mean = self(inputs)
-        noise = self.noise_std * (standard_normal_like(mean, generator) if noise is None else noise)
+        noise = self.noise_std * standard_normal_like(mean, generator)
         if noise_clip is not None:
             noise = noise.clamp(-noise_clip, noise_clip)
         action = mean + noise
@@ -234,8 +219,7 @@ def squashed_gaussian(loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor
     r"""Reparameterised tanh-Gaussian sample ``[*, A]`` and its log-density ``[*]``, of mean, deviation and noise.
 
     :math:`\log\pi(a) = \sum_A \log\mathcal N(u;\mu,\sigma) - 2(\log 2 - u - \mathrm{softplus}(-2u))` with
-    :math:`u = \mu + \sigma\epsilon`, evaluated before the tanh: finite and with the right gradient even where tanh
-    rounds to 1.
+    :math:`u = \mu + \sigma\epsilon`, before the tanh: finite, with the right gradient, where tanh rounds to 1.
     """
     pre_tanh = loc + scale * noise
     log_normal = -0.5 * noise.square() - scale.log() - 0.5 * math.log(2 * math.pi)

@@ -43,19 +43,10 @@ class PixelEncoder(nn.Module):
         standardised: have the buffers of :meth:`standardise` from the start (0 and 1), to load weights into.
 
     Attributes:
-        feature_dim: length of the flattened output, in (C, H, W) order.
-        feature_map_shape: ``(C, H, W)`` before flattening.
+        feature_dim: length of the flattened output, in (C, H, W) order, the ``feature_map_shape``.
         config: the constructor arguments, JSON-able.
         compute_dtype: ``torch.float32`` (the parameters' own dtype) or ``torch.bfloat16``; also of the output.
         micro_batch: chunk length on a CPU, where chunks stay in cache and go to different cores.
-
-    Raises:
-        ValueError: an argument out of its range, lists of unequal length, or too small an image.
-
-    Examples:
-        >>> encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=16)
-        >>> encoder(torch.zeros(5, 3, 16, 16, dtype=torch.uint8)).shape
-        torch.Size([5, 100])
     """
 
     convs: Any
@@ -122,12 +113,9 @@ class PixelEncoder(nn.Module):
 
     @torch.no_grad()
     def standardise(self, mean: Tensor, scale: Tensor) -> PixelEncoder:
-        """Give out ``(features - mean) / scale`` from now on; returns the encoder. A control needs it.
+        """Give out ``(features - mean) / scale`` from now on, finite ``[feature_dim]``, scale positive; returns self.
 
-        Both, ``[feature_dim]``, become buffers ``feature_mean`` and ``feature_scale``, saved with the weights.
-
-        Raises:
-            ValueError: another shape, a value that is not finite, or a scale that is not positive.
+        Both become buffers ``feature_mean`` and ``feature_scale``, saved with the weights.
         """
         like = self.convs[0].weight
         for name, value in (("mean", mean), ("scale", scale)):
@@ -144,14 +132,9 @@ class PixelEncoder(nn.Module):
         return self
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Encode images.
+        """Encode images ``[*, in_channels, image_size, image_size]`` to ``[*, feature_dim]`` in ``compute_dtype``.
 
-        Args:
-            pixels: ``[*, in_channels, image_size, image_size]``, uint8, or floating in [0, 1]; in bfloat16 floating
-                values are rounded to eight significant bits.
-
-        Returns:
-            ``[*, feature_dim]`` in ``compute_dtype``; non-negative unless standardised.
+        In bfloat16 floating values are rounded to eight significant bits. Not negative unless standardised.
 
         Raises:
             ValueError: images of another shape, or values that are neither uint8 nor in [0, 1].

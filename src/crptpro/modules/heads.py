@@ -23,11 +23,8 @@ NORM_EPS = 1e-12
 def init_weights_(layer: nn.Linear | nn.Conv2d, init: WeightInit = "orthogonal", gain: float = 1.0) -> None:
     """Initialise a layer in place, with zero bias.
 
-    Args:
-        layer: linear or convolutional.
-        init: ``"orthogonal"`` on the flattened kernel, or ``"kaiming"``: normal with variance 2 / fan-in (rlpyt, the
-            framework of ATC).
-        gain: of the orthogonal matrix.
+    ``"orthogonal"`` is on the flattened kernel, times ``gain``; ``"kaiming"`` is normal with variance 2 / fan-in
+    (rlpyt, the framework of ATC).
     """
     if init not in get_args(WeightInit):
         raise ValueError(f"init must be one of {', '.join(get_args(WeightInit))}, got {init!r}.")
@@ -59,15 +56,10 @@ def plain_sizes(**sizes: Any) -> dict[str, int]:
 
 
 class Projector(LinearNetwork):
-    r"""One linear layer from features to the latent space, :math:`g_\theta` (denisyarats/proto ``proto.py``).
+    r"""One linear layer from features to latents of length D, :math:`g_\theta` (denisyarats/proto ``proto.py``).
 
     The product runs in ``compute_dtype``; the result has the parameters' dtype, so normalisation, softmax and Sinkhorn
-    stay float32.
-
-    Args:
-        feature_dim: input length (39,200 for the default encoder).
-        latent_dim: output length D.
-        init: ``"orthogonal"``, or ``"kaiming"`` (normal, fan-in, for ReLU), as ATC draws its own.
+    stay float32. ``init="kaiming"`` (normal, fan-in, for ReLU) is how ATC draws its own.
     """
 
     def __init__(
@@ -89,9 +81,7 @@ class Projector(LinearNetwork):
 class Predictor(LinearNetwork):
     r"""Perceptron in the latent space, online branch only: :math:`v_\psi` (denisyarats/proto ``proto.py``).
 
-    Args:
-        latent_dim: input and output length D.
-        hidden_dim: hidden width. 1024 as in the paper's table; the released code has 512.
+    ``hidden_dim`` is 1024 as in the paper's table; the released code has 512.
     """
 
     def __init__(self, latent_dim: int = 128, hidden_dim: int = 1024) -> None:

@@ -23,18 +23,11 @@ _Module = TypeVar("_Module", bound=nn.Module)
 
 
 def resolve_precision(precision: Precision, device: torch.device | str) -> torch.dtype:
-    """Turn a precision name into the compute dtype for a device.
+    """Turn a precision name into the compute dtype for a device; an unknown name is a ``ValueError``.
 
-    Where float32 is what comes out for a CUDA device, this switches TF32 off for the whole process, so that fp32
-    means the same on every device.
-
-    Args:
-        precision: ``"fp32"`` (the reference), ``"bf16"``, or ``"auto"``: bf16 where the hardware is faster in it (CUDA
-            compute capability 8 or newer; a CPU with AMX or AVX512-BF16), otherwise fp32.
-        device: the device that will compute.
-
-    Raises:
-        ValueError: unknown precision name.
+    ``"fp32"`` is the reference. ``"auto"`` is bf16 where the hardware is faster in it: CUDA of compute capability 8 or
+    newer, a CPU with AMX or AVX512-BF16. Where float32 comes out for a CUDA device, TF32 is switched off for the whole
+    process, so that fp32 means the same on every device.
     """
     if precision not in ("auto", "fp32", "bf16"):
         raise ValueError(f"precision must be 'auto', 'fp32' or 'bf16', got {precision!r}.")
@@ -61,14 +54,9 @@ def _is_faster_in_bf16(device: torch.device) -> bool:
 
 
 def set_compute_dtype(module: _Module, dtype: torch.dtype) -> _Module:
-    """Set ``compute_dtype`` on every network inside ``module`` that has one; parameters keep their dtype.
+    """Set ``compute_dtype`` on every network inside ``module``, a network or a loss; parameters keep their dtype.
 
-    Args:
-        module: a network, or a loss that owns networks, hidden by TorchRL's ``LossModule`` or not.
-        dtype: ``torch.bfloat16``, or ``torch.float32`` for "the dtype of the parameters".
-
-    Raises:
-        ValueError: any other dtype.
+    ``dtype`` is ``torch.bfloat16``, or ``torch.float32`` for that of the parameters; others are a ``ValueError``.
     """
     if dtype not in (torch.float32, torch.bfloat16):
         raise ValueError(f"compute dtype must be torch.float32 or torch.bfloat16, got {dtype}.")
@@ -101,10 +89,7 @@ def _networks_within(module: nn.Module) -> Iterator[nn.Module]:
 
 
 def linear_in(inputs: Tensor, layer: nn.Linear, compute_dtype: torch.dtype) -> Tensor:
-    """Apply a linear layer whose product runs in ``compute_dtype`` and whose result has the weight's dtype.
-
-    In bfloat16 the factors and the product are rounded; the bias is added in the weight's dtype.
-    """
+    """Apply a linear layer whose product runs in ``compute_dtype``; its result and bias have the weight's dtype."""
     weight, bias = layer.weight, layer.bias
     if compute_dtype == torch.float32:
         return F.linear(inputs.to(weight.dtype), weight, bias)
@@ -119,11 +104,7 @@ def device_of(module: nn.Module) -> torch.device | None:
 
 
 def usable_device(name: str | torch.device) -> torch.device:
-    """Return a device, once a tensor could be put there.
-
-    Raises:
-        CRPTproError: with torch's reason, if this machine or this build of torch has no such device.
-    """
+    """Return a device once a tensor could be put there, or raise a :class:`CRPTproError` with torch's reason."""
     try:
         device = torch.device(name)
         torch.empty(1, device=device)

@@ -53,17 +53,8 @@ class ATCLoss(ContrastiveLoss):
 
     There is no temperature. A loss that stays at ln B (6.238 for a batch of 512) says that anchors are not told apart.
     In TorchRL batches ``("next", "pixels")`` is the true successor, so ends of episodes need no mask as in the source.
-
-    Args:
-        encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
-        projector: features to latents ``[B, D]``; default ``Projector(encoder.feature_dim, latent_dim)`` with ATC's
-            Kaiming-normal weights.
-        anchor_head: latents of anchors to ``[B, D]``; default ``AnchorHead(latent_dim, hidden_dim)``.
-        latent_dim: D.
-        hidden_dim: width of the anchors' perceptron.
-
-    Raises:
-        ValueError: heads of different latent lengths.
+    Default heads are ``Projector(encoder.feature_dim, latent_dim)`` with ATC's Kaiming-normal weights, and
+    ``AnchorHead(latent_dim, hidden_dim)``; heads of different latent lengths are a ``ValueError``.
     """
 
     anchor_head: nn.Module
@@ -110,16 +101,7 @@ class SimCLRLoss(ContrastiveLoss):
     makes it by shifting the same images again.
 
     Deviation: APT has published no code for DeepMind Control; loss and temperature are those of the authors' code
-    for Atari, the head (one linear layer, 128) is the one that every method here has.
-
-    Args:
-        encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
-        projector: features to latents ``[B, D]``; default ``Projector(encoder.feature_dim, latent_dim)``.
-        latent_dim: D.
-        temperature: tau, positive.
-
-    Raises:
-        ValueError: a temperature that is not positive.
+    for Atari, the head (``Projector(encoder.feature_dim, latent_dim)``) is the one that every method here has.
     """
 
     @dataclass
@@ -162,22 +144,11 @@ class SimCLRLoss(ContrastiveLoss):
 class BeCLLoss(ContrastiveLoss):
     r"""Behaviour contrastive learning (BeCL, arXiv 2305.04477; Rooshy-yang/BeCL ``agent/becl.py``).
 
-    :func:`~crptpro.objectives.functional.becl_loss` of :math:`F = h(f_\theta(x'))` with the head h of
-    :class:`~crptpro.modules.SkillHead`: for every row, one other row of the same skill is told from all other
-    rows. :math:`x'` is the next observation (three agent steps ahead with the method's n-step batches). The
-    gradient reaches encoder and head; there is no target network. All rows should come from one domain, where
-    skills are comparable. A batch of one is legal and uninformative (loss 0).
-
-    Args:
-        encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
-        projector: the whole head, features to ``[B, D]``; default
-            ``SkillHead(encoder.feature_dim, skill_dim, hidden_dim)``.
-        skill_dim: D, equal to the number of skills in the source.
-        hidden_dim: hidden width of the default head.
-        temperature: tau, divides the cosines; positive.
-
-    Raises:
-        ValueError: a temperature that is not positive.
+    :func:`~crptpro.objectives.functional.becl_loss` of :math:`F = h(f_\theta(x'))` with the head h, by default
+    ``SkillHead(encoder.feature_dim, skill_dim, hidden_dim)``, as ``projector``: for every row, one other row of the
+    same skill is told from all other rows. :math:`x'` is the next observation (three agent steps ahead with the
+    method's n-step batches). All rows should come from one domain, where skills are comparable. A batch of one has the
+    loss 0.
     """
 
     @dataclass

@@ -297,12 +297,8 @@ def register_method(name: str, loss_class: type[LossModule], **fields: Any) -> M
 def get_method(name: str, *, besides: Iterable[str] = ()) -> Method:
     """Look a method or preset up by name.
 
-    Args:
-        name: as it was registered.
-        besides: further names that the caller takes, which the error may propose.
-
     Raises:
-        UnknownNameError: with the nearest known names.
+        UnknownNameError: with the nearest known names, of ``besides`` too.
     """
     if name not in _METHODS:
         known = sorted({*_METHODS, *besides})

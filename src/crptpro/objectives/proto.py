@@ -28,11 +28,13 @@ class ProtoLoss(PretrainingLoss):
       :math:`q = \mathrm{sinkhorn}(\hat z' C^T)` (no gradient),
     * :math:`L_{intr}` = :func:`~crptpro.objectives.functional.prototype_dispersion` of the prototypes.
 
-    ``loss_comp`` that stays at ln M (6.238 for 512 prototypes), or ``embedding_cosine`` that stays near 1, is
-    a dead run. Images must already be augmented. Normalisation, softmax and Sinkhorn always run in float32 or wider.
+    Images must already be augmented. Call :meth:`before_update` before each forward of a training loop: it keeps the
+    prototype rows at unit length, as the released code does. ``forward`` itself never writes to a parameter.
 
-    Call :meth:`before_update` before each forward of a training loop: it keeps the prototype rows at unit
-    length, as the released code does in place. ``forward`` itself never writes to a parameter.
+    ``forward`` returns scalars ``loss_comp`` and ``loss_intr`` (already times alpha; their sum is minimised) and,
+    detached, ``comp``, ``intr`` (without alpha), ``assignment_entropy`` (nats), ``prototypes_in_use`` (count),
+    ``embedding_cosine`` (mean pairwise cosine of the online latents), ``prototype_ane``. ``loss_comp`` that stays at ln
+    M (6.238 for 512 prototypes), or ``embedding_cosine`` that stays near 1, is a dead run.
 
     Args:
         encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
@@ -50,21 +52,6 @@ class ProtoLoss(PretrainingLoss):
 
     Raises:
         ValueError: a coefficient out of its range, or heads of different latent lengths.
-
-    Returns (``forward``):
-        Scalars ``loss_comp`` and ``loss_intr`` (already times alpha; their sum is minimised) and, detached,
-        ``comp``, ``intr`` (without alpha), ``assignment_entropy`` (nats), ``prototypes_in_use`` (count),
-        ``embedding_cosine`` (mean pairwise cosine of the online latents), ``prototype_ane``.
-
-    Examples:
-        >>> from crptpro.modules import PixelEncoder
-        >>> encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=12)
-        >>> loss = ProtoLoss(encoder, num_prototypes=8, latent_dim=4, hidden_dim=16)
-        >>> pixels = torch.randint(0, 256, (6, 3, 12, 12), dtype=torch.uint8)
-        >>> from torchrl.objectives import SoftUpdate
-        >>> updater = SoftUpdate(loss, tau=0.05)
-        >>> out = loss.before_update()(TensorDict({"pixels": pixels, "next": {"pixels": pixels}}, [6]))
-        >>> (out["loss_comp"] + out["loss_intr"]).backward()
     """
 
     predictor: nn.Module

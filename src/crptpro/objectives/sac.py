@@ -52,6 +52,9 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
     Deviation: the released code always bootstraps; here ``terminated`` cuts it, which no task of the paper has.
 
+    ``forward`` returns the losses and, detached, ``alpha``, ``entropy`` (-log pi, nats), ``q_mean``, ``target_q_mean``,
+    ``td_error`` (mean over rows of the larger of the two heads' absolute errors).
+
     Args:
         actor: on features.
         critic: on features and actions; the target is a copy of all of it.
@@ -60,24 +63,8 @@ class RADSACLoss(NetworkLoss, SACLoss):
         target_entropy: in nats; None for minus the action dimension.
         generator: source of all action noise; torch's global one if None. Not part of the state dictionary.
 
-    Returns (``forward``):
-        ``loss_actor``, ``loss_qvalue``, ``loss_alpha`` and, detached scalars, ``alpha``, ``entropy`` (-log
-        pi, nats), ``q_mean``, ``target_q_mean``, ``td_error`` (mean over rows of the larger of the two heads'
-        absolute errors).
-
     Raises:
-        ValueError: ``gamma`` outside [0, 1], or an ``alpha_init`` that is not positive.
-
-    Examples:
-        >>> actor = SquashedGaussianActor(6, 2, hidden_dim=8)
-        >>> loss = RADSACLoss(actor, TwinCritic(6, 2, hidden_dim=8))
-        >>> from torchrl.objectives import SoftUpdate
-        >>> updater = SoftUpdate(loss, tau=0.01)
-        >>> h, reward, done = torch.randn(4, 6), torch.ones(4, 1), torch.zeros(4, 1, dtype=torch.bool)
-        >>> after = {"features": h, "reward": reward, "done": done, "terminated": done}
-        >>> td = TensorDict({"features": h, "action": torch.zeros(4, 2), "next": after}, [4])
-        >>> loss(td)["loss_qvalue"].shape
-        torch.Size([])
+        ValueError: ``gamma`` or ``alpha_init`` out of its range.
     """
 
     @dataclass
@@ -231,20 +218,13 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
 
 class AveragedSACLoss(RADSACLoss):
-    r""":class:`RADSACLoss` with two views of each observation (DrQ, arXiv 2004.13649, K = M = 2).
+    """:class:`RADSACLoss` with two views of each observation (DrQ, arXiv 2004.13649, K = M = 2).
 
-    With :math:`h_m, h_m'` the features of view m of an observation and the next, each with its own
-    :math:`a_m' \sim \pi(h_m')`:
+    Each view of the next observation has its own action; y is the mean of their targets. ``loss_qvalue`` is the sum,
+    not the mean, over the views, as in denisyarats/drq ``drq.py``; ``loss_actor`` and ``loss_alpha`` are on the first
+    view. A ``generator`` is asked for the next actions of the first view, of the second, then for the actor's.
 
-    * :math:`y = \frac12 \sum_m [r + \gamma (1-\mathrm{terminated}) (\min(Q_1', Q_2')(h_m', a_m') - \alpha
-      \log\pi(a_m'|h_m'))]`
-    * ``loss_qvalue`` = :math:`\sum_m` (MSE(Q1, y) + MSE(Q2, y)), a sum and not a mean over the views, as in
-      denisyarats/drq ``drq.py``;
-    * ``loss_actor`` and ``loss_alpha`` on the first view.
-
-    The exploration agent of APT learns with it on detached features (forhaoliu/mini_apt averages likewise). A
-    ``generator`` is asked for the next actions of the first view, of the second, then for the actor's. ``q_mean`` and
-    ``td_error`` are means over the views too.
+    The exploration agent of APT learns with it on detached features (forhaoliu/mini_apt averages likewise).
     """
 
     @dataclass
@@ -256,23 +236,14 @@ class AveragedSACLoss(RADSACLoss):
 
 
 class DrQLoss(AveragedSACLoss):
-    r"""DrQ (arXiv 2004.13649; denisyarats/drq ``drq.py``): :class:`AveragedSACLoss` with the encoder inside.
+    """DrQ (arXiv 2004.13649; denisyarats/drq ``drq.py``): :class:`AveragedSACLoss` with the encoder inside.
 
     Actor and critic share the convolutions, tied, and each has a head of its own. The convolutions learn from
-    ``loss_qvalue`` alone: the actor, its critic and the policy of the targets see detached features. The target
-    critic has its own copy of convolutions and head. Give actor and critic ``has_tanh=True``: DrQ's heads end
-    with a tanh.
+    ``loss_qvalue`` alone: the actor, its critic and the policy of the targets see detached features. The target critic
+    has its own copy of convolutions and head. Give actor and critic ``has_tanh=True``: DrQ's heads end with a tanh.
+    ``options`` are those of :class:`RADSACLoss`; a critic that does not fit the encoder is a ``ValueError``.
 
     Deviation: as in :class:`RADSACLoss`, ``terminated`` cuts the bootstrap.
-
-    Args:
-        encoder: trained in place.
-        actor: on the encoder's features.
-        critic: on the encoder's features and actions.
-        **options: of :class:`RADSACLoss`.
-
-    Raises:
-        ValueError: a critic that does not fit the encoder; otherwise as :class:`RADSACLoss`.
     """
 
     @dataclass

@@ -27,19 +27,10 @@ class SkillDDPGLoss(NetworkLoss):
     * ``loss_qvalue`` = MSE(Q1, y) + MSE(Q2, y), gradient to the critic only;
     * ``loss_actor`` = -mean(min(Q1, Q2)(s, a)), gradient to the actor only.
 
-    Both actions are the actor's with Gaussian noise clipped to ``noise_clip``. Only the critic has a target.
-    Features never receive a gradient.
-
-    Args:
-        actor: on features and skill; it knows the size of its noise.
-        critic: built for ``feature_dim + skill_dim`` and with ``has_tanh=True``, as in the released code.
-        noise_clip: largest absolute noise of the actions that are learned from.
-        generator: source of all noise, asked for the target's first; torch's global generator if None. Not part
-            of the state dictionary.
-
-    Returns (``forward``):
-        ``loss_actor``, ``loss_qvalue`` and, detached scalars, ``q_mean``, ``target_q_mean``, ``td_error`` (mean
-        over rows of the larger of the two heads' absolute errors).
+    Both actions are the actor's with Gaussian noise clipped to ``noise_clip``, from ``generator`` (the target's first;
+    torch's global one if None). Only the critic has a target, and it ends its trunk with a tanh in the released code.
+    Features never receive a gradient. ``forward`` returns the diagnostics of :class:`~crptpro.objectives.RADSACLoss`
+    too.
 
     Raises:
         ValueError: ``noise_clip`` negative, or a critic for other features than the actor's.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from tensordict import TensorDictBase
@@ -12,7 +11,7 @@ from torchrl.data.tensor_specs import Composite
 from torchrl.envs.transforms import Transform
 
 #: One (nested) key, or a list of keys: as in TorchRL, a tuple is one key.
-Keys = NestedKey | Sequence[NestedKey]
+Keys = Any
 
 
 def read_entry(transform: Transform, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
@@ -35,15 +34,9 @@ class PixelTransform(Transform):
     """Computes one entry from each image entry, in replay batches (``forward``) and in environments.
 
     Keys under ``"next"`` belong to replay batches: on an environment only root keys count, at each reset and each step.
-    A subclass writes ``_apply_transform`` and, where it is not that of the image, :meth:`written_spec`.
-
-    Args:
-        in_keys: images; ``"pixels"`` and, where a batch has it, ``("next", "pixels")`` if None. Keys that are named
-            must be present.
-        out_keys: one key per image; in place if None.
-
-    Raises:
-        ValueError: ``in_keys`` and ``out_keys`` of unequal length.
+    Without ``in_keys`` they are ``"pixels"`` and, where a batch has it, ``("next", "pixels")``; keys that are named
+    must be present. Without ``out_keys`` the images are replaced. A subclass writes ``_apply_transform`` and, where it
+    is not that of the image, :meth:`written_spec`.
     """
 
     def __init__(self, in_keys: Keys | None, out_keys: Keys | None) -> None:

@@ -13,14 +13,8 @@ class ColorSwap(PixelTransform):
     """Reverses the channel order, RGB to BGR, of whole images: the simplest reading of the paper's unseen colours.
 
     Everything changes its colour with it, the robot too; ``make_env(..., colors="reversed_background")`` changes the
-    background alone. Twice gives the images back. For environments and replay batches.
-
-    Args:
-        in_keys: images ``[*, 3 k, H, W]`` of k RGB frames; ``pixels`` and ``("next", "pixels")`` if None.
-        out_keys: where they go; in place if None.
-
-    Raises (``forward``):
-        ValueError: channels that are no whole number of RGB frames.
+    background alone. For environments and replay batches, of RGB frames and stacks of them, ``[*, 3 k, H, W]``; keys as
+    of :class:`RandomShift`.
     """
 
     def __init__(self, in_keys: Keys | None = None, out_keys: Keys | None = None) -> None:

@@ -56,9 +56,8 @@ class DenseShiftGeometry(NamedTuple):
 def dense_shift_geometry(encoder: nn.Module, pad: int = 4) -> DenseShiftGeometry:
     """Work out the dense maps of an encoder for shifts of up to ``pad`` pixels in each direction.
 
-    Raises:
-        ValueError: the encoder is not known to be un-padded and convolutional throughout, or its stride
-            leaves no shifts to share (then encoding every shift by itself costs the same).
+    A ``ValueError`` says that the encoder is not known to be un-padded and convolutional throughout, or that its stride
+    leaves no shifts to share (then encoding every shift by itself costs the same).
     """
     if not isinstance(encoder, PixelEncoder):
         raise ValueError(
@@ -83,14 +82,8 @@ def dense_shift_maps(
 ) -> Tensor:
     """Encode images once per stride phase, border replicated, for every shift of up to ``pad`` pixels.
 
-    Args:
-        encoder: see :func:`dense_shift_geometry`.
-        pixels: ``[B, in_channels, image_size, image_size]``, as the encoder takes them.
-        pad: largest shift in pixels.
-        dtype: of the result; the encoder's compute dtype by default.
-
-    Returns:
-        ``[B, phases**2, C, m, m]`` contiguous, phases ordered (row, column); not standardised; without gradient.
+    Returns ``[B, phases**2, C, m, m]`` contiguous, of ``dtype`` or the encoder's compute dtype, phases ordered (row,
+    column); not standardised; without gradient.
     """
     phases, window, _ = dense_shift_geometry(encoder, pad)
     expected = (encoder.in_channels, encoder.image_size, encoder.image_size)
@@ -107,19 +100,13 @@ def dense_shift_maps(
 
 @torch.no_grad()
 def crop_features(maps: Tensor, rows: Tensor, offsets: Tensor, out: Tensor, *, pad: int = 4) -> Tensor:
-    """Read the features of one shift per image from its dense maps.
+    """Read the features of one shift per image, int64 ``offsets`` ``[B, 2]``, from the maps at ``rows`` ``[B]``.
 
     Equal to ``encoder(random_shift(pixels, offsets, pad=pad))``, not standardised: bit for bit in float32 where the
     convolution adds up each output in an order that does not depend on the image size (oneDNN on x86 does),
     otherwise to the rounding of the convolution (about 1e-6 of the largest feature).
 
-    Args:
-        maps: contiguous ``[N, phases**2, C, m, m]`` of :func:`dense_shift_maps` with the same ``pad``.
-        rows: int64 ``[B]``, of the maps.
-        offsets: int64 ``[B, 2]``, (row, column) in ``{0, ..., 2 * pad}``.
-        out: contiguous ``[B, feature_dim]`` to write into and to return, of the maps' dtype, or float32 of bfloat16
-            maps.
-        pad: largest shift in pixels.
+    Writes into ``out`` ``[B, feature_dim]``, of the maps' dtype or float32 of bfloat16 maps, and returns it.
     """
     phases, channels = math.isqrt(maps.shape[1]), maps.shape[2]
     extra = 2 * pad // phases
@@ -350,22 +337,21 @@ def choose_feature_mode(
 ) -> tuple[Literal["dense", "reencode"], str]:
     """Decide between dense maps and encoding shifted images anew; both give the same features.
 
+    ``"auto"`` takes dense maps where the encoder has the form and four fifths of the free memory suffice; ``"dense"``
+    and ``"reencode"`` are obeyed.
+
     Args:
-        mode: ``"auto"`` takes dense maps where the encoder has the form and the memory suffices; the other two are
-            obeyed.
+        mode: as above.
         encoder: the frozen encoder.
         observations: to hold maps of.
         dtype: of the stored maps.
-        available_bytes: free memory, of which the maps may take four fifths; measured when None.
+        available_bytes: free memory; measured on ``device`` when None.
         pad: largest shift in pixels.
         latent_dim: length of the projections if they are to be kept too.
         device: whose memory is measured.
 
     Returns:
         The mode, and the reason in one line, to be shown to the user.
-
-    Raises:
-        ValueError: ``"dense"`` for an encoder that is not of the form, or an unknown mode.
     """
     if mode == "reencode":
         return "reencode", "re-encoding at every update, as asked"
@@ -387,7 +373,7 @@ def choose_feature_mode(
         return "dense", f"dense-shift cache ({size})"
     in_bf16 = dense_maps_bytes(encoder, observations, torch.bfloat16, pad=pad, latent_dim=latent_dim)
     if in_bf16 <= MEMORY_SHARE * available:
-        size += f"; in bf16, by dense_precision, it would fit with {in_bf16 / 2**30:.1f} GiB"
+        size += f"; with features=dense-bf16 it would fit in {in_bf16 / 2**30:.1f} GiB"
     return "reencode", f"re-encoding at every update: too little memory for the dense-shift cache ({size})"
 
 

@@ -33,9 +33,7 @@ logger = logging.getLogger(__name__)
 
 
 class IntrinsicReward(Transform):
-    r"""Computes an intrinsic reward from the features of next observations.
-
-    .. math:: r = r_\mathrm{ext} + c \hat r
+    r"""Computes an intrinsic reward from the features of next observations: :math:`r = r_\mathrm{ext} + c \hat r`.
 
     A subclass writes ``intrinsic_reward`` of rows. Works on replay batches (``forward``) and on environments, where the
     batch is what one step returns: all of a vectorised environment. A reset is not rewarded.
@@ -46,9 +44,6 @@ class IntrinsicReward(Transform):
         in_keys: one key, features ``[*, D]`` of the next observation.
         out_keys: one key for :math:`\hat r`, of the reward's shape.
         reward_key: :math:`r_\mathrm{ext}`, ``[*, 1]``, which :math:`r` replaces; read where there is a ``coef``.
-
-    Raises:
-        ValueError: more than one key.
     """
 
     def __init__(
@@ -75,11 +70,7 @@ class IntrinsicReward(Transform):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the intrinsic reward of a batch and add it to the reward; stored rewards stay as they are.
-
-        Raises:
-            KeyError: features or reward are missing.
-        """
+        """Write the intrinsic reward of a batch and add it to the reward; stored rewards stay as they are."""
         features = read_entry(self, tensordict, self.in_keys[0])
         rows = features.reshape(-1, features.shape[-1])
         beside = [read_entry(self, tensordict, key).reshape(len(rows), -1) for key in self.beside_keys]
@@ -122,9 +113,7 @@ def _in_a_step(key: NestedKey) -> NestedKey:
 
 
 class PrototypeReward(IntrinsicReward):
-    r"""Add the prototype-kNN exploration bonus to the reward (CRPTpro, Eq. 10-11).
-
-    .. math:: r = r_\mathrm{ext} + \beta \hat r
+    r"""Add the prototype-kNN exploration bonus, :math:`r = r_\mathrm{ext} + \beta \hat r` (CRPTpro, Eq. 10-11).
 
     With :math:`z_i` the l2-normalised projections of a batch of next observations and :math:`c_j` the
     l2-normalised prototypes, each call
@@ -146,17 +135,13 @@ class PrototypeReward(IntrinsicReward):
 
     Args:
         projector: maps features to the latent space, frozen; None if ``in_keys`` already names projections.
-        prototypes: :class:`~crptpro.modules.Prototypes`, rows of any length.
+        prototypes: :class:`~crptpro.modules.Prototypes`, rows of any length, as long as the projections.
         coef: :math:`\beta`; None writes :math:`\hat r` only.
         knn_k: k, counted with copies of the sample itself; at most ``queue_size``.
         queue_size: length of Q, a multiple of M.
-        queue: ``[queue_size, D]`` to start from, such as a checkpoint's, the row that is overwritten first in front;
-            zeros when None.
+        queue: ``[queue_size, D]`` to start from, the row that is overwritten first in front; zeros when None.
         generator: source of the draws; the global generator of the device when None. Not part of the state dict.
         **keys: ``in_keys``, ``out_keys`` and ``reward_key`` of :class:`~crptpro.transforms.rewards.IntrinsicReward`.
-
-    Raises:
-        ValueError: an argument out of its range, or a projector whose outputs are not as long as the prototypes.
     """
 
     projector: nn.Module | None
@@ -198,18 +183,7 @@ class PrototypeReward(IntrinsicReward):
 
     @torch.no_grad()
     def intrinsic_reward(self, features: Tensor, *beside: Tensor) -> Tensor:
-        r"""Insert this batch's candidates into the queue and return the bonus before :math:`\beta`.
-
-        Args:
-            features: ``[B, feature_dim]``, or ``[B, D]`` without a projector; any floating dtype.
-            *beside: nothing.
-
-        Returns:
-            float32 ``[B]``.
-
-        Raises:
-            ValueError: projections that are not as long as the prototypes.
-        """
+        r"""Insert this batch's candidates into the queue and return the bonus of each row before :math:`\beta`."""
         latents = features if self.projector is None else self.projector(features)
         _check_latents(latents.shape[-1], self.queue.shape[-1])
         latents = F.normalize(latents.float(), dim=-1)
@@ -275,10 +249,8 @@ class ParticleReward(IntrinsicReward):
     Deviation: in a batch smaller than k the whole batch are the neighbours, and a single particle earns 0; the
     published code fails there. Where all distances seen so far are 0 the bonus is 0; there it is not a number.
 
-    Args:
-        projector: maps features to the latent space; None if ``in_keys`` already names projections.
-        k: neighbours, the particle itself included; at least 2.
-        **options: of :class:`~crptpro.transforms.rewards.IntrinsicReward`.
+    ``projector`` is None if ``in_keys`` already names projections; ``options`` are those of
+    :class:`~crptpro.transforms.rewards.IntrinsicReward`.
     """
 
     projector: nn.Module | None
@@ -295,15 +267,7 @@ class ParticleReward(IntrinsicReward):
 
     @torch.no_grad()
     def intrinsic_reward(self, features: Tensor, *beside: Tensor) -> Tensor:
-        r"""Take this batch's distances into the running mean and return the reward before the coefficient.
-
-        Args:
-            features: ``[B, feature_dim]``, or ``[B, D]`` without a projector; any floating dtype.
-            *beside: nothing.
-
-        Returns:
-            float32 ``[B]``, non-negative.
-        """
+        """Take this batch's distances into the running mean; return the reward of each row before the coefficient."""
         latents = (features if self.projector is None else self.projector(features)).float()
         count = latents.shape[0]
         if count < 2:
@@ -333,11 +297,8 @@ class ContrastiveReward(IntrinsicReward):
 
     Deviation: the published code fails on a batch of one; here that has nothing to be contrasted with and earns 0.
 
-    Args:
-        head: maps features to the embedding; None if ``in_keys`` already names embeddings.
-        temperature: T, positive.
-        skill_key: one-hot ``[*, K]``, the skill that acted, at the root.
-        **options: of :class:`~crptpro.transforms.rewards.IntrinsicReward`.
+    ``head`` is None if ``in_keys`` already names embeddings, ``skill_key`` the one-hot skill ``[*, K]`` that acted, at
+    the root; ``options`` are those of :class:`~crptpro.transforms.rewards.IntrinsicReward`.
     """
 
     head: nn.Module | None
@@ -357,15 +318,7 @@ class ContrastiveReward(IntrinsicReward):
 
     @torch.no_grad()
     def intrinsic_reward(self, features: Tensor, *beside: Tensor) -> Tensor:
-        """Return the reward before the coefficient.
-
-        Args:
-            features: ``[B, feature_dim]``, or embeddings without a head; any floating dtype.
-            *beside: one-hot skills ``[B, K]``.
-
-        Returns:
-            float32 ``[B]``, in (0, 1]; 0 for a batch of one.
-        """
+        """Return the reward of rows ``[B, D]`` and one-hot skills ``[B, K]`` before the coefficient."""
         embeddings = (features if self.head is None else self.head(features)).float()
         if len(embeddings) < 2:
             return embeddings.new_zeros(len(embeddings))
