@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from collections.abc import Callable
 from functools import partial
 
 import pytest
@@ -11,7 +12,7 @@ import torch
 from fake_pixel_env import SIZE, SKILLS, FakePixelEnv, FakeReplay, small_encoder, small_heads
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs import Compose, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from crptpro.transforms import (
@@ -24,17 +25,7 @@ from crptpro.transforms import (
     RandomShift,
 )
 
-
-def shift_in_place():
-    return RandomShift()
-
-
-def colors_in_place():
-    return ColorSwap()
-
-
-def frozen_encoder():
-    return FrozenEncoder(small_encoder())
+BATCH = 6
 
 
 def prototype(encoder, **options):
@@ -49,56 +40,47 @@ def contrastive(encoder):
     return ContrastiveReward(small_heads(encoder)[0], coef=0.2)
 
 
-def prototype_reward():
-    encoder = small_encoder()
-    return Compose(FrozenEncoder(encoder), prototype(encoder))
+def to_new_keys(encoder):
+    return prototype(encoder, in_keys=("next", "z"), out_keys=("next", "bonus"))
 
 
-def reward_to_a_new_key():
-    encoder = small_encoder()
-    reward = prototype(encoder, in_keys=("next", "z"), out_keys=("next", "bonus"))
-    return Compose(FrozenEncoder(encoder, out_keys="z"), reward)
+def rewarding(reward: Callable, *before: Callable, key: str = "features") -> Callable:
+    """Encode the next observation and reward it, on an environment or a batch."""
+
+    def make(is_offline: bool) -> Transform:
+        encoder = small_encoder()
+        read, written = (("next", "pixels"), ("next", key)) if is_offline else ("pixels", key)
+        encode = FrozenEncoder(encoder, in_keys=[read], out_keys=[written])
+        return Compose(*(each() for each in before), encode, reward(encoder))
+
+    return make
 
 
-def particle_reward():
-    encoder = small_encoder()
-    return Compose(FrozenEncoder(encoder), particle(encoder))
+IN_PLACE = {"pixels", ("next", "pixels")}
+REWARDED = {("next", "features"), ("next", "intrinsic_reward"), ("next", "reward")}
 
-
-def contrastive_reward():
-    encoder = small_encoder()
-    return Compose(FrozenEncoder(encoder), contrastive(encoder))
-
-
-def everything():
-    return Compose(RandomShift(), *prototype_reward().transforms)
-
-
-def dense_features():
-    return DenseShiftFeatures(small_encoder(), FakeReplay(BATCH), in_keys=["rows", ("next", "rows")])
-
-
-def transformed(make):
-    return TransformedEnv(FakePixelEnv(), make())
-
-
-BATCH = 6
-BONUS = {("next", "intrinsic_reward"), ("next", "reward")}
-
-# What each changes in, or adds to, a replay batch.
-WRITES = {
-    shift_in_place: {"pixels", ("next", "pixels")},
-    colors_in_place: {"pixels", ("next", "pixels")},
-    frozen_encoder: {"features"},
-    prototype_reward: {("next", "features")} | BONUS,
-    reward_to_a_new_key: {("next", "z"), ("next", "bonus"), ("next", "reward")},
-    particle_reward: {("next", "features")} | BONUS,
-    contrastive_reward: {("next", "features")} | BONUS,
-    everything: {"pixels", ("next", "pixels"), ("next", "features")} | BONUS,
-    dense_features: {"features", ("next", "features")},
+# How each is made, for a batch or an environment, and what it changes in, or adds to, a batch.
+CASES: dict[str, tuple[Callable[[bool], Transform], set]] = {
+    "shift": (lambda is_offline: RandomShift(), IN_PLACE),
+    "colors": (lambda is_offline: ColorSwap(), IN_PLACE),
+    "encoder": (lambda is_offline: FrozenEncoder(small_encoder()), {"features"}),
+    "prototype": (rewarding(prototype), REWARDED),
+    "new keys": (
+        rewarding(to_new_keys, key="z"),
+        {("next", "z"), ("next", "bonus"), ("next", "reward")},
+    ),
+    "particle": (rewarding(particle), REWARDED),
+    "contrastive": (rewarding(contrastive), REWARDED),
+    "everything": (rewarding(prototype, RandomShift), IN_PLACE | REWARDED),
+    "dense": (
+        lambda is_offline: DenseShiftFeatures(
+            small_encoder(), FakeReplay(BATCH), in_keys=["rows", ("next", "rows")]
+        ),
+        {"features", ("next", "features")},
+    ),
 }
-each = pytest.mark.parametrize("make", [make for make in WRITES if make is not dense_features])
-each_offline = pytest.mark.parametrize("make", list(WRITES))
+each = pytest.mark.parametrize("case", [name for name in CASES if name != "dense"])
+each_offline = pytest.mark.parametrize("case", list(CASES))
 
 
 @pytest.fixture(autouse=True)
@@ -106,24 +88,24 @@ def _seeded():
     torch.manual_seed(0)
 
 
-def sampled():
+def online(case: str) -> Transform:
+    return CASES[case][0](False)
+
+
+def offline(case: str) -> Transform:
+    return CASES[case][0](True)
+
+
+def transformed(case: str) -> TransformedEnv:
+    return TransformedEnv(FakePixelEnv(), online(case))
+
+
+def sampled() -> TensorDict:
     pixels = torch.randint(0, 256, (BATCH, 9, SIZE, SIZE), dtype=torch.uint8)
     rows = torch.arange(BATCH)
     following = {"pixels": pixels.flip(0), "rows": rows.flip(0), "reward": torch.rand(BATCH, 1)}
     skill = torch.eye(SKILLS)[rows % SKILLS]
     return TensorDict({"pixels": pixels, "rows": rows, "skill": skill, "next": following}, batch_size=[BATCH])
-
-
-def offline(make):
-    """The transform with what it needs on a replay batch."""
-    if make in (shift_in_place, colors_in_place, frozen_encoder, dense_features):
-        return make()
-    encoder, key = small_encoder(), "z" if make is reward_to_a_new_key else "features"
-    encode = FrozenEncoder(encoder, in_keys=[("next", "pixels")], out_keys=[("next", key)])
-    rewards = {particle_reward: particle, contrastive_reward: contrastive}
-    options = {"in_keys": ("next", "z"), "out_keys": ("next", "bonus")} if make is reward_to_a_new_key else {}
-    reward = rewards.get(make, prototype)(encoder, **options)
-    return Compose(*([RandomShift()] if make is everything else []), encode, reward)
 
 
 def changed(before: TensorDictBase, after: TensorDictBase) -> set:
@@ -134,7 +116,7 @@ def changed(before: TensorDictBase, after: TensorDictBase) -> set:
     }
 
 
-def assert_the_same(first, second):
+def assert_the_same(first: Transform, second: Transform) -> None:
     """Two transforms do the same to two batches in a row: same draws, same queues."""
     for seed in range(2):
         td = sampled()
@@ -147,79 +129,59 @@ def assert_the_same(first, second):
 
 
 @each
-def test_single_environment(make):
-    check_env_specs(transformed(make), seed=0)
-
-
-@each
-def test_serial_environment_of_transformed_ones(make):
-    check_env_specs(SerialEnv(2, partial(transformed, make)), seed=0)
-
-
-@each
-def test_transformed_serial_environment(make):
-    check_env_specs(TransformedEnv(SerialEnv(2, FakePixelEnv), make()), seed=0)
+def test_the_specs_of_single_and_batched_environments_hold(case: str) -> None:
+    check_env_specs(transformed(case), seed=0)
+    check_env_specs(SerialEnv(2, partial(transformed, case)), seed=0)
+    check_env_specs(TransformedEnv(SerialEnv(2, FakePixelEnv), online(case)), seed=0)
 
 
 @each_offline
-def test_without_an_environment(make):
-    td = sampled()
-    assert changed(td.clone(), offline(make)(td)) == WRITES[make]
-
-
-@each_offline
-def test_in_a_replay_buffer(make):
+def test_a_batch_and_a_sample_of_a_buffer_are_changed_and_what_is_stored_is_not(case: str) -> None:
+    writes, stored = CASES[case][1], sampled()
+    assert changed(stored, offline(case)(stored.clone())) == writes
     buffer = ReplayBuffer(storage=LazyTensorStorage(BATCH), batch_size=4)
-    stored = sampled()
     buffer.extend(stored.clone())
-    buffer.append_transform(offline(make))
+    buffer.append_transform(offline(case))
     sample = buffer.sample()
     assert sample.batch_size == (4,)
-    assert changed(stored[sample["rows"]], sample) == WRITES[make]
+    assert changed(stored[sample["rows"]], sample) == writes
     assert changed(stored, buffer._storage[:]) == set()
 
 
 @each
-def test_attaching_switches_to_evaluation_mode_and_it_still_acts(make):
+def test_attaching_switches_to_evaluation_mode_and_it_still_acts(case: str) -> None:
     # Two of them: rewards that compare the elements of a batch give nothing to a single one.
-    plain, env = SerialEnv(2, FakePixelEnv), TransformedEnv(SerialEnv(2, FakePixelEnv), make())
+    plain, env = SerialEnv(2, FakePixelEnv), TransformedEnv(SerialEnv(2, FakePixelEnv), online(case))
     assert not env.transform.training
     for each_env in (plain, env):
         each_env.set_seed(0)
     plain, rollout = plain.rollout(3), env.rollout(3)
     new = set(rollout["next"].keys(True, True)) - set(plain["next"].keys(True, True))
-    assert new == {key[-1] if isinstance(key, tuple) else key for key in WRITES[make]} - {"pixels", "reward"}
+    writes = CASES[case][1]
+    assert new == {key[-1] if isinstance(key, tuple) else key for key in writes} - {"pixels", "reward"}
     for key in new:
         assert rollout["next"][key].any(), key
-    changes_in_place = make in (shift_in_place, colors_in_place, everything)
     for key in ("pixels", ("next", "pixels")):
-        assert torch.equal(rollout[key], plain[key]) is not changes_in_place
-    bonus = new & {"intrinsic_reward", "bonus"}
-    for key in bonus:
+        assert torch.equal(rollout[key], plain[key]) is (key not in writes)
+    for key in new & {"intrinsic_reward", "bonus"}:
         external = rollout["action"].mean(-1, keepdim=True)
         torch.testing.assert_close(rollout["next", "reward"], external + 0.2 * rollout["next", key])
 
 
 @each
-def test_a_clone_has_no_parent_and_can_be_attached_elsewhere(make):
-    env = transformed(make)
+def test_a_clone_has_no_parent_and_can_be_attached_elsewhere(case: str) -> None:
+    env = transformed(case)
     clone = env.transform.clone()
     assert clone.parent is None
     check_env_specs(TransformedEnv(FakePixelEnv(), clone), seed=0)
 
 
 @each_offline
-def test_a_clone_does_the_same_without_touching_the_original(make):
-    transform = offline(make)
+def test_clones_and_pickles_do_the_same_without_touching_the_original(case: str) -> None:
+    transform = offline(case)
+    assert_the_same(pickle.loads(pickle.dumps(transform)), copy.deepcopy(transform))
     transform(sampled())
     untouched = copy.deepcopy(transform)
-    clone = transform.clone()
-    assert_the_same(clone, copy.deepcopy(transform))
+    assert_the_same(transform.clone(), copy.deepcopy(transform))
+    assert_the_same(pickle.loads(pickle.dumps(transform)), copy.deepcopy(transform))
     assert_the_same(transform, untouched)
-
-
-@each_offline
-def test_it_is_picklable_before_and_after_use(make):
-    transform = offline(make)
-    for _ in range(2):
-        assert_the_same(pickle.loads(pickle.dumps(transform)), transform)
