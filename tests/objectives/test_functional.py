@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-import torch.nn.functional as F
 from loss_cases import close, double, unit
 from torch import Tensor
 
@@ -151,15 +150,6 @@ def test_dispersion_is_zero_for_orthogonal_or_single_prototypes_and_ignores_rota
     assert prototype_dispersion(unit(1, 4), reduction="mean_offdiag").item() == 0
     rotation, _ = torch.linalg.qr(torch.randn(6, 6).double())
     close(prototype_dispersion(unit(9, 6) @ rotation), prototype_dispersion(unit(9, 6)), 1e-12)
-
-
-def test_descending_the_dispersion_spreads_prototypes() -> None:
-    prototypes = F.normalize(unit(8, 3) + 2.0, dim=1).requires_grad_()
-    before = prototype_ane(prototypes)
-    for _ in range(50):
-        (gradient,) = torch.autograd.grad(prototype_dispersion(prototypes), prototypes)
-        prototypes = F.normalize(prototypes.detach() - gradient, dim=1).requires_grad_()
-    assert prototype_ane(prototypes) < before - 0.3
 
 
 # Nearest neighbours --------------------------------------------------------------------------------------------

@@ -337,21 +337,15 @@ def choose_feature_mode(
 ) -> tuple[Literal["dense", "reencode"], str]:
     """Decide between dense maps and encoding shifted images anew; both give the same features.
 
-    ``"auto"`` takes dense maps where the encoder has the form and four fifths of the free memory suffice; ``"dense"``
-    and ``"reencode"`` are obeyed.
-
-    Args:
-        mode: as above.
-        encoder: the frozen encoder.
-        observations: to hold maps of.
-        dtype: of the stored maps.
-        available_bytes: free memory; measured on ``device`` when None.
-        pad: largest shift in pixels.
-        latent_dim: length of the projections if they are to be kept too.
-        device: whose memory is measured.
+    ``"auto"`` takes dense maps, of ``observations`` in ``dtype`` and of their projections of ``latent_dim`` if there are to
+    be any, where the encoder has the form and four fifths of the free memory suffice (measured on ``device`` if it is not
+    given). ``"dense"`` and ``"reencode"`` are obeyed.
 
     Returns:
         The mode, and the reason in one line, to be shown to the user.
+
+    Raises:
+        ValueError: ``"dense"`` for an encoder that is not of the form, or an unknown mode.
     """
     if mode == "reencode":
         return "reencode", "re-encoding at every update, as asked"
