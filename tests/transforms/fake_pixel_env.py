@@ -6,37 +6,25 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
-from torchrl.data import Bounded, OneHot
+from torchrl.data import Bounded
 from toy_world import ToyEnv
 
 from crptpro.modules import PixelEncoder, Projector, Prototypes
 
 SIZE = 20
-EPISODE = 4
-SKILLS = 3
 
 
 class FakePixelEnv(ToyEnv):
-    """uint8 [9, 20, 20] noise and a skill that changes every second agent step; reward = mean action.
-
-    Truncated after 4 agent steps.
-    """
+    """uint8 [9, 20, 20] noise, whatever the actions; truncated after 4 agent steps."""
 
     def __init__(self) -> None:
-        super().__init__(lambda seed: EPISODE, image_size=SIZE)
+        super().__init__(lambda seed: 4, image_size=SIZE)
         self.observation_spec["pixels"] = Bounded(0, 255, (9, SIZE, SIZE), dtype=torch.uint8)
-        self.observation_spec["skill"] = OneHot(SKILLS, dtype=torch.float32)
 
     def _observe(self) -> dict[str, Any]:
-        self.total = 0.0  # the frames do not depend on the actions
+        self.total = 0.0
         frame = super()._observe()["pixels"]
-        return {
-            "pixels": torch.cat([frame, 255 - frame, frame // 2]),
-            "skill": torch.eye(SKILLS)[self.count // 2],
-        }
-
-    def _step(self, tensordict: TensorDict) -> TensorDict:
-        return super()._step(tensordict).set("reward", tensordict["action"].mean(-1, keepdim=True))
+        return {"pixels": torch.cat([frame, 255 - frame, frame // 2])}
 
 
 def small_encoder(**changes: object) -> PixelEncoder:

@@ -144,9 +144,7 @@ def select_backend(timeout_s: float | None = None, *, processes: int = 1) -> str
 
 
 def backend_card() -> dict[str, Any]:
-    """Return the backend, the GL vendor, renderer and version, and whether GL is software or hardware."""
-    if _proof() is None:
-        select_backend()
+    """Return the backend that was proven, the GL vendor, renderer and version, and whether GL is soft- or hardware."""
     proof = _proof() or {}
     keys = ("backend", "gl_vendor", "gl_renderer", "gl_version", "gl_kind")
     return {key: proof.get(key, "unknown") for key in keys}

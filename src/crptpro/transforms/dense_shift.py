@@ -337,9 +337,9 @@ def choose_feature_mode(
 ) -> tuple[Literal["dense", "reencode"], str]:
     """Decide between dense maps and encoding shifted images anew; both give the same features.
 
-    ``"auto"`` takes dense maps, of ``observations`` in ``dtype`` and of their projections of ``latent_dim`` if there are to
-    be any, where the encoder has the form and four fifths of the free memory suffice (measured on ``device`` if it is not
-    given). ``"dense"`` and ``"reencode"`` are obeyed.
+    ``"auto"`` takes dense maps, of ``observations`` in ``dtype`` and of their projections of ``latent_dim`` if there
+    are to be any, where the encoder has the form and four fifths of the free memory suffice (measured on ``device`` if
+    it is not given). ``"dense"`` and ``"reencode"`` are obeyed.
 
     Returns:
         The mode, and the reason in one line, to be shown to the user.

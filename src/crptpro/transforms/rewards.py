@@ -1,4 +1,4 @@
-"""Intrinsic rewards of replay batches and environments: CRPTpro's prototypes, APT's particles, BeCL's skills."""
+"""Intrinsic rewards of replay batches: CRPTpro's prototypes, APT's particles, BeCL's skills."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data.tensor_specs import Composite, Unbounded
+from torchrl.data.tensor_specs import TensorSpec
 from torchrl.envs.transforms import Transform
 
 from crptpro.modules.heads import latent_dim_of
@@ -35,8 +35,7 @@ logger = logging.getLogger(__name__)
 class IntrinsicReward(Transform):
     r"""Computes an intrinsic reward from the features of next observations: :math:`r = r_\mathrm{ext} + c \hat r`.
 
-    A subclass writes ``intrinsic_reward`` of rows. Works on replay batches (``forward``) and on environments, where the
-    batch is what one step returns: all of a vectorised environment. A reset is not rewarded.
+    A subclass writes ``intrinsic_reward`` of the rows of a replay batch, which are compared with each other.
 
     Args:
         networks: that are read, by attribute name. They are somebody else's, and no part of the state dictionary.
@@ -83,33 +82,15 @@ class IntrinsicReward(Transform):
         # A new tensor: the sampled reward may share memory with the storage.
         return tensordict.set(self.reward_key, reward + self.coef * intrinsic)
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self.forward(tensordict.copy().set("next", next_tensordict)).get("next")
-
-    def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Register the intrinsic reward and the sum, both unbounded; a missing reward is a ``KeyError``."""
-        output_spec = output_spec.clone()
-        rewards = output_spec["full_reward_spec"]
-        spec = Unbounded(shape=(*rewards.shape, 1), dtype=torch.float32, device=rewards.device)
-        if self.coef is not None:
-            key = _in_a_step(self.reward_key)
-            if key not in rewards.keys(True, True):
-                raise KeyError(f"{type(self).__name__} found no {key!r} in the rewards {rewards}.")
-            spec = Unbounded(shape=rewards[key].shape, dtype=rewards[key].dtype, device=rewards.device)
-            rewards[key] = spec.clone()
-        rewards[_in_a_step(self.out_keys[0])] = spec
-        return output_spec
+    def transform_output_spec(self, output_spec: TensorSpec) -> TensorSpec:
+        """Refuse to be part of an environment, whose single step has nothing to be compared with."""
+        raise NotImplementedError(f"{type(self).__name__} rewards replay batches; attach it to a buffer.")
 
     def clone(self) -> Self:
         """Return a transform without parent, with a state of its own; networks and generator are shared."""
         copy = super().clone()
         copy._buffers = {name: value.clone() for name, value in self._buffers.items() if value is not None}
         return copy
-
-
-def _in_a_step(key: NestedKey) -> NestedKey:
-    """Return where an environment's step keeps an entry of a replay batch."""
-    return unravel_key(key[1:] if isinstance(key, tuple) and key[0] == "next" else key)
 
 
 class PrototypeReward(IntrinsicReward):
@@ -127,8 +108,7 @@ class PrototypeReward(IntrinsicReward):
     512 prototypes and k = 3), and rows of the queue not yet filled are zero vectors at distance 1. A row that is not
     finite is never drawn.
 
-    The candidates come from the batch at hand: one sample alone fills the queue with itself and earns 0. Never put it
-    on evaluation environments.
+    The candidates come from the batch at hand: one sample alone fills the queue with itself and earns 0.
 
     Deviation: the released pre-training fills Q on the way and hands it over; here Q starts from zeros unless ``queue``
     is given.
