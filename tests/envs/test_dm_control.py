@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -36,35 +37,23 @@ def play(env: EnvBase, agent_steps: int) -> TensorDictBase:
     return torch.stack(seen)
 
 
-class Played:
-    """An environment of a domain, the third episode of which was played from its seed, with its camera counted."""
-
-    seed = 11
-
-    def __init__(self, name: str, monkeypatch: pytest.MonkeyPatch):
-        select_backend()
-        from dm_control.mujoco import engine
-
-        self.name, self.renders = name, 0
-        self.env = make_env(name, seed=0, physics_state=True)
-        self.first = play(self.env, 1)
-        self.env.set_seed(self.seed)
-        render = engine.Camera.render
-
-        def counted(*args: Any, **kwargs: Any) -> Any:
-            self.renders += 1
-            return render(*args, **kwargs)
-
-        monkeypatch.setattr(engine.Camera, "render", counted)
-        self.rollout = play(self.env, 3)
+SEED = 11
 
 
 @pytest.fixture(scope="module", params=PAPER_DOMAINS)
-def played(request: pytest.FixtureRequest) -> Iterator[Played]:
+def played(request: pytest.FixtureRequest) -> Iterator[Any]:
+    """An environment of a domain, an episode of which was played from ``SEED`` with its camera counted."""
+    select_backend()
+    from dm_control.mujoco import engine
+
+    env, renders, render = make_env(request.param, seed=0, physics_state=True), [], engine.Camera.render
+    first = play(env, 1)
+    env.set_seed(SEED)
     with pytest.MonkeyPatch.context() as monkeypatch:
-        played = Played(request.param, monkeypatch)
-    yield played
-    played.env.close()
+        monkeypatch.setattr(engine.Camera, "render", lambda *a, **k: renders.append(1) or render(*a, **k))
+        rollout = play(env, 3)
+    yield SimpleNamespace(name=request.param, env=env, first=first, rollout=rollout, renders=len(renders))
+    env.close()
 
 
 def plain_dm_control(domain: Domain, seed: int) -> tuple[Any, Any, Any]:
@@ -82,8 +71,8 @@ def plain_dm_control(domain: Domain, seed: int) -> tuple[Any, Any, Any]:
 
 
 @pytest.mark.gl
-def test_every_paper_domain_gives_the_frames_and_rewards_of_plain_dm_control(played: Played) -> None:
-    world, scaled, image_of = plain_dm_control(PAPER_DOMAINS[played.name], played.seed)
+def test_every_paper_domain_gives_the_frames_and_rewards_of_plain_dm_control(played: Any) -> None:
+    world, scaled, image_of = plain_dm_control(PAPER_DOMAINS[played.name], SEED)
     step = scaled.reset()
     frames, rewards = [torch.from_numpy(image_of(step).transpose(2, 0, 1).copy())], []
     for action in played.rollout["action"].numpy():
@@ -102,7 +91,7 @@ def test_every_paper_domain_gives_the_frames_and_rewards_of_plain_dm_control(pla
 
 
 @pytest.mark.gl
-def test_every_paper_domain_is_drawn_once_per_agent_step_by_torchrls_parts(played: Played) -> None:
+def test_every_paper_domain_is_drawn_once_per_agent_step_by_torchrls_parts(played: Any) -> None:
     assert played.renders == 1 + 3
     assert isinstance(played.env.base_env, DMControlWrapper)
     assert isinstance(played.env.transform[-1], CatFrames)
@@ -119,7 +108,7 @@ def test_every_paper_domain_is_drawn_once_per_agent_step_by_torchrls_parts(playe
 
 
 @pytest.mark.gl
-def test_an_episode_depends_on_its_seed(played: Played) -> None:
+def test_an_episode_depends_on_its_seed(played: Any) -> None:
     played.env.set_seed(0)
     again = play(played.env, 1)
     for key in ("pixels", ("next", "pixels"), ("next", "reward"), ("next", "qpos"), ("next", "qvel")):
