@@ -164,7 +164,7 @@ DDPG = {"loss_qvalue": {"qvalue_network_params"}, "loss_actor": {"actor_network_
 SAC = {**DDPG, "loss_alpha": {"log_alpha"}}
 SAC_KEYS = {name: name for name in ("action", "reward", "done", "terminated")}
 SKILL_KEYS = {name: name for name in ("skill", "action", "reward", "discount")}
-FRAMED = {"observation": "features"}
+ON_FEATURES = {"observation": "features"}
 
 CASES = [
     LossCase(
@@ -182,12 +182,12 @@ CASES = [
              {"observation": "pixels", "observation_view": "pixels_view"}),
     LossCase("BeCLLoss", becl, skill_image_batch, CONTRAST,
              {"next_observation": ("next", "pixels"), "skill": "skill"}),
-    LossCase("RADSACLoss", rad_sac, transition_batch, SAC, FRAMED | SAC_KEYS, ("qvalue_network",), True),
+    LossCase("RADSACLoss", rad_sac, transition_batch, SAC, ON_FEATURES | SAC_KEYS, ("qvalue_network",), True),
     LossCase("AveragedSACLoss", averaged_sac, two_view_batch, SAC,
-             {**FRAMED, "observation_view": "features_view", **SAC_KEYS}, ("qvalue_network",), True),
+             {**ON_FEATURES, "observation_view": "features_view", **SAC_KEYS}, ("qvalue_network",), True),
     LossCase("DrQLoss", drq, pixel_batch, SAC,
              {"observation": "pixels", "observation_view": "pixels_view", **SAC_KEYS}, ("qvalue_network",), True),
-    LossCase("SkillDDPGLoss", skill_ddpg, skill_batch, DDPG, FRAMED | SKILL_KEYS, ("qvalue_network",), True),
+    LossCase("SkillDDPGLoss", skill_ddpg, skill_batch, DDPG, ON_FEATURES | SKILL_KEYS, ("qvalue_network",), True),
 ]  # fmt: skip
 
 
