@@ -20,7 +20,7 @@ from crptpro.objectives.functional import prototype_dispersion, sinkhorn_knopp
 from crptpro.pretrained import Pretrained
 from crptpro.training import SACLearner
 from crptpro.transforms import PrototypeReward, random_shift
-from crptpro.transforms.prototype_reward import draw_candidates
+from crptpro.transforms.rewards import draw_candidates
 
 B, SIZE, A = 24, 32, 3
 ENCODER = {"channels": (8, 8, 8, 8), "image_size": SIZE}

@@ -21,15 +21,7 @@ from crptpro.domains import Domain
 
 
 class Painter(gymnasium.Env[np.ndarray, np.ndarray]):
-    """Paints its seed's number and its clock; what it answers can be replaced.
-
-    Args:
-        action_space: Any space.
-        image: From the clock to what ``render`` returns.
-        reward: From the clock to the reward.
-        answer: From the clock to what ``step`` returns, instead of five values.
-        end: Clock at which it terminates.
-    """
+    """Paints its seed's number and its clock; what it answers can be replaced by functions of the clock."""
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
     observation_space = gymnasium.spaces.Box(0, 1, (1,))
@@ -45,14 +37,8 @@ class Painter(gymnasium.Env[np.ndarray, np.ndarray]):
     ):
         bounds = np.array([-2.0, 0.0]), np.array([2.0, 1.0])
         self.action_space = action_space or gymnasium.spaces.Box(*bounds, dtype=np.float64)
-        self.image, self.reward, self.answer, self.end, self.render_mode = (
-            image,
-            reward,
-            answer,
-            end,
-            render_mode,
-        )
-        self.clock, self.renders, self.actions = 0, 0, list[np.ndarray]()
+        self.image, self.reward, self.answer, self.end = image, reward, answer, end
+        self.render_mode, self.clock, self.renders, self.actions = render_mode, 0, 0, list[np.ndarray]()
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
@@ -100,6 +86,8 @@ class OwnWorld(EnvBase):
         length: int = 4,
         truncates: bool = True,
         dtype: torch.dtype = torch.float32,
+        bound: float = 1.0,
+        actions: int = 2,
     ):
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
         self.pixels = pixels or (
@@ -113,7 +101,7 @@ class OwnWorld(EnvBase):
             qpos=Unbounded(shape=(1,), dtype=torch.float64),
             observation=Unbounded(shape=(2,)),
         )
-        self.action_spec = Bounded(-1.0, 1.0, shape=(2,), dtype=dtype)
+        self.action_spec = Bounded(-bound, bound, shape=(actions,), dtype=dtype)
         self.reward_spec = Unbounded(shape=(1,), dtype=dtype)
         flag = Categorical(2, shape=(1,), dtype=torch.bool)
         names = ("done", "terminated", "truncated") if truncates else ("done", "terminated")
@@ -146,14 +134,11 @@ def own(make: Any, **settings: Any) -> Domain:
 
 
 class FakeDmEnv(dm_env.Environment):
-    """Ends after ``length`` env steps with the given discount; the reward is the number of the env step."""
+    """Ends after ``length`` env steps; the reward is the number of the env step."""
 
-    def __init__(
-        self, *, length: int = 5, last_discount: float = 1.0, bounds: Any = ([-1.0, -0.8], [1.1, 0.8])
-    ):
-        self._length, self._last_discount, self._bounds = length, last_discount, bounds
-        self.env_steps = 0
-        self.actions: list[np.ndarray] = []
+    def __init__(self, *, length: int = 5, bounds: Any = ([-1.0, -0.8], [1.1, 0.8])):
+        self._length, self._bounds = length, bounds
+        self.env_steps, self.actions = 0, list[np.ndarray]()
         self.task = SimpleNamespace(random=np.random.RandomState(0))
         self.physics = SimpleNamespace(free=lambda: None)
 
@@ -164,9 +149,8 @@ class FakeDmEnv(dm_env.Environment):
     def step(self, action: np.ndarray) -> dm_env.TimeStep:
         self.env_steps += 1
         self.actions.append(action)
-        if self.env_steps >= self._length:
-            return dm_env.TimeStep(dm_env.StepType.LAST, float(self.env_steps), self._last_discount, {})
-        return dm_env.transition(float(self.env_steps), {})
+        end = dm_env.termination if self.env_steps >= self._length else dm_env.transition
+        return end(float(self.env_steps), {})
 
     def observation_spec(self) -> dict[str, Any]:
         return {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -19,7 +20,6 @@ from crptpro.envs.dm_control import AgentSteps, load_dm_env, reverse_background
 from crptpro.envs.rendering import select_backend
 from crptpro.errors import CRPTproError, UnknownNameError
 
-TASKS = [task for tasks in SUITE_TASKS.values() for task in tasks]
 ACTION_SIZES = {
     "cheetah": 6, "walker": 6, "quadruped": 12, "cartpole": 1, "pendulum": 1, "manipulation": 9, "hopper": 4,
     "finger": 2,
@@ -37,35 +37,23 @@ def play(env: EnvBase, agent_steps: int) -> TensorDictBase:
     return torch.stack(seen)
 
 
-class Played:
-    """An environment of a domain, the third episode of which was played from its seed, with its camera counted."""
-
-    seed = 11
-
-    def __init__(self, name: str, monkeypatch: pytest.MonkeyPatch):
-        select_backend()
-        from dm_control.mujoco import engine
-
-        self.name, self.renders = name, 0
-        self.env = make_env(name, seed=0, physics_state=True)
-        self.first = play(self.env, 1)
-        self.env.set_seed(self.seed)
-        render = engine.Camera.render
-
-        def counted(*args: Any, **kwargs: Any) -> Any:
-            self.renders += 1
-            return render(*args, **kwargs)
-
-        monkeypatch.setattr(engine.Camera, "render", counted)
-        self.rollout = play(self.env, 3)
+SEED = 11
 
 
 @pytest.fixture(scope="module", params=PAPER_DOMAINS)
-def played(request: pytest.FixtureRequest) -> Iterator[Played]:
+def played(request: pytest.FixtureRequest) -> Iterator[Any]:
+    """An environment of a domain, an episode of which was played from ``SEED`` with its camera counted."""
+    select_backend()
+    from dm_control.mujoco import engine
+
+    env, renders, render = make_env(request.param, seed=0, physics_state=True), [], engine.Camera.render
+    first = play(env, 1)
+    env.set_seed(SEED)
     with pytest.MonkeyPatch.context() as monkeypatch:
-        played = Played(request.param, monkeypatch)
-    yield played
-    played.env.close()
+        monkeypatch.setattr(engine.Camera, "render", lambda *a, **k: renders.append(1) or render(*a, **k))
+        rollout = play(env, 3)
+    yield SimpleNamespace(name=request.param, env=env, first=first, rollout=rollout, renders=len(renders))
+    env.close()
 
 
 def plain_dm_control(domain: Domain, seed: int) -> tuple[Any, Any, Any]:
@@ -83,8 +71,8 @@ def plain_dm_control(domain: Domain, seed: int) -> tuple[Any, Any, Any]:
 
 
 @pytest.mark.gl
-def test_every_paper_domain_gives_the_frames_and_rewards_of_plain_dm_control(played: Played) -> None:
-    world, scaled, image_of = plain_dm_control(PAPER_DOMAINS[played.name], played.seed)
+def test_every_paper_domain_gives_the_frames_and_rewards_of_plain_dm_control(played: Any) -> None:
+    world, scaled, image_of = plain_dm_control(PAPER_DOMAINS[played.name], SEED)
     step = scaled.reset()
     frames, rewards = [torch.from_numpy(image_of(step).transpose(2, 0, 1).copy())], []
     for action in played.rollout["action"].numpy():
@@ -94,16 +82,16 @@ def test_every_paper_domain_gives_the_frames_and_rewards_of_plain_dm_control(pla
     state = world.physics.data.qpos.copy()
     world.close()
     shown = [frames[0]] * 3 + frames[1:]
-    for step_index, td in enumerate(played.rollout):
-        assert torch.equal(td["pixels"], torch.cat(shown[step_index : step_index + 3]))
-        assert torch.equal(td["next", "pixels"], torch.cat(shown[step_index + 1 : step_index + 4]))
+    for index, td in enumerate(played.rollout):
+        assert torch.equal(td["pixels"], torch.cat(shown[index : index + 3]))
+        assert torch.equal(td["next", "pixels"], torch.cat(shown[index + 1 : index + 4]))
     np.testing.assert_array_equal(played.rollout["next", "reward"].numpy(), rewards)
     np.testing.assert_array_equal(played.rollout["next", "qpos"][-1].numpy(), state)
     assert not torch.equal(frames[0], frames[-1])
 
 
 @pytest.mark.gl
-def test_every_paper_domain_is_drawn_once_per_agent_step_by_torchrls_parts(played: Played) -> None:
+def test_every_paper_domain_is_drawn_once_per_agent_step_by_torchrls_parts(played: Any) -> None:
     assert played.renders == 1 + 3
     assert isinstance(played.env.base_env, DMControlWrapper)
     assert isinstance(played.env.transform[-1], CatFrames)
@@ -120,7 +108,7 @@ def test_every_paper_domain_is_drawn_once_per_agent_step_by_torchrls_parts(playe
 
 
 @pytest.mark.gl
-def test_an_episode_depends_on_its_seed(played: Played) -> None:
+def test_an_episode_depends_on_its_seed(played: Any) -> None:
     played.env.set_seed(0)
     again = play(played.env, 1)
     for key in ("pixels", ("next", "pixels"), ("next", "reward"), ("next", "qpos"), ("next", "qvel")):
@@ -191,20 +179,8 @@ def test_a_full_episode_is_truncated_and_not_terminated(task: str, agent_steps: 
 
 
 @pytest.mark.gl
-def test_a_suite_task_may_be_registered_under_another_domain_name() -> None:
-    select_backend()
-    env = load_dm_env(Domain("seen_from_behind", "acrobot_swingup", camera=0, source="suite"))
-    assert env.physics.model.nq == 2
-    with pytest.raises(UnknownNameError, match="acrobot_dance"):
-        load_dm_env(Domain("own", "acrobot_dance", source="suite"))
-    with pytest.raises(UnknownNameError, match="walker_walk"):
-        get_domain("walker_wolk")
-
-
-@pytest.mark.gl
-@pytest.mark.slow
-@pytest.mark.parametrize("task", TASKS)
-def test_every_suite_task_is_built_by_its_name_and_its_pixels_change(task: str) -> None:
+@pytest.mark.parametrize("task", [tasks[0] for tasks in SUITE_TASKS.values()])
+def test_a_task_of_every_world_of_the_suite_is_built_and_its_pixels_change(task: str) -> None:
     # Long agent steps, so that every world moves visibly in one.
     env = make_env(task, seed=0, image_size=48, frame_stack=1, action_repeat=20, quality="fast")
     first = env.reset()
@@ -214,7 +190,26 @@ def test_every_suite_task_is_built_by_its_name_and_its_pixels_change(task: str) 
     assert not torch.equal(first["pixels"], last["pixels"])
 
 
-def steps_of(env: FakeDmEnv, action_repeat: int = 2) -> AgentSteps:
+@pytest.mark.gl
+def test_every_task_of_the_suite_is_known_to_dm_control_also_under_another_domains_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    select_backend()
+    from dm_control import suite
+
+    loaded = []
+    monkeypatch.setattr(suite, "load", lambda world, name, **options: loaded.append((world, name)))
+    for task in (task for tasks in SUITE_TASKS.values() for task in tasks):
+        load_dm_env(get_domain(task))
+    assert set(loaded) <= set(suite.ALL_TASKS)
+    assert len(set(loaded)) == len(loaded)
+    load_dm_env(Domain("seen_from_behind", "acrobot_swingup", camera=0, source="suite"))
+    assert loaded[-1] == ("acrobot", "swingup")
+    with pytest.raises(UnknownNameError, match="acrobot_dance"):
+        load_dm_env(Domain("own", "acrobot_dance", source="suite"))
+
+
+def steps_of(env: FakeDmEnv, action_repeat: int = 1) -> AgentSteps:
     steps = AgentSteps(env, world="fake", image_size=8, action_repeat=action_repeat, render=False)
     steps.reset()
     return steps
@@ -228,12 +223,25 @@ def test_rewards_of_repeated_env_steps_are_summed_up_to_the_episodes_end() -> No
     assert (last.reward, last.last(), env.env_steps) == (4.0 + 5.0, True, 5)
 
 
-def test_actions_are_mapped_to_the_actuators_ranges() -> None:
-    env = FakeDmEnv()
-    steps = steps_of(env, action_repeat=1)
+@pytest.mark.parametrize(
+    ("bounds", "commands"),
+    [
+        (([-1.0, -0.8], [1.1, 0.8]), [[-1.0, -0.8], [1.1, 0.8], [0.05, 0.4]]),
+        # An actuator without bounds takes the action as it is.
+        *((([-big, 0.0], [big, 4.0]), [[-1.0, 0.0], [1.0, 4.0], [0.0, 3.0]]) for big in (np.inf, 3e38, 1e10)),
+    ],
+)
+def test_actions_are_mapped_to_the_actuators_ranges(bounds: Any, commands: list) -> None:
+    env = FakeDmEnv(bounds=bounds)
+    steps = steps_of(env)
     for action in ([-1, -1], [1, 1], [0, 0.5]):
         steps.step(np.array(action, np.float32))
-    np.testing.assert_allclose(env.actions, [[-1.0, -0.8], [1.1, 0.8], [0.05, 0.4]], atol=1e-12)
+    np.testing.assert_allclose(env.actions, commands, atol=1e-12)
+
+
+def test_bounds_on_one_side_only_are_refused() -> None:
+    with pytest.raises(CRPTproError, match="one side only"):
+        steps_of(FakeDmEnv(bounds=([-1.0, 0.0], [np.inf, 4.0])))
 
 
 def test_seeding_reaches_the_generator_of_either_kind_of_environment() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from fake_worlds import OwnWorld, own
-from torchrl.data import Bounded, Composite
+from torchrl.data import Composite
 from torchrl.envs import (
     Compose,
     EnvBase,
@@ -27,6 +27,8 @@ from crptpro.domains import Domain
 from crptpro.envs import episode_length, factory, make_env, resolve_action_repeat
 from crptpro.errors import CRPTproError
 
+each_stack = pytest.mark.parametrize("frame_stack", [1, 3])
+
 
 def make_chw(seed: int, image_size: int) -> EnvBase:
     return OwnWorld()
@@ -41,40 +43,39 @@ def make_hwc(**_: Any) -> EnvBase:
     return OwnWorld(pixels)
 
 
-@pytest.mark.parametrize("frame_stack", [1, 3])
-@pytest.mark.parametrize("make", [make_chw, make_hwc])
-def test_own_pixels_are_stacked_channels_first(make: Any, frame_stack: int) -> None:
-    env = make_env(own(make), seed=0, image_size=8, frame_stack=frame_stack)
+def checked(make: Any, **options: Any) -> EnvBase:
+    env = make_env(own(make), seed=0, image_size=8, **options)
     check_env_specs(env)
     env.set_seed(0)
-    rollout = env.rollout(3)
-    shown = rollout["next", "pixels"][1]
+    return env
+
+
+@each_stack
+@pytest.mark.parametrize("make", [make_chw, make_hwc])
+def test_own_pixels_are_stacked_channels_first(make: Any, frame_stack: int) -> None:
+    env = checked(make, frame_stack=frame_stack)
+    shown = env.rollout(3)["next", "pixels"][1]
     assert shown.shape == (3 * frame_stack, 8, 8)
     assert shown[::3, 1, 0].tolist() == [0, 1, 2][-frame_stack:]
     assert (shown[1::3, 0] == 200).all() == (make is make_hwc)
     assert set(env.observation_spec.keys()) == {"pixels"}
 
 
-def test_a_seed_waits_for_the_next_reset() -> None:
-    env = make_env(own(make_chw), seed=2, image_size=8, frame_stack=1)
+def test_a_seed_waits_for_the_next_reset_and_the_physical_state_is_kept_on_request() -> None:
+    env = make_env(own(make_chw), seed=2, image_size=8, frame_stack=1, physics_state=True)
     assert env.reset()["pixels"].unique().tolist() == [20]
     env.set_seed(5)
     assert env.reset()["pixels"].unique().tolist() == [50]
-
-
-def test_the_physical_state_is_kept_on_request() -> None:
-    env = make_env(own(make_chw), seed=0, image_size=8, physics_state=True)
     assert set(env.observation_spec.keys()) == {"pixels", "qpos"}
     assert env.rollout(3)["next", "qpos"].flatten().tolist() == [1.0, 2.0, 3.0]
 
 
-@pytest.mark.parametrize("frame_stack", [1, 3])
+@each_stack
 def test_entries_that_a_worlds_own_transforms_read_back_are_kept(frame_stack: int) -> None:
-    def make() -> EnvBase:
-        return TransformedEnv(OwnWorld(), Compose(StepCounter(), RewardSum(), InitTracker()))
-
-    env = make_env(own(make), seed=0, image_size=8, frame_stack=frame_stack)
-    check_env_specs(env)
+    parts = (StepCounter, RewardSum, InitTracker)
+    env = checked(
+        lambda: TransformedEnv(OwnWorld(), Compose(*(part() for part in parts))), frame_stack=frame_stack
+    )
     assert set(env.observation_spec.keys()) == {"pixels", "step_count", "episode_reward", "is_init"}
     rollout = env.rollout(3)["next"]
     assert rollout["step_count"].flatten().tolist() == [1, 2, 3]
@@ -88,8 +89,7 @@ def test_entries_that_a_world_without_a_state_reads_back_are_kept() -> None:
             self.state_spec = Composite(observation=self.observation_spec["observation"].clone())
 
         def _step(self, tensordict: Any) -> Any:
-            carried = tensordict["observation"] + 1
-            return super()._step(tensordict).set("observation", carried)
+            return super()._step(tensordict).set("observation", tensordict["observation"] + 1)
 
     rollout = make_env(own(lambda: Stateless()), seed=0, image_size=8).rollout(3)
     assert rollout["next", "observation"][:, 0].tolist() == [1.0, 2.0, 3.0]
@@ -121,21 +121,15 @@ def test_an_option_that_make_does_not_take_is_said_to_do_nothing(caplog: pytest.
     assert "takes no quality" in caplog.text
 
 
-def test_float64_actions_and_rewards_become_float32() -> None:
-    env = make_env(own(lambda: OwnWorld(dtype=torch.float64)), seed=0, image_size=8)
-    check_env_specs(env)
-    rollout = env.rollout(2)
+@each_stack
+def test_float64_becomes_float32_and_an_environment_without_truncation_is_never_truncated(
+    frame_stack: int,
+) -> None:
+    make = functools.partial(OwnWorld, length=3, truncates=False, dtype=torch.float64)
+    rollout = checked(lambda: make(), frame_stack=frame_stack).rollout(10)
     assert rollout["action"].dtype == rollout["next", "reward"].dtype == torch.float32
-
-
-@pytest.mark.parametrize("frame_stack", [1, 3])
-def test_an_environment_without_truncation_is_never_truncated(frame_stack: int) -> None:
-    domain = own(lambda: OwnWorld(length=3, truncates=False))
-    env = make_env(domain, seed=0, image_size=8, frame_stack=frame_stack)
-    check_env_specs(env)
-    rollout = env.rollout(10)["next"]
-    assert rollout["terminated"].flatten().tolist() == [False, False, True]
-    assert not rollout["truncated"].any()
+    assert rollout["next", "terminated"].flatten().tolist() == [False, False, True]
+    assert not rollout["next", "truncated"].any()
 
 
 @pytest.mark.parametrize("truncates", [True, False])
@@ -143,8 +137,7 @@ def test_a_world_without_an_end_is_truncated_and_starts_again(
     truncates: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(factory, "LONGEST_EPISODE_AGENT_STEPS", 7)
-    env = make_env(own(lambda: OwnWorld(length=10**9, truncates=truncates)), seed=0, image_size=8)
-    check_env_specs(env)
+    env = checked(lambda: OwnWorld(length=10**9, truncates=truncates))
     for _ in range(2):
         last = env.rollout(20)["next"]
         assert last["truncated"].flatten().tolist() == [False] * 6 + [True]
@@ -168,21 +161,9 @@ def test_agent_steps_are_counted_by_what_a_world_repeats() -> None:
     assert episode_length("gymnasium:HalfCheetah-v5") == 500
 
 
-def unscaled() -> EnvBase:
-    env = OwnWorld()
-    env.action_spec = Bounded(-2.0, 2.0, shape=(2,), dtype=torch.float32)
-    return env
-
-
-def without_action() -> EnvBase:
-    env = OwnWorld()
-    env.action_spec = Bounded(-1.0, 1.0, shape=(0,), dtype=torch.float32)
-    return env
-
-
 @pytest.mark.parametrize(("make", "complaint"), [
-    (unscaled, r"bounds other than \[-1, 1\]"),
-    (without_action, "bounded float vector"),
+    (lambda: OwnWorld(bound=2.0), r"bounds other than \[-1, 1\]"),
+    (lambda: OwnWorld(actions=0), "bounded float vector"),
     (lambda: TransformedEnv(OwnWorld(), ExcludeTransform("pixels")), "no 'pixels'"),
     (lambda: TransformedEnv(OwnWorld(), UnsqueezeTransform(-4, in_keys=["pixels"])), r"shape \(1, 3, 8, 8\)"),
     (lambda: SerialEnv(1, OwnWorld), "batch size"),

@@ -15,14 +15,8 @@ from torch.distributions import Normal, TanhTransform, TransformedDistribution
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import ProbabilisticActor, TanhNormal
 
-from crptpro.modules import (
-    DeterministicActor,
-    PixelEncoder,
-    SquashedGaussianActor,
-    TwinCritic,
-    set_compute_dtype,
-)
-from crptpro.modules.actor_critic import PixelCritic, squashed_gaussian
+from crptpro.modules import DeterministicActor, SquashedGaussianActor, TwinCritic, set_compute_dtype
+from crptpro.modules.actor_critic import squashed_gaussian
 
 
 def actor(**options) -> SquashedGaussianActor:
@@ -35,9 +29,9 @@ def critic(**options) -> TwinCritic:
     return TwinCritic(40, 3, bottleneck_dim=10, hidden_dim=32, **options)
 
 
-def skilled() -> DeterministicActor:
+def skilled(**options) -> DeterministicActor:
     torch.manual_seed(0)
-    return DeterministicActor(40, 3, skill_dim=4, bottleneck_dim=10, hidden_dim=32)
+    return DeterministicActor(40, 3, skill_dim=4, bottleneck_dim=10, hidden_dim=32, **options)
 
 
 def test_golden_values_of_the_squashed_gaussian() -> None:
@@ -51,11 +45,8 @@ def test_golden_values_of_the_squashed_gaussian() -> None:
 
 
 def test_log_probability_equals_torch_distributions_away_from_saturation() -> None:
-    loc, scale, noise = (
-        torch.randn(5, 3).double(),
-        torch.rand(5, 3).double() + 0.1,
-        torch.randn(5, 3).double(),
-    )
+    loc, scale, noise = torch.randn(3, 5, 3).double()
+    scale = scale.abs() + 0.1
     action, log_prob = squashed_gaussian(loc, scale, noise)
     reference = TransformedDistribution(Normal(loc, scale), [TanhTransform(cache_size=1)])
     torch.testing.assert_close(log_prob, reference.log_prob(action).sum(-1), rtol=1e-6, atol=1e-6)
@@ -71,16 +62,36 @@ def test_log_probability_and_gradient_are_right_at_saturation() -> None:
     assert loc.grad.item() == pytest.approx(2.0)
 
 
+def perceptron(mlp: torch.nn.Module, inputs: torch.Tensor) -> torch.Tensor:
+    for layer in (mlp.first, mlp.middle):
+        inputs = (inputs @ layer.weight.T).clamp_min(0)
+    return inputs @ mlp.last.weight.T
+
+
 @pytest.mark.parametrize("has_tanh", [False, True])
-def test_actor_is_linear_layernorm_and_three_layers(has_tanh: bool) -> None:
-    policy, features = actor(has_tanh=has_tanh), torch.rand(4, 40)
-    hidden = F.layer_norm(features @ policy.trunk.linear.weight.T, (10,))
-    hidden = torch.tanh(hidden) if has_tanh else hidden
-    for layer in (policy.mlp.first, policy.mlp.middle):
-        hidden = (hidden @ layer.weight.T).clamp_min(0)
-    loc, raw = (hidden @ policy.mlp.last.weight.T).split(3, dim=-1)
+def test_actor_and_critic_are_linear_layernorm_and_three_layers_and_both_heads_share_one_trunk(
+    has_tanh: bool,
+) -> None:
+    features, action = torch.rand(4, 40), torch.rand(4, 3) * 2 - 1
+
+    def bottleneck(network: torch.nn.Module) -> torch.Tensor:
+        hidden = F.layer_norm(features @ network.trunk.linear.weight.T, (10,))
+        return torch.tanh(hidden) if has_tanh else hidden
+
+    policy, twin = actor(has_tanh=has_tanh), critic(has_tanh=has_tanh)
+    loc, raw = perceptron(policy.mlp, bottleneck(policy)).split(3, dim=-1)
     torch.testing.assert_close(policy(features), (loc, torch.exp(-10 + 6 * (torch.tanh(raw) + 1))))
     torch.testing.assert_close(policy.mode(features), torch.tanh(loc))
+    inputs = torch.cat([bottleneck(twin), action], dim=-1)
+    values = [perceptron(head, inputs) for head in (twin.q1, twin.q2)]
+    torch.testing.assert_close(twin(features, action), torch.cat(values, dim=-1))
+    assert not torch.equal(*values)
+
+
+def test_parameter_counts_are_the_published_ones() -> None:
+    head = 57 * 1024 + 1025 * 1024 + 1025
+    count = sum(p.numel() for p in TwinCritic(39_200, 6).parameters())
+    assert count == 39_200 * 50 + 50 + 100 + 2 * head
 
 
 def test_samples_come_from_the_noise_or_the_generator_and_are_reparameterised() -> None:
@@ -97,28 +108,6 @@ def test_samples_come_from_the_noise_or_the_generator_and_are_reparameterised() 
     assert torch.equal(torch.get_rng_state(), before)
     first.sum().backward()
     assert policy.trunk.linear.weight.grad.any()
-
-
-def test_both_heads_share_one_trunk() -> None:
-    twin, features, action = critic(), torch.rand(4, 40), torch.rand(4, 3) * 2 - 1
-    bottleneck = F.layer_norm(features @ twin.trunk.linear.weight.T, (10,))
-    values = []
-    for head in (twin.q1, twin.q2):
-        hidden = torch.cat([bottleneck, action], dim=-1)
-        hidden = (hidden @ head.first.weight.T).clamp_min(0)
-        hidden = (hidden @ head.middle.weight.T).clamp_min(0)
-        values.append(hidden @ head.last.weight.T)
-    torch.testing.assert_close(twin(features, action), torch.cat(values, dim=-1))
-    assert not torch.equal(values[0], values[1])
-    full = TwinCritic(39_200, 6)
-    head = 57 * 1024 + 1025 * 1024 + 1025
-    assert sum(p.numel() for p in full.parameters()) == 39_200 * 50 + 50 + 100 + 2 * head
-
-
-def test_a_pixel_critic_refuses_a_head_of_other_features() -> None:
-    encoder = PixelEncoder(3, channels=(4,), strides=(2,), image_size=9)
-    with pytest.raises(ValueError, match="build it with feature_dim=64"):
-        PixelCritic(encoder, critic())
 
 
 @pytest.mark.parametrize("make", [actor, critic, skilled])
@@ -158,25 +147,25 @@ def test_sizes_of_any_number_type_become_plain_integers_in_the_card(make) -> Non
     type(module)(**module.config).load_state_dict(module.state_dict())
     with pytest.raises(ValueError, match="`action_dim` must be at least 1"):
         make(6, 0)
-
-
-def test_log_std_bounds_must_ascend() -> None:
     with pytest.raises(ValueError, match="low < high"):
         actor(log_std_bounds=(2, -10))
-
-
-# DDPG with skills ----------------------------------------------------------------------------------------
 
 
 def test_the_skill_policy_clips_its_noise_and_lets_the_gradient_through_the_bound() -> None:
     policy, inputs = skilled(), torch.rand(6, 44)
     mean = policy(inputs)
     assert mean.abs().max() <= 1
-    noise = torch.full((6, 3), 50.0)
-    torch.testing.assert_close(policy.sample(inputs, noise=noise * 0.01), mean + 0.1)
-    torch.testing.assert_close(policy.sample(inputs, noise=noise * 0.01, noise_clip=0.05), mean + 0.05)
-    action = policy.sample(inputs, noise=noise)
-    torch.testing.assert_close(action, torch.full((6, 3), 1 - 1e-6), rtol=0, atol=2e-6)
+
+    def noise() -> dict:
+        return {"generator": torch.Generator().manual_seed(1)}
+
+    drawn = 0.2 * torch.randn(6, 3, **noise())
+    torch.testing.assert_close(policy.sample(inputs, **noise()), mean + drawn)
+    clipped = policy.sample(inputs, noise_clip=0.05, **noise())
+    torch.testing.assert_close(clipped, mean + drawn.clamp(-0.05, 0.05))
+    policy.noise_std = 1e3
+    action = policy.sample(inputs, **noise())
+    torch.testing.assert_close(action, drawn.sign() * (1 - 1e-6), rtol=0, atol=2e-6)
     action.sum().backward()
     assert policy.mlp.last.weight.grad.any()
 

@@ -17,11 +17,11 @@ from crptpro.modules import PixelEncoder
 from crptpro.modules.convolutions import apply_to_chunks
 
 
-@pytest.fixture(autouse=True, params=[1, 2])
-def _threads(request: pytest.FixtureRequest) -> Iterator[None]:
+@pytest.fixture(params=[1, 2])
+def threads(request: pytest.FixtureRequest) -> Iterator[int]:
     before = torch.get_num_threads()
     torch.set_num_threads(request.param)
-    yield
+    yield request.param
     assert torch.get_num_threads() == request.param
     torch.set_num_threads(before)
 
@@ -37,7 +37,7 @@ def rows() -> tuple[Tensor, list[Tensor]]:
     return images, [torch.randn(5, 3, generator=generator).requires_grad_(), torch.zeros(3).requires_grad_()]
 
 
-def test_outputs_and_gradients_of_chunks_are_those_of_the_whole_batch() -> None:
+def test_outputs_and_gradients_of_chunks_are_those_of_the_whole_batch(threads: int) -> None:
     images, parameters = rows()
     expected = affine(images, parameters)
     found = apply_to_chunks(affine, images.split(2), parameters)
@@ -50,8 +50,7 @@ def test_outputs_and_gradients_of_chunks_are_those_of_the_whole_batch() -> None:
         assert not apply_to_chunks(affine, images.split(2), parameters).requires_grad
 
 
-def test_every_thread_computes_alone_in_the_callers_gradient_mode() -> None:
-    threads = torch.get_num_threads()
+def test_every_thread_computes_alone_in_the_callers_gradient_mode_and_passes_errors_on(threads: int) -> None:
     together, seen = threading.Barrier(threads), []
 
     def look(chunk: Tensor, parameters: Sequence[Tensor]) -> Tensor:
@@ -67,8 +66,14 @@ def test_every_thread_computes_alone_in_the_callers_gradient_mode() -> None:
         assert [rest for _, *rest in seen] == [[1, mode]] * 2
         seen.clear()
 
+    def refuse(chunk: Tensor, parameters: Sequence[Tensor]) -> Tensor:
+        raise ValueError(f"{len(chunk)} rows")
 
-def test_the_graphs_are_freed_by_the_backward_pass_although_somebody_keeps_the_loss() -> None:
+    with pytest.raises(ValueError, match="2 rows"):
+        apply_to_chunks(refuse, images.split(2), parameters)
+
+
+def test_the_graphs_are_freed_by_the_backward_pass_although_somebody_keeps_the_loss(threads: int) -> None:
     images, (weight, bias) = rows()
     activations: list[weakref.ref[Tensor]] = []
 
@@ -85,38 +90,36 @@ def test_the_graphs_are_freed_by_the_backward_pass_although_somebody_keeps_the_l
     assert bias.grad is not None
 
 
-def test_an_error_in_a_chunk_reaches_the_caller() -> None:
-    def refuse(chunk: Tensor, parameters: Sequence[Tensor]) -> Tensor:
-        raise ValueError(f"{len(chunk)} rows")
-
-    images, parameters = rows()
-    with pytest.raises(ValueError, match="2 rows"):
-        apply_to_chunks(refuse, images.split(2), parameters)
-
-
-def test_the_number_of_threads_changes_no_bit_of_the_encoder_and_others_see_its_operations() -> None:
+def test_the_number_of_threads_changes_no_bit_of_the_encoder() -> None:
     torch.manual_seed(0)
     encoder = PixelEncoder(3, channels=(8, 8), strides=(2, 1), image_size=21)
     encoder.micro_batch = 3
-    images = torch.randint(0, 256, (11, 3, 21, 21), dtype=torch.uint8)
+    images, before = torch.randint(0, 256, (11, 3, 21, 21), dtype=torch.uint8), torch.get_num_threads()
     for dtype in (torch.float32, torch.bfloat16):
         encoder.compute_dtype = dtype
         outcomes = []
-        for threads in (1, torch.get_num_threads()):
+        for threads in (1, 2):
             torch.set_num_threads(threads)
             encoder.zero_grad()
             features = encoder(images)
             features.float().square().sum().backward()
             outcomes.append([features, *[p.grad for p in encoder.parameters()]])
         assert all(torch.equal(first, second) for first, second in zip(*outcomes))
-    encoder.compute_dtype = torch.float32
+    torch.set_num_threads(before)
+
+
+def test_autocast_and_functional_transforms_see_the_operations_of_the_encoder() -> None:
+    encoder = PixelEncoder(3, channels=(8, 8), strides=(2, 1), image_size=21)
+    encoder.micro_batch = 3
+    images = torch.randint(0, 256, (11, 3, 21, 21), dtype=torch.uint8)
     with torch.autocast("cpu", torch.bfloat16):
         assert encoder(images).dtype == torch.bfloat16
     weights = {name: weight.detach() for name, weight in encoder.named_parameters()}
-    found = torch.func.grad(lambda w: torch.func.functional_call(encoder, w, (images,)).square().sum())(
-        weights
-    )
-    encoder.zero_grad()
+
+    def total(given: dict[str, Tensor]) -> Tensor:
+        return torch.func.functional_call(encoder, given, (images,)).square().sum()
+
+    found = torch.func.grad(total)(weights)
     encoder(images).square().sum().backward()
     torch.testing.assert_close(found["convs.0.weight"], encoder.convs[0].weight.grad, rtol=1e-4, atol=1e-3)
 
@@ -145,12 +148,6 @@ try:
 except RuntimeError as reason:
     print(reason)
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-        env=os.environ,
-    )
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60, env=os.environ)
     assert done.stdout == "can't start new thread\n"

@@ -12,15 +12,10 @@ import torch.nn.functional as F
 from crptpro.modules import AnchorHead, PixelEncoder, Predictor, Projector, Prototypes, SkillHead
 
 
-def count(module: torch.nn.Module) -> int:
-    return sum(p.numel() for p in module.parameters())
-
-
 def test_parameter_counts_are_the_published_ones() -> None:
-    assert count(Projector()) == 5_017_728
-    assert count(Predictor()) == 263_296
-    assert count(Predictor(hidden_dim=512)) == 131_712
-    assert count(Prototypes()) == 65_536
+    sizes = [Projector(), Predictor(), Predictor(hidden_dim=512), Prototypes()]
+    counts = [sum(p.numel() for p in module.parameters()) for module in sizes]
+    assert counts == [5_017_728, 263_296, 131_712, 65_536]
 
 
 @pytest.mark.parametrize("module", [Projector(50, 8), Predictor(16, 64), SkillHead(50, 4, 8)])
@@ -75,40 +70,34 @@ def test_bfloat16_products_are_close_and_return_float32(head: torch.nn.Module) -
     assert all(p.grad.dtype == torch.float32 for p in head.parameters())
 
 
-def test_fresh_prototypes_are_a_tight_frame_of_unit_rows() -> None:
+def test_fresh_prototypes_are_a_tight_frame_and_normalize_restores_unit_rows_in_place() -> None:
     torch.manual_seed(0)
     unscaled = torch.nn.init.orthogonal_(torch.empty(64, 16))
     torch.manual_seed(0)
-    torch.testing.assert_close(Prototypes(64, 16).weight.detach(), F.normalize(unscaled, dim=1))
-
-
-def test_normalize_restores_unit_length_in_place_and_without_gradient() -> None:
-    prototypes = Prototypes(8, 4)
+    prototypes = Prototypes(64, 16)
+    torch.testing.assert_close(prototypes.weight.detach(), F.normalize(unscaled, dim=1))
     storage = prototypes.weight.data_ptr()
     with torch.no_grad():
         prototypes.weight.mul_(3.0)
     assert prototypes.normalize_() is prototypes
-    torch.testing.assert_close(prototypes.weight.detach().norm(dim=1), torch.ones(8))
+    torch.testing.assert_close(prototypes.weight.detach(), F.normalize(unscaled, dim=1))
     assert prototypes.weight.data_ptr() == storage
     assert prototypes.weight.grad_fn is None
 
 
-def test_scores_are_cosines_whatever_the_length_of_the_rows() -> None:
+def test_scores_are_cosines_whatever_the_length_of_the_rows_which_is_a_constant_to_the_gradient() -> None:
     prototypes, z = Prototypes(8, 4), F.normalize(torch.randn(5, 4), dim=1)
     expected = prototypes(z)
     torch.testing.assert_close(expected, F.cosine_similarity(z[:, None], prototypes.weight[None], dim=-1))
+    target = torch.randn(8, 4)
+    (prototypes.unit_weight() * target).sum().backward()
+    torch.testing.assert_close(prototypes.weight.grad, target)
     with torch.no_grad():
         prototypes.weight.mul_(torch.rand(8, 1) + 0.5)
     torch.testing.assert_close(prototypes(z), expected)
     with torch.no_grad():
         prototypes.weight[0].zero_()
     assert not prototypes(z)[:, 0].any()
-
-
-def test_the_gradient_does_not_pass_through_the_normalisation() -> None:
-    prototypes, target = Prototypes(8, 4), torch.randn(8, 4)
-    (prototypes.unit_weight() * target).sum().backward()
-    torch.testing.assert_close(prototypes.weight.grad, target)
 
 
 @pytest.mark.parametrize("head", [Projector, Predictor, Prototypes, AnchorHead, SkillHead])

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -60,45 +60,41 @@ def test_auto_follows_the_gpu(monkeypatch: pytest.MonkeyPatch, capability, dtype
     assert resolve_precision("auto", "cuda:0") == dtype
 
 
-@pytest.fixture
-def tf32_everywhere() -> Iterator[tuple]:
-    backends = (torch.backends.cudnn, torch.backends.cuda.matmul)
-    before = [backend.allow_tf32 for backend in backends]
-    for backend in backends:
-        backend.allow_tf32 = True
-    yield backends
-    for backend, allowed in zip(backends, before):
-        backend.allow_tf32 = allowed
-
-
 @pytest.mark.parametrize(
     ("precision", "device", "allowed"),
     [("fp32", "cuda:0", False), ("auto", "cuda:0", False), ("bf16", "cuda:0", True), ("fp32", "cpu", True)],
 )
 def test_float32_on_a_gpu_means_float32_and_not_tf32(
-    monkeypatch: pytest.MonkeyPatch, tf32_everywhere, precision, device: str, allowed: bool
+    monkeypatch: pytest.MonkeyPatch, precision, device: str, allowed: bool
 ) -> None:
     monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: (7, 5))
+    backends: Any = (torch.backends.cudnn, torch.backends.cuda.matmul)
+    before = [backend.allow_tf32 for backend in backends]
+    for backend in backends:
+        backend.allow_tf32 = True
     resolve_precision(precision, device)
-    for backend in tf32_everywhere:
-        assert backend.allow_tf32 is allowed
+    found = [backend.allow_tf32 for backend in backends]
+    for backend, value in zip(backends, before):
+        backend.allow_tf32 = value
+    assert found == [allowed] * 2
 
 
-def test_set_compute_dtype_reaches_the_networks_of_a_loss() -> None:
+def test_a_compute_dtype_reaches_the_networks_that_a_loss_hides_and_ends_with_its_block() -> None:
     encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=12)
-    loss = set_compute_dtype(ProtoLoss(encoder, num_prototypes=8, latent_dim=4, hidden_dim=8), torch.bfloat16)
-    assert loss.encoder.compute_dtype == loss.projector.compute_dtype == torch.bfloat16
     actor, critic = SquashedGaussianActor(6, 2, hidden_dim=8), TwinCritic(6, 2, hidden_dim=8)
-    set_compute_dtype(RADSACLoss(actor, critic), torch.bfloat16)
-    assert actor.trunk.compute_dtype == critic.q2.compute_dtype == torch.bfloat16
-    assert all(p.dtype == torch.float32 for p in [*loss.parameters(), *actor.parameters()])
-
-
-def test_other_names_are_refused() -> None:
+    pretraining = ProtoLoss(encoder, num_prototypes=8, latent_dim=4, hidden_dim=8)
+    hidden = {
+        pretraining: (encoder, pretraining.projector),
+        RADSACLoss(actor, critic): (actor.trunk, critic.q2),
+    }
+    for loss, networks in hidden.items():
+        with pytest.raises(RuntimeError, match="inside"), computing(loss, torch.bfloat16):  # noqa: PT012
+            assert {network.compute_dtype for network in networks} == {torch.bfloat16}
+            assert all(p.dtype == torch.float32 for p in loss.parameters())
+            raise RuntimeError("inside")
+        assert {network.compute_dtype for network in networks} == {torch.float32}
     with pytest.raises(ValueError, match="float16"):
-        set_compute_dtype(PixelEncoder(3, image_size=21), torch.float16)
-    with pytest.raises(CRPTproError, match="'cpu' always works"):
-        usable_device("nowhere")
+        set_compute_dtype(encoder, torch.float16)
 
 
 def test_linear_in_adds_the_bias_in_full_precision() -> None:
@@ -107,15 +103,6 @@ def test_linear_in_adds_the_bias_in_full_precision() -> None:
     assert torch.equal(linear_in(torch.zeros(1, 4), layer, torch.bfloat16)[0], layer.bias)
 
 
-def test_computing_reaches_networks_that_a_loss_hides_and_ends_whatever_happens_inside() -> None:
-    encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=12)
-    loss = ProtoLoss(encoder, num_prototypes=8, latent_dim=4, hidden_dim=8)
-
-    def break_off() -> None:
-        with computing(loss, torch.bfloat16):
-            assert encoder.compute_dtype == loss.projector.compute_dtype == torch.bfloat16
-            raise RuntimeError("inside")
-
-    with pytest.raises(RuntimeError, match="inside"):
-        break_off()
-    assert encoder.compute_dtype == loss.projector.compute_dtype == torch.float32
+def test_a_device_that_is_not_there_is_refused() -> None:
+    with pytest.raises(CRPTproError, match="'cpu' always works"):
+        usable_device("nowhere")

@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-import torch.nn.functional as F
 from loss_cases import close, double, unit
 from torch import Tensor
 
@@ -43,19 +42,16 @@ def released_sinkhorn(scores: Tensor, temperature: float, iterations: int = 3) -
     return (q / q.sum(dim=0, keepdim=True)).T
 
 
-def test_sinkhorn_golden_values() -> None:
+def test_sinkhorn_and_comparative_loss_golden_values() -> None:
     expected = [
         [0.999007, 0.000891, 0.000101],
         [0.000929, 0.996992, 0.002079],
         [0.000000, 0.007945, 0.992054],
         [0.478508, 0.468186, 0.053306],
     ]
-    close(sinkhorn_knopp(SCORES, temperature=0.1, iterations=3), double(expected))
-
-
-def test_comparative_loss_golden_value() -> None:
-    loss = comparative_loss(SCORES, sinkhorn_knopp(SCORES), temperature=0.1)
-    assert loss.item() == pytest.approx(0.289759, abs=1e-6)
+    assignments = sinkhorn_knopp(SCORES, temperature=0.1, iterations=3)
+    close(assignments, double(expected))
+    assert comparative_loss(SCORES, assignments, temperature=0.1).item() == pytest.approx(0.289759, abs=1e-6)
 
 
 @pytest.mark.parametrize(("samples", "prototypes"), [(64, 32), (7, 20), (1, 5)])
@@ -76,32 +72,23 @@ def test_sinkhorn_spreads_the_mass_evenly_as_iterations_grow() -> None:
         unevenness.append((assignments.mean(dim=0) - 0.1).abs().max().item())
     assert unevenness[2] < 1e-6 < unevenness[1] < unevenness[0]
     close(sinkhorn_knopp(scores, iterations=0), (scores / 0.1).softmax(dim=1), 1e-12)
+    identical = unit(1, 8).expand(6, 8) @ unit(4, 8).T
+    close(sinkhorn_knopp(identical), torch.full((6, 4), 0.25, dtype=torch.float64))
 
 
-def test_sinkhorn_of_identical_samples_is_uniform() -> None:
-    close(
-        sinkhorn_knopp(unit(1, 8).expand(6, 8) @ unit(4, 8).T), torch.full((6, 4), 0.25, dtype=torch.float64)
-    )
-
-
-def test_sinkhorn_survives_rows_that_underflow_and_has_no_gradient() -> None:
+def test_sinkhorn_survives_underflow_has_no_gradient_stays_in_float32_and_passes_nan_on() -> None:
     scores = torch.tensor([[1.0, 0.9], [-1.0, -0.9]], requires_grad=True)
     assignments = sinkhorn_knopp(scores, temperature=1e-3)
     assert assignments.isfinite().all()
     assert not assignments.requires_grad
-
-
-def test_sinkhorn_stays_in_float32_for_half_precision_scores_and_passes_nan_on() -> None:
     assert sinkhorn_knopp(SCORES.to(torch.bfloat16)).dtype == torch.float32
     assert sinkhorn_knopp(torch.tensor([[0.1, float("nan")], [0.2, 0.3]])).isnan().any()
 
 
-@pytest.mark.parametrize("count", [2, 512])
-def test_comparative_loss_of_uniform_predictions_is_log_m(count: int) -> None:
-    uniform = torch.full((3, count), 1 / count)
-    assert comparative_loss(torch.zeros(3, count), uniform).item() == pytest.approx(math.log(count), abs=1e-5)
-    if count == 512:
-        assert math.log(count) == pytest.approx(6.238, abs=1e-3)
+def test_comparative_loss_of_uniform_predictions_is_log_m() -> None:
+    for count, expected in ((2, math.log(2)), (512, 6.2383)):
+        uniform = torch.full((3, count), 1 / count)
+        assert comparative_loss(torch.zeros(3, count), uniform).item() == pytest.approx(expected, abs=1e-4)
 
 
 def test_comparative_loss_equals_the_published_double_sum() -> None:
@@ -130,7 +117,6 @@ def test_dispersion_golden_values_and_gradient() -> None:
     loss = prototype_dispersion(prototypes, offset=1.5, reduction="mean_all")
     loss.backward()
     assert loss.item() == pytest.approx(-0.107143, abs=1e-6)
-    assert prototype_dispersion(PROTOTYPES, reduction="sum").item() == pytest.approx(-1.714286, abs=1e-6)
     assert prototype_ane(PROTOTYPES).item() == pytest.approx(-0.025, abs=1e-9)
     expected = [
         [-0.053571, 0.077381, -0.041667],
@@ -151,12 +137,12 @@ def test_dispersion_equals_the_released_loop_in_value_and_gradient() -> None:
 
 
 def test_dispersion_reductions_differ_by_their_divisors() -> None:
-    prototypes = unit(7, 4)
-    total = prototype_dispersion(prototypes, reduction="sum")
-    close(prototype_dispersion(prototypes, reduction="mean_all"), total / 49, 1e-12)
-    close(prototype_dispersion(prototypes, reduction="mean_offdiag"), total / 42, 1e-12)
+    total = prototype_dispersion(PROTOTYPES, reduction="sum")
+    assert total.item() == pytest.approx(-1.714286, abs=1e-6)
+    close(prototype_dispersion(PROTOTYPES, reduction="mean_all"), total / 16, 1e-12)
+    close(prototype_dispersion(PROTOTYPES, reduction="mean_offdiag"), total / 12, 1e-12)
     with pytest.raises(ValueError, match="mean_all"):
-        prototype_dispersion(prototypes, reduction="mean")  # type: ignore[arg-type]
+        prototype_dispersion(PROTOTYPES, reduction="mean")  # type: ignore[arg-type]
 
 
 def test_dispersion_is_zero_for_orthogonal_or_single_prototypes_and_ignores_rotation() -> None:
@@ -166,24 +152,12 @@ def test_dispersion_is_zero_for_orthogonal_or_single_prototypes_and_ignores_rota
     close(prototype_dispersion(unit(9, 6) @ rotation), prototype_dispersion(unit(9, 6)), 1e-12)
 
 
-def test_descending_the_dispersion_spreads_prototypes() -> None:
-    prototypes = F.normalize(unit(8, 3) + 2.0, dim=1).requires_grad_()
-    before = prototype_ane(prototypes)
-    for _ in range(50):
-        (gradient,) = torch.autograd.grad(prototype_dispersion(prototypes), prototypes)
-        prototypes = F.normalize(prototypes.detach() - gradient, dim=1).requires_grad_()
-    assert prototype_ane(prototypes) < before - 0.3
-
-
 # Nearest neighbours --------------------------------------------------------------------------------------------
 
 
-def test_knn_reward_golden_values() -> None:
+def test_knn_equals_the_golden_values_and_the_broadcast_difference() -> None:
     queries, queue = double([[1, 0], [0.6, 0.8]]), double([[1, 0], [0, 1], [0.8, 0.6], [-1, 0]])
     close(knn_distance(queries, queue, k=3), double([1.414214, 0.894427]))
-
-
-def test_knn_equals_the_broadcast_difference() -> None:
     queries, keys = unit(30, 16).float(), unit(200, 16, seed=1).float()
     expected = (queries[:, None] - keys[None]).norm(dim=-1).sort(dim=1).values[:, :5]
     close(knn_distances(queries, keys, k=5), expected, 1e-6)
@@ -201,15 +175,14 @@ def test_k_copies_of_a_query_are_at_exactly_zero() -> None:
 def test_impossible_k_is_refused(k: int) -> None:
     with pytest.raises(ValueError, match=rf"4, got {k}"):
         knn_distance(torch.zeros(2, 3), torch.zeros(4, 3), k=k)
+    with pytest.raises(ValueError, match="between 1 and 4"):
+        functional.prototype_kne(torch.zeros(5, 3), k=k)
 
 
-def test_particle_reward_golden_values() -> None:
+def test_particle_reward_golden_values_scaled_and_clipped_before_averaging() -> None:
     points = double([[0, 0], [1, 0], [0, 2], [3, 3]])
     close(particle_reward(points, k=3), double([0.693147, 0.731738, 0.880466, 1.180482]))
     close(particle_reward(points, k=3, average=False), double([1.098612, 1.174359, 1.174359, 1.527262]))
-
-
-def test_particle_reward_scales_and_clips_each_distance_before_averaging() -> None:
     points = double([[0.0], [1.0], [10.0]])
     # Row 0: distances 0, 1, 10 -> /2 - 1 -> relu: 0, 0, 4.
     assert particle_reward(points, k=3, scale=2.0, clip=1.0)[0].item() == pytest.approx(math.log(1 + 4 / 3))
@@ -221,9 +194,9 @@ def test_particle_reward_scales_and_clips_each_distance_before_averaging() -> No
 
 def test_atc_golden_values() -> None:
     anchors, positives = double([[1, 2], [0, 1], [2, 0]]), double([[1, 1], [0, 2], [1, 0]])
-    rows = info_nce(anchors, positives, reduction="none")
-    close(rows, double([1.349012, 0.407606, 0.758624]))
+    close(info_nce(anchors, positives, reduction="none"), double([1.349012, 0.407606, 0.758624]))
     assert info_nce(anchors, positives).item() == pytest.approx(0.838414, abs=1e-6)
+    assert info_nce(anchors, positives, reduction="sum").item() == pytest.approx(3 * 0.838414, abs=3e-6)
 
 
 def test_simclr_equals_the_published_sum_over_2b_views() -> None:
@@ -234,9 +207,8 @@ def test_simclr_equals_the_published_sum_over_2b_views() -> None:
         similarities = [math.exp(float(views[i] @ views[j]) / 0.5) for j in range(10)]
         positive = similarities[(i + 5) % 10]
         expected.append(-math.log(positive / (sum(similarities) - similarities[i])))
-    close(
-        info_nce(first, second, temperature=0.5, negatives="both", reduction="none"), double(expected), 1e-9
-    )
+    rows = info_nce(first, second, temperature=0.5, negatives="both", reduction="none")
+    close(rows, double(expected), 1e-9)
 
 
 @pytest.mark.parametrize("negatives", ["positives", "both"])
@@ -247,22 +219,21 @@ def test_invalid_rows_are_ignored_but_stay_negatives(negatives) -> None:
     rows = info_nce(anchors, positives, negatives=negatives, reduction="none")
     masked = info_nce(anchors, positives, negatives=negatives, valid=valid, reduction="none")
     close(masked, rows * both)
-    loss = info_nce(anchors, positives, negatives=negatives, valid=valid)
-    close(loss, rows[both].mean())
+    close(info_nce(anchors, positives, negatives=negatives, valid=valid), rows[both].mean())
     nothing = info_nce(anchors, positives, negatives=negatives, valid=torch.zeros(4, dtype=torch.bool))
     assert nothing.item() == 0
     with pytest.raises(ValueError, match="'all'"):
         info_nce(anchors, positives, negatives="all")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="'median'"):
+        info_nce(anchors, positives, reduction="median")  # type: ignore[arg-type]
 
 
 def test_what_an_invalid_anchor_holds_reaches_neither_the_loss_nor_the_gradient() -> None:
-    anchors, positives = unit(4, 3), unit(4, 3, seed=1)
+    anchors, positives = unit(4, 3), unit(4, 3, seed=1).requires_grad_()
     valid = torch.tensor([True, False, True, True])
     expected = info_nce(anchors, positives, valid=valid)
     anchors[1] = torch.nan
-    anchors.requires_grad_()
-    positives.requires_grad_()
-    loss = info_nce(anchors, positives, valid=valid)
+    loss = info_nce(anchors.requires_grad_(), positives, valid=valid)
     loss.backward()
     close(loss, expected)
     assert not anchors.grad[1].any()
@@ -276,6 +247,8 @@ def test_becl_golden_losses_and_rewards() -> None:
     close(rows, double([0.294128, 0.948772, 1.939172, 0.362229]))
     close((-rows).exp(), double([0.745181, 0.387216, 0.143823, 0.696123]))
     close(becl_loss(3 * features, skills, temperature=0.5), rows.mean())
+    with pytest.raises(ValueError, match="at least two rows, got 1"):
+        becl_loss(features[:1], skills[:1])
 
 
 def test_becl_equals_the_released_arithmetic_with_lonely_skills() -> None:
@@ -290,52 +263,29 @@ def test_becl_equals_the_released_arithmetic_with_lonely_skills() -> None:
     close(becl_loss(features, skills, reduction="none"), double(expected), 1e-9)
 
 
-def test_becl_of_one_row_is_refused() -> None:
-    with pytest.raises(ValueError, match="at least two rows, got 1"):
-        becl_loss(torch.ones(1, 3), torch.zeros(1))
-
-
 # Diagnostics -----------------------------------------------------------------------------------------------
 
 
-def off_diagonal(x: torch.Tensor) -> torch.Tensor:
+def off_diagonal(x: Tensor) -> Tensor:
     return (x @ x.T)[~torch.eye(len(x), dtype=torch.bool)].reshape(len(x), -1)
 
 
-def test_entropy_is_zero_for_certain_and_log_m_for_uniform_assignments() -> None:
+def test_entropy_and_use_of_assignments() -> None:
     assert functional.assignment_entropy(torch.eye(4)).item() == 0
     assert functional.assignment_entropy(torch.full((3, 8), 1 / 8)).item() == pytest.approx(math.log(8))
-
-
-def test_prototypes_in_use_counts_distinct_largest_assignments() -> None:
     assignments = torch.tensor([[0.9, 0.1, 0.0], [0.8, 0.1, 0.1], [0.0, 0.1, 0.9]])
     assert functional.prototypes_in_use(assignments).item() == 2
 
 
-def test_mean_pairwise_cosine_equals_the_mean_over_all_pairs() -> None:
-    assert functional.mean_pairwise_cosine(unit(9, 4)).item() == pytest.approx(
-        off_diagonal(unit(9, 4)).mean().item()
-    )
+def test_cosine_diagnostics_equal_what_all_pairs_give() -> None:
+    rows, cosines = unit(9, 4), off_diagonal(unit(9, 4))
+    assert functional.mean_pairwise_cosine(rows).item() == pytest.approx(cosines.mean().item())
     assert functional.mean_pairwise_cosine(unit(1, 4).expand(5, 4)).item() == pytest.approx(1.0)
     assert functional.mean_pairwise_cosine(unit(1, 4)).item() == pytest.approx(0.0, abs=1e-12)
-
-
-def test_ane_divides_the_off_diagonal_sum_by_m_squared() -> None:
-    assert functional.prototype_ane(unit(9, 4)).item() == pytest.approx(
-        off_diagonal(unit(9, 4)).sum().item() / 81
-    )
-
-
-@pytest.mark.parametrize("k", [1, 3, 8])
-def test_kne_is_the_kth_largest_other_cosine(k: int) -> None:
-    expected = off_diagonal(unit(9, 4)).sort(dim=1, descending=True).values[:, k - 1].mean()
-    assert functional.prototype_kne(unit(9, 4), k=k).item() == pytest.approx(expected.item())
-
-
-@pytest.mark.parametrize("k", [0, 9])
-def test_an_impossible_neighbour_is_refused(k: int) -> None:
-    with pytest.raises(ValueError, match="between 1 and 8"):
-        functional.prototype_kne(unit(9, 4), k=k)
+    assert functional.prototype_ane(rows).item() == pytest.approx(cosines.sum().item() / 81)
+    for k in (1, 3, 8):
+        expected = cosines.sort(dim=1, descending=True).values[:, k - 1].mean().item()
+        assert functional.prototype_kne(rows, k=k).item() == pytest.approx(expected)
 
 
 def test_fresh_prototypes_have_the_expected_metrics() -> None:

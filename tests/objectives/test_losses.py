@@ -7,24 +7,31 @@ import pickle
 
 import pytest
 import torch
-from loss_cases import CASES, LossCase, assert_same, keep_targets, leaves, run, total
+from loss_cases import (
+    CASES,
+    LossCase,
+    assert_same,
+    atc,
+    becl,
+    drq,
+    image_batch,
+    keep_targets,
+    leaves,
+    pixel_batch,
+    proto,
+    rad_sac,
+    run,
+    simclr,
+    skill_image_batch,
+    total,
+    transition_batch,
+    view_batch,
+)
 from tensordict import TensorDictBase
 from tensordict.utils import unravel_key
 
-pytestmark = [
-    pytest.mark.parametrize("case", CASES, ids=str),
-    pytest.mark.filterwarnings("ignore:No target network updater"),
-]
-
-
-def test_keys_have_documented_defaults(case: LossCase) -> None:
-    loss = case.make()
-    assert {name: getattr(loss.tensor_keys, name) for name in case.keys} == case.keys
-
-
-def test_unknown_key_is_refused(case: LossCase) -> None:
-    with pytest.raises(ValueError, match="not an accepted tensordict key"):
-        case.make().set_keys(unheard_of="x")
+pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
+each = pytest.mark.parametrize("case", CASES, ids=str)
 
 
 def renamed(case: LossCase, names: dict) -> tuple[TensorDictBase, TensorDictBase]:
@@ -41,116 +48,117 @@ def renamed(case: LossCase, names: dict) -> tuple[TensorDictBase, TensorDictBase
     return original, moved
 
 
-def test_each_key_can_be_renamed_and_nested(case: LossCase) -> None:
+@each
+def test_each_key_has_its_default_and_can_be_renamed_and_nested(case: LossCase) -> None:
+    loss = case.make()
+    assert {name: getattr(loss.tensor_keys, name) for name in case.keys} == case.keys
     groups = [{name: ("group", name)} for name in case.keys]
     groups += [{name: ("group", name) for name in case.keys}]
+    expected = run(loss, case.batch())
     for names in groups:
         original, moved = renamed(case, names)
-        loss = case.make()
-        expected = run(loss, original)
         loss.set_keys(**names)
         assert set(loss.in_keys) <= set(moved.keys(True))
         assert_same(run(loss, moved), expected)
         loss.set_keys(**dict.fromkeys(names))
         assert_same(run(loss, original), expected)
+    with pytest.raises(ValueError, match="not an accepted tensordict key"):
+        loss.set_keys(unheard_of="x")
 
 
-def test_forward_leaves_its_input_alone(case: LossCase) -> None:
-    td = case.batch()
-    before = td.clone()
-    run(case.make(), td)
-    assert leaves(td).keys() == leaves(before).keys()
-    for key, value in leaves(before).items():
-        assert torch.equal(leaves(td)[key], value), key
-
-
-def test_forward_writes_to_no_parameter(case: LossCase) -> None:
-    loss = case.make()
+@each
+def test_forward_writes_neither_to_its_input_nor_to_a_parameter(case: LossCase) -> None:
+    loss, td = case.make(), case.batch()
     with torch.no_grad():
         for parameter in loss.parameters():
             parameter.add_(0.1)
-    before = {name: value.clone() for name, value in loss.state_dict().items()}
-    run(loss, case.batch())
-    for name, value in loss.state_dict().items():
-        assert torch.equal(value, before[name]), name
+    before = {**leaves(td.clone()), **{name: value.clone() for name, value in loss.state_dict().items()}}
+    run(loss, td)
+    after = {**leaves(td), **loss.state_dict()}
+    assert after.keys() == before.keys()
+    for key, value in before.items():
+        assert torch.equal(after[key], value), key
 
 
-def test_keyword_and_positional_calls_equal_the_tensordict_call(case: LossCase) -> None:
+@each
+def test_keyword_positional_and_selecting_calls_equal_the_tensordict_call(case: LossCase) -> None:
     loss, td = case.make(), case.batch()
     expected = run(loss, td)
+    assert set(expected.keys()) == set(loss.out_keys)
+    assert set(case.routing) == {key for key in loss.out_keys if key.startswith("loss_")}
     values = [td[key] for key in loss.in_keys]
     names = ["_".join(key) if isinstance(key, tuple) else key for key in loss.in_keys]
     torch.manual_seed(7)
     by_keyword = loss(**dict(zip(names, values)))
     torch.manual_seed(7)
     by_position = loss(*values)
-    assert len(by_keyword) == len(loss.out_keys)
-    for key, first, second in zip(loss.out_keys, by_keyword, by_position):
-        torch.testing.assert_close(first, expected[key])
-        torch.testing.assert_close(second, expected[key])
-
-
-def test_out_keys_are_what_forward_returns_and_can_be_selected(case: LossCase) -> None:
-    loss, td = case.make(), case.batch()
-    out = run(loss, td)
-    assert set(out.keys()) == set(loss.out_keys)
-    assert set(case.routing) == {key for key in loss.out_keys if key.startswith("loss_")}
+    for key, first, second in zip(loss.out_keys, by_keyword, by_position, strict=True):
+        torch.testing.assert_close((first, second), (expected[key], expected[key]))
     selected = next(iter(case.routing))
     loss.select_out_keys(selected)
-    values = [td[key] for key in loss.in_keys]
     torch.manual_seed(7)
-    torch.testing.assert_close(loss(*values), out[selected])
+    torch.testing.assert_close(loss(*values), expected[selected])
 
 
-def test_two_batch_dimensions_equal_one(case: LossCase) -> None:
+@each
+def test_batches_of_two_dimensions_and_of_one_row_are_legal(case: LossCase) -> None:
     td = case.batch(6)
     assert_same(run(case.make(), td.reshape(2, 3)), run(case.make(), td))
+    out = run(case.make(), case.batch(1))
+    total(out).backward()
+    assert all(value.isfinite().all() for value in out.values())
 
 
+@each
 def test_each_loss_term_reaches_exactly_its_parameters(case: LossCase) -> None:
     groups = set.union(*case.routing.values())
     for key, expected in case.routing.items():
         loss = case.make()
-        run(loss, case.batch())[key].sum().backward()
+        out = run(loss, case.batch())
+        assert all(value.requires_grad == name.startswith("loss_") for name, value in out.items())
+        out[key].sum().backward()
         reached = set()
         for name, parameter in loss.named_parameters():
             group = name.split(".")[0]
-            assert group in groups, name
+            assert group in groups, name  # no target among them
             if parameter.grad is not None and parameter.grad.any():
                 reached.add(group)
                 assert group in expected, f"{key} reaches {name}"
             elif group in expected:
                 assert "bias" in name, f"{key} does not reach {name}"
         assert reached == expected
+        for name, value in loss.state_dict(keep_vars=True).items():
+            assert not (name.startswith("target_") and value.requires_grad), name
 
 
-def test_targets_and_diagnostics_carry_no_gradient(case: LossCase) -> None:
-    loss = case.make()
-    out = run(loss, case.batch())
-    for key, value in out.items():
-        assert value.requires_grad == key.startswith("loss_"), key
-    total(out).backward()
-    for name, value in loss.state_dict(keep_vars=True).items():
-        if name.startswith("target_"):
-            assert not value.requires_grad
-            assert value.grad is None
-    assert not any(name.startswith("target_") for name, _ in loss.named_parameters())
-
-
-def test_state_dict_round_trip_restores_outputs(case: LossCase) -> None:
+@each
+def test_state_dict_round_trip_restores_outputs_and_targets(case: LossCase) -> None:
     first, second = case.make(seed=0), case.make(seed=1)
     td = case.batch()
+    with torch.no_grad():
+        for parameter in first.parameters():
+            parameter.add_(0.1)  # the targets differ from their sources
+    keep_targets(case, second)
     assert not torch.equal(total(run(first, td)), total(run(second, td)))
     second.load_state_dict(first.state_dict())
     assert_same(run(second, td), run(first, td))
+    for name, value in first.state_dict().items():
+        assert torch.equal(second.state_dict()[name], value), name
 
 
+@each
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss))])
-def test_copies_are_equal_and_independent(case: LossCase, duplicate) -> None:
+def test_copies_are_equal_and_independent_and_their_networks_hold_their_parameters(
+    case: LossCase, duplicate
+) -> None:
     loss, td = case.make(), case.batch()
     expected = run(loss, td)
     twin = duplicate(loss)
     assert_same(run(twin, td), expected)
+    own = {id(parameter) for parameter in twin.parameters()}
+    for name, module in vars(twin).items():
+        if isinstance(module, torch.nn.Module):
+            assert {id(p) for p in module.parameters()} <= own, name
     with torch.no_grad():
         for parameter in twin.parameters():
             parameter.mul_(2)
@@ -160,14 +168,7 @@ def test_copies_are_equal_and_independent(case: LossCase, duplicate) -> None:
     assert_same(run(twin, td), run(fresh, td))
 
 
-def test_networks_of_a_copy_hold_the_copied_parameters(case: LossCase) -> None:
-    twin = copy.deepcopy(case.make())
-    own = {id(parameter) for parameter in twin.parameters()}
-    for name, module in vars(twin).items():
-        if isinstance(module, torch.nn.Module):
-            assert {id(p) for p in module.parameters()} <= own, name
-
-
+@each
 def test_soft_update_moves_targets_by_tau(case: LossCase) -> None:
     loss = case.make()
     update_targets = keep_targets(case, loss)
@@ -184,18 +185,7 @@ def test_soft_update_moves_targets_by_tau(case: LossCase) -> None:
         torch.testing.assert_close(after[name], before[name] + 0.05 * (source - before[name]))
 
 
-def test_targets_loaded_after_the_updater_was_built_are_kept(case: LossCase) -> None:
-    first = case.make()
-    with torch.no_grad():
-        for parameter in first.parameters():
-            parameter.add_(1.0)
-    second = case.make(seed=1)
-    keep_targets(case, second)
-    second.load_state_dict(first.state_dict())
-    for name, value in first.state_dict().items():
-        assert torch.equal(second.state_dict()[name], value), name
-
-
+@each
 def test_reset_changes_every_parameter_and_target(case: LossCase) -> None:
     loss = case.make()
     with torch.no_grad():
@@ -210,43 +200,20 @@ def test_reset_changes_every_parameter_and_target(case: LossCase) -> None:
             assert torch.equal(value, loss.state_dict()[name.removeprefix("target_")]), name
 
 
-def test_double_precision_runs_in_double(case: LossCase) -> None:
+@each
+def test_double_precision_runs_in_double_and_nan_shows(case: LossCase) -> None:
     loss = case.make().to(torch.float64)
     td = case.batch().apply(lambda value: value.double() if value.is_floating_point() else value)
     out = run(loss, td)
     assert all(value.dtype == torch.float64 for key, value in out.items() if key.startswith("loss_"))
     total(out).backward()
     assert all(p.grad.dtype == torch.float64 for p in loss.parameters() if p.grad is not None)
-
-
-def test_compiled_forward_equals_eager(case: LossCase) -> None:
-    loss, td = case.make(), case.batch()
-    keep_targets(case, loss)
-    expected = run(loss, td)
-    total(expected).backward()
-    gradients = {name: p.grad.clone() for name, p in loss.named_parameters()}
-    loss.zero_grad()
-    out = run(torch.compile(loss, fullgraph=True, backend="aot_eager"), td)
-    assert_same(out, expected)
-    total(out).backward()
-    for name, parameter in loss.named_parameters():
-        torch.testing.assert_close(parameter.grad, gradients[name])
-
-
-def test_one_row_is_a_legal_batch(case: LossCase) -> None:
-    loss = case.make()
-    out = run(loss, case.batch(1))
-    total(out).backward()
-    assert all(value.isfinite().all() for value in out.values())
-
-
-def test_non_finite_parameters_propagate_to_the_loss(case: LossCase) -> None:
-    loss = case.make()
     with torch.no_grad():
         next(p for name, p in loss.named_parameters() if "weight" in name).fill_(float("nan"))
-    assert total(run(loss, case.batch())).isnan()
+    assert total(run(loss, td)).isnan()
 
 
+@each
 def test_twenty_adam_updates_lower_the_loss(case: LossCase) -> None:
     loss, td = case.make(), case.batch()
     update_targets = keep_targets(case, loss)
@@ -261,3 +228,29 @@ def test_twenty_adam_updates_lower_the_loss(case: LossCase) -> None:
         optimizer.step()
         update_targets()
     assert run(loss, td)[key].item() < 0.9 * first
+
+
+@pytest.mark.parametrize(
+    ("make", "batch", "method"),
+    [
+        (proto, image_batch, "forward"),
+        (atc, image_batch, "forward"),
+        (simclr, view_batch, "forward"),
+        (becl, skill_image_batch, "forward"),
+        (rad_sac, transition_batch, "critic_loss"),
+        (drq, pixel_batch, "actor_and_temperature_loss"),
+    ],
+)
+def test_what_training_compiles_compiles_as_a_whole_and_equals_eager(make, batch, method: str) -> None:
+    loss, td = make(), batch()
+    outcomes = []
+    for wrap in (lambda step: step, lambda step: torch.compile(step, fullgraph=True, backend="eager")):
+        step = wrap(loss if method == "forward" else getattr(loss, method))
+        torch.manual_seed(7)
+        out = step(td)
+        loss.zero_grad()
+        total(out).backward()
+        gradients = {name: p.grad for name, p in loss.named_parameters() if p.grad is not None}
+        outcomes.append((out, gradients))
+    assert_same(outcomes[1][0], outcomes[0][0])
+    torch.testing.assert_close(outcomes[1][1], outcomes[0][1])

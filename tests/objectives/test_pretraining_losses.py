@@ -12,6 +12,7 @@ from loss_cases import (
     SKILLS,
     atc,
     becl,
+    disturb,
     image_batch,
     proto,
     simclr,
@@ -21,6 +22,7 @@ from loss_cases import (
     view_batch,
 )
 from tensordict import TensorDict
+from torch import Tensor, nn
 
 from crptpro.modules import AnchorHead, PixelEncoder, Predictor, Projector, Prototypes, set_compute_dtype
 from crptpro.objectives import ATCLoss, BeCLLoss, ProtoLoss, SimCLRLoss
@@ -29,11 +31,20 @@ from crptpro.objectives.functional import sinkhorn_knopp
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 
 
-def disturb(loss) -> None:
-    """Targets differ from their sources, and prototypes are not unit."""
-    with torch.no_grad():
-        for parameter in loss.parameters():
-            parameter.add_(0.05 * torch.randn_like(parameter))
+def copies(loss, *names: str) -> list[nn.Module]:
+    """Networks with the same parameters; ``target_*`` with those of the target."""
+    found = []
+    for name in names:
+        online = name.removeprefix("target_")
+        found.append(copy.deepcopy(getattr(loss, online)))
+        if name != online:
+            found[-1].load_state_dict(target_state(loss, online))
+    return found
+
+
+def graded(value: Tensor, *modules: nn.Module) -> list:
+    value.backward()
+    return [p.grad for module in modules for p in module.parameters()]
 
 
 def require_gradients(loss, gradients: list, tolerance: float = 1e-6) -> None:
@@ -42,12 +53,10 @@ def require_gradients(loss, gradients: list, tolerance: float = 1e-6) -> None:
 
 
 def released_proto(loss: ProtoLoss, td: TensorDict, *, alpha: float, w: float, tau: float):
-    """liuxin0824/CRPTpro proto.py ``update_proto``, on copies of the same parameters; returns terms and gradients."""
-    encoder, projector, predictor = (copy.deepcopy(m) for m in (loss.encoder, loss.projector, loss.predictor))
-    target_encoder, target_projector = copy.deepcopy(encoder), copy.deepcopy(projector)
-    target_encoder.load_state_dict(target_state(loss, "encoder"))
-    target_projector.load_state_dict(target_state(loss, "projector"))
-    protos = torch.nn.Linear(*reversed(loss.prototypes.weight.shape), bias=False)
+    """liuxin0824/CRPTpro proto.py ``update_proto``: both terms and the gradients."""
+    encoder, projector, predictor = copies(loss, "encoder", "projector", "predictor")
+    target_encoder, target_projector = copies(loss, "target_encoder", "target_projector")
+    protos = nn.Linear(*reversed(loss.prototypes.weight.shape), bias=False)
     with torch.no_grad():
         protos.weight.copy_(F.normalize(loss.prototypes.weight, dim=1))
 
@@ -69,39 +78,35 @@ def released_proto(loss: ProtoLoss, td: TensorDict, *, alpha: float, w: float, t
     for i in range(ratio.shape[0]):
         ratio[i, i] = 0
     intr = ratio.mean()
-    (comp + alpha * intr).backward()
-    modules = (encoder, projector, predictor, protos)
-    return comp.detach(), intr.detach(), [p.grad for module in modules for p in module.parameters()]
+    gradients = graded(comp + alpha * intr, encoder, projector, predictor, protos)
+    return comp.detach(), intr.detach(), gradients
 
 
-@pytest.mark.parametrize("options", [{}, {"intr_loss_coef": 3.0, "offset": 2.0, "temperature": 0.3}])
-def test_proto_equals_the_released_update_in_value_and_gradients(options: dict) -> None:
+@pytest.mark.parametrize(("alpha", "w", "tau"), [(5e-3, 1.5, 0.1), (3.0, 2.0, 0.3)])
+def test_proto_equals_the_released_update_in_value_and_gradients(alpha: float, w: float, tau: float) -> None:
+    options = {} if tau == 0.1 else {"intr_loss_coef": alpha, "offset": w, "temperature": tau}
     loss, td = proto(**options), image_batch(12)
     disturb(loss)
-    settings = {"intr_loss_coef": 5e-3, "offset": 1.5, "temperature": 0.1, **options}
-    comp, intr, gradients = released_proto(
-        loss.before_update(),
-        td,
-        alpha=settings["intr_loss_coef"],
-        w=settings["offset"],
-        tau=settings["temperature"],
-    )
+    comp, intr, gradients = released_proto(loss.before_update(), td, alpha=alpha, w=w, tau=tau)
     out = loss(td)
-    torch.testing.assert_close(out["loss_comp"].detach(), comp)
-    torch.testing.assert_close(out["loss_intr"].detach(), settings["intr_loss_coef"] * intr)
-    torch.testing.assert_close(out["comp"], comp)
-    torch.testing.assert_close(out["intr"], intr)
+    found = (out["loss_comp"].detach(), out["comp"], out["loss_intr"].detach(), out["intr"])
+    torch.testing.assert_close(found, (comp, comp, alpha * intr, intr))
     (out["loss_comp"] + out["loss_intr"]).backward()
     require_gradients(loss, gradients)
 
 
-def test_full_size_loss_has_the_published_parameters_and_starts_near_its_published_value() -> None:
+def test_full_size_losses_have_the_published_parameters_and_proto_starts_near_its_published_value() -> None:
+    def sizes(loss) -> list[int]:
+        names = loss.network_names
+        return [sum(p.numel() for p in getattr(loss, f"{name}_params").parameters()) for name in names]
+
     torch.manual_seed(0)
-    loss = ProtoLoss(PixelEncoder())
-    sizes = [
-        sum(p.numel() for p in getattr(loss, f"{name}_params").parameters()) for name in loss.network_names
-    ]
-    assert sizes == [30_368, 5_017_728, 263_296, 65_536]
+    loss, anchors, views = ProtoLoss(PixelEncoder()), ATCLoss(PixelEncoder()), SimCLRLoss(PixelEncoder())
+    assert sizes(loss) == [30_368, 5_017_728, 263_296, 65_536]
+    assert sizes(anchors) == [30_368, 5_017_728, 148_096]
+    assert sizes(views) == [30_368, 5_017_728]
+    assert anchors.projector.linear.weight.std().item() == pytest.approx((2 / 39_200) ** 0.5, rel=0.01)
+    assert views.temperature.item() == 0.07
     pixels = torch.randint(0, 256, (16, 9, 84, 84), dtype=torch.uint8)
     with torch.no_grad():
         out = loss(TensorDict({"pixels": pixels, "next": {"pixels": pixels}}, [16]))
@@ -120,26 +125,11 @@ def test_given_networks_are_trained_and_must_share_one_latent_length() -> None:
     assert {id(p) for p in loss.parameters()} == {id(p) for module in given for p in module.parameters()}
     with pytest.raises(ValueError, match=r"projector 6, predictor 6, prototypes 4; pass latent_dim="):
         proto(prototypes=Prototypes(10, 4))
-    mute = torch.nn.Linear(encoder.feature_dim, 6)
-    assert proto(projector=mute)(image_batch())["loss_comp"].isfinite()
+    assert proto(projector=nn.Linear(encoder.feature_dim, 6))(image_batch())["loss_comp"].isfinite()
     with pytest.raises(ValueError, match="projector 6, anchor_head 128"):
         ATCLoss(small_encoder(), projector=projector)
     head = ATCLoss(encoder, projector=projector, anchor_head=AnchorHead(6, 8))
     assert (head.latent_dim, head.hidden_dim) == (6, 8)
-
-
-def test_targets_start_as_copies_and_feed_only_the_assignments() -> None:
-    loss, td = proto(), image_batch()
-    for name, module in (("encoder", loss.encoder), ("projector", loss.projector)):
-        state = target_state(loss, name)
-        assert state.keys() == module.state_dict().keys()
-        assert all(torch.equal(state[key], value) for key, value in module.state_dict().items())
-    before = loss(td)
-    for value in target_state(loss, "encoder").values():
-        value.mul_(-1.0)  # live tensors: the target changes
-    after = loss(td)
-    assert not torch.equal(after["loss_comp"], before["loss_comp"])
-    assert torch.equal(after["embedding_cosine"], before["embedding_cosine"])
 
 
 def test_before_update_gives_unit_rows_and_forward_does_not_need_it() -> None:
@@ -152,25 +142,22 @@ def test_before_update_gives_unit_rows_and_forward_does_not_need_it() -> None:
     torch.testing.assert_close(loss.prototypes.weight.detach().norm(dim=1), torch.ones(10))
 
 
-def test_assignment_temperature_follows_the_temperature_unless_given() -> None:
+def test_coefficients_are_scheduled_in_place_and_the_assignments_follow_the_temperature_unless_given() -> (
+    None
+):
     td = image_batch()
     same, cold = proto(), proto(assignment_temperature=0.02)
     assert same.assignment_temperature is None
     torch.testing.assert_close(proto(assignment_temperature=0.1)(td)["comp"], same(td)["comp"])
     assert cold(td)["assignment_entropy"] < same(td)["assignment_entropy"]
-    same.temperature = 0.02  # scheduled in place
+    first = same(td)["loss_intr"]
+    same.temperature, same.intr_loss_coef = 0.02, 0.5
     torch.testing.assert_close(same(td)["assignment_entropy"], cold(td)["assignment_entropy"])
+    torch.testing.assert_close(same(td)["loss_intr"], 100 * first)
+    assert same.state_dict()["intr_loss_coef"].item() == 0.5
 
 
-def test_scheduled_coefficients_act_on_the_next_call() -> None:
-    loss, td = proto(), image_batch()
-    first = loss(td)["loss_intr"]
-    loss.intr_loss_coef = 0.5
-    torch.testing.assert_close(loss(td)["loss_intr"], 100 * first)
-    assert loss.state_dict()["intr_loss_coef"].item() == 0.5
-
-
-def test_diagnostics_describe_the_batch() -> None:
+def test_diagnostics_describe_the_batch_and_identical_images_read_as_a_dead_run() -> None:
     loss, td = proto(), image_batch(8)
     out = loss(td)
     with torch.no_grad():
@@ -180,20 +167,15 @@ def test_diagnostics_describe_the_batch() -> None:
     cosines = (z @ z.T)[~torch.eye(8, dtype=torch.bool)]
     assert out["embedding_cosine"].item() == pytest.approx(cosines.mean().item(), abs=1e-5)
     assert out["prototypes_in_use"].item() == q.argmax(dim=1).unique().numel()
-    assert out["assignment_entropy"].item() == pytest.approx(
-        -(q * q.log()).sum(dim=1).mean().item(), abs=1e-4
-    )
+    entropy = -(q * q.log()).sum(dim=1).mean().item()
+    assert out["assignment_entropy"].item() == pytest.approx(entropy, abs=1e-4)
+    dead = proto()(image_batch(1).expand(8).contiguous())
+    assert dead["embedding_cosine"].item() == pytest.approx(1.0, abs=1e-5)
+    assert dead["assignment_entropy"].item() == pytest.approx(math.log(10), abs=1e-5)
+    assert dead["comp"].item() >= math.log(10) - 1e-5
 
 
-def test_identical_images_read_as_a_dead_run() -> None:
-    td = image_batch(1).expand(8).contiguous()
-    out = proto()(td)
-    assert out["embedding_cosine"].item() == pytest.approx(1.0, abs=1e-5)
-    assert out["assignment_entropy"].item() == pytest.approx(math.log(10), abs=1e-5)
-    assert out["comp"].item() >= math.log(10) - 1e-5
-
-
-def test_bfloat16_loss_and_gradients_are_close_to_float32() -> None:
+def test_bfloat16_is_close_to_float32_and_softmax_and_sinkhorn_stay_in_float32_under_autocast_too() -> None:
     td = image_batch(16)
     results = []
     for dtype in (torch.float32, torch.bfloat16):
@@ -206,15 +188,10 @@ def test_bfloat16_loss_and_gradients_are_close_to_float32() -> None:
     (reference, expected), (low, gradient) = results
     assert low == pytest.approx(reference, rel=0.01)
     assert F.cosine_similarity(gradient, expected, dim=0) > 0.99
-
-
-def test_autocast_around_the_loss_leaves_softmax_and_sinkhorn_in_float32() -> None:
-    loss, td = proto(), image_batch(16)
-    expected = loss(td)["loss_comp"].item()
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        out = loss(td)
+        out = proto()(td)
     assert out["loss_comp"].dtype == torch.float32
-    assert out["loss_comp"].item() == pytest.approx(expected, rel=0.05)
+    assert out["loss_comp"].item() == pytest.approx(reference, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -234,36 +211,38 @@ def test_impossible_options_are_refused_by_name(make, options: dict, message: st
         make(**options)
 
 
-def test_a_missing_entry_is_named() -> None:
-    with pytest.raises(KeyError, match=r"\('next', 'pixels'\)"):
-        proto()(TensorDict({"pixels": image_batch()["pixels"]}, [6]))
-    with pytest.raises(KeyError, match="pixels_view"):
-        simclr()(view_batch().exclude("pixels_view"))
-    with pytest.raises(KeyError, match="skill"):
-        becl()(skill_image_batch().exclude("skill"))
+@pytest.mark.parametrize(
+    ("make", "batch", "missing"),
+    [
+        (proto, image_batch, ("next", "pixels")),
+        (simclr, view_batch, "pixels_view"),
+        (becl, skill_image_batch, "skill"),
+    ],
+)
+def test_a_missing_entry_is_named(make, batch, missing) -> None:
+    with pytest.raises(KeyError) as caught:
+        make()(batch().exclude(missing))
+    assert repr(missing) in caught.value.args[0]
 
 
 def released_atc(loss: ATCLoss, td: TensorDict):
-    """rlpyt ``augmented_temporal_contrast.py`` and ``atc_models.py`` on copies of the parameters."""
-    encoder, projector, head = (copy.deepcopy(m) for m in (loss.encoder, loss.projector, loss.anchor_head))
-    target_encoder, target_projector = copy.deepcopy(encoder), copy.deepcopy(projector)
-    target_encoder.load_state_dict(target_state(loss, "encoder"))
-    target_projector.load_state_dict(target_state(loss, "projector"))
+    """rlpyt ``augmented_temporal_contrast.py`` and ``atc_models.py``."""
+    encoder, projector, head = copies(loss, "encoder", "projector", "anchor_head")
+    target_encoder, target_projector = copies(loss, "target_encoder", "target_projector")
     anchor = projector(encoder(td["pixels"]))
     with torch.no_grad():
         positive = target_projector(target_encoder(td["next", "pixels"]))
-    mlp = torch.nn.Sequential(head.hidden, torch.nn.ReLU(), head.output)
+    mlp = nn.Sequential(head.hidden, nn.ReLU(), head.output)
     anchor = anchor + mlp(anchor)
     logits = torch.matmul(head.bilinear(anchor), positive.T)
     logits = logits - torch.max(logits, dim=1, keepdim=True)[0]
     value = F.cross_entropy(logits, torch.arange(len(logits)))
-    value.backward()
-    return value.detach(), [p.grad for m in (encoder, projector, head) for p in m.parameters()]
+    return value.detach(), graded(value, encoder, projector, head)
 
 
 def released_simclr(loss: SimCLRLoss, td: TensorDict):
     """The authors' InfoNCE over 2B views: the positive is moved to column 0 of the logits."""
-    encoder, projector = copy.deepcopy(loss.encoder), copy.deepcopy(loss.projector)
+    encoder, projector = copies(loss, "encoder", "projector")
     features = F.normalize(projector(encoder(torch.cat([td["pixels"], td["pixels_view"]]))), dim=1)
     labels = torch.cat([torch.arange(len(td)), torch.arange(len(td))])
     labels = (labels[:, None] == labels[None]).float()
@@ -275,17 +254,14 @@ def released_simclr(loss: SimCLRLoss, td: TensorDict):
     negatives = similarity[~labels.bool()].view(len(labels), -1)
     logits = torch.cat([positives, negatives], dim=1) / 0.07
     value = F.cross_entropy(logits, torch.zeros(len(logits), dtype=torch.long))
-    value.backward()
-    return value.detach(), [p.grad for m in (encoder, projector) for p in m.parameters()]
+    return value.detach(), graded(value, encoder, projector)
 
 
 def released_becl(loss: BeCLLoss, td: TensorDict):
-    """Rooshy-yang/BeCL ``agent/becl.py`` on copies of the parameters."""
-    encoder, head = copy.deepcopy(loss.encoder), copy.deepcopy(loss.projector)
-    embed = torch.nn.Sequential(
-        head.embed_input, torch.nn.ReLU(), head.embed_hidden, torch.nn.ReLU(), head.embed_output
-    )
-    project = torch.nn.Sequential(head.project_hidden, torch.nn.ReLU(), head.project_output)
+    """Rooshy-yang/BeCL ``agent/becl.py``."""
+    encoder, head = copies(loss, "encoder", "projector")
+    embed = nn.Sequential(head.embed_input, nn.ReLU(), head.embed_hidden, nn.ReLU(), head.embed_output)
+    project = nn.Sequential(head.project_hidden, nn.ReLU(), head.project_output)
     features = F.normalize(project(embed(encoder(td["next", "pixels"]))), dim=1)
     skills = td["skill"].argmax(dim=1)
     count = len(skills)
@@ -296,8 +272,7 @@ def released_becl(loss: BeCLLoss, td: TensorDict):
     similarity = similarity.exp()
     positive = similarity.gather(1, same.argmax(dim=1, keepdim=True)).squeeze(1)
     value = -torch.log(positive / (similarity.sum(dim=1) + 1e-6) + 1e-6).mean()
-    value.backward()
-    return value.detach(), [p.grad for m in (encoder, head) for p in m.parameters()]
+    return value.detach(), graded(value, encoder, head)
 
 
 @pytest.mark.parametrize(
@@ -318,27 +293,25 @@ def test_contrastive_losses_and_gradients_equal_the_released_updates(make, batch
     require_gradients(loss, gradients, 1e-5)
 
 
-def test_the_gradient_reaches_the_anchors_of_atc_and_both_views_of_simclr() -> None:
-    td = image_batch(6).apply(lambda pixels: (pixels / 255).requires_grad_())
-    atc()(td)["loss_contrast"].backward()
-    assert td["pixels"].grad.any()
-    assert td["next", "pixels"].grad is None
-    td = view_batch(4).apply(lambda pixels: (pixels / 255).requires_grad_())
-    simclr()(td)["loss_contrast"].backward()
-    assert td["pixels"].grad.any()
-    assert td["pixels_view"].grad.any()
+@pytest.mark.parametrize(
+    ("make", "batch", "learning", "constant"),
+    [
+        (atc, image_batch, ["pixels"], [("next", "pixels")]),
+        (simclr, view_batch, ["pixels", "pixels_view"], []),
+    ],
+)
+def test_the_gradient_reaches_the_anchors_of_atc_and_both_views_of_simclr(
+    make, batch, learning: list, constant: list
+) -> None:
+    td = batch().apply(lambda pixels: (pixels / 255).requires_grad_())
+    make()(td)["loss_contrast"].backward()
+    assert all(td[key].grad.any() for key in learning)
+    assert all(td[key].grad is None for key in constant)
 
 
-def test_contrastive_losses_have_the_heads_and_entries_of_their_papers() -> None:
-    loss = ATCLoss(PixelEncoder())
-    sizes = [
-        sum(p.numel() for p in getattr(loss, f"{name}_params").parameters()) for name in loss.network_names
-    ]
-    assert sizes == [30_368, 5_017_728, 148_096]
-    assert loss.projector.linear.weight.std().item() == pytest.approx((2 / 39_200) ** 0.5, rel=0.01)
-    views = SimCLRLoss(PixelEncoder())
-    assert views.projector.config["latent_dim"] == 128
-    assert views.temperature.item() == 0.07
+def test_a_loss_says_which_entries_are_second_views_and_reads_what_its_paper_reads() -> None:
+    assert proto().views == {}
+    views = simclr()
     assert views.views == {"pixels_view": "pixels"}
     views.set_keys(observation=("next", "pixels"), observation_view=("next", "pixels_view"))
     assert views.views == {("next", "pixels_view"): ("next", "pixels")}

@@ -2,63 +2,29 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
-from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Bounded, Composite, OneHot, Unbounded
-from torchrl.envs import EnvBase
+from tensordict import TensorDict
+from torchrl.data import Bounded
+from toy_world import ToyEnv
 
 from crptpro.modules import PixelEncoder, Projector, Prototypes
 
 SIZE = 20
-EPISODE = 4
-SKILLS = 3
 
 
-class FakePixelEnv(EnvBase):
-    """uint8 [9, 20, 20] noise and a skill that changes every second agent step; reward = mean action.
-
-    Truncated after 4 agent steps.
-    """
+class FakePixelEnv(ToyEnv):
+    """uint8 [9, 20, 20] noise, whatever the actions; truncated after 4 agent steps."""
 
     def __init__(self) -> None:
-        super().__init__(device="cpu")
-        self.observation_spec = Composite(
-            pixels=Bounded(0, 255, (9, SIZE, SIZE), dtype=torch.uint8),
-            skill=OneHot(SKILLS, dtype=torch.float32),
-        )
-        self.action_spec = Bounded(-1.0, 1.0, (2,))
-        self.reward_spec = Unbounded((1,))
-        flag = Bounded(0, 1, (1,), dtype=torch.bool)
-        self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone())
-        self._rng = torch.Generator().manual_seed(0)
-        self._count = 0
+        super().__init__(lambda seed: 4, image_size=SIZE)
+        self.observation_spec["pixels"] = Bounded(0, 255, (9, SIZE, SIZE), dtype=torch.uint8)
 
-    def _pixels(self) -> torch.Tensor:
-        return torch.randint(0, 256, (9, SIZE, SIZE), dtype=torch.uint8, generator=self._rng)
-
-    def _skill(self) -> torch.Tensor:
-        return torch.eye(SKILLS)[self._count // 2]
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **_: object) -> TensorDict:
-        self._count = 0
-        return TensorDict({"pixels": self._pixels(), "skill": self._skill()})
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        self._count += 1
-        over = torch.tensor([self._count >= EPISODE])
-        return TensorDict(
-            {
-                "pixels": self._pixels(),
-                "skill": self._skill(),
-                "reward": tensordict["action"].mean(-1, keepdim=True),
-                "done": over,
-                "truncated": over,
-                "terminated": torch.zeros(1, dtype=torch.bool),
-            }
-        )
-
-    def _set_seed(self, seed: int | None) -> None:
-        self._rng.manual_seed(seed or 0)
+    def _observe(self) -> dict[str, Any]:
+        self.total = 0.0
+        frame = super()._observe()["pixels"]
+        return {"pixels": torch.cat([frame, 255 - frame, frame // 2])}
 
 
 def small_encoder(**changes: object) -> PixelEncoder:
@@ -75,9 +41,9 @@ def small_heads(
 class FakeReplay:
     """Observations by number, as a replay hands them out; remembers what it was asked for."""
 
-    def __init__(self, count: int = 12, window: int | None = None, size: int = SIZE) -> None:
-        self.window = count if window is None else window
-        self.frames = torch.randint(0, 256, (count, 9, size, size), dtype=torch.uint8)
+    def __init__(self, count: int = 12) -> None:
+        self.window = count
+        self.frames = torch.randint(0, 256, (count, 9, SIZE, SIZE), dtype=torch.uint8)
         self.asked: list[int] = []
 
     def observations(self, numbers: torch.Tensor) -> torch.Tensor:

@@ -7,7 +7,6 @@ import torch
 from fake_pixel_env import SIZE, FakePixelEnv, small_encoder
 from tensordict import TensorDict
 from torch import nn
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import SerialEnv, TransformedEnv
 
 from crptpro.transforms import FrozenEncoder, choose_feature_mode
@@ -52,14 +51,15 @@ def test_any_module_is_an_encoder_for_any_batch_and_stays_frozen(make, lead):
     torch.manual_seed(0)
     encoder = make()
     state = {name: value.clone() for name, value in encoder.state_dict().items()}
-    transform = FrozenEncoder(encoder).train()
-    td = TensorDict({"pixels": images(*lead)}, batch_size=lead)
-    features = transform(td)["features"]
-    with torch.no_grad():
-        direct = encoder.eval()(td["pixels"].reshape(-1, 9, SIZE, SIZE))
-    assert torch.equal(features, direct.reshape(features.shape))
-    assert features.shape[:-1] == lead
-    assert not features.requires_grad
+    keys = {"in_keys": ["pixels", ("next", "pixels")], "out_keys": ["features", ("next", "features")]}
+    td = TensorDict({"pixels": images(*lead), "next": {"pixels": images(*lead)}}, batch_size=lead)
+    FrozenEncoder(encoder, **keys).train()(td)
+    for part in (td, td["next"]):
+        with torch.no_grad():
+            direct = encoder.eval()(part["pixels"].reshape(-1, 9, SIZE, SIZE))
+        assert torch.equal(part["features"], direct.reshape(part["features"].shape))
+        assert part["features"].shape[:-1] == lead
+        assert not part["features"].requires_grad
     assert all(parameter.requires_grad for parameter in encoder.parameters())
     assert all(torch.equal(value, state[name]) for name, value in encoder.state_dict().items())
 
@@ -72,31 +72,9 @@ def test_an_encoder_without_dense_maps_is_encoded_anew_with_a_one_line_reason(ma
     assert "\n" not in reason
 
 
-def test_an_encoder_that_returns_no_tensor_is_named():
-    class Pair(nn.Module):
-        def forward(self, pixels):
-            return pixels, pixels
-
-    with pytest.raises(TypeError, match="Pair returned tuple, not a tensor"):
-        FrozenEncoder(Pair())(TensorDict(pixels=images(1)))
-
-
-def test_several_keys_are_encoded_in_a_replay_buffer():
-    encoder = small_encoder()
-    buffer = ReplayBuffer(storage=LazyTensorStorage(8), batch_size=4)
-    buffer.extend(TensorDict({"pixels": images(8), "next": {"pixels": images(8)}}, batch_size=[8]))
-    keys = {"in_keys": ["pixels", ("next", "pixels")], "out_keys": ["features", ("next", "features")]}
-    buffer.append_transform(FrozenEncoder(encoder, **keys))
-    sample = buffer.sample()
-    with torch.no_grad():
-        assert torch.equal(sample["features"], encoder(sample["pixels"]))
-        assert torch.equal(sample["next", "features"], encoder(sample["next", "pixels"]))
-
-
 def test_partial_resets_of_a_batched_environment_renew_only_what_was_reset():
-    encoder = small_encoder()
-    env = TransformedEnv(SerialEnv(2, FakePixelEnv), FrozenEncoder(encoder))
-    td = env.reset()
+    env = TransformedEnv(SerialEnv(2, FakePixelEnv), FrozenEncoder(small_encoder()))
+    td = env.rand_step(env.reset())["next"]
     before = td["features"].clone()
     td["_reset"] = torch.tensor([[True], [False]])
     after = env.reset(td)["features"]
@@ -139,10 +117,18 @@ def test_pixels_go_to_the_encoders_device_and_features_come_back():
         FrozenEncoder(small_encoder().to("meta"))(TensorDict(pixels=images(2)))
 
 
-def test_missing_pixels_are_named():
+def test_missing_pixels_keys_that_do_not_pair_and_an_encoder_that_returns_no_tensor_are_named():
+    frames = FrozenEncoder(small_encoder(), in_keys="frames")
     with pytest.raises(KeyError, match="frames"):
-        FrozenEncoder(small_encoder(), in_keys="frames")(TensorDict(pixels=images(1)))
+        frames(TensorDict(pixels=images(1)))
     with pytest.raises(KeyError, match="frames"):
-        TransformedEnv(FakePixelEnv(), FrozenEncoder(small_encoder(), in_keys="frames")).observation_spec  # noqa: B018
+        TransformedEnv(FakePixelEnv(), frames).observation_spec  # noqa: B018
     with pytest.raises(ValueError, match="pair up"):
         FrozenEncoder(small_encoder(), in_keys=["a", "b"])
+
+    class Pair(nn.Module):
+        def forward(self, pixels):
+            return pixels, pixels
+
+    with pytest.raises(TypeError, match="Pair returned tuple, not a tensor"):
+        FrozenEncoder(Pair())(TensorDict(pixels=images(1)))

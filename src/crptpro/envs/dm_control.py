@@ -38,18 +38,15 @@ def load_dm_env(domain: Domain) -> dm_env.Environment:
 
     The model does not depend on a seed, so that an episode depends only on the seed given before its reset.
     """
-    if domain.source == "manipulation":
-        from dm_control import manipulation
+    from dm_control import manipulation, suite
 
-        route_mujoco_warnings()
+    route_mujoco_warnings()
+    if domain.source == "manipulation":
         env = manipulation.load(f"{domain.task}_vision", seed=0)
         # The built-in camera renders at every env step, twice per agent step.
         for observable in env.task.observables.values():
             observable.enabled = False
         return env
-    from dm_control import suite
-
-    route_mujoco_warnings()
     world = next((world for world, tasks in SUITE_TASKS.items() if domain.task in tasks), None)
     if world is None:
         raise UnknownNameError(f"Domain {domain.name!r} has the task {domain.task!r}, which the suite lacks.")
@@ -74,16 +71,13 @@ def route_mujoco_warnings() -> None:
 
 
 def reverse_background(model: Any) -> None:
-    """Reverse the order of the red, green and blue values of a model's background, in place.
+    """Reverse the order of the red, green and blue values of the background of a ``mujoco.MjModel``, in place.
 
     The paper reverses the RGB values of the background without saying what that is. Here it is the skybox, and the
     planes and height fields that are fixed to the world (floor, walls, terrain): their textures, materials and geoms. A
     material or texture that something else uses too keeps its colours.
 
     Call it once per compiled model, before its render context is made: that is when textures are copied to it.
-
-    Args:
-        model: ``mujoco.MjModel``, 3.2 or later.
 
     Raises:
         CRPTproError: the model has no background to reverse.
@@ -122,16 +116,8 @@ class AgentSteps(dm_env.Environment):
     composer environments at every reset. A frame of cheetah or walker takes 7 to 16 % less time (software GL; no gain
     on manipulation).
 
-    Args:
-        env: with ``physics`` and either ``task.random`` (suite) or ``random_state`` (composer).
-        world: name for messages.
-        image_size: H = W, pixels.
-        action_repeat: env steps per step, fewer where the episode ends.
-        camera: index or name of a camera of the model, -1 for the free camera.
-        render: ``False`` leaves every image black.
-        physics_state: also observe ``qpos`` and ``qvel``.
-        shadow_size: side of the shadow map, texels; ``None`` keeps the model's.
-        reverses_background: render the background with its colours reversed.
+    The settings are those of :func:`crptpro.envs.make_env`; ``world`` is the name for messages, ``shadow_size`` the
+    side of the shadow map in texels.
     """
 
     def __init__(
@@ -189,8 +175,14 @@ class AgentSteps(dm_env.Environment):
                 break
         return dm_env.TimeStep(last.step_type, reward, last.discount, self._observe())
 
-    def draw(self) -> Tensor:
-        """Return the frame of the current state, uint8 ``[3, H, W]``."""
+    def _observe(self) -> dict[str, Any]:
+        observation = {"pixels": self._draw()}
+        if self.physics_state:
+            data = self.physics.data
+            observation |= {"qpos": torch.tensor(data.qpos), "qvel": torch.tensor(data.qvel)}
+        return observation
+
+    def _draw(self) -> Tensor:
         if not self._renders:
             return torch.zeros(self._image_shape, dtype=torch.uint8)
         is_first = self.physics.model is not self._model
@@ -233,22 +225,12 @@ class AgentSteps(dm_env.Environment):
         self._camera = Camera(self.physics, self._image_size, self._image_size, camera_id=self._camera_id)
         self._model = model
 
-    def _observe(self) -> dict[str, Any]:
-        observation = {"pixels": self.draw()}
-        if self.physics_state:
-            data = self.physics.data
-            observation |= {"qpos": torch.tensor(data.qpos), "qvel": torch.tensor(data.qvel)}
-        return observation
-
     def observation_spec(self) -> dict[str, specs.Array]:
         """Describe the frame and the physical state."""
         found = {"pixels": specs.BoundedArray(self._image_shape, np.uint8, 0, 255)}
         if self.physics_state:
             model = self.physics.model
-            found |= {
-                "qpos": specs.Array((model.nq,), np.float64),
-                "qvel": specs.Array((model.nv,), np.float64),
-            }
+            found |= {"qpos": specs.Array((model.nq,), float), "qvel": specs.Array((model.nv,), float)}
         return found
 
     def action_spec(self) -> specs.BoundedArray:

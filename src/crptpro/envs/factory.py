@@ -52,7 +52,7 @@ def make_env(
         seed: of the simulator's first episode, from 0 to 2**32 - 1.
         image_size: H = W, pixels.
         action_repeat: env steps per agent step; ``None`` takes the domain's (2).
-        frame_stack: frames per observation; 1 gives the single frame ``[3, H, W]``.
+        frame_stack: frames per observation.
         camera: index or name; ``None`` takes the domain's.
         quality: ``"fast"`` renders smaller shadow maps, up to twice as fast on software GL, with fewer than 1 % of the
             pixels changed (quadruped_escape: 8 %).
@@ -70,45 +70,44 @@ def make_env(
     """
     domain = get_domain(task)
     seed = as_int(seed, "seed", minimum=0, maximum=2**32 - 1)
-    action_repeat = resolve_action_repeat(domain, action_repeat)
-    image_size = as_int(image_size, "image_size", minimum=1)
     frame_stack = as_int(frame_stack, "frame_stack", minimum=1)
     camera = domain.camera if camera is None else camera
     if camera is not None and not isinstance(camera, str):
         camera = as_int(camera, "camera")
+    settings: dict[str, Any] = {
+        "image_size": as_int(image_size, "image_size", minimum=1), "camera": camera, "quality": quality,
+        "action_repeat": resolve_action_repeat(domain, action_repeat), "physics_state": physics_state,
+    }  # fmt: skip
+    is_dm_control = domain.source in ("suite", "manipulation")
     for name, value, allowed in (("quality", quality, QUALITIES), ("colors", colors, COLORS)):
         if value not in allowed:
             raise CRPTproError(f"{name} must be {' or '.join(map(repr, allowed))}, got {value!r}.")
-    if colors == "reversed_background" and domain.source not in ("suite", "manipulation"):
+    if colors == "reversed_background" and not is_dm_control:
         raise CRPTproError(
             f"The background of {domain.name!r} is not known: only dm_control's worlds can have it reversed. "
             "colors='reversed_image' reverses the colours of whole images in any world."
         )
     card = {
-        "task": domain.task, "image_size": image_size, "camera": camera, "backend": "none", "quality": quality,
-        "colors": colors, "action_repeat": action_repeat,
+        "task": domain.task, "image_size": settings["image_size"], "camera": camera, "backend": "none",
+        "quality": quality, "colors": colors, "action_repeat": settings["action_repeat"],
     }  # fmt: skip
     if needs_gl(domain):
         select_backend()
         card |= backend_card()
-    settings: dict[str, Any] = {
-        "image_size": image_size, "action_repeat": action_repeat, "camera": camera, "quality": quality,
-        "physics_state": physics_state,
-    }  # fmt: skip
     world: Any
     if domain.source == "own":
         world = _own(domain, seed=seed, **settings)
         card = {"task": domain.task}  # its make decides what the settings shape
-    elif domain.source == "gymnasium":
-        from crptpro.envs.gymnasium_worlds import make_gymnasium
-
-        world = make_gymnasium(domain.task, render=render, **settings)
-    else:
+    elif is_dm_control:
         # Imported late: dm_control keeps the GL backend that it is imported with.
         from crptpro.envs.dm_control import make_dm_control
 
         reverses_background = colors == "reversed_background"
         world = make_dm_control(domain, render=render, reverses_background=reverses_background, **settings)
+    else:
+        from crptpro.envs.gymnasium_worlds import make_gymnasium
+
+        world = make_gymnasium(domain.task, render=render, **settings)
     limit = LONGEST_EPISODE_AGENT_STEPS if domain.episode_env_steps is None else None
     world.watch(card, agent_step_limit=limit, checks_frames=render or domain.source == "own")
     transforms: list[Transform] = []
@@ -125,13 +124,10 @@ def make_env(
 
 
 def resolve_action_repeat(task: str | Domain, action_repeat: int | None = None) -> int:
-    """Return the env steps of one agent step: as asked, or the domain's.
+    """Return the env steps of one agent step: as asked, at least one, or the domain's.
 
     A world of your own whose ``make`` takes no ``action_repeat`` has 1, or what a ``partial`` of it binds; asked for
     another number, it warns.
-
-    Raises:
-        ValueError: asked for less than one.
     """
     if action_repeat is not None:
         action_repeat = as_int(action_repeat, "action_repeat", minimum=1)
@@ -156,10 +152,7 @@ def episode_length(task: str | Domain, *, action_repeat: int | None = None) -> i
 
 
 def needs_gl(task: str | Domain) -> bool:
-    """Whether MuJoCo renders the frames, so that a GL backend must be selected first.
-
-    True for dm_control's worlds, and Gymnasium's where MuJoCo or its robotics package simulates.
-    """
+    """Whether MuJoCo renders the frames (dm_control's, and some of Gymnasium's), so that a GL backend is needed."""
     domain = get_domain(task)
     if domain.source != "gymnasium":
         return domain.source != "own"
@@ -179,21 +172,19 @@ class FrameTransform(Transform):
     TorchRL's ``PermuteTransform`` returns a view of the world's own buffer, ``ToTensorImage`` divides uint8 by 255.
     """
 
-    def __init__(self, world: str):
+    def __init__(self, world: str, image_size: int):
         super().__init__(in_keys=["pixels"], out_keys=["pixels"])
-        self._read_frame = FrameReader(world)
+        self._read_frame, self._shape = FrameReader(world), (3, image_size, image_size)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Make it uint8, channels first."""
-        shape = observation_spec["pixels"].shape
-        size = shape[1]  # the world is square
-        observation_spec["pixels"] = Bounded(0, 255, shape=(3, size, size), dtype=torch.uint8)
+        observation_spec["pixels"] = Bounded(0, 255, shape=self._shape, dtype=torch.uint8)
         return observation_spec
 
     def transform_done_spec(self, done_spec: Composite) -> Composite:
         """Add ``truncated``, a copy of ``done``."""
         done_spec = done_spec.clone()
-        if "truncated" not in set(done_spec.keys()):
+        if "truncated" not in done_spec.keys():  # noqa: SIM118
             done_spec["truncated"] = done_spec["done"].clone()
         return done_spec
 
@@ -202,7 +193,7 @@ class FrameTransform(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         next_tensordict.set("pixels", self._read_frame(next_tensordict.get("pixels")))
-        if "truncated" not in set(next_tensordict.keys()):
+        if next_tensordict.get("truncated", None) is None:
             next_tensordict.set("truncated", torch.zeros_like(next_tensordict.get("done")))
         return next_tensordict
 
@@ -218,11 +209,14 @@ def _own(domain: Domain, **settings: Any) -> EnvBase:
         )  # fmt: skip
     with passed_on(domain.task, "make"):
         env = make(**named)
-    _require_contract(domain, env, settings["image_size"])
+    if broken := _broken_contract(env, settings["image_size"]):
+        raise CRPTproError(
+            f"The environment of domain {domain.name!r} {broken} (see crptpro.domains.Domain)."
+        )
     state = ("qpos", "qvel") if settings["physics_state"] else ()
     present = set(env.observation_spec.keys(True, True))
     kept = [key for key in ("pixels", *state, *_read_back(env)) if key in present]
-    transforms: list[Transform] = [FrameTransform(domain.task)]
+    transforms: list[Transform] = [FrameTransform(domain.task, settings["image_size"])]
     if present - set(kept):
         transforms.insert(0, SelectTransform(*kept))
     rewards = ["reward"] if env.reward_spec.dtype == torch.float64 else []
@@ -251,38 +245,35 @@ def _named_by(make: Any, settings: dict[str, Any]) -> dict[str, Any]:
     # TorchRL's metaclass hides what the constructor of an environment names.
     parameters = inspect.signature(make.__init__ if inspect.isclass(make) else make).parameters
     takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
-    return {
-        name: value
-        for name, value in settings.items()
-        if (takes_all or name in parameters) and name not in _bound(make)
-    }
+    wanted = {name for name in settings if takes_all or name in parameters} - set(_bound(make))
+    return {name: value for name, value in settings.items() if name in wanted}
 
 
-def _require_contract(domain: Domain, env: Any, image_size: int) -> None:
-    def refuse(what: str) -> CRPTproError:
-        return CRPTproError(f"The environment of domain {domain.name!r} {what} (see crptpro.domains.Domain).")
-
+def _broken_contract(env: Any, image_size: int) -> str:
+    """Return what is wrong with a user's environment, otherwise nothing."""
     if not isinstance(env, EnvBase):
-        raise refuse(f"is a {type(env).__name__}; make must return a TorchRL EnvBase")
+        return f"is a {type(env).__name__}; make must return a TorchRL EnvBase"
     if env.device is not None and env.device.type != "cpu":
-        raise refuse(f"lives on {env.device}; it must be on the CPU, where frames are stored")
+        return f"lives on {env.device}; it must be on the CPU, where frames are stored"
     if env.batch_size != torch.Size([]):
-        raise refuse(f"has batch size {tuple(env.batch_size)}; it must be unbatched")
-    if "pixels" not in set(env.observation_spec.keys()):
-        raise refuse(f"emits {sorted(map(str, env.observation_spec.keys()))}, but no 'pixels'")
-    spec = env.observation_spec["pixels"]
-    if spec.dtype != torch.uint8 and not spec.dtype.is_floating_point:
-        raise refuse(f"emits pixels of {spec.dtype}; they must be torch.uint8, or floats in [0, 1]")
-    shapes = ((3, image_size, image_size), (image_size, image_size, 3))
-    if tuple(spec.shape) not in shapes:
-        expected = " or ".join(map(str, shapes))
-        raise refuse(f"emits pixels of shape {tuple(spec.shape)}; expected one RGB image, {expected}")
+        return f"has batch size {tuple(env.batch_size)}; it must be unbatched"
+    shown = env.observation_spec
+    if "pixels" not in set(shown.keys()):
+        return f"emits {sorted(map(str, shown.keys()))}, but no 'pixels'"
+    pixels, shapes = shown["pixels"], ((3, image_size, image_size), (image_size, image_size, 3))
+    if pixels.dtype != torch.uint8 and not pixels.dtype.is_floating_point:
+        return f"emits pixels of {pixels.dtype}; they must be torch.uint8, or floats in [0, 1]"
+    if tuple(pixels.shape) not in shapes:
+        return (
+            f"emits pixels of shape {tuple(pixels.shape)}; expected one RGB image, {shapes[0]} or {shapes[1]}"
+        )
     action = env.action_spec
     low: Any = getattr(action.space, "low", None)
     high: Any = getattr(action.space, "high", None)
     if not action.dtype.is_floating_point or low is None or len(action.shape) != 1 or 0 in action.shape:
-        raise refuse(f"has the action {action}; it must be a bounded float vector")
+        return f"has the action {action}; it must be a bounded float vector"
     if not ((low == -1).all() and (high == 1).all()):
-        raise refuse("has action bounds other than [-1, 1]; let make scale the actions")
+        return "has action bounds other than [-1, 1]; let make scale the actions"
     if tuple(env.reward_spec.shape) != (1,):
-        raise refuse(f"has rewards of shape {tuple(env.reward_spec.shape)}; expected (1,)")
+        return f"has rewards of shape {tuple(env.reward_spec.shape)}; expected (1,)"
+    return ""

@@ -24,19 +24,9 @@ from crptpro.values import Quality
 class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
     """A Gymnasium world of which one step is one agent step: repeated, summed, scaled, and rendered once.
 
-    Gymnasium's own wrappers need OpenCV (``ResizeObservation``), render every repeated step
-    (``AddRenderObservation``), and none repeats an action.
-
-    Args:
-        env: made with ``render_mode="rgb_array"``.
-        world: name for messages.
-        image_size: H = W, pixels; images of another size are resized.
-        action_repeat: Gymnasium steps per step, on top of any frame skip of the environment.
-        physics_state: also observe ``qpos`` and ``qvel``, where it has them.
-        render: ``False`` leaves every image black.
-
-    Raises:
-        CRPTproError: for actions that are not a bounded vector of floats.
+    Gymnasium's own wrappers need OpenCV (``ResizeObservation``), render every repeated step (``AddRenderObservation``),
+    and none repeats an action. The settings are those of :func:`crptpro.envs.make_env`; ``world`` is the name for
+    messages.
     """
 
     def __init__(
@@ -49,8 +39,8 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
         action = env.action_space
         if not isinstance(action, spaces.Box):
             raise CRPTproError(
-                f"{world} has {type(action).__name__} actions. Only continuous actions are supported (a "
-                "Box); wrap it, and make it known with register_domain."
+                f"{world} has {type(action).__name__} actions. Only continuous actions (a Box) are supported; wrap it, "
+                "and make it known with register_domain."
             )
         self._to_actuators = ActionRange(action.low, action.high, action.dtype, world)
         if self._to_actuators.unbounded:
@@ -59,11 +49,12 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
                 "gymnasium.wrappers.RescaleAction or ClipAction, and make it known with register_domain."
             )
         self.action_space = spaces.Box(-1.0, 1.0, (int(np.prod(action.shape)),), np.float32)
-        self._data: Any = getattr(env.unwrapped, "data", None)
         shown = spaces.Box(0, 255, (3, image_size, image_size), np.uint8)
         observed: dict[str, spaces.Space[Any]] = {"pixels": shown}
-        self._emits_state = physics_state and hasattr(self._data, "qpos") and hasattr(self._data, "qvel")
-        for name in ("qpos", "qvel") if self._emits_state else ():
+        self._data: Any = getattr(env.unwrapped, "data", None)
+        has_state = hasattr(self._data, "qpos") and hasattr(self._data, "qvel")
+        self._state_names = ("qpos", "qvel") if physics_state and has_state else ()
+        for name in self._state_names:
             observed[name] = spaces.Box(-np.inf, np.inf, getattr(self._data, name).shape, np.float64)
         self.observation_space = spaces.Dict(observed)
 
@@ -96,10 +87,8 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
     def _observe(self) -> dict[str, Any]:
         size = self._image_size
         frame = self._draw() if self._renders else torch.zeros(3, size, size, dtype=torch.uint8)
-        observed = {"pixels": frame}
-        if self._emits_state:
-            observed |= {"qpos": torch.tensor(self._data.qpos), "qvel": torch.tensor(self._data.qvel)}
-        return observed
+        state = {name: torch.tensor(getattr(self._data, name)) for name in self._state_names}
+        return {"pixels": frame, **state}
 
     def _draw(self) -> Tensor:
         viewer = getattr(getattr(self.env.unwrapped, "mujoco_renderer", None), "viewer", None)
@@ -130,10 +119,6 @@ def make_gymnasium(
     """Build ``gymnasium:<id>``; the settings are those of :func:`crptpro.envs.make_env`.
 
     Gymnasium's MuJoCo environments render at twice ``image_size``, others at their own size; images are resized.
-
-    Raises:
-        CRPTproError: it cannot be made with RGB rendering, or has no such camera.
-        WorldFailedError: its own code fails.
     """
     env_id = task[len(GYMNASIUM_PREFIX) :]
     options: dict[str, Any] = {}

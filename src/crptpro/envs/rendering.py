@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import IO, Any
+from typing import Any
 
 from crptpro.errors import RenderingError
 
@@ -29,13 +29,11 @@ PROOF_VARIABLE = "CRPTPRO_GL_PROOF"
 #: Environment variable with the seconds a first frame may take, for slow disks and busy machines.
 TIMEOUT_VARIABLE = "CRPTPRO_GL_TIMEOUT_S"
 
-ALTERNATIVES = (
+HANG = (
+    "The usual cause is a GPU driver that hangs when several processes hold EGL contexts at once (NVIDIA "
+    "580.x does, google-deepmind/mujoco issue 3444), or one left behind by a killed run. "
     "Alternatives: MUJOCO_GL=osmesa (software, no GPU driver involved), MUJOCO_EGL_DEVICE_ID=<number> "
     f"(another GPU), fewer worker processes, or a longer {TIMEOUT_VARIABLE} on a machine that is merely slow."
-)
-HANG_CAUSE = (
-    "The usual cause is a GPU driver that hangs when several processes hold EGL contexts at once (NVIDIA "
-    "580.x does, google-deepmind/mujoco issue 3444), or one left behind by a killed run."
 )
 REMEDIES = {
     "egl": "Install EGL (Debian, Ubuntu: apt-get install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri), or "
@@ -53,8 +51,7 @@ _SYNONYMS = {
 #: Renders one small scene with the backend that MUJOCO_GL names and describes it as JSON. It imports MuJoCo alone, to
 #: stay below a second or two, and runs in a process of its own, because a broken GL driver may hang or crash.
 _PROBE = """
-import importlib, json, os, time
-start = time.perf_counter()
+import importlib, json, os
 import mujoco
 if not hasattr(mujoco, "Renderer"):  # MuJoCo hides why its backend cannot be imported
     importlib.import_module("mujoco." + os.environ["MUJOCO_GL"])
@@ -66,14 +63,12 @@ mujoco.mj_forward(model, data)
 renderer = mujoco.Renderer(model, 84, 84)
 renderer.update_scene(data, camera="c")
 first = renderer.render().copy()
-first_frame_s = time.perf_counter() - start
 again = renderer.render()
 from OpenGL import GL
 names = {"gl_vendor": GL.GL_VENDOR, "gl_renderer": GL.GL_RENDERER, "gl_version": GL.GL_VERSION}
 answer = {key: (GL.glGetString(name) or b"unknown").decode(errors="replace") for key, name in names.items()}
 soft = any(name in answer["gl_renderer"].lower() for name in ("llvmpipe", "softpipe", "swrast", "software"))
 answer["gl_kind"] = "software" if soft else "hardware"
-answer["first_frame_s"] = round(first_frame_s, 3)
 answer["alive"] = bool(first.max() > first.min() and (first == again).all())
 renderer.close()
 print(json.dumps(answer))
@@ -82,15 +77,7 @@ PROBE_COMMAND = (sys.executable, "-c", _PROBE)
 
 
 def canonical_backend(text: str) -> str:
-    """Return ``"egl"``, ``"osmesa"``, ``"glfw"`` or ``"off"`` for a value of ``MUJOCO_GL``.
-
-    Raises:
-        RenderingError: for any other value.
-
-    Examples:
-        >>> canonical_backend("EGL"), canonical_backend("disabled")
-        ('egl', 'off')
-    """
+    """Return ``"egl"``, ``"osmesa"``, ``"glfw"`` or ``"off"`` for a value of ``MUJOCO_GL``, or refuse it."""
     name = text.strip().lower()
     backend = _SYNONYMS.get(name, name)
     if backend not in (*BACKENDS, "off"):
@@ -105,17 +92,11 @@ def select_backend(timeout_s: float | None = None, *, processes: int = 1) -> str
     """Choose the GL backend, prove that it renders, set ``MUJOCO_GL``; call it before importing dm_control.
 
     A ``MUJOCO_GL`` that the user has set is never overridden, only proven. Otherwise EGL, OSMesa and (with a display)
-    GLFW are tried in this order. The proof is a frame with content, rendered in a process of its own within the time
-    limit. It holds for this process and its children, on this machine and for one ``MUJOCO_EGL_DEVICE_ID``. With
-    software GL, ``LP_NUM_THREADS=1`` is set unless the user has set it: more threads cost a third more CPU time per
-    frame and hardly gain any.
-
-    Args:
-        timeout_s: seconds each backend has for its first frame; by default 60, or ``CRPTPRO_GL_TIMEOUT_S``.
-        processes: prove that so many processes can render at the same time, as parallel collection needs.
-
-    Returns:
-        ``"egl"``, ``"osmesa"`` or ``"glfw"``.
+    GLFW are tried in this order. The proof is a frame with content, rendered in a process of its own (or in as many at
+    the same time, as parallel collection needs) within ``timeout_s``, by default 60 or ``CRPTPRO_GL_TIMEOUT_S``. It
+    holds for this process and its children, on this machine and for one ``MUJOCO_EGL_DEVICE_ID``. With software GL,
+    ``LP_NUM_THREADS=1`` is set unless the user has set it: more threads cost a third more CPU time per frame and hardly
+    gain any.
 
     Raises:
         RenderingError: naming, for every backend tried, what went wrong and what to do.
@@ -136,23 +117,21 @@ def select_backend(timeout_s: float | None = None, *, processes: int = 1) -> str
         candidates = candidates[candidates.index(proof["backend"]) :]  # those before it have failed already
     failures: list[str] = []
     for backend in candidates:
-        gl, failure = _try_backend(backend, timeout_s=timeout_s, processes=processes)
-        if not failure:
-            for failure in failures:
-                logger.warning("%s Rendering with %s instead.", failure, backend)
-            # A user's spelling ("EGL", "on") becomes the one that dm_control and Gymnasium both understand.
-            os.environ["MUJOCO_GL"] = backend
-            if gl.get("gl_kind") == "software":
-                os.environ.setdefault("LP_NUM_THREADS", "1")
-            facts = {
-                "backend": backend,
-                "processes": processes,
-                "chosen_by": "user" if requested else "crptpro",
-            }
-            os.environ[PROOF_VARIABLE] = json.dumps({**gl, **_place(), **facts})
-            logger.info("GL backend %s: %s", backend, gl.get("gl_renderer"))
-            return backend
-        failures.append(failure)
+        try:
+            gl = _prove(backend, timeout_s=timeout_s, processes=processes)
+        except RenderingError as reason:
+            failures.append(str(reason))
+            continue
+        for failure in failures:
+            logger.warning("%s Rendering with %s instead.", failure, backend)
+        # A user's spelling ("EGL", "on") becomes the one that dm_control and Gymnasium both understand.
+        os.environ["MUJOCO_GL"] = backend
+        if gl["gl_kind"] == "software":
+            os.environ.setdefault("LP_NUM_THREADS", "1")
+        gl |= {"backend": backend, "processes": processes, "chosen_by": "user" if requested else "crptpro"}
+        os.environ[PROOF_VARIABLE] = json.dumps(gl | _place())
+        logger.info("GL backend %s: %s", backend, gl["gl_renderer"])
+        return backend
     what = "No GL backend renders a frame."
     if requested:
         what = f"MUJOCO_GL={os.environ['MUJOCO_GL']} was set by you, is kept, and does not render a frame."
@@ -165,13 +144,7 @@ def select_backend(timeout_s: float | None = None, *, processes: int = 1) -> str
 
 
 def backend_card() -> dict[str, Any]:
-    """Return the backend, the GL vendor, renderer and version, and whether GL is software or hardware.
-
-    Raises:
-        RenderingError: if no backend has been proven yet and none can be.
-    """
-    if _proof() is None:
-        select_backend()
+    """Return the backend that was proven, the GL vendor, renderer and version, and whether GL is soft- or hardware."""
     proof = _proof() or {}
     keys = ("backend", "gl_vendor", "gl_renderer", "gl_version", "gl_kind")
     return {key: proof.get(key, "unknown") for key in keys}
@@ -185,9 +158,7 @@ def first_frame_watchdog(timeout_s: float | None = None) -> Iterator[None]:
     what starts workers should end those that log this.
     """
     timeout_s = default_timeout_s() if timeout_s is None else timeout_s
-    message = (
-        f"Process {os.getpid()} has waited {timeout_s:g} s for its first frame. {HANG_CAUSE} {ALTERNATIVES}"
-    )
+    message = f"Process {os.getpid()} has waited {timeout_s:g} s for its first frame. {HANG}"
     timer = threading.Timer(timeout_s, logger.error, args=(message,))
     timer.daemon = True
     timer.start()
@@ -203,10 +174,7 @@ def own_context(make_current: Callable[[], Any] | None) -> Iterator[None]:
 
     What frees a world frees its textures and buffers in whichever context is current, and then takes that away from the
     thread: the frames of another world would be black from there on. The garbage collector, which may free one at any
-    moment, waits until the body has ended.
-
-    Args:
-        make_current: makes the context current; ``None`` before there is one.
+    moment, waits until the body has ended. ``make_current`` is ``None`` before there is a context.
     """
     collects = gc.isenabled()
     gc.disable()
@@ -245,20 +213,16 @@ def run_isolated(
     """Run commands at the same time with ``MUJOCO_GL=backend``; kill what is not done in time.
 
     Output goes through files, not pipes, and nobody waits for long for a killed process: one that hangs in the kernel
-    cannot be reaped.
-
-    Returns:
-        For each command its exit status (``None``: killed), standard output and standard error.
+    cannot be reaped. Returns of each command its exit status (``None``: killed), standard output and standard error.
     """
     environment = {**os.environ, "MUJOCO_GL": backend}
     if "OpenGL" in sys.modules:  # then dm_control or mujoco has set it here, for the backend of this process
         environment.pop("PYOPENGL_PLATFORM", None)
     results: list[tuple[int | None, str, str]] = []
     with contextlib.ExitStack() as stack:
-        jobs: list[tuple[subprocess.Popen[bytes], IO[bytes], IO[bytes]]] = []
+        jobs = []
         for command in commands:
-            out: IO[bytes] = stack.enter_context(tempfile.TemporaryFile())
-            err: IO[bytes] = stack.enter_context(tempfile.TemporaryFile())
+            out, err = (stack.enter_context(tempfile.TemporaryFile()) for _ in range(2))
             process = subprocess.Popen(
                 command,
                 env=environment,
@@ -275,8 +239,8 @@ def run_isolated(
                 process.wait(max(0.0, deadline - time.monotonic()))
             for file in files:
                 file.seek(0)
-            output = [file.read().decode(errors="replace") for file in files]
-            results.append((process.returncode, output[0], output[1]))
+            output, errors = (file.read().decode(errors="replace") for file in files)
+            results.append((process.returncode, output, errors))
     return results
 
 
@@ -288,34 +252,32 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
             process.wait(2.0)
 
 
-def _try_backend(backend: str, *, timeout_s: float, processes: int) -> tuple[dict[str, Any], str]:
-    """Render in ``processes`` simultaneous processes; returns what the probe saw, and why it failed, if it did."""
+def _prove(backend: str, *, timeout_s: float, processes: int) -> dict[str, Any]:
+    """Render in ``processes`` simultaneous processes; return what the probe saw, or raise what is wrong."""
     gl: dict[str, Any] = {}
-    for returncode, stdout, stderr in run_isolated([PROBE_COMMAND] * processes, backend, timeout_s=timeout_s):
-        if returncode is None:
+    for status, stdout, stderr in run_isolated([PROBE_COMMAND] * processes, backend, timeout_s=timeout_s):
+        lines = [line.strip() for line in stderr.splitlines() if line.strip()]
+        if status is None:
             where = f" from each of {processes} simultaneous processes" if processes > 1 else ""
-            late = f"{backend}: the first frame did not arrive{where} within {timeout_s:g} s."
-            return gl, f"{late} {HANG_CAUSE} {ALTERNATIVES}"
-        reason, lines = "", [line.strip() for line in stderr.splitlines() if line.strip()]
-        if returncode < 0:
-            reason = f"the GL driver crashed the process ({signal.Signals(-returncode).name})."
-        elif returncode > 0:
-            reason = (
-                f"{lines[-1] if lines else f'the probe ended with exit status {returncode}'}".rstrip(".")
-                + "."
+            raise RenderingError(
+                f"{backend}: the first frame did not arrive{where} within {timeout_s:g} s. {HANG}"
             )
+        if status < 0:
+            reason = f"the GL driver crashed the process ({signal.Signals(-status).name})"
+        elif status > 0:
+            reason = lines[-1].rstrip(".") if lines else f"the probe ended with exit status {status}"
         else:
             try:
                 gl = json.loads(stdout.strip().splitlines()[-1])
             except (json.JSONDecodeError, IndexError):
-                reason = "the probe gave no answer."
+                reason = "the probe gave no answer"
             else:
-                if not gl["alive"]:
-                    reason = "the frame came back without content; the GL driver does not work."
-        if reason:
-            remedy = "Unset PYOPENGL_PLATFORM." if "PYOPENGL_PLATFORM" in reason else REMEDIES[backend]
-            return gl, f"{backend}: {reason} {remedy}"
-    return gl, ""
+                if gl["alive"]:
+                    continue
+                reason = "the frame came back without content; the GL driver does not work"
+        remedy = "Unset PYOPENGL_PLATFORM." if "PYOPENGL_PLATFORM" in reason else REMEDIES[backend]
+        raise RenderingError(f"{backend}: {reason}. {remedy}")
+    return gl
 
 
 def _platform_candidates() -> tuple[str, ...]:
@@ -328,9 +290,8 @@ def _platform_candidates() -> tuple[str, ...]:
 
 def _requested_backend() -> str | None:
     """Return the backend of a MUJOCO_GL that is not our own doing, here or where the environment comes from."""
-    text = os.environ.get("MUJOCO_GL")
-    proof = _carried_proof()
-    if text is None or (proof and proof.get("chosen_by") == "crptpro" and text == proof["backend"]):
+    text, proof = os.environ.get("MUJOCO_GL"), _carried_proof()
+    if text is None or (proof and proof["chosen_by"] == "crptpro" and text == proof["backend"]):
         return None
     backend = canonical_backend(text)
     if backend == "off":
@@ -347,18 +308,13 @@ def _imported_backend() -> str | None:
 
 def _carried_proof() -> dict[str, Any] | None:
     """Return the proof in the environment, wherever it was made."""
-    try:
-        proof = json.loads(os.environ.get(PROOF_VARIABLE) or "null")
-    except json.JSONDecodeError:
-        return None
-    return proof if isinstance(proof, dict) and "backend" in proof else None
+    return json.loads(os.environ.get(PROOF_VARIABLE) or "null")
 
 
 def _proof() -> dict[str, Any] | None:
     """Return the proof if it was made here: on this machine, for the same GPU."""
     proof = _carried_proof()
-    is_ours = proof is not None and all(proof.get(name) == value for name, value in _place().items())
-    return proof if is_ours else None
+    return proof if proof and proof.items() >= _place().items() else None
 
 
 def _place() -> dict[str, Any]:

@@ -81,10 +81,9 @@ class CheckedWorld:
         if self._agent_step == self.agent_step_limit:
             for flag in ("truncated", "done"):
                 found.set(flag, torch.ones_like(found.get(flag)))
-        if self._is_still:
-            self._is_still = torch.equal(found.get("pixels"), self._first_frame)  # type: ignore[arg-type]
-            if self._is_still and found.get("done").any():
-                self._report_still_frames()
+        self._is_still = self._is_still and torch.equal(found.get("pixels"), cast(Tensor, self._first_frame))
+        if self._is_still and found.get("done").any():
+            self._report_still_frames()
         return found
 
     def _require_finite(self, td: TensorDictBase, verb: str, *keys: str) -> None:
@@ -98,10 +97,10 @@ class CheckedWorld:
                 )
 
     def _report_still_frames(self) -> None:
-        if not self._is_still or self._has_warned or self._first_frame is None or self._agent_step < 2:
+        if not self._is_still or self._has_warned or self._agent_step < 2:
             return
         self._has_warned, self._is_still = True, False
-        shade = self._first_frame.unique()
+        shade = cast(Tensor, self._first_frame).unique()
         what = f" ({'black' if not shade.any() else 'of one shade'})" if shade.numel() == 1 else ""
         logger.warning(
             "All frames of a whole episode of the world %r are alike%s: %d agent steps, nothing moved. Look at what it "
@@ -130,10 +129,9 @@ def _close_what_is_open() -> None:
 
 @contextmanager
 def passed_on(world: str, call: str) -> Iterator[None]:
-    """Raise exceptions of a world's own code in the body again, with the world's name and the call.
+    """Raise exceptions of a world's own code in the body as ``WorldFailedError``, with the world's name and the call.
 
-    Raises:
-        WorldFailedError: from the world's exception; errors of this library are left alone.
+    Errors of this library are left alone.
     """
     try:
         yield
@@ -173,7 +171,8 @@ class FrameReader:
         dtype = str(image.dtype).removeprefix("torch.")
         if dtype not in ("uint8", "float16", "float32", "float64"):
             raise self._refusal(f"has dtype {dtype}", "uint8, or floats in [0, 1]")
-        pixels = torch.as_tensor(image if isinstance(image, Tensor) or _is_plain(image) else image.copy())
+        # torch cannot look at arrays that run backwards, or are read-only.
+        pixels = image if isinstance(image, Tensor) else torch.from_numpy(image.copy())
         if pixels.shape[2] == 3:
             pixels = pixels.permute(2, 0, 1)
         if dtype == "uint8":
@@ -192,47 +191,33 @@ class FrameReader:
         return WorldError(f"The image that the world {self.world!r} renders {what}; it must be {expected}.")
 
 
-def _is_plain(image: np.ndarray) -> bool:
-    """Whether torch can look at the array without a copy."""
-    return image.flags.writeable and all(stride >= 0 for stride in image.strides)
-
-
 class ActionRange:
     """The affine map from [-1, 1] to a world's own bounds; without bounds an action is passed on as it is.
 
-    Raises:
-        CRPTproError: for integer or empty actions, for bounds in the wrong order, or on one side only.
-
-    Examples:
-        >>> ActionRange(np.array([0.0, -1.0]), np.array([4.0, 1.0]))(np.array([0.5, -1.0]))
-        array([ 3., -1.])
+    Integer or empty actions, bounds in the wrong order, or on one side only, are refused by name.
     """
 
     def __init__(self, low: np.ndarray, high: np.ndarray, dtype: Any = np.float64, world: str = ""):
-        if not np.issubdtype(dtype, np.floating):
-            raise CRPTproError(
-                f"The world {world!r} has actions of {np.dtype(dtype)}; only continuous actions (floats) are "
-                "supported. Wrap it in one that takes floats and rounds as it should."
-            )
         low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
-        if not low.size:
-            raise CRPTproError(
-                f"The world {world!r} has an empty action, shape {low.shape}: nothing to learn."
-            )
         no_low, no_high = ~(np.abs(low) < NO_BOUND), ~(np.abs(high) < NO_BOUND)
-        if (no_low != no_high).any():
-            raise CRPTproError(
-                f"The world {world!r} bounds an action on one side only (low {low.tolist()}, high {high.tolist()}), so "
-                "[-1, 1] cannot be mapped to it."
-            )
         self.unbounded = bool(no_low.any())
-        self._low, high = np.where(no_low, -1.0, low), np.where(no_high, 1.0, high)
-        if not (self._low < high).all():
-            raise CRPTproError(
-                f"The world {world!r} has action bounds that hold nothing: low {low.tolist()}, high {high.tolist()}."
-            )
-        self._half = (high - self._low) / 2.0
+        self._low, high_ = np.where(no_low, -1.0, low), np.where(no_high, 1.0, high)
+        self._half = (high_ - self._low) / 2.0
         self._dtype = dtype
+        bounds = f"low {low.tolist()}, high {high.tolist()}"
+        wrong = ""
+        if not np.issubdtype(dtype, np.floating):
+            wrong = (
+                f"has actions of {np.dtype(dtype)}; wrap it in one that takes floats and rounds as it should"
+            )
+        elif not low.size:
+            wrong = f"has an empty action, shape {low.shape}: nothing to learn"
+        elif (no_low != no_high).any():
+            wrong = f"bounds an action on one side only ({bounds}), so [-1, 1] cannot be mapped to it"
+        elif not (self._half > 0).all():
+            wrong = f"has action bounds that hold nothing: {bounds}"
+        if wrong:
+            raise CRPTproError(f"The world {world!r} {wrong}.")
 
     def __call__(self, action: np.ndarray) -> np.ndarray:
         """Map ``action``, float ``[A]`` in [-1, 1]."""

@@ -1,6 +1,8 @@
 """Actors and critics: the "RAD-SAC" agent of CRPTpro and Proto-RL, DrQ's critic of images, BeCL's skill policy.
 
-Each raises ``ValueError`` for a size that is no positive whole number, and keeps its arguments in ``config``.
+Each is a trunk that brings ``feature_dim`` features down to ``bottleneck_dim``, and perceptrons of two hidden layers of
+``hidden_dim``. Each raises ``ValueError`` for a size that is no positive whole number, and keeps its arguments in
+``config``.
 """
 
 from __future__ import annotations
@@ -13,14 +15,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from crptpro.modules.encoder import PixelEncoder
-from crptpro.modules.heads import OrthogonalNetwork, plain_sizes
+from crptpro.modules.heads import LinearNetwork, plain_sizes
 from crptpro.modules.precision import linear_in
 from crptpro.values import as_float
 
 BOUND_MARGIN = 1e-6
 
 
-class FeatureTrunk(OrthogonalNetwork):
+class FeatureTrunk(LinearNetwork):
     """Linear layer and LayerNorm that bring long features down to a bottleneck; DrQ and URLB's DDPG end with a tanh."""
 
     def __init__(self, feature_dim: int, bottleneck_dim: int, *, has_tanh: bool) -> None:
@@ -28,7 +30,7 @@ class FeatureTrunk(OrthogonalNetwork):
         self.has_tanh = has_tanh
         self.linear = nn.Linear(feature_dim, bottleneck_dim)
         self.norm = nn.LayerNorm(bottleneck_dim)
-        self.compute_dtype: torch.dtype = torch.float32
+        self.compute_dtype = torch.float32
 
     def forward(self, features: Tensor) -> Tensor:
         """Map ``[*, feature_dim]``, any floating dtype, to ``[*, bottleneck_dim]`` in the weights' dtype."""
@@ -36,7 +38,7 @@ class FeatureTrunk(OrthogonalNetwork):
         return torch.tanh(bottleneck) if self.has_tanh else bottleneck
 
 
-class MLP(OrthogonalNetwork):
+class MLP(LinearNetwork):
     """Three linear layers with ReLU between them; only the wide middle product runs in ``compute_dtype``."""
 
     def __init__(self, in_dim: int, hidden_dim: int, out_dim: int) -> None:
@@ -44,7 +46,7 @@ class MLP(OrthogonalNetwork):
         self.first = nn.Linear(in_dim, hidden_dim)
         self.middle = nn.Linear(hidden_dim, hidden_dim)
         self.last = nn.Linear(hidden_dim, out_dim)
-        self.compute_dtype: torch.dtype = torch.float32
+        self.compute_dtype = torch.float32
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Map ``[*, in_dim]`` to ``[*, out_dim]``."""
@@ -52,19 +54,11 @@ class MLP(OrthogonalNetwork):
         return self.last(F.relu(linear_in(hidden, self.middle, self.compute_dtype)))
 
 
-class SquashedGaussianActor(OrthogonalNetwork):
+class SquashedGaussianActor(LinearNetwork):
     r"""Stochastic policy :math:`a = \tanh(u),\ u \sim \mathcal N(\mu, \sigma)` on features.
 
-    The raw log standard deviation is squashed: ``log_std = lo + (hi - lo) / 2 * (tanh(raw) + 1)``.
-    Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
-
-    Args:
-        feature_dim: length of the features.
-        action_dim: A.
-        bottleneck_dim: width after the trunk.
-        hidden_dim: width of the two hidden layers.
-        log_std_bounds: range of the log standard deviation, ascending.
-        has_tanh: end the trunk with a tanh, as DrQ does.
+    The raw log standard deviation is squashed: ``log_std = lo + (hi - lo) / 2 * (tanh(raw) + 1)``, with (lo, hi)
+    ``log_std_bounds``. DrQ's trunk ``has_tanh``. Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
     """
 
     def __init__(
@@ -103,15 +97,9 @@ class SquashedGaussianActor(OrthogonalNetwork):
     def sample(
         self, features: Tensor, *, noise: Tensor | None = None, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Draw reparameterised actions.
+        """Draw reparameterised actions ``[*, A]`` in [-1, 1], and their ``log_prob`` ``[*]`` (nats, summed over A).
 
-        Args:
-            features: ``[*, feature_dim]``.
-            noise: standard normal ``[*, A]``; drawn if None.
-            generator: source of the noise; torch's global generator if None.
-
-        Returns:
-            ``action`` ``[*, A]`` in [-1, 1] and ``log_prob`` ``[*]`` (nats, summed over A).
+        Of standard normal ``noise`` ``[*, A]``; drawn from ``generator``, or torch's global one, if None.
         """
         loc, scale = self(features)
         return squashed_gaussian(loc, scale, standard_normal_like(loc, generator) if noise is None else noise)
@@ -121,17 +109,10 @@ class SquashedGaussianActor(OrthogonalNetwork):
         return torch.tanh(self(features)[0])
 
 
-class TwinCritic(OrthogonalNetwork):
+class TwinCritic(LinearNetwork):
     """Two Q-functions that share ONE trunk, as in the released code; a target network is a copy of all of it.
 
-    Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
-
-    Args:
-        feature_dim: length of the features.
-        action_dim: A.
-        bottleneck_dim: width after the trunk.
-        hidden_dim: width of the two hidden layers of each head.
-        has_tanh: end the trunk with a tanh, as DrQ and URLB's DDPG do.
+    DrQ and URLB's DDPG have trunks with ``has_tanh``. Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
     """
 
     def __init__(
@@ -165,11 +146,7 @@ class TwinCritic(OrthogonalNetwork):
 
 
 class PixelCritic(nn.Module):
-    """Twin Q-functions of pixels; a target network is a copy of all of it, convolutions included.
-
-    Raises:
-        ValueError: the head was built for features of another length.
-    """
+    """Twin Q-functions of pixels; a target network is a copy of all of it, convolutions included."""
 
     def __init__(self, encoder: PixelEncoder, head: TwinCritic) -> None:
         super().__init__()
@@ -186,19 +163,11 @@ class PixelCritic(nn.Module):
         return self.head(self.encoder(pixels), action)
 
 
-class DeterministicActor(OrthogonalNetwork):
+class DeterministicActor(LinearNetwork):
     r"""Policy :math:`a = \tanh(f([h, z]))` on features h and a one-hot skill z, plus Gaussian noise.
 
-    Trunk (linear, LayerNorm, tanh) and two hidden layers. Source: rll-research/url_benchmark ``agent/ddpg.py``;
-    BeCL's exploring agent.
-
-    Args:
-        feature_dim: length of the features.
-        action_dim: A.
-        skill_dim: K, number of skills.
-        bottleneck_dim: width after the trunk.
-        hidden_dim: width of the two hidden layers.
-        noise_std: standard deviation of the noise, not negative.
+    The trunk ends with a tanh; ``skill_dim`` is the number of skills K, ``noise_std`` the noise's standard deviation.
+    BeCL's exploring agent; source: rll-research/url_benchmark ``agent/ddpg.py``.
     """
 
     def __init__(
@@ -231,26 +200,14 @@ class DeterministicActor(OrthogonalNetwork):
         return torch.tanh(self.mlp(self.trunk(inputs)))
 
     def sample(
-        self,
-        inputs: Tensor,
-        *,
-        noise_clip: float | None = None,
-        noise: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        self, inputs: Tensor, *, noise_clip: float | None = None, generator: torch.Generator | None = None
     ) -> Tensor:
-        """Return a noisy action; the gradient passes as if nothing were clamped.
+        """Return a noisy action, ``[*, A]`` in [-1 + 1e-6, 1 - 1e-6]; the gradient passes as if nothing were clamped.
 
-        Args:
-            inputs: features and skill, ``[*, feature_dim + K]``.
-            noise_clip: largest absolute noise; not limited if None.
-            noise: standard normal ``[*, A]``; drawn if None.
-            generator: source of the noise; torch's global generator if None.
-
-        Returns:
-            ``[*, A]`` in [-1 + 1e-6, 1 - 1e-6].
+        The noise is drawn from ``generator`` (torch's global one if None), and at most ``noise_clip`` in size.
         """
         mean = self(inputs)
-        noise = self.noise_std * (standard_normal_like(mean, generator) if noise is None else noise)
+        noise = self.noise_std * standard_normal_like(mean, generator)
         if noise_clip is not None:
             noise = noise.clamp(-noise_clip, noise_clip)
         action = mean + noise
@@ -262,8 +219,7 @@ def squashed_gaussian(loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor
     r"""Reparameterised tanh-Gaussian sample ``[*, A]`` and its log-density ``[*]``, of mean, deviation and noise.
 
     :math:`\log\pi(a) = \sum_A \log\mathcal N(u;\mu,\sigma) - 2(\log 2 - u - \mathrm{softplus}(-2u))` with
-    :math:`u = \mu + \sigma\epsilon`, evaluated before the tanh: finite and with the right gradient even where tanh
-    rounds to 1.
+    :math:`u = \mu + \sigma\epsilon`, before the tanh: finite, with the right gradient, where tanh rounds to 1.
     """
     pre_tanh = loc + scale * noise
     log_normal = -0.5 * noise.square() - scale.log() - 0.5 * math.log(2 * math.pi)

@@ -30,9 +30,8 @@ def apply_to_chunks(
 ) -> Tensor:
     """Return ``torch.cat([function(chunk, parameters) for chunk in chunks])``, computed side by side.
 
-    PyTorch's way is that all cores share every operation and wait for each other at its end; here they meet once per
-    batch. The gradient of every parameter is the sum over the chunks in their order, whatever the number of threads.
-    There is no second derivative, and none for the chunks.
+    In PyTorch all cores share every operation and wait for each other at its end; here they meet once per batch. The
+    gradient of a parameter is the sum over the chunks in their order, whatever the number of threads. Chunks have none.
     """
     if torch.is_grad_enabled() and any(parameter.requires_grad for parameter in parameters):
         return _Chunks.apply(function, chunks, *parameters)

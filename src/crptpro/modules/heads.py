@@ -23,14 +23,8 @@ NORM_EPS = 1e-12
 def init_weights_(layer: nn.Linear | nn.Conv2d, init: WeightInit = "orthogonal", gain: float = 1.0) -> None:
     """Initialise a layer in place, with zero bias.
 
-    Args:
-        layer: linear or convolutional.
-        init: ``"orthogonal"`` on the flattened kernel, or ``"kaiming"``: normal with variance 2 / fan-in (rlpyt, the
-            framework of ATC).
-        gain: of the orthogonal matrix.
-
-    Raises:
-        ValueError: unknown ``init``.
+    ``"orthogonal"`` is on the flattened kernel, times ``gain``; ``"kaiming"`` is normal with variance 2 / fan-in
+    (rlpyt, the framework of ATC).
     """
     if init not in get_args(WeightInit):
         raise ValueError(f"init must be one of {', '.join(get_args(WeightInit))}, got {init!r}.")
@@ -42,37 +36,30 @@ def init_weights_(layer: nn.Linear | nn.Conv2d, init: WeightInit = "orthogonal",
         nn.init.zeros_(layer.bias)
 
 
-class OrthogonalNetwork(nn.Module):
-    """A network of linear layers with orthogonal weights (gain 1) and zero biases; LayerNorms start as the identity."""
+class LinearNetwork(nn.Module):
+    """Linear layers, drawn as ``init`` says (gain 1) with zero biases; LayerNorms start as the identity."""
+
+    init: WeightInit = "orthogonal"
 
     def reset_parameters(self) -> None:
         """Draw all weights anew."""
         for layer in self.modules():
             if isinstance(layer, nn.Linear):
-                init_weights_(layer)
+                init_weights_(layer, self.init)
             elif isinstance(layer, nn.LayerNorm):
                 layer.reset_parameters()
 
 
 def plain_sizes(**sizes: Any) -> dict[str, int]:
-    """Return sizes from users as plain positive integers, for a card to hold.
-
-    Raises:
-        ValueError: naming the first that is none.
-    """
+    """Return sizes from users as plain positive integers, for a card to hold; anything else is refused by name."""
     return {name: as_int(value, name, minimum=1) for name, value in sizes.items()}
 
 
-class Projector(nn.Module):
-    r"""One linear layer from features to the latent space: :math:`g_\theta`.
+class Projector(LinearNetwork):
+    r"""One linear layer from features to latents of length D, :math:`g_\theta` (denisyarats/proto ``proto.py``).
 
     The product runs in ``compute_dtype``; the result has the parameters' dtype, so normalisation, softmax and Sinkhorn
-    stay float32. Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
-
-    Args:
-        feature_dim: input length (39,200 for the default encoder).
-        latent_dim: output length D.
-        init: ``"orthogonal"``, or ``"kaiming"`` (normal, fan-in, for ReLU), as ATC draws its own.
+    stay float32. ``init="kaiming"`` (normal, fan-in, for ReLU) is how ATC draws its own.
     """
 
     def __init__(
@@ -82,32 +69,24 @@ class Projector(nn.Module):
         sizes = plain_sizes(feature_dim=feature_dim, latent_dim=latent_dim)
         self.config: dict[str, Any] = {**sizes, "init": init}
         self.linear = nn.Linear(sizes["feature_dim"], sizes["latent_dim"])
-        self.init: WeightInit = init
-        self.compute_dtype: torch.dtype = torch.float32
+        self.init = init
+        self.compute_dtype = torch.float32
         self.reset_parameters()
 
-    def reset_parameters(self) -> None:
-        """Draw the weights and zero the bias."""
-        init_weights_(self.linear, self.init)
-
     def forward(self, features: Tensor) -> Tensor:
-        """Project ``[*, feature_dim]`` (any floating dtype) to ``[*, latent_dim]``, not normalised."""
+        """Project ``[*, feature_dim]`` (any floating dtype) to ``[*, D]``, not normalised."""
         return linear_in(features, self.linear, self.compute_dtype)
 
 
-class Predictor(OrthogonalNetwork):
-    r"""Two-layer perceptron in the latent space, online branch only: :math:`v_\psi`.
+class Predictor(LinearNetwork):
+    r"""Perceptron in the latent space, online branch only: :math:`v_\psi` (denisyarats/proto ``proto.py``).
 
-    Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
-
-    Args:
-        latent_dim: input and output length D.
-        hidden_dim: hidden width. 1024 as in the paper's table; the released code has 512.
+    ``hidden_dim`` is 1024 as in the paper's table; the released code has 512.
     """
 
     def __init__(self, latent_dim: int = 128, hidden_dim: int = 1024) -> None:
         super().__init__()
-        self.config: dict[str, Any] = plain_sizes(latent_dim=latent_dim, hidden_dim=hidden_dim)
+        self.config = plain_sizes(latent_dim=latent_dim, hidden_dim=hidden_dim)
         latent_dim, hidden_dim = self.config.values()
         self.hidden = nn.Linear(latent_dim, hidden_dim)
         self.output = nn.Linear(hidden_dim, latent_dim)
@@ -119,20 +98,16 @@ class Predictor(OrthogonalNetwork):
 
 
 class Prototypes(nn.Module):
-    """M trainable vectors; what matters of each is its direction.
+    """M trainable vectors of length D; what matters of each is its direction.
 
     Orthogonal initialisation (a tight frame when M > D). Training keeps the rows at unit length by calling
     :meth:`normalize_` before every update, as the released code does; every read goes through :meth:`unit_weight`.
     Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``; the idea is SwaV's (arXiv 2006.09882).
-
-    Args:
-        num_prototypes: M.
-        latent_dim: D.
     """
 
     def __init__(self, num_prototypes: int = 512, latent_dim: int = 128) -> None:
         super().__init__()
-        self.config: dict[str, Any] = plain_sizes(num_prototypes=num_prototypes, latent_dim=latent_dim)
+        self.config = plain_sizes(num_prototypes=num_prototypes, latent_dim=latent_dim)
         self.weight = nn.Parameter(torch.empty(*self.config.values()))
         self.reset_parameters()
 
@@ -166,15 +141,11 @@ class AnchorHead(nn.Module):
 
     The logits are the inner products of the result with the positives' latents. PyTorch's default initialisation, as
     in the source: astooke/rlpyt ``rlpyt/ul/models/ul/atc_models.py`` (ATC, arXiv 2009.08319).
-
-    Args:
-        latent_dim: length D of the latents.
-        hidden_dim: hidden width of the perceptron.
     """
 
     def __init__(self, latent_dim: int = 128, hidden_dim: int = 512) -> None:
         super().__init__()
-        self.config: dict[str, Any] = plain_sizes(latent_dim=latent_dim, hidden_dim=hidden_dim)
+        self.config = plain_sizes(latent_dim=latent_dim, hidden_dim=hidden_dim)
         latent_dim, hidden_dim = self.config.values()
         self.hidden = nn.Linear(latent_dim, hidden_dim)
         self.output = nn.Linear(hidden_dim, latent_dim)
@@ -185,31 +156,24 @@ class AnchorHead(nn.Module):
         return self.bilinear(anchors + self.output(F.relu(self.hidden(anchors))))
 
 
-class SkillHead(OrthogonalNetwork):
-    """BeCL's head: embedding of the features, then projection, in one module.
+class SkillHead(LinearNetwork):
+    """BeCL's head: embedding of the features, then projection (Rooshy-yang/BeCL ``agent/becl.py``, arXiv 2305.04477).
 
     features -> hidden ReLU -> hidden ReLU -> D (embedding) -> hidden ReLU -> D (projection). The product with the
-    features runs in ``compute_dtype``; everything after it, and the result, has the parameters' dtype. Source:
-    Rooshy-yang/BeCL ``agent/becl.py`` (arXiv 2305.04477).
-
-    Args:
-        feature_dim: input length (39,200 for the default encoder).
-        latent_dim: length D of the embedding and of the result; the number of skills in the source.
-        hidden_dim: hidden width of both parts.
+    features runs in ``compute_dtype``; everything after it, and the result, has the parameters' dtype. D is the number
+    of skills in the source.
     """
 
     def __init__(self, feature_dim: int = 39_200, latent_dim: int = 16, hidden_dim: int = 1024) -> None:
         super().__init__()
-        self.config: dict[str, Any] = plain_sizes(
-            feature_dim=feature_dim, latent_dim=latent_dim, hidden_dim=hidden_dim
-        )
+        self.config = plain_sizes(feature_dim=feature_dim, latent_dim=latent_dim, hidden_dim=hidden_dim)
         feature_dim, latent_dim, hidden_dim = self.config.values()
         self.embed_input = nn.Linear(feature_dim, hidden_dim)
         self.embed_hidden = nn.Linear(hidden_dim, hidden_dim)
         self.embed_output = nn.Linear(hidden_dim, latent_dim)
         self.project_hidden = nn.Linear(latent_dim, hidden_dim)
         self.project_output = nn.Linear(hidden_dim, latent_dim)
-        self.compute_dtype: torch.dtype = torch.float32
+        self.compute_dtype = torch.float32
         self.reset_parameters()
 
     def forward(self, features: Tensor) -> Tensor:
@@ -226,11 +190,7 @@ def latent_dim_of(head: nn.Module) -> int | None:
 
 
 def require_one_latent_dim(**heads: nn.Module) -> None:
-    """Refuse heads that could not be multiplied; those that do not tell their length are left to the product.
-
-    Raises:
-        ValueError: naming each head's length.
-    """
+    """Refuse heads that could not be multiplied; those that do not tell their length are left to the product."""
     dims = {name: dim for name, head in heads.items() if (dim := latent_dim_of(head)) is not None}
     if len(set(dims.values())) > 1:
         told = ", ".join(f"{name} {dim}" for name, dim in dims.items())

@@ -16,29 +16,18 @@ from crptpro.errors import CRPTproError
 
 Precision = Literal["auto", "fp32", "bf16"]
 
+#: Where Linux tells the processor's vendor and instructions.
 CPUINFO = Path("/proc/cpuinfo")
-"""Where Linux tells the processor's vendor and instructions."""
 
 _Module = TypeVar("_Module", bound=nn.Module)
 
 
 def resolve_precision(precision: Precision, device: torch.device | str) -> torch.dtype:
-    """Turn a precision name into the compute dtype for a device.
+    """Turn a precision name into the compute dtype for a device; an unknown name is a ``ValueError``.
 
-    Where float32 is what comes out for a CUDA device, this switches TF32 off for the whole process, so that fp32
-    means the same on every device.
-
-    Args:
-        precision: ``"fp32"`` (the reference), ``"bf16"``, or ``"auto"``: bf16 where the hardware is faster in it (CUDA
-            compute capability 8 or newer; a CPU with AMX or AVX512-BF16), otherwise fp32.
-        device: the device that will compute.
-
-    Raises:
-        ValueError: unknown precision name.
-
-    Examples:
-        >>> resolve_precision("fp32", "cpu")
-        torch.float32
+    ``"fp32"`` is the reference. ``"auto"`` is bf16 where the hardware is faster in it: CUDA of compute capability 8 or
+    newer, a CPU with AMX or AVX512-BF16. Where float32 comes out for a CUDA device, TF32 is switched off for the whole
+    process, so that fp32 means the same on every device.
     """
     if precision not in ("auto", "fp32", "bf16"):
         raise ValueError(f"precision must be 'auto', 'fp32' or 'bf16', got {precision!r}.")
@@ -52,21 +41,26 @@ def resolve_precision(precision: Precision, device: torch.device | str) -> torch
     return torch.float32
 
 
+def _is_faster_in_bf16(device: torch.device) -> bool:
+    if device.type == "cuda":
+        return torch.cuda.get_device_capability(device)[0] >= 8
+    if device.type != "cpu" or not CPUINFO.exists():
+        return False
+    text = CPUINFO.read_text(errors="replace")
+    # Intel's cores with AVX512-FP16 leave bf16 to AMX. Where a virtual machine hides it, AVX512-BF16 multiplied
+    # matrices at 81 GFLOP/s and float32 at 154 (a core of 2023); AMD's cores are twice as fast in bf16.
+    hides_amx = "GenuineIntel" in text and "avx512_fp16" in text
+    return "amx_bf16" in text or ("avx512_bf16" in text and not hides_amx)
+
+
 def set_compute_dtype(module: _Module, dtype: torch.dtype) -> _Module:
-    """Set ``compute_dtype`` on every network inside ``module`` that has one; parameters keep their dtype.
+    """Set ``compute_dtype`` on every network inside ``module``, a network or a loss; parameters keep their dtype.
 
-    Networks that a TorchRL ``LossModule`` keeps outside its registered children are reached too.
-
-    Args:
-        module: a network, or a loss that owns networks.
-        dtype: ``torch.bfloat16``, or ``torch.float32`` for "the dtype of the parameters".
-
-    Raises:
-        ValueError: any other dtype.
+    ``dtype`` is ``torch.bfloat16``, or ``torch.float32`` for that of the parameters; others are a ``ValueError``.
     """
     if dtype not in (torch.float32, torch.bfloat16):
         raise ValueError(f"compute dtype must be torch.float32 or torch.bfloat16, got {dtype}.")
-    for network in networks_within(module):
+    for network in _networks_within(module):
         if hasattr(network, "compute_dtype"):
             cast(Any, network).compute_dtype = dtype
     return module
@@ -82,23 +76,8 @@ def computing(module: nn.Module, dtype: torch.dtype) -> Iterator[None]:
         set_compute_dtype(module, torch.float32)
 
 
-def linear_in(inputs: Tensor, layer: nn.Linear, compute_dtype: torch.dtype) -> Tensor:
-    """Apply a linear layer whose product runs in ``compute_dtype`` and whose result has the weight's dtype.
-
-    In bfloat16 the factors and the product are rounded; the bias is added in the weight's dtype.
-    """
-    weight, bias = layer.weight, layer.bias
-    if compute_dtype == torch.float32:
-        return F.linear(inputs.to(weight.dtype), weight, bias)
-    product = F.linear(inputs.to(compute_dtype), weight.to(compute_dtype)).to(weight.dtype)
-    return product if bias is None else product + bias
-
-
-def networks_within(module: nn.Module) -> Iterator[nn.Module]:
-    """Yield a network and everything inside it, each once.
-
-    ``LossModule.convert_to_functional`` hides networks in the instance dictionary, where ``modules()`` does not look.
-    """
+def _networks_within(module: nn.Module) -> Iterator[nn.Module]:
+    # LossModule.convert_to_functional hides networks in the instance dictionary, where modules() does not look.
     seen: set[int] = set()
     waiting = [module]
     while waiting:
@@ -109,6 +88,15 @@ def networks_within(module: nn.Module) -> Iterator[nn.Module]:
                 waiting += [value for value in list(vars(child).values()) if isinstance(value, nn.Module)]
 
 
+def linear_in(inputs: Tensor, layer: nn.Linear, compute_dtype: torch.dtype) -> Tensor:
+    """Apply a linear layer whose product runs in ``compute_dtype``; its result and bias have the weight's dtype."""
+    weight, bias = layer.weight, layer.bias
+    if compute_dtype == torch.float32:
+        return F.linear(inputs.to(weight.dtype), weight, bias)
+    product = F.linear(inputs.to(compute_dtype), weight.to(compute_dtype)).to(weight.dtype)
+    return product if bias is None else product + bias
+
+
 def device_of(module: nn.Module) -> torch.device | None:
     """Return the device of a network's first parameter or buffer; None if it has neither."""
     first = next(chain(module.parameters(), module.buffers()), None)
@@ -116,11 +104,7 @@ def device_of(module: nn.Module) -> torch.device | None:
 
 
 def usable_device(name: str | torch.device) -> torch.device:
-    """Return a device, once a tensor could be put there.
-
-    Raises:
-        CRPTproError: with torch's reason, if this machine or this build of torch has no such device.
-    """
+    """Return a device once a tensor could be put there, or raise a :class:`CRPTproError` with torch's reason."""
     try:
         device = torch.device(name)
         torch.empty(1, device=device)
@@ -129,15 +113,3 @@ def usable_device(name: str | torch.device) -> torch.device:
             f"Device {str(name)!r} cannot be used ({str(reason).splitlines()[0]}); 'cpu' always works."
         ) from None
     return device
-
-
-def _is_faster_in_bf16(device: torch.device) -> bool:
-    if device.type == "cuda":
-        return torch.cuda.get_device_capability(device)[0] >= 8
-    if device.type != "cpu" or not CPUINFO.exists():
-        return False
-    text = CPUINFO.read_text(errors="replace")
-    # Intel's cores with AVX512-FP16 leave bf16 to AMX. Where a virtual machine hides it, AVX512-BF16 multiplied
-    # matrices at 81 GFLOP/s and float32 at 154 (a core of 2023); AMD's cores are twice as fast in bf16.
-    hides_amx = "GenuineIntel" in text and "avx512_fp16" in text
-    return "amx_bf16" in text or ("avx512_bf16" in text and not hides_amx)

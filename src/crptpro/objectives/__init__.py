@@ -1,8 +1,7 @@
 """Objectives: pure functions in ``functional``, one LossModule per method, and the table of methods."""
 
-from crptpro.objectives.atc import ATCLoss
 from crptpro.objectives.base import PretrainingLoss
-from crptpro.objectives.becl import BeCLLoss
+from crptpro.objectives.contrastive import ATCLoss, BeCLLoss, SimCLRLoss
 from crptpro.objectives.methods import (
     Exploration,
     Method,
@@ -13,7 +12,6 @@ from crptpro.objectives.methods import (
 )
 from crptpro.objectives.proto import ProtoLoss
 from crptpro.objectives.sac import AveragedSACLoss, DrQLoss, RADSACLoss
-from crptpro.objectives.simclr import SimCLRLoss
 from crptpro.objectives.skill_ddpg import SkillDDPGLoss
 
 __all__ = [

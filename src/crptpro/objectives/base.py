@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -16,30 +18,33 @@ from crptpro.values import as_float
 class NetworkLoss(LossModule):
     """A loss whose networks hold its own parameters, also in a copy, and are re-initialised together with its targets.
 
-    A subclass converts its networks with ``convert_to_functional`` and lists their names in ``network_names``, and what
-    ``forward`` returns in ``default_out_keys``.
+    A subclass converts its networks with ``convert_to_functional`` and lists what ``forward`` returns.
     """
 
-    network_names: ClassVar[tuple[str, ...]] = ()
-    default_out_keys: ClassVar[tuple[str, ...]] = ()
+    default_out_keys: tuple[str, ...] = ()
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self.out_keys = list(self.default_out_keys)
+        self.out_keys = list(self.default_out_keys)  # of the instance, where select_out_keys can change them
         self._set_in_keys()
+
+    @property
+    def network_names(self) -> list[str]:
+        """The networks, in the order in which they were converted."""
+        names = [name for name, _ in self.named_children() if name.endswith("_params")]
+        return [name.removesuffix("_params") for name in names if not name.startswith("target_")]
 
     @torch.no_grad()
     def reset_parameters_recursive(self) -> None:
-        """Re-initialise every network, in the order of ``network_names``, and copy the new parameters into the targets.
+        """Re-initialise every network in turn, and copy the new parameters into its target.
 
         TorchRL's version re-draws the targets independently and cannot reach plain modules.
         """
         for name in self.network_names:
-            network, params = getattr(self, name), getattr(self, f"{name}_params")
-            with params.to_module(network, preserve_module_state=False):
-                _reset(network)
+            with self._holding(name):
+                _reset(getattr(self, name))
             if (target := self._modules.get(f"target_{name}_params")) is not None:
-                target.data.update_(params.data)
+                target.data.update_(getattr(self, f"{name}_params").data)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore from a pickle or a deep copy, tying the networks to the copied parameters again."""
@@ -47,6 +52,11 @@ class NetworkLoss(LossModule):
         self._erase_cache()  # of detached views of the original's parameters
         for name in self.network_names:
             getattr(self, f"{name}_params").to_module(getattr(self, name), preserve_module_state=False)
+
+    def _holding(self, name: str, *, target: bool = False) -> AbstractContextManager[Any]:
+        """Have a network hold its parameters, or its target's, while a block runs."""
+        params = getattr(self, f"target_{name}_params" if target else f"{name}_params")
+        return params.to_module(getattr(self, name), preserve_module_state=False)
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         super()._forward_value_estimator_keys(**kwargs)
@@ -65,18 +75,11 @@ class PretrainingLoss(NetworkLoss):
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that ``set_keys`` can change.
+        observation: NestedKey = "pixels"  # images at time t
+        next_observation: NestedKey = ("next", "pixels")  # images at time t + 1
 
-        Attributes:
-            observation: images at time t.
-            next_observation: images at time t + 1.
-        """
-
-        observation: NestedKey = "pixels"
-        next_observation: NestedKey = ("next", "pixels")
-
-    default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
+    default_keys: Any = _AcceptedKeys
+    tensor_keys: Any
 
     encoder: nn.Module
     encoder_params: Any
@@ -96,6 +99,10 @@ class PretrainingLoss(NetworkLoss):
         """
         return {}
 
+    def _convert(self, targets: Sequence[str] = (), **networks: nn.Module) -> None:
+        for name, network in networks.items():
+            self.convert_to_functional(network, name, create_target_params=name in targets)
+
     def _register_coefficients(self, **values: float | None) -> None:
         # float64 scalars do not promote float32 tensors, and 0.1 stays 0.1.
         for name, value in values.items():
@@ -103,10 +110,8 @@ class PretrainingLoss(NetworkLoss):
             self.register_coeff_buffer(name, number, dtype=torch.float64)
 
     def _apply_network(self, name: str, inputs: Tensor, *, target: bool = False) -> Tensor:
-        network = getattr(self, name)
-        params = getattr(self, f"target_{name}_params" if target else f"{name}_params")
-        with params.to_module(network, preserve_module_state=False):
-            return network(inputs)
+        with self._holding(name, target=target):
+            return getattr(self, name)(inputs)
 
     def _latents(self, pixels: Tensor) -> Tensor:
         return self._apply_network("projector", self._apply_network("encoder", pixels))
@@ -125,11 +130,7 @@ class PretrainingLoss(NetworkLoss):
 
 
 def require_positive(**values: float) -> None:
-    """Refuse coefficients that would only show as NaN thousands of updates later.
-
-    Raises:
-        ValueError: naming the first that is not a positive number.
-    """
+    """Refuse coefficients that would only show as NaN thousands of updates later, naming the first."""
     for name, value in values.items():
         if not as_float(value, name) > 0:
             raise ValueError(f"`{name}` must be positive, got {value}.")

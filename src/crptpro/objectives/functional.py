@@ -18,21 +18,14 @@ DispersionReduction = Literal["mean_all", "sum", "mean_offdiag"]
 
 @torch.no_grad()
 def sinkhorn_knopp(scores: Tensor, *, temperature: float | Tensor = 0.1, iterations: int = 3) -> Tensor:
-    r"""Soft assignments with evenly loaded prototypes (CRPTpro Eq. 4-6; SwaV, arXiv 2006.09882).
+    r"""Soft assignments with evenly loaded prototypes (CRPTpro Eq. 4-6; SwaV, arXiv 2006.09882), ``[B, M]``.
 
-    Starts from :math:`\exp(s/\tau)`, alternately scales the prototype marginal to 1/M and the sample marginal
-    to 1/B, and ends with each sample's assignments summing to 1. No gradient. Computed in the log domain, in
-    float32 or wider: equal to the released code's exponentiated form wherever that is finite.
+    Starts from :math:`\exp(s/\tau)` of cosine similarities ``[B, M]``, alternately scales the prototype marginal to 1/M
+    and the sample marginal to 1/B (0 ``iterations`` leave a softmax), and ends with each sample's assignments summing
+    to 1. No gradient. Computed in the log domain, in float32 or wider: equal to the released code's exponentiated form
+    wherever that is finite. One sample gives the uniform row.
 
     Deviation: the paper's Eq. 4 prints the scores without the exponential; it would divide by sums near 0.
-
-    Args:
-        scores: ``[B, M]`` cosine similarities.
-        temperature: positive; smaller is sharper.
-        iterations: number of prototype/sample scalings; 0 leaves a softmax.
-
-    Returns:
-        ``[B, M]``, rows sum to 1. One sample gives (for ``iterations >= 1``) the uniform row.
     """
     log_q = _at_least_float32(scores) / temperature
     for _ in range(iterations):
@@ -49,19 +42,10 @@ def comparative_loss(
     temperature: float | Tensor = 0.1,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    r"""Cross-entropy between target assignments and predicted ones (CRPTpro Eq. 1 and 7).
+    r"""Cross-entropy between target assignments and predicted ones (CRPTpro Eq. 1 and 7), both ``[B, M]``, in nats.
 
-    :math:`L_{comp} = -\frac1B\sum_i\sum_j q_{ij}\log\mathrm{softmax}_j(s_{ij}/\tau)`. At uniform prediction
-    it equals ln M (6.238 for 512); a run that stays there has learned nothing.
-
-    Args:
-        student_scores: ``[B, M]`` cosine similarities, with gradient.
-        assignments: ``[B, M]``, rows sum to 1.
-        temperature: positive.
-        reduction: over the batch.
-
-    Returns:
-        Scalar, or ``[B]`` for ``"none"``; non-negative, nats.
+    :math:`L_{comp} = -\frac1B\sum_i\sum_j q_{ij}\log\mathrm{softmax}_j(s_{ij}/\tau)`, or ``[B]`` for ``"none"``. At
+    uniform prediction it equals ln M (6.238 for 512); a run that stays there has learned nothing.
     """
     log_p = F.log_softmax(_at_least_float32(student_scores) / temperature, dim=-1)
     return _reduced(-(assignments * log_p).sum(dim=-1), reduction)
@@ -70,24 +54,14 @@ def comparative_loss(
 def prototype_dispersion(
     prototypes: Tensor, *, offset: float | Tensor = 1.5, reduction: DispersionReduction = "mean_all"
 ) -> Tensor:
-    r"""Intrinsic loss that pushes prototypes apart (CRPTpro Eq. 9).
+    r"""Intrinsic loss that pushes prototypes apart (CRPTpro Eq. 9), of unit rows ``[M, D]``.
 
     :math:`L_{intr} = \frac1{M^2}\sum_{j\ne k} \mathrm{sg}(c_j)\cdot c_k / (\mathrm{sg}(c_j\cdot c_k) + w)`, whose left
-    factor and denominator carry no gradient.
+    factor and denominator carry no gradient. About -0.0023 to -0.0028 at orthogonal initialisation of 512 x 128.
+    ``"mean_all"`` divides by M^2 (the zeroed diagonal counts), ``"mean_offdiag"`` by M(M-1), ``"sum"`` by nothing.
+    The ``offset`` w exceeds 1 so that the denominator stays positive.
 
     Deviation: the paper prints a sum; its own table only fits the mean over all M x M entries, the default.
-
-    Args:
-        prototypes: ``[M, D]`` unit rows, see :meth:`crptpro.modules.Prototypes.unit_weight`.
-        offset: w, larger than 1 so that the denominator stays positive.
-        reduction: ``"mean_all"`` divides by M^2 (the zeroed diagonal counts), ``"mean_offdiag"`` by M(M-1),
-            ``"sum"`` by nothing.
-
-    Returns:
-        Scalar; about -0.0023 to -0.0028 at orthogonal initialisation of 512 x 128.
-
-    Raises:
-        ValueError: unknown reduction.
     """
     count = prototypes.shape[0]
     divisors = {"mean_all": count * count, "mean_offdiag": max(count * (count - 1), 1), "sum": 1}
@@ -99,27 +73,11 @@ def prototype_dispersion(
 
 
 def knn_distances(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
-    """Euclidean distances to the k nearest keys, ascending.
+    """Euclidean distances ``[N, k]`` of queries ``[N, D]`` to the k nearest of keys ``[K, D]``, ascending.
 
-    The neighbours are found with a matrix product, which cannot resolve distances near zero; the k distances
-    are then taken again from the differences, so that a key equal to the query is at exactly 0.
-
-    Args:
-        queries: ``[N, D]``.
-        keys: ``[K, D]``. A query that is itself among the keys is its own nearest neighbour.
-        k: number of neighbours.
-
-    Returns:
-        ``[N, k]``, non-negative, ascending along each row; at most 2 between unit vectors.
-
-    Raises:
-        ValueError: fewer keys than ``k``.
-
-    Examples:
-        >>> z = torch.tensor([[1.0, 0.0]])
-        >>> keys = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
-        >>> knn_distances(z, keys, k=3)
-        tensor([[0.0000, 1.4142, 2.0000]])
+    A query that is itself among the keys is its own nearest neighbour. The neighbours are found with a matrix product,
+    which cannot resolve distances near zero; the k distances are then taken again from the differences, so that a key
+    equal to the query is at exactly 0. Fewer keys than ``k`` are a ``ValueError``.
     """
     if not 1 <= k <= keys.shape[0]:
         raise ValueError(f"k must be between 1 and the number of keys {keys.shape[0]}, got {k}.")
@@ -129,10 +87,7 @@ def knn_distances(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
 
 
 def knn_distance(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
-    """Euclidean distance ``[N]`` to the k-th nearest key: the exploration reward of CRPTpro (Eq. 11).
-
-    Arguments and errors are those of :func:`knn_distances`; a copy of the query counts as a neighbour.
-    """
+    """Euclidean distance ``[N]`` to the k-th nearest key, copies of the query counted: CRPTpro's reward (Eq. 11)."""
     return knn_distances(queries, keys, k=k)[:, -1]
 
 
@@ -145,21 +100,10 @@ def particle_reward(
     scale: float | Tensor = 1.0,
     clip: float = 0.0,
 ) -> Tensor:
-    r"""Particle entropy among the k nearest neighbours, :func:`particle_entropy` of their distances.
+    """Particle entropy ``[N]`` of features ``[N, D]`` among their k nearest of ``keys`` ``[K, D]``, or of themselves.
 
-    Args:
-        features: ``[N, D]``.
-        k: neighbours, self included when ``keys`` is None.
-        keys: ``[K, D]``; the features themselves if None.
-        average: mean over the k neighbours, otherwise the k-th alone.
-        scale: running mean of the distances, kept by the caller.
-        clip: subtracted before the relu.
-
-    Returns:
-        ``[N]``, non-negative.
-
-    Raises:
-        ValueError: fewer keys than ``k``.
+    :func:`particle_entropy` of the k distances, or with ``average=False`` of the k-th alone; ``scale`` is their running
+    mean, kept by the caller.
     """
     distances = knn_distances(features, features if keys is None else keys, k=k)
     return particle_entropy(distances if average else distances[:, -1:], scale=scale, clip=clip)
@@ -183,24 +127,19 @@ def info_nce(
     valid: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Contrastive cross-entropy in which row i's positive is row i of the other side.
+    """Contrastive cross-entropy in nats of ``[B, D]`` each, in which row i's positive is row i of the other side.
+
+    Normalise both beforehand where the method asks for cosines (SimCLR yes, ATC no).
 
     Args:
         anchors: ``[B, D]``.
-        positives: ``[B, D]``. Normalise both beforehand where the method asks for cosines (SimCLR yes, ATC
-            no).
+        positives: ``[B, D]``.
         temperature: divides the inner products.
         negatives: ``"positives"`` compares each anchor with all B positives (ATC); ``"both"`` compares each
             of the 2B views with the other 2B - 1 (SimCLR).
         valid: ``[B]`` bool; rows that are False do not count, but their positives stay as negatives. Rows of
             both views for ``"both"``. Anchors of invalid rows may be NaN (not for ``"both"``: negatives too).
-        reduction: over the rows; the mean is over valid rows, 0 if there is none.
-
-    Returns:
-        Non-negative, nats: scalar, or for ``"none"`` ``[B]`` (``"both"``: ``[2B]``), zero where invalid.
-
-    Raises:
-        ValueError: unknown ``negatives``.
+        reduction: over the valid rows; ``"none"`` gives ``[B]`` (``"both"``: ``[2B]``), zero where invalid.
     """
     count = anchors.shape[0]
     labels = torch.arange(count, device=anchors.device)
@@ -229,22 +168,9 @@ def becl_loss(
 ) -> Tensor:
     r"""Behaviour contrastive loss (Rooshy-yang/BeCL ``agent/becl.py``); the reward is ``exp(-loss)`` per row.
 
-    :math:`\ell_i = -\log(pos_i / (\sum_{j\ne i} e^{s_{ij}} + \epsilon) + \epsilon)` of cosines over the temperature,
-    the row's maximum subtracted. The positive is the first other row with the same skill, or, where no other row has
-    it, the first other row, as in the released code.
-
-    Args:
-        features: ``[B, D]``, B at least 2; l2-normalised here.
-        skills: ``[B]`` integer skill indices.
-        temperature: divides the cosines.
-        eps: guard in the quotient and in the logarithm.
-        reduction: over the rows.
-
-    Returns:
-        Scalar, or ``[B]`` for ``"none"``.
-
-    Raises:
-        ValueError: fewer than two rows.
+    :math:`\ell_i = -\log(pos_i / (\sum_{j\ne i} e^{s_{ij}} + \epsilon) + \epsilon)` of the cosines of features ``[B,
+    D]`` over the temperature, the row's maximum subtracted. The positive is the first other row with the same of the
+    skills ``[B]``, or, where no other row has it, the first other row, as in the released code. B is at least 2.
     """
     count = features.shape[0]
     if count < 2:
@@ -294,17 +220,10 @@ def prototype_ane(prototypes: Tensor) -> Tensor:
 
 @torch.no_grad()
 def prototype_kne(prototypes: Tensor, *, k: int = 3) -> Tensor:
-    """Mean over prototypes of the cosine to the k-th nearest other prototype (the paper's KNE).
+    """Mean over unit rows ``[M, D]`` of the cosine to the k-th nearest other one (the paper's KNE); k at most M - 1.
 
     The paper does not state k. With k = 3, 512 spread vectors in 128 dimensions give about +0.2; its negative
     values only fit a median-like k near M / 2.
-
-    Args:
-        prototypes: ``[M, D]`` unit rows.
-        k: which neighbour, the prototype itself not counted; at most M - 1.
-
-    Raises:
-        ValueError: ``k`` out of range.
     """
     count = prototypes.shape[0]
     if not 1 <= k < count:
@@ -315,16 +234,7 @@ def prototype_kne(prototypes: Tensor, *, k: int = 3) -> Tensor:
 
 @torch.no_grad()
 def prototype_metrics(prototypes: Tensor, *, offset: float = 1.5) -> dict[str, Tensor]:
-    """ANE, KNE at k = 3 and k = M / 2, and the dispersion (mean over all entries), as scalars.
-
-    Args:
-        prototypes: ``[M, D]``, rows of any length, M at least 4.
-        offset: w of the dispersion.
-
-    Examples:
-        >>> sorted(prototype_metrics(torch.eye(8)))
-        ['prototype_ane', 'prototype_dispersion', 'prototype_kne_3', 'prototype_kne_half']
-    """
+    """ANE, KNE at k = 3 and k = M / 2, and the dispersion (mean over all entries), of rows ``[M, D]`` of any length."""
     unit = F.normalize(prototypes, dim=-1)
     return {
         "prototype_ane": prototype_ane(unit),

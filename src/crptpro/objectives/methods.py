@@ -10,24 +10,21 @@ import difflib
 import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 from torch import nn
 from torchrl.objectives import LossModule
 
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.modules import PixelEncoder
-from crptpro.objectives.atc import ATCLoss
-from crptpro.objectives.becl import BeCLLoss
+from crptpro.objectives.contrastive import ATCLoss, BeCLLoss, SimCLRLoss
 from crptpro.objectives.proto import ProtoLoss
-from crptpro.objectives.simclr import SimCLRLoss
 from crptpro.values import as_float, as_int
 
 
 def _plain(row: Any, minima: Mapping[str, int]) -> None:
     for name, minimum in minima.items():
-        value = getattr(row, name)
-        if value is not None:
+        if (value := getattr(row, name)) is not None:
             object.__setattr__(row, name, as_int(value, name, minimum=minimum))
 
 
@@ -37,52 +34,42 @@ class Exploration:
 
     Every interval counts a domain's own agent steps, so that no domain is starved whatever their number.
 
+    Attributes:
+        reward: intrinsic reward that alone drives the exploration: ``"prototype"``, ``"particle"``,
+            ``"skill-contrast"``, or a function of the loss and a ``torch.Generator`` that returns a transform writing
+            ``("next", "intrinsic_reward")``.
+        agent: ``"rad-sac"``, ``"averaged-sac"`` (DrQ's K = M = 2 on detached features) or ``"skill-ddpg"``.
+        env_steps: simulator steps over all domains of a group, or of the one domain, random phases included.
+        is_single_domain: the (S) variants: pre-trained on one domain only.
+        encoder_update_interval: agent steps between two encoder updates.
+        encoder_updates_each: encoder updates every time, each on a fresh batch.
+        agent_update_interval: agent steps between two updates of the agent.
+        encodes_before_update: reward and agent see the features from before the encoder update of the same step.
+        transfers_actor: the downstream agent starts from the exploring actor.
+        n_step: agent steps from an observation to the "next" one in the agent's and the encoder's batches.
+        skill_dim: number of skills, at least two; None for an agent without skills.
+        skill_agent_steps: agent steps that a skill is kept.
+        replay_capacity: transitions kept per domain.
+        random_agent_steps: agent steps of uniformly random actions per domain, before its updates start.
+
     Raises:
-        ValueError: a count or interval below 1, or fewer than two skills.
+        ValueError: a number out of its range.
     """
 
     reward: str | Callable[..., Any] = "prototype"
-    """Intrinsic reward that alone drives the exploration: ``"prototype"``, ``"particle"``, ``"skill-contrast"``, or a
-    function of the loss and a ``torch.Generator`` that returns a transform writing ``("next", "intrinsic_reward")``."""
-
     agent: str = "rad-sac"
-    """Exploring agent: ``"rad-sac"``, ``"averaged-sac"`` (DrQ's K = M = 2 on detached features), ``"skill-ddpg"``."""
-
     env_steps: int = 200_000
-    """Simulator steps over all domains of a group, or of the one domain; the random phases come out of them."""
-
     is_single_domain: bool = False
-    """The (S) variants: pre-trained on one domain only."""
-
     encoder_update_interval: int = 2
-    """Agent steps between two encoder updates."""
-
     encoder_updates_each: int = 1
-    """Encoder updates every time, each on a fresh batch."""
-
     agent_update_interval: int = 1
-    """Agent steps between two updates of the agent."""
-
     encodes_before_update: bool = False
-    """Whether reward and agent see the features from before the encoder update of the same step, not after it."""
-
     transfers_actor: bool = False
-    """Whether the downstream agent starts from the exploring actor."""
-
     n_step: int = 1
-    """Agent steps from an observation to the "next" one in the agent's and the encoder's batches."""
-
     skill_dim: int | None = None
-    """Number of skills; None for an agent without skills."""
-
     skill_agent_steps: int = 50
-    """Agent steps that a skill is kept."""
-
     replay_capacity: int = 100_000
-    """Transitions kept per domain."""
-
     random_agent_steps: int = 1_000
-    """Agent steps of uniformly random actions per domain, before its updates start."""
 
     def __post_init__(self) -> None:
         counts = (
@@ -96,63 +83,52 @@ class Exploration:
 class Method:
     """A row of the table; the values here are CRPTpro's.
 
+    Attributes:
+        name: unique name.
+        loss_class: the loss that pre-trains its encoder; None where nothing is pre-trained.
+        loss_options: keyword arguments of ``loss_class``.
+        encoder_options: keyword arguments of :class:`~crptpro.modules.PixelEncoder`.
+        updates: encoder updates in total, over all domains.
+        batch_size: transitions per update.
+        learning_rate: of Adam (its highest value, if scheduled).
+        encoder_tau: rate of the target networks, every update; None for a method without targets.
+        schedule: ``"constant"`` or ``"warmup_cosine"``: learning rate over the updates.
+        warmup_updates: length of the linear warm-up of the learning rate from 0; 0 for none.
+        grad_clip: largest gradient norm; None for no clipping.
+        exploration: how it explores while it pre-trains; None if it learns from random datasets, or from nothing.
+        downstream: settings of downstream training that differ from CRPTpro's, such as
+            ``{"replay_capacity": 100_000}``.
+        starts_from: method whose encoder it takes: as it is where ``updates`` is 0, otherwise to train it on.
+        is_preset: a variant of another method: not listed among the methods, not what a loss built by hand is
+            trained like.
+        is_builtin: comes with the library, whose revision says what it is.
+
     Raises:
         ValueError: a number out of its range.
     """
 
     name: str
-    """Unique name."""
-
     loss_class: type[LossModule] | None
-    """The loss that pre-trains its encoder; None where nothing is pre-trained."""
-
     loss_options: Mapping[str, Any] = field(default_factory=dict)
-    """Keyword arguments of ``loss_class``."""
-
     encoder_options: Mapping[str, Any] = field(default_factory=dict)
-    """Keyword arguments of :class:`~crptpro.modules.PixelEncoder`."""
-
     updates: int = 50_000
-    """Encoder updates in total, over all domains."""
-
     batch_size: int = 512
-    """Transitions per update."""
-
     learning_rate: float = 1e-4
-    """Of Adam (its highest value, if scheduled)."""
-
     encoder_tau: float | None = 0.05
-    """Rate of the target networks, every update; None for a method without targets."""
-
     schedule: Literal["constant", "warmup_cosine"] = "constant"
-    """Learning rate over the updates."""
-
     warmup_updates: int = 0
-    """Length of the linear warm-up of the learning rate from 0; 0 for none."""
-
     grad_clip: float | None = None
-    """Largest gradient norm; None for no clipping."""
-
     exploration: Exploration | None = None
-    """How it explores while it pre-trains; None for a method that learns from random datasets, or from nothing."""
-
     downstream: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of downstream training that differ from CRPTpro's, such as ``{"replay_capacity": 100_000}``."""
-
     starts_from: str | None = None
-    """Method whose encoder it takes: as it is where ``updates`` is 0, otherwise to train it on."""
-
     is_preset: bool = False
-    """A variant of another method: not listed among the methods, not what a loss built by hand is trained like."""
-
     is_builtin: bool = False
-    """Comes with the library, whose revision says what it is."""
 
     def __post_init__(self) -> None:
         _plain(self, {"updates": 0, "batch_size": 1, "warmup_updates": 0})
-        for name, bounds in {"learning_rate": {}, "encoder_tau": {"maximum": 1}, "grad_clip": {}}.items():
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, as_float(getattr(self, name), name, minimum=0, **bounds))
+        for name, maximum in {"learning_rate": None, "encoder_tau": 1, "grad_clip": None}.items():
+            if (value := getattr(self, name)) is not None:
+                object.__setattr__(self, name, as_float(value, name, minimum=0, maximum=maximum))
         if self.schedule not in ("constant", "warmup_cosine"):
             raise ValueError(f"`schedule` must be 'constant' or 'warmup_cosine', got {self.schedule!r}.")
 
@@ -172,13 +148,7 @@ class Method:
         return values
 
     def build_encoder(self, in_channels: int = 9, image_size: int = 84, **options: Any) -> PixelEncoder:
-        """Build a fresh encoder of the kind that the method trains.
-
-        Args:
-            in_channels: colour channels times stacked frames.
-            image_size: height and width in pixels.
-            **options: of :class:`~crptpro.modules.PixelEncoder`, over the method's own.
-        """
+        """Build a fresh encoder of the kind that the method trains; ``options`` override the method's own."""
         return PixelEncoder(in_channels, image_size=image_size, **{**self.encoder_options, **options})
 
     def build(self, encoder: nn.Module, **options: Any) -> LossModule:
@@ -202,8 +172,8 @@ class Method:
         return loss
 
 
-_CRPTPRO = Method("crptpro", ProtoLoss)
 _NO_BONUS = {"intrinsic_reward_coef": 0.0}
+_CRPTPRO = Method("crptpro", ProtoLoss)
 
 # ATC's own loss, head and schedule on the trunk (orthogonal weights), batch and budget that all methods share.
 _ATC = Method(
@@ -219,13 +189,9 @@ _ATC = Method(
 
 # Active methods: four simulator steps per encoder update, 200,000 in total over a group (C) or 500,000 in one
 # domain (S). The paper's efficiency table has equal times for one to three domains, so (C) counts in total.
-_APT_C = Method(
-    "apt-c",
-    SimCLRLoss,
-    encoder_tau=None,
-    exploration=Exploration(reward="particle", agent="averaged-sac"),
-    downstream=_NO_BONUS,
-)
+_SINGLE_DOMAIN: dict[str, Any] = {"env_steps": 500_000, "is_single_domain": True}
+_APT_EXPLORES = Exploration(reward="particle", agent="averaged-sac")
+_APT_C = Method("apt-c", SimCLRLoss, encoder_tau=None, exploration=_APT_EXPLORES, downstream=_NO_BONUS)
 # Deviation: the released code of Proto-RL has a predictor of width 512; the paper's table, which has it beside
 # CRPTpro, says 1024.
 _PROTO_RL_C = Method(
@@ -235,23 +201,6 @@ _PROTO_RL_C = Method(
     exploration=Exploration(),
     downstream={"replay_capacity": 100_000},
 )
-_BECL = Exploration(
-    reward="skill-contrast",
-    agent="skill-ddpg",
-    encoder_updates_each=3,
-    encodes_before_update=True,
-    agent_update_interval=2,
-    n_step=3,
-    skill_dim=16,
-    random_agent_steps=2_000,
-)
-
-
-def _single_domain(method: Method, name: str, **exploration: Any) -> Method:
-    explores = replace(
-        cast(Exploration, method.exploration), env_steps=500_000, is_single_domain=True, **exploration
-    )
-    return replace(method, name=name, updates=125_000, exploration=explores)
 
 
 def _preset(method: Method, name: str, **fields: Any) -> Method:
@@ -269,16 +218,16 @@ TABLE = (
     # The authors' published code where it differs from the paper: predictor width, and 3 x 16,666 updates.
     _preset(_CRPTPRO, "released-code", updates=49_998, loss_options={"hidden_dim": 512}),
     _ATC,
-    _preset(
-        _ATC,
-        "atc-native",
-        batch_size=256,
-        encoder_options={"strides": (2, 2, 2, 1), "init": "kaiming"},
-    ),
+    _preset(_ATC, "atc-native", batch_size=256, encoder_options={"strides": (2, 2, 2, 1), "init": "kaiming"}),
     _APT_C,
-    _single_domain(_APT_C, "apt-s"),
+    replace(_APT_C, name="apt-s", updates=125_000, exploration=replace(_APT_EXPLORES, **_SINGLE_DOMAIN)),
     _PROTO_RL_C,
-    _single_domain(_PROTO_RL_C, "proto-rl-s", transfers_actor=True),
+    replace(
+        _PROTO_RL_C,
+        name="proto-rl-s",
+        updates=125_000,
+        exploration=Exploration(transfers_actor=True, **_SINGLE_DOMAIN),
+    ),
     # An update of BeCL's agent every second agent step brings three encoder updates: 150,000 for 50,000 of the agent.
     Method(
         "becl",
@@ -286,7 +235,16 @@ TABLE = (
         updates=150_000,
         encoder_tau=None,
         encoder_options={"pixel_offset": 0.5},
-        exploration=_BECL,
+        exploration=Exploration(
+            reward="skill-contrast",
+            agent="skill-ddpg",
+            encoder_updates_each=3,
+            encodes_before_update=True,
+            agent_update_interval=2,
+            n_step=3,
+            skill_dim=16,
+            random_agent_steps=2_000,
+        ),
         downstream=_NO_BONUS,
     ),
     # Trains its encoder end to end, with the critic.
@@ -339,16 +297,8 @@ def register_method(name: str, loss_class: type[LossModule], **fields: Any) -> M
 def get_method(name: str, *, besides: Iterable[str] = ()) -> Method:
     """Look a method or preset up by name.
 
-    Args:
-        name: as it was registered.
-        besides: further names that the caller takes, which the error may propose.
-
     Raises:
-        UnknownNameError: with the nearest known names.
-
-    Examples:
-        >>> get_method("crptpro").updates
-        50000
+        UnknownNameError: with the nearest known names, of ``besides`` too.
     """
     if name not in _METHODS:
         known = sorted({*_METHODS, *besides})

@@ -8,20 +8,12 @@ import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
-from torch import Tensor, nn
+from torch import nn
 
 from crptpro.modules import Predictor, Projector, Prototypes
 from crptpro.modules.heads import require_one_latent_dim
+from crptpro.objectives import functional
 from crptpro.objectives.base import PretrainingLoss, require_positive
-from crptpro.objectives.functional import (
-    assignment_entropy,
-    comparative_loss,
-    mean_pairwise_cosine,
-    prototype_ane,
-    prototype_dispersion,
-    prototypes_in_use,
-    sinkhorn_knopp,
-)
 from crptpro.values import as_int
 
 
@@ -36,11 +28,13 @@ class ProtoLoss(PretrainingLoss):
       :math:`q = \mathrm{sinkhorn}(\hat z' C^T)` (no gradient),
     * :math:`L_{intr}` = :func:`~crptpro.objectives.functional.prototype_dispersion` of the prototypes.
 
-    ``loss_comp`` that stays at ln M (6.238 for 512 prototypes), or ``embedding_cosine`` that stays near 1, is
-    a dead run. Images must already be augmented. Normalisation, softmax and Sinkhorn always run in float32 or wider.
+    Images must already be augmented. Call :meth:`before_update` before each forward of a training loop: it keeps the
+    prototype rows at unit length, as the released code does. ``forward`` itself never writes to a parameter.
 
-    Call :meth:`before_update` before each forward of a training loop: it keeps the prototype rows at unit
-    length, as the released code does in place. ``forward`` itself never writes to a parameter.
+    ``forward`` returns scalars ``loss_comp`` and ``loss_intr`` (already times alpha; their sum is minimised) and,
+    detached, ``comp``, ``intr`` (without alpha), ``assignment_entropy`` (nats), ``prototypes_in_use`` (count),
+    ``embedding_cosine`` (mean pairwise cosine of the online latents), ``prototype_ane``. ``loss_comp`` that stays at ln
+    M (6.238 for 512 prototypes), or ``embedding_cosine`` that stays near 1, is a dead run.
 
     Args:
         encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
@@ -58,21 +52,6 @@ class ProtoLoss(PretrainingLoss):
 
     Raises:
         ValueError: a coefficient out of its range, or heads of different latent lengths.
-
-    Returns (``forward``):
-        Scalars ``loss_comp`` and ``loss_intr`` (already times alpha; their sum is minimised) and, detached,
-        ``comp``, ``intr`` (without alpha), ``assignment_entropy`` (nats), ``prototypes_in_use`` (count),
-        ``embedding_cosine`` (mean pairwise cosine of the online latents), ``prototype_ane``.
-
-    Examples:
-        >>> from crptpro.modules import PixelEncoder
-        >>> encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=12)
-        >>> loss = ProtoLoss(encoder, num_prototypes=8, latent_dim=4, hidden_dim=16)
-        >>> pixels = torch.randint(0, 256, (6, 3, 12, 12), dtype=torch.uint8)
-        >>> from torchrl.objectives import SoftUpdate
-        >>> updater = SoftUpdate(loss, tau=0.05)
-        >>> out = loss.before_update()(TensorDict({"pixels": pixels, "next": {"pixels": pixels}}, [6]))
-        >>> (out["loss_comp"] + out["loss_intr"]).backward()
     """
 
     predictor: nn.Module
@@ -82,7 +61,6 @@ class ProtoLoss(PretrainingLoss):
     prototypes_params: Any
     target_prototypes_params: Any
 
-    network_names = ("encoder", "projector", "predictor", "prototypes")
     default_out_keys = (
         "loss_comp",
         "loss_intr",
@@ -114,19 +92,17 @@ class ProtoLoss(PretrainingLoss):
         super().__init__()
         if not offset > 1:
             raise ValueError(f"`offset` must exceed 1, the largest negative cosine, got {offset}.")
-        sharper = {} if assignment_temperature is None else {"assignment_temperature": assignment_temperature}
-        require_positive(temperature=temperature, **sharper)
-        if projector is None:
-            projector = Projector(cast(int, encoder.feature_dim), latent_dim)
-        if predictor is None:
-            predictor = Predictor(latent_dim, hidden_dim)
-        if prototypes is None:
-            prototypes = Prototypes(num_prototypes, latent_dim)
+        require_positive(temperature=temperature)
+        if assignment_temperature is not None:
+            require_positive(assignment_temperature=assignment_temperature)
+        projector = projector or Projector(cast(int, encoder.feature_dim), latent_dim)
+        predictor = predictor or Predictor(latent_dim, hidden_dim)
+        prototypes = prototypes or Prototypes(num_prototypes, latent_dim)
         require_one_latent_dim(projector=projector, predictor=predictor, prototypes=prototypes)
-        self.convert_to_functional(encoder, "encoder", create_target_params=True)
-        self.convert_to_functional(projector, "projector", create_target_params=True)
-        self.convert_to_functional(predictor, "predictor")
-        self.convert_to_functional(prototypes, "prototypes")
+        self._convert(
+            ("encoder", "projector"),
+            encoder=encoder, projector=projector, predictor=predictor, prototypes=prototypes,
+        )  # fmt: skip
         self.sinkhorn_iterations = as_int(sinkhorn_iterations, "sinkhorn_iterations", minimum=0)
         self._register_coefficients(
             intr_loss_coef=intr_loss_coef,
@@ -137,7 +113,7 @@ class ProtoLoss(PretrainingLoss):
 
     def before_update(self) -> ProtoLoss:
         """Scale the prototype rows to unit length in place, outside autograd. Returns self."""
-        with self.prototypes_params.to_module(self.prototypes, preserve_module_state=False):
+        with self._holding("prototypes"):
             self.prototypes.normalize_()
         return self
 
@@ -149,31 +125,28 @@ class ProtoLoss(PretrainingLoss):
         targets = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))
         # The prototypes' precision from here on, also in a caller's autocast region or after a half-precision head.
         with torch.autocast(device_type=latents.device.type, enabled=False):
-            unit = self._unit_prototypes()
+            with self._holding("prototypes"):
+                unit = self.prototypes.unit_weight()
             latents, predictions, targets = (x.to(unit.dtype) for x in (latents, predictions, targets))
-            sharpness = (
-                self.temperature if self.assignment_temperature is None else self.assignment_temperature
-            )
-            assignments = sinkhorn_knopp(
+            assignments = functional.sinkhorn_knopp(
                 F.normalize(targets, dim=-1) @ unit.detach().T,
-                temperature=sharpness,
+                temperature=self.temperature
+                if self.assignment_temperature is None
+                else self.assignment_temperature,
                 iterations=self.sinkhorn_iterations,
             )
             scores = F.normalize(predictions, dim=-1) @ unit.T  # (B, D) x (D, M) -> (B, M)
-            comp = comparative_loss(scores, assignments, temperature=self.temperature)
-            intr = prototype_dispersion(unit, offset=self.offset)
+            comp = functional.comparative_loss(scores, assignments, temperature=self.temperature)
+            intr = functional.prototype_dispersion(unit, offset=self.offset)
+            unit_latents = F.normalize(latents.detach(), dim=-1)
             out = {
                 "loss_comp": comp,
                 "loss_intr": (self.intr_loss_coef * intr).to(intr.dtype),
                 "comp": comp.detach(),
                 "intr": intr.detach(),
-                "assignment_entropy": assignment_entropy(assignments),
-                "prototypes_in_use": prototypes_in_use(assignments),
-                "embedding_cosine": mean_pairwise_cosine(F.normalize(latents.detach(), dim=-1)),
-                "prototype_ane": prototype_ane(unit.detach()),
+                "assignment_entropy": functional.assignment_entropy(assignments),
+                "prototypes_in_use": functional.prototypes_in_use(assignments),
+                "embedding_cosine": functional.mean_pairwise_cosine(unit_latents),
+                "prototype_ane": functional.prototype_ane(unit.detach()),
             }
         return TensorDict(out, batch_size=[])
-
-    def _unit_prototypes(self) -> Tensor:
-        with self.prototypes_params.to_module(self.prototypes, preserve_module_state=False):
-            return self.prototypes.unit_weight()

@@ -19,6 +19,19 @@ from crptpro.objectives.base import NetworkLoss, require_positive
 from crptpro.values import as_float
 
 
+def squared_errors(values: Tensor, target: Tensor) -> TensorDict:
+    """Regression of the values ``[B, views, 2]`` of two heads on a target ``[B]``, and what a log tells of it."""
+    errors = values - target[..., None, None]
+    out = {
+        # Sum over the views and the two heads of the mean over the batch.
+        "loss_qvalue": errors.square().sum((-2, -1)).mean(),
+        "q_mean": values.detach().mean(-2).mean(),
+        "target_q_mean": target.mean(),
+        "td_error": errors.detach().abs().amax(-1).mean(-1).mean(),
+    }
+    return TensorDict(out, batch_size=[])
+
+
 class RADSACLoss(NetworkLoss, SACLoss):
     r"""RAD-SAC of CRPTpro (liuxin0824/CRPTpro and denisyarats/proto, ``proto.py``) on TorchRL's ``SACLoss``.
 
@@ -39,6 +52,9 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
     Deviation: the released code always bootstraps; here ``terminated`` cuts it, which no task of the paper has.
 
+    ``forward`` returns the losses and, detached, ``alpha``, ``entropy`` (-log pi, nats), ``q_mean``, ``target_q_mean``,
+    ``td_error`` (mean over rows of the larger of the two heads' absolute errors).
+
     Args:
         actor: on features.
         critic: on features and actions; the target is a copy of all of it.
@@ -47,39 +63,16 @@ class RADSACLoss(NetworkLoss, SACLoss):
         target_entropy: in nats; None for minus the action dimension.
         generator: source of all action noise; torch's global one if None. Not part of the state dictionary.
 
-    Returns (``forward``):
-        ``loss_actor``, ``loss_qvalue``, ``loss_alpha`` and, detached scalars, ``alpha``, ``entropy`` (-log
-        pi, nats), ``q_mean``, ``target_q_mean``, ``td_error`` (mean over rows of the larger of the two heads'
-        absolute errors).
-
     Raises:
-        ValueError: ``gamma`` outside [0, 1], or an ``alpha_init`` that is not positive.
-
-    Examples:
-        >>> actor = SquashedGaussianActor(6, 2, hidden_dim=8)
-        >>> loss = RADSACLoss(actor, TwinCritic(6, 2, hidden_dim=8))
-        >>> from torchrl.objectives import SoftUpdate
-        >>> updater = SoftUpdate(loss, tau=0.01)
-        >>> h, reward, done = torch.randn(4, 6), torch.ones(4, 1), torch.zeros(4, 1, dtype=torch.bool)
-        >>> after = {"features": h, "reward": reward, "done": done, "terminated": done}
-        >>> td = TensorDict({"features": h, "action": torch.zeros(4, 2), "next": after}, [4])
-        >>> loss(td)["loss_qvalue"].shape
-        torch.Size([])
+        ValueError: ``gamma`` or ``alpha_init`` out of its range.
     """
 
     @dataclass
     class _AcceptedKeys(SACLoss._AcceptedKeys):
-        """``SACLoss``'s keys and one more.
-
-        Attributes:
-            observation: the features, at the root and under ``"next"``.
-        """
-
-        observation: NestedKey = "features"
+        observation: NestedKey = "features"  # at the root and under "next"
 
     default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
-    network_names = ("actor_network", "qvalue_network")
+    tensor_keys: Any
     view_names: ClassVar[tuple[str, ...]] = ("observation",)
     """Configurable keys of the views of an observation."""
 
@@ -141,31 +134,20 @@ class RADSACLoss(NetworkLoss, SACLoss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute all three losses against the same critic; see the class."""
-        critic = self.critic_loss(tensordict)
-        return critic.update(self.actor_and_temperature_loss(tensordict)).select(*self.default_out_keys)
+        return self.critic_loss(tensordict).update(self.actor_and_temperature_loss(tensordict))
 
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not changed."""
         target = self._compute_target_v2(tensordict)  # (B,)
         action = tensordict.get(self.tensor_keys.action)
-        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
-            values = torch.stack([self._q_values(view, action) for view in self._views(tensordict)], -2)
-        errors = values - target[..., None, None]  # (B, views, 2)
-        out = {
-            # Sum over the views and the two heads of the mean over the batch.
-            "loss_qvalue": errors.square().sum((-2, -1)).mean(),
-            "q_mean": values.detach().mean(-2).mean(),
-            "target_q_mean": target.mean(),
-            "td_error": errors.detach().abs().amax(-1).mean(-1).mean(),
-        }
-        return TensorDict(out, batch_size=[])
+        with self._holding("qvalue_network"):
+            values = torch.stack([self.critic(view, action) for view in self._views(tensordict)], -2)
+        return squared_errors(values, target)
 
     def actor_and_temperature_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """``loss_actor`` and ``loss_alpha`` of one action draw, with ``alpha`` and ``entropy``."""
         features = self._policy_features(self._views(tensordict)[0])
-        noise = self._noise(features)
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            action, log_prob = self.actor.sample(features, noise=noise)
+        action, log_prob = self._act(features)
         # Detached weights: the gradient passes through Q to the action and to nothing else.
         with self._cached_detached_qvalue_params.to_module(self.qvalue_network, preserve_module_state=False):
             value = self._q_values_on_features(features, action).amin(-1)
@@ -186,14 +168,9 @@ class RADSACLoss(NetworkLoss, SACLoss):
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
         soft_values = []
         for view in self._views(tensordict.get("next")):
-            features = self._policy_features(view)
-            noise = self._noise(features)
-            with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-                action, log_prob = self.actor.sample(features, noise=noise)
-            with self.target_qvalue_network_params.to_module(
-                self.qvalue_network, preserve_module_state=False
-            ):
-                soft_values.append(self._q_values(view, action).amin(-1) - self._alpha * log_prob)
+            action, log_prob = self._act(self._policy_features(view))
+            with self._holding("qvalue_network", target=True):
+                soft_values.append(self.critic(view, action).amin(-1) - self._alpha * log_prob)
         soft_value = torch.stack(soft_values).mean(0).unsqueeze(-1)
         names = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
         keys = [unravel_key(("next", name)) for name in names]
@@ -202,23 +179,23 @@ class RADSACLoss(NetworkLoss, SACLoss):
         estimate.set(("next", self.value_estimator.tensor_keys.value), soft_value)
         return self.value_estimator.value_estimate(estimate).squeeze(-1)
 
-    def _noise(self, features: Tensor) -> Tensor:
-        # Drawn before the parameters are swapped in, where a compiler cannot pause for a generator.
+    def _act(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return an action of the policy, and its log-probability."""
+        # The noise is drawn before the parameters are swapped in, where a compiler cannot pause for a generator.
         like = features.new_empty(*features.shape[:-1], self.actor.action_dim, dtype=self.log_alpha.dtype)
-        return standard_normal_like(like, self.generator)
-
-    # What subclasses change: how many views there are of an observation, and what lies before the features.
+        noise = standard_normal_like(like, self.generator)
+        with self._holding("actor_network"):
+            return self.actor.sample(features, noise=noise)
 
     def _views(self, tensordict: TensorDictBase) -> list[Tensor]:
         """The views of the observation; the first is the one that the actor learns from."""
         return [tensordict.get(getattr(self.tensor_keys, name)).detach() for name in self.view_names]
 
+    # What lies before the features; DrQ has an encoder there.
+
     def _policy_features(self, view: Tensor) -> Tensor:
         """What the actor sees of a view, without gradient."""
         return view
-
-    def _q_values(self, view: Tensor, action: Tensor) -> Tensor:
-        return self.critic(view, action)
 
     def _q_values_on_features(self, features: Tensor, action: Tensor) -> Tensor:
         return self.critic(features, action)
@@ -241,78 +218,40 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
 
 class AveragedSACLoss(RADSACLoss):
-    r""":class:`RADSACLoss` with two views of each observation (DrQ, arXiv 2004.13649, K = M = 2).
+    """:class:`RADSACLoss` with two views of each observation (DrQ, arXiv 2004.13649, K = M = 2).
 
-    With :math:`h_m, h_m'` the features of view m of an observation and the next, each with its own
-    :math:`a_m' \sim \pi(h_m')`:
-
-    * :math:`y = \frac12 \sum_m [r + \gamma (1-\mathrm{terminated}) (\min(Q_1', Q_2')(h_m', a_m') - \alpha
-      \log\pi(a_m'|h_m'))]`
-    * ``loss_qvalue`` = :math:`\sum_m` (MSE(Q1, y) + MSE(Q2, y)), a sum and not a mean over the views, as in
-      denisyarats/drq ``drq.py``;
-    * ``loss_actor`` and ``loss_alpha`` on the first view.
+    Each view of the next observation has its own action; y is the mean of their targets. ``loss_qvalue`` is the sum,
+    not the mean, over the views, as in denisyarats/drq ``drq.py``; ``loss_actor`` and ``loss_alpha`` are on the first
+    view. A ``generator`` is asked for the next actions of the first view, of the second, then for the actor's.
 
     The exploration agent of APT learns with it on detached features (forhaoliu/mini_apt averages likewise).
-
-    Args:
-        actor: on features.
-        critic: on features and actions; the target is a copy of all of it.
-        **options: of :class:`RADSACLoss`. A ``generator`` is asked for the next actions of the first view, of
-            the second, then for the actor's.
-
-    Returns (``forward``):
-        As :class:`RADSACLoss`; ``q_mean`` and ``td_error`` are means over the views too.
     """
 
     @dataclass
     class _AcceptedKeys(RADSACLoss._AcceptedKeys):
-        """``RADSACLoss``'s keys and one more.
-
-        Attributes:
-            observation_view: features of the second view, at the root and under ``"next"``.
-        """
-
-        observation_view: NestedKey = "features_view"
+        observation_view: NestedKey = "features_view"  # of the second view, at the root and under "next"
 
     default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
-    view_names: ClassVar[tuple[str, ...]] = ("observation", "observation_view")
+    view_names = ("observation", "observation_view")
 
 
 class DrQLoss(AveragedSACLoss):
-    r"""DrQ (arXiv 2004.13649; denisyarats/drq ``drq.py``): :class:`AveragedSACLoss` with the encoder inside.
+    """DrQ (arXiv 2004.13649; denisyarats/drq ``drq.py``): :class:`AveragedSACLoss` with the encoder inside.
 
     Actor and critic share the convolutions, tied, and each has a head of its own. The convolutions learn from
-    ``loss_qvalue`` alone: the actor, its critic and the policy of the targets see detached features. The target
-    critic has its own copy of convolutions and head. Give actor and critic ``has_tanh=True``: DrQ's heads end
-    with a tanh.
+    ``loss_qvalue`` alone: the actor, its critic and the policy of the targets see detached features. The target critic
+    has its own copy of convolutions and head. Give actor and critic ``has_tanh=True``: DrQ's heads end with a tanh.
+    ``options`` are those of :class:`RADSACLoss`; a critic that does not fit the encoder is a ``ValueError``.
 
     Deviation: as in :class:`RADSACLoss`, ``terminated`` cuts the bootstrap.
-
-    Args:
-        encoder: trained in place.
-        actor: on the encoder's features.
-        critic: on the encoder's features and actions.
-        **options: of :class:`RADSACLoss`.
-
-    Raises:
-        ValueError: a critic that does not fit the encoder; otherwise as :class:`RADSACLoss`.
     """
 
     @dataclass
     class _AcceptedKeys(AveragedSACLoss._AcceptedKeys):
-        """The keys of :class:`AveragedSACLoss` with other defaults.
-
-        Attributes:
-            observation: images of the first view, at the root and under ``"next"``.
-            observation_view: images of the second view, likewise.
-        """
-
-        observation: NestedKey = "pixels"
-        observation_view: NestedKey = "pixels_view"
+        observation: NestedKey = "pixels"  # images of the first view, at the root and under "next"
+        observation_view: NestedKey = "pixels_view"  # of the second view, likewise
 
     default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
 
     def __init__(
         self, encoder: PixelEncoder, actor: SquashedGaussianActor, critic: TwinCritic, **options: Any
@@ -326,7 +265,7 @@ class DrQLoss(AveragedSACLoss):
 
     @torch.no_grad()
     def _policy_features(self, view: Tensor) -> Tensor:
-        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
+        with self._holding("qvalue_network"):
             return self.critic.encoder(view)
 
     def _q_values_on_features(self, features: Tensor, action: Tensor) -> Tensor:

@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import dispatch
 from tensordict.utils import unravel_key
 from torch import Tensor
 
 from crptpro.modules import DeterministicActor, TwinCritic
 from crptpro.objectives.base import NetworkLoss
+from crptpro.objectives.sac import squared_errors
 from crptpro.values import as_float
 
 
@@ -26,19 +27,10 @@ class SkillDDPGLoss(NetworkLoss):
     * ``loss_qvalue`` = MSE(Q1, y) + MSE(Q2, y), gradient to the critic only;
     * ``loss_actor`` = -mean(min(Q1, Q2)(s, a)), gradient to the actor only.
 
-    Both actions are the actor's with Gaussian noise clipped to ``noise_clip``. Only the critic has a target.
-    Features never receive a gradient.
-
-    Args:
-        actor: on features and skill; it knows the size of its noise.
-        critic: built for ``feature_dim + skill_dim`` and with ``has_tanh=True``, as in the released code.
-        noise_clip: largest absolute noise of the actions that are learned from.
-        generator: source of all noise, asked for the target's first; torch's global generator if None. Not part
-            of the state dictionary.
-
-    Returns (``forward``):
-        ``loss_actor``, ``loss_qvalue`` and, detached scalars, ``q_mean``, ``target_q_mean``, ``td_error`` (mean
-        over rows of the larger of the two heads' absolute errors).
+    Both actions are the actor's with Gaussian noise clipped to ``noise_clip``, from ``generator`` (the target's first;
+    torch's global one if None). Only the critic has a target, and it ends its trunk with a tanh in the released code.
+    Features never receive a gradient. ``forward`` returns the diagnostics of :class:`~crptpro.objectives.RADSACLoss`
+    too.
 
     Raises:
         ValueError: ``noise_clip`` negative, or a critic for other features than the actor's.
@@ -46,25 +38,14 @@ class SkillDDPGLoss(NetworkLoss):
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that ``set_keys`` can change.
-
-        Attributes:
-            observation: the features, at the root and under ``"next"``.
-            skill: one-hot skill, at the root.
-            action: what was done.
-            reward: n-step return, under ``"next"``.
-            discount: of the value n steps later, under ``"next"``.
-        """
-
-        observation: NestedKey = "features"
-        skill: NestedKey = "skill"
+        observation: NestedKey = "features"  # at the root and under "next"
+        skill: NestedKey = "skill"  # one-hot, at the root
         action: NestedKey = "action"
-        reward: NestedKey = "reward"
-        discount: NestedKey = "discount"
+        reward: NestedKey = "reward"  # n-step return, under "next"
+        discount: NestedKey = "discount"  # of the value n steps later, under "next"
 
     default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
-    network_names = ("actor_network", "qvalue_network")
+    tensor_keys: Any
     default_out_keys = ("loss_actor", "loss_qvalue", "q_mean", "target_q_mean", "td_error")
 
     actor_network: DeterministicActor
@@ -113,24 +94,15 @@ class SkillDDPGLoss(NetworkLoss):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute both losses against the same critic; see the class."""
-        out = self.critic_loss(tensordict)
-        out.set("loss_actor", self.actor_loss(tensordict))
-        return out.select(*self.default_out_keys)
+        return self.critic_loss(tensordict).set("loss_actor", self.actor_loss(tensordict))
 
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not changed."""
         target = self._target(tensordict)  # (B,)
         inputs = self._inputs(tensordict, tensordict)
-        with self.qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
+        with self._holding("qvalue_network"):
             values = self.qvalue_network(inputs, tensordict.get(self.tensor_keys.action))  # (B, 2)
-        errors = values - target.unsqueeze(-1)
-        out = {
-            "loss_qvalue": errors.square().sum(-1).mean(),
-            "q_mean": values.detach().mean(),
-            "target_q_mean": target.mean(),
-            "td_error": errors.detach().abs().amax(-1).mean(),
-        }
-        return TensorDict(out, batch_size=[])
+        return squared_errors(values.unsqueeze(-2), target)
 
     def actor_loss(self, tensordict: TensorDictBase) -> Tensor:
         """The actor's loss, against the critic as it is now."""
@@ -138,23 +110,21 @@ class SkillDDPGLoss(NetworkLoss):
         action = self._act(inputs)
         # Detached weights: the gradient passes through Q to the action and to nothing else.
         with self.qvalue_network_params.data.to_module(self.qvalue_network, preserve_module_state=False):
-            value = self.qvalue_network(inputs, action).amin(-1)
-        return -value.mean()
+            return -self.qvalue_network(inputs, action).amin(-1).mean()
 
     @torch.no_grad()
     def _target(self, tensordict: TensorDictBase) -> Tensor:
         following = tensordict.get("next")
         inputs = self._inputs(following, tensordict)
         action = self._act(inputs)
-        with self.target_qvalue_network_params.to_module(self.qvalue_network, preserve_module_state=False):
+        with self._holding("qvalue_network", target=True):
             value = self.qvalue_network(inputs, action).amin(-1)
-        reward, discount = (
-            following.get(key).squeeze(-1) for key in (self.tensor_keys.reward, self.tensor_keys.discount)
-        )
+        names = (self.tensor_keys.reward, self.tensor_keys.discount)
+        reward, discount = (following.get(name).squeeze(-1) for name in names)
         return reward + discount * value
 
     def _act(self, inputs: Tensor) -> Tensor:
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
+        with self._holding("actor_network"):
             return self.actor_network.sample(inputs, noise_clip=self.noise_clip, generator=self.generator)
 
     def _inputs(self, observed: TensorDictBase, root: TensorDictBase) -> Tensor:

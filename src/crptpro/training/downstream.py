@@ -41,7 +41,7 @@ from crptpro.transforms import (
     choose_feature_mode,
 )
 from crptpro.transforms.free_memory import free_bytes
-from crptpro.transforms.prototype_reward import warn_if_mostly_zero
+from crptpro.transforms.rewards import warn_if_mostly_zero
 from crptpro.values import Colors, Quality, check_numbers
 from crptpro.workers import can_be_sent
 

@@ -50,7 +50,7 @@ from crptpro.training.pretrain import (
 from crptpro.training.run import Generators, Run
 from crptpro.training.world import SPARE_FRAMES, EnvThread, make_replay
 from crptpro.transforms import ContrastiveReward, FrozenEncoder, ParticleReward, PrototypeReward, RandomShift
-from crptpro.transforms.prototype_reward import warn_if_mostly_zero
+from crptpro.transforms.rewards import warn_if_mostly_zero
 from crptpro.values import Quality, check_numbers
 
 logger = logging.getLogger(__name__)

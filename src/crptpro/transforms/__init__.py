@@ -1,12 +1,10 @@
 """TorchRL transforms: augmentation, frozen features, and intrinsic rewards."""
 
 from crptpro.transforms.color_swap import ColorSwap
-from crptpro.transforms.contrastive_reward import ContrastiveReward
 from crptpro.transforms.dense_shift import DenseShiftFeatures, choose_feature_mode
 from crptpro.transforms.frozen_encoder import FrozenEncoder
-from crptpro.transforms.particle_reward import ParticleReward
-from crptpro.transforms.prototype_reward import PrototypeReward
 from crptpro.transforms.random_shift import RandomShift, draw_offsets, random_shift
+from crptpro.transforms.rewards import ContrastiveReward, ParticleReward, PrototypeReward
 
 __all__ = [
     "ColorSwap",

@@ -12,8 +12,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -25,9 +24,9 @@ from torchrl.envs.transforms import Transform
 
 from crptpro.modules import PixelEncoder
 from crptpro.modules.precision import device_of
-from crptpro.transforms.base import Keys, paired_keys, read_entry
+from crptpro.transforms.base import Keys, read_entry, require_pairs
 from crptpro.transforms.free_memory import free_bytes
-from crptpro.transforms.random_shift import as_numpy_bits, check_offsets, draw_offsets
+from crptpro.transforms.random_shift import as_numpy_bits, draw_offsets
 from crptpro.values import as_int
 
 if TYPE_CHECKING:
@@ -35,31 +34,17 @@ if TYPE_CHECKING:
 
 FeatureMode = Literal["auto", "dense", "reencode"]
 
+#: What dense maps may take of the memory that is free; the rest is for networks, batches and the page cache.
 MEMORY_SHARE = 0.8
-"""What dense maps may take of the memory that is free; the rest is for networks, batches and the page cache."""
 
 logger = logging.getLogger(__name__)
 
 
-class ReplayOfObservations(Protocol):
-    """What is asked of a replay: a :class:`~crptpro.data.FrameReplay` has it."""
-
-    @property
-    def window(self) -> int:
-        """Observations that it can hold at once; those that it holds have numbers that differ modulo this."""
-        ...
-
-    def observations(self, numbers: Tensor) -> Tensor:
-        """Return observations by number, uint8 ``[B, C, H, W]``."""
-        ...
-
-
-@dataclass(frozen=True)
-class DenseShiftGeometry:
+class DenseShiftGeometry(NamedTuple):
     """Sizes that follow from an encoder and a largest shift."""
 
     phases: int
-    """Phases per axis: the encoder's total stride (2), at most ``2 * pad + 1``."""
+    """Phases per axis: the encoder's total stride (2)."""
 
     window: int
     """Side in pixels of the image that each phase encodes (92)."""
@@ -71,9 +56,8 @@ class DenseShiftGeometry:
 def dense_shift_geometry(encoder: nn.Module, pad: int = 4) -> DenseShiftGeometry:
     """Work out the dense maps of an encoder for shifts of up to ``pad`` pixels in each direction.
 
-    Raises:
-        ValueError: the encoder is not known to be un-padded and convolutional throughout, or its stride
-            leaves no shifts to share (then encoding every shift by itself costs the same).
+    A ``ValueError`` says that the encoder is not known to be un-padded and convolutional throughout, or that its stride
+    leaves no shifts to share (then encoding every shift by itself costs the same).
     """
     if not isinstance(encoder, PixelEncoder):
         raise ValueError(
@@ -98,24 +82,13 @@ def dense_shift_maps(
 ) -> Tensor:
     """Encode images once per stride phase, border replicated, for every shift of up to ``pad`` pixels.
 
-    Args:
-        encoder: see :func:`dense_shift_geometry`.
-        pixels: ``[B, in_channels, image_size, image_size]``, as the encoder takes them.
-        pad: largest shift in pixels.
-        dtype: of the result; the encoder's compute dtype by default.
-
-    Returns:
-        ``[B, phases**2, C, m, m]`` contiguous, phases ordered (row, column); not standardised; without gradient.
-        ``[B, 4, 32, 39, 39]`` for the default encoder.
-
-    Raises:
-        ValueError: an encoder that is not of this form, or pixels of another shape.
+    Returns ``[B, phases**2, C, m, m]`` contiguous, of ``dtype`` or the encoder's compute dtype, phases ordered (row,
+    column); not standardised; without gradient.
     """
-    geometry = dense_shift_geometry(encoder, pad)
+    phases, window, _ = dense_shift_geometry(encoder, pad)
     expected = (encoder.in_channels, encoder.image_size, encoder.image_size)
     if pixels.ndim != 4 or tuple(pixels.shape[1:]) != expected:
         raise ValueError(f"expected pixels of shape [B, {expected}], got {tuple(pixels.shape)}.")
-    phases, window = geometry.phases, geometry.window
     # The last phase's window ends beyond the padded image; no crop that is ever read depends on those lines.
     far = pad + max(0, phases - 1 + window - (encoder.image_size + 2 * pad))
     padded = F.pad(pixels, (pad, far, pad, far), mode="replicate")
@@ -126,61 +99,32 @@ def dense_shift_maps(
 
 
 @torch.no_grad()
-def crop_features(
-    maps: Tensor,
-    offsets: Tensor,
-    *,
-    pad: int = 4,
-    rows: Tensor | None = None,
-    out: Tensor | None = None,
-    dtype: torch.dtype | None = None,
-) -> Tensor:
-    """Read the features of one shift per image from its dense maps.
+def crop_features(maps: Tensor, rows: Tensor, offsets: Tensor, out: Tensor, *, pad: int = 4) -> Tensor:
+    """Read the features of one shift per image, int64 ``offsets`` ``[B, 2]``, from the maps at ``rows`` ``[B]``.
 
     Equal to ``encoder(random_shift(pixels, offsets, pad=pad))``, not standardised: bit for bit in float32 where the
     convolution adds up each output in an order that does not depend on the image size (oneDNN on x86 does),
     otherwise to the rounding of the convolution (about 1e-6 of the largest feature).
 
-    Args:
-        maps: contiguous ``[N, phases**2, C, m, m]`` of :func:`dense_shift_maps` with the same ``pad``.
-        offsets: int64 ``[B, 2]``, (row, column) in ``{0, ..., 2 * pad}``.
-        pad: largest shift in pixels.
-        rows: int64 ``[B]``, of the maps; all in turn if None.
-        out: contiguous ``[B, feature_dim]`` of ``dtype`` to write into, and to return.
-        dtype: of the crops: that of the maps when None, or float32 of bfloat16 maps.
-
-    Raises:
-        ValueError: shapes or formats that do not fit, or an offset outside the range (read on the CPU only).
+    Writes into ``out`` ``[B, feature_dim]``, of the maps' dtype or float32 of bfloat16 maps, and returns it.
     """
-    dtype = maps.dtype if dtype is None else dtype
-    _require_readable(maps.dtype, dtype)
-    rows = torch.arange(maps.shape[0], device=maps.device) if rows is None else rows
-    batch, channels = rows.shape[0], maps.shape[2]
-    if offsets.shape != (batch, 2):
-        raise ValueError(f"expected offsets of shape [{batch}, 2], got {tuple(offsets.shape)}.")
-    check_offsets(offsets, pad)
-    phases = math.isqrt(maps.shape[1])
+    phases, channels = math.isqrt(maps.shape[1]), maps.shape[2]
     extra = 2 * pad // phases
     height, width = maps.shape[-2] - extra, maps.shape[-1] - extra
-    shape = (batch, channels * height * width)
-    if out is not None and (out.shape != shape or out.dtype != dtype):
-        raise ValueError(f"expected out of shape {shape} and {dtype}, got {tuple(out.shape)}, {out.dtype}.")
     if maps.device.type != "cpu":
-        crops = _crop_by_index(maps, rows, offsets, phases, (extra + 1, height, width))
-        return crops.to(dtype) if out is None else out.copy_(crops)
+        return out.copy_(_crop_by_index(maps, rows, offsets, phases, (extra + 1, height, width)))
     # In numpy, whose slices cost less: 512 float32 crops took 23 ms on one thread, torch.stack of slices 28 ms.
-    crops = torch.empty(shape, dtype=dtype) if out is None else out
+    widens = out.dtype != maps.dtype
     source = as_numpy_bits(maps)
-    widens = dtype != maps.dtype
-    target = crops.view(torch.int32).numpy() if widens else as_numpy_bits(crops)
-    target = target.reshape(batch, channels, height, width)
+    target = out.view(torch.int32).numpy() if widens else as_numpy_bits(out)
+    target = target.reshape(len(rows), channels, height, width)
     for crop, row, (dy, dx) in zip(target, rows.tolist(), offsets.tolist()):
         top, left = dy // phases, dx // phases
         phase = dy % phases * phases + dx % phases
         crop[:] = source[row, phase, :, top : top + height, left : left + width]
         if widens:
             crop <<= 16  # the bits of a bfloat16 are the upper half of the same number's in float32
-    return crops
+    return out
 
 
 def _crop_by_index(
@@ -199,11 +143,6 @@ def _crop_by_index(
     return every_crop[rows, phase, origin[:, 0], origin[:, 1]].flatten(1)
 
 
-def _require_readable(maps: torch.dtype, features: torch.dtype) -> None:
-    if features != maps and (maps, features) != (torch.bfloat16, torch.float32):
-        raise ValueError(f"maps in {maps} are read as {maps}, or bfloat16 as float32; got {features}.")
-
-
 class DenseShiftFeatures(Transform):
     """Write a frozen encoder's features of randomly shifted observations into a replay batch.
 
@@ -218,7 +157,8 @@ class DenseShiftFeatures(Transform):
 
     Args:
         encoder: frozen, see :func:`dense_shift_geometry`; its weights must not change from now on.
-        replay: where observations are fetched by number.
+        replay: a :class:`~crptpro.data.FrameReplay`, or what else has ``observations(numbers)``, uint8
+            ``[B, C, H, W]``, and a ``window``: those that it holds at once have numbers that differ modulo this.
         pad: largest shift in pixels.
         projector: with one, its output for all ``(2 * pad + 1)**2`` shifts of an observation is kept too (float32), and
             ``embedding_key`` is written.
@@ -226,13 +166,14 @@ class DenseShiftFeatures(Transform):
             feature to eight significant bits (exact if the encoder computes in bfloat16).
         generator: source of the offsets; torch's global generator when None. Not part of the state dict.
         observations: maps to keep; what the replay can hold when None. Fewer will do for a run that stores fewer.
-        in_keys: int64 ``[*]`` or ``[*, 1]``, numbers of observations.
-        out_keys: features ``[*, feature_dim]`` in the encoder's compute dtype, one key per observation.
+        in_keys: int64 ``[*]`` or ``[*, 1]``, numbers of observations; ``"number"`` and ``("next", "number")`` if None.
+        out_keys: features ``[*, feature_dim]`` in the encoder's compute dtype, one key per observation; ``"features"``
+            and ``("next", "features")`` if None.
         embedding_key: with a projector, projections ``[*, D]`` of the observation of the last in key.
 
     Raises:
-        ValueError: an encoder that has no dense maps, key lists of unequal length, or features in a format that maps
-            are not read in.
+        ValueError: an encoder that has no dense maps, key lists of unequal length, or a ``dtype`` that cannot be read
+            as the encoder's.
     """
 
     encoder: PixelEncoder
@@ -241,23 +182,28 @@ class DenseShiftFeatures(Transform):
     def __init__(
         self,
         encoder: PixelEncoder,
-        replay: ReplayOfObservations,
+        replay: Any,
         *,
         pad: int = 4,
         projector: nn.Module | None = None,
         dtype: torch.dtype | None = None,
         generator: torch.Generator | None = None,
         observations: int | None = None,
-        in_keys: Keys = ("number", ("next", "number")),
-        out_keys: Keys = ("features", ("next", "features")),
+        in_keys: Keys | None = None,
+        out_keys: Keys | None = None,
         embedding_key: NestedKey = ("next", "embedding"),
     ) -> None:
-        read, written = paired_keys(in_keys, out_keys)
-        super().__init__(in_keys=read, out_keys=written)
+        super().__init__(in_keys=["number", ("next", "number")] if in_keys is None else in_keys)
+        self.out_keys = ["features", ("next", "features")] if out_keys is None else out_keys
+        require_pairs(self)
         self.pad = as_int(pad, "pad", minimum=0)
-        self.geometry = dense_shift_geometry(encoder, self.pad)
-        self.dtype = encoder.compute_dtype if dtype is None else dtype
-        _require_readable(self.dtype, encoder.compute_dtype)
+        self.maps_shape = dense_shift_geometry(encoder, self.pad).maps_shape
+        computed = encoder.compute_dtype
+        self.dtype = computed if dtype is None else dtype
+        if computed != self.dtype and (self.dtype, computed) != (torch.bfloat16, torch.float32):
+            raise ValueError(
+                f"maps in {self.dtype} are read as {self.dtype}, or bfloat16 as float32; got {computed}."
+            )
         # Hidden from nn.Module: the networks are somebody else's, and no part of a replay's state.
         self.__dict__["encoder"] = encoder
         self.__dict__["projector"] = projector
@@ -291,10 +237,7 @@ class DenseShiftFeatures(Transform):
             for (flat, lead), out_key in zip(numbers, self.out_keys):
                 offsets = draw_offsets(flat.shape[0], self.pad, self.generator)
                 rows = flat % self.observations
-                features = crop_features(
-                    maps, offsets, pad=self.pad, rows=rows, out=self._output(out_key, len(flat)),
-                    dtype=self.encoder.compute_dtype,
-                )  # fmt: skip
+                features = crop_features(maps, rows, offsets, self._output(out_key, len(flat)), pad=self.pad)
                 tensordict.set(out_key, self.encoder.standardised(features).reshape(*lead, -1))
             if embeddings is not None:
                 shifts = offsets[:, 0] * (2 * self.pad + 1) + offsets[:, 1]
@@ -311,7 +254,7 @@ class DenseShiftFeatures(Transform):
     def _encode_missing(self, numbers: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return the maps and the projections, those of these observations among them."""
         if self._maps is None:
-            shape = (self.observations, *self.geometry.maps_shape)
+            shape = (self.observations, *self.maps_shape)
             self._maps = torch.empty(shape, dtype=self.dtype, device=device_of(self.encoder))
         missing = numbers[self._held[numbers % self.observations] != numbers].unique()
         for number in missing.tolist():
@@ -337,7 +280,7 @@ class DenseShiftFeatures(Transform):
         side = torch.arange(2 * self.pad + 1)
         offsets = torch.cartesian_prod(side, side)
         rows = torch.zeros(len(offsets), dtype=torch.int64)
-        features = crop_features(maps, offsets, pad=self.pad, rows=rows, dtype=self.encoder.compute_dtype)
+        features = crop_features(maps, rows, offsets, self._new_output(len(offsets)), pad=self.pad)
         return projector(self.encoder.standardised(features)).float()
 
     def _output(self, key: NestedKey, count: int) -> Tensor:
@@ -348,10 +291,12 @@ class DenseShiftFeatures(Transform):
         kept: dict[str, Tensor] = self._outputs.__dict__
         out = kept.get(str(key))
         if out is None or len(out) != count:
-            dtype, device = self.encoder.compute_dtype, device_of(self.encoder)
-            out = torch.empty(count, self.encoder.feature_dim, dtype=dtype, device=device)
-            kept[str(key)] = out
+            out = kept[str(key)] = self._new_output(count)
         return out
+
+    def _new_output(self, count: int) -> Tensor:
+        dtype, device = self.encoder.compute_dtype, device_of(self.encoder)
+        return torch.empty(count, self.encoder.feature_dim, dtype=dtype, device=device)
 
     def clone(self) -> Self:
         """Return a transform without parent and maps; replay, networks and generator are shared."""
@@ -372,22 +317,11 @@ class DenseShiftFeatures(Transform):
     def _load_from_state_dict(self, *args: Any) -> None:
         self.forget()  # whoever loads a state may number observations anew
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        raise NotImplementedError(_REPLAY_ONLY)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        raise NotImplementedError(_REPLAY_ONLY)
-
     def transform_output_spec(self, output_spec: TensorSpec) -> TensorSpec:
-        """Refuse to be part of an environment.
-
-        Raises:
-            NotImplementedError: always.
-        """
-        raise NotImplementedError(_REPLAY_ONLY)
-
-
-_REPLAY_ONLY = "DenseShiftFeatures reads a replay batch; on an environment use FrozenEncoder."
+        """Refuse to be part of an environment."""
+        raise NotImplementedError(
+            "DenseShiftFeatures reads a replay batch; on an environment use FrozenEncoder."
+        )
 
 
 def choose_feature_mode(
@@ -403,16 +337,9 @@ def choose_feature_mode(
 ) -> tuple[Literal["dense", "reencode"], str]:
     """Decide between dense maps and encoding shifted images anew; both give the same features.
 
-    Args:
-        mode: ``"auto"`` takes dense maps where the encoder has the form and the memory suffices; the other two are
-            obeyed.
-        encoder: the frozen encoder.
-        observations: to hold maps of.
-        dtype: of the stored maps.
-        available_bytes: free memory, of which the maps may take four fifths; measured when None.
-        pad: largest shift in pixels.
-        latent_dim: length of the projections if they are to be kept too.
-        device: whose memory is measured.
+    ``"auto"`` takes dense maps, of ``observations`` in ``dtype`` and of their projections of ``latent_dim`` if there
+    are to be any, where the encoder has the form and four fifths of the free memory suffice (measured on ``device`` if
+    it is not given). ``"dense"`` and ``"reencode"`` are obeyed.
 
     Returns:
         The mode, and the reason in one line, to be shown to the user.
@@ -436,24 +363,17 @@ def choose_feature_mode(
         if needed > available:
             logger.warning("The dense-shift cache was asked for and may not fit: %s.", size)
         return "dense", f"dense-shift cache, as asked ({size})"
-    if needed > MEMORY_SHARE * available:
-        in_bf16 = dense_maps_bytes(encoder, observations, torch.bfloat16, pad=pad, latent_dim=latent_dim)
-        fits = in_bf16 <= MEMORY_SHARE * available
-        remedy = f"; in bf16, by dense_precision, it would fit with {in_bf16 / 2**30:.1f} GiB" if fits else ""
-        return (
-            "reencode",
-            f"re-encoding at every update: too little memory for the dense-shift cache ({size}{remedy})",
-        )
-    return "dense", f"dense-shift cache ({size})"
+    if needed <= MEMORY_SHARE * available:
+        return "dense", f"dense-shift cache ({size})"
+    in_bf16 = dense_maps_bytes(encoder, observations, torch.bfloat16, pad=pad, latent_dim=latent_dim)
+    if in_bf16 <= MEMORY_SHARE * available:
+        size += f"; with features=dense-bf16 it would fit in {in_bf16 / 2**30:.1f} GiB"
+    return "reencode", f"re-encoding at every update: too little memory for the dense-shift cache ({size})"
 
 
 def dense_maps_bytes(
     encoder: nn.Module, observations: int, dtype: torch.dtype, *, pad: int = 4, latent_dim: int | None = None
 ) -> int:
-    """Return the memory of dense maps in bytes; see :func:`choose_feature_mode`.
-
-    Raises:
-        ValueError: an encoder that is not of the form.
-    """
+    """Return the memory of dense maps in bytes; see :func:`choose_feature_mode`."""
     values = math.prod(dense_shift_geometry(encoder, pad).maps_shape)
     return observations * (values * dtype.itemsize + (latent_dim or 0) * 4 * (2 * pad + 1) ** 2)

@@ -28,11 +28,8 @@ def free_bytes(device: torch.device) -> int:
 def cgroup_free_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> Iterator[int]:
     """Yield what each memory-limited cgroup around this process has left, in bytes; what is unreadable counts not.
 
-    psutil does not look at them: inside a container it reports the machine.
-
-    Args:
-        own: the process's groups, one ``number:controllers:path`` a line.
-        root: where the groups are mounted.
+    psutil does not look at them: inside a container it reports the machine. The process's groups stand in ``own``, one
+    ``number:controllers:path`` a line; they are mounted at ``root``.
     """
     for line in own.read_text().splitlines() if own.exists() else []:
         _, controllers, group = line.split(":", 2)
@@ -40,10 +37,8 @@ def cgroup_free_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> Iterator
             continue
         base = root / "memory" if controllers else root
         innermost = base / group.lstrip("/")
-        for directory in (
-            innermost,
-            *(parent for parent in innermost.parents if parent.is_relative_to(base)),
-        ):
+        around = [parent for parent in innermost.parents if parent.is_relative_to(base)]
+        for directory in (innermost, *around):
             for limit, usage, cache in _FILES:
                 try:
                     left = int((directory / limit).read_text()) - int((directory / usage).read_text())

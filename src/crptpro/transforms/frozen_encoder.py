@@ -13,20 +13,13 @@ from crptpro.transforms.base import Keys, PixelTransform
 
 
 class FrozenEncoder(PixelTransform):
-    """Encode images without gradient, on environments (single and batched) and in replay buffers.
+    """Encode images ``[*, C, H, W]`` without gradient, on environments (single and batched) and in replay buffers.
 
-    Any ``nn.Module`` that maps images to features will do, a ResNet or a vision transformer as well as a
-    :class:`~crptpro.modules.PixelEncoder`; whether it wants uint8 or scaled images is its own affair. It is used by
-    reference, in evaluation mode, so an encoder that a loss is still training can be looked through at any time. Images
-    are moved to the encoder's device, and the features back to where the images were.
-
-    Args:
-        encoder: maps ``[N, C, H, W]`` to ``[N, ...]``.
-        in_keys: images ``[*, C, H, W]`` with any number of leading dimensions.
-        out_keys: features ``[*, ...]``, in the encoder's output dtype.
-
-    Raises:
-        ValueError: ``in_keys`` and ``out_keys`` of unequal length.
+    Any ``nn.Module`` that maps ``[N, C, H, W]`` to features ``[N, ...]`` will do, a ResNet or a vision transformer as
+    well as a :class:`~crptpro.modules.PixelEncoder`; whether it wants uint8 or scaled images is its own affair. It is
+    used by reference, in evaluation mode, so an encoder that a loss is still training can be looked through at any
+    time. Images are moved to the encoder's device, and the features, in its output dtype, back to where the images
+    were.
 
     Examples:
         >>> from crptpro.modules import PixelEncoder
@@ -37,13 +30,7 @@ class FrozenEncoder(PixelTransform):
         torch.Size([2, 100])
     """
 
-    def __init__(
-        self,
-        encoder: nn.Module,
-        *,
-        in_keys: Keys = "pixels",
-        out_keys: Keys = "features",
-    ) -> None:
+    def __init__(self, encoder: nn.Module, *, in_keys: Keys = "pixels", out_keys: Keys = "features") -> None:
         super().__init__(in_keys, out_keys)
         self.encoder = encoder.eval()
 

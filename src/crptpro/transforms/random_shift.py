@@ -15,44 +15,24 @@ from crptpro.values import as_int
 def draw_offsets(
     batch: int, pad: int, generator: torch.Generator | None = None, device: torch.device | str = "cpu"
 ) -> Tensor:
-    """Draw one shift per sample, uniform over the ``(2 * pad + 1)**2`` integer offsets.
+    """Draw one shift per sample, uniform over the ``(2 * pad + 1)**2`` integer offsets of up to ``pad`` pixels.
 
-    Args:
-        batch: number of samples.
-        pad: largest shift in pixels, in each direction.
-        generator: source of the draws; torch's global generator of ``device`` when None. A generator on
-            another device is drawn from where it lives, so one CPU generator gives the same shifts on every
-            device.
-        device: where the offsets are returned.
-
-    Returns:
-        int64 ``[batch, 2]``, (row, column), each in ``{0, ..., 2 * pad}``; ``(pad, pad)`` is no shift.
+    Returns int64 ``[batch, 2]``, (row, column), each in ``{0, ..., 2 * pad}``; ``(pad, pad)`` is no shift. A generator
+    on another device is drawn from where it lives, so one CPU generator gives the same shifts on every device.
     """
     source = torch.device(device) if generator is None else generator.device
     return torch.randint(0, 2 * pad + 1, (batch, 2), generator=generator, device=source).to(device)
 
 
 def random_shift(pixels: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
-    """Shift every image by its own integer offset, repeating the border where nothing was.
+    """Shift every image ``[B, C, H, W]`` by its own integer offset ``[B, 2]``, repeating the border where nothing was.
 
-    A crop of the image with its border replicated ``pad`` times: the augmentation of DrQ
-    (denisyarats/drq) as CRPTpro and Proto-RL use it for pre-training and downstream RL.
-    Values are copied, never interpolated, so the result is exact in every dtype.
+    A crop of the image with its border replicated ``pad`` times: the augmentation of DrQ (denisyarats/drq) as CRPTpro
+    and Proto-RL use it. Offsets are (row, column) in ``{0, ..., 2 * pad}`` (a ``ValueError`` otherwise, where they can
+    be read without waiting). Values are copied, never interpolated, so the result is exact in every dtype.
 
     On a CPU this copies slices, in half the time of padding and cropping. On other devices, under ``torch.compile``
     and where a gradient is wanted, it is one gather without host synchronisation.
-
-    Args:
-        pixels: ``[B, C, H, W]``, any dtype.
-        offsets: int64 ``[B, 2]``, (row, column) in ``{0, ..., 2 * pad}``, shared by all channels of a sample.
-        pad: width of the replicated border.
-
-    Returns:
-        ``[B, C, H, W]``, same dtype and device.
-
-    Raises:
-        ValueError: shapes that do not fit, or an offset outside ``{0, ..., 2 * pad}`` (offsets on the CPU;
-            not under ``torch.compile``).
 
     Examples:
         >>> image = torch.arange(4).view(1, 1, 2, 2)
@@ -67,23 +47,13 @@ def random_shift(pixels: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
         )
     if torch.compiler.is_compiling():
         return _shift_by_gather(pixels, offsets, pad)
-    check_offsets(offsets, pad)
+    if offsets.device.type == "cpu" and offsets.numel():
+        low, high = (int(bound) for bound in torch.aminmax(offsets))
+        if low < 0 or high > 2 * pad:
+            raise ValueError(f"offsets must lie in 0..{2 * pad} (pad {pad}), got {low}..{high}.")
     if pixels.device.type != "cpu" or pixels.requires_grad:
         return _shift_by_gather(pixels, offsets, pad)
     return _shift_by_slices(pixels, offsets, pad)
-
-
-def check_offsets(offsets: Tensor, pad: int) -> None:
-    """Refuse offsets outside ``{0, ..., 2 * pad}``; offsets on other devices are not read (that would wait).
-
-    Raises:
-        ValueError: naming the smallest and largest offset.
-    """
-    if offsets.device.type != "cpu" or offsets.numel() == 0:
-        return
-    low, high = (int(bound) for bound in torch.aminmax(offsets))
-    if low < 0 or high > 2 * pad:
-        raise ValueError(f"offsets must lie in 0..{2 * pad} (pad {pad}), got {low}..{high}.")
 
 
 def as_numpy_bits(tensor: Tensor) -> np.ndarray[Any, Any]:
@@ -120,34 +90,25 @@ def _copy_shifted(view: np.ndarray[Any, Any], image: np.ndarray[Any, Any], row: 
     left, right = max(-column, 0), width - max(column, 0)
     rows = slice(top + row, bottom + row)
     view[:, top:bottom, left:right] = image[:, rows, left + column : right + column]
-    if left:
-        view[:, top:bottom, :left] = image[:, rows, :1]
-    if right < width:
-        view[:, top:bottom, right:] = image[:, rows, -1:]
-    if top:
-        view[:, :top] = view[:, top : top + 1]
-    if bottom < height:
-        view[:, bottom:] = view[:, bottom - 1 : bottom]
+    view[:, top:bottom, :left] = image[:, rows, :1]
+    view[:, top:bottom, right:] = image[:, rows, -1:]
+    view[:, :top] = view[:, top : top + 1]
+    view[:, bottom:] = view[:, bottom - 1 : bottom]
 
 
 class RandomShift(PixelTransform):
-    """Shift images at random, for replay buffers (``forward``) and environments.
+    """Shift images ``[*, C, H, W]`` at random by up to ``pad`` pixels, for replay buffers and environments.
 
-    Every key and every sample draws its own offset; all channels (stacked frames) of a sample share it. The
-    transform acts whether or not it is in training mode, because TorchRL puts every attached transform into
-    evaluation mode. On an environment only the root keys are shifted.
+    Every key and every sample draws its own offset; all channels (stacked frames) of a sample share it. The transform
+    acts whether or not it is in training mode, because TorchRL puts every attached transform into evaluation mode.
 
     Args:
         pad: largest shift in pixels.
-        in_keys: uint8 or float images ``[*, C, H, W]``. By default ``"pixels"`` and, where present,
-            ``("next", "pixels")``; keys that are named must be present.
+        in_keys: images. By default ``"pixels"`` and, where present, ``("next", "pixels")``; keys that are named must be
+            present. On an environment only the root keys are shifted.
         out_keys: where the shifted images go; in place of the originals by default.
         generator: source of the offsets; torch's global generator when None. It is not part of the state
             dict: whoever owns it saves it. Clones of the transform share it.
-
-    Raises:
-        ValueError: negative ``pad``, or ``in_keys`` and ``out_keys`` of unequal length.
-
     """
 
     def __init__(

@@ -1,0 +1,187 @@
+"""Contrastive losses: ATC tells successors apart, SimCLR (APT's) second views, BeCL the observations of a skill."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, cast
+
+import torch
+import torch.nn.functional as F
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from torch import Tensor, nn
+
+from crptpro.modules import AnchorHead, Projector, SkillHead
+from crptpro.modules.heads import latent_dim_of, require_one_latent_dim
+from crptpro.objectives.base import PretrainingLoss, require_positive
+from crptpro.objectives.functional import becl_loss, info_nce, mean_pairwise_cosine
+
+
+class ContrastiveLoss(PretrainingLoss):
+    """One scalar, ``loss_contrast`` (nats), and detached ``embedding_cosine``, the mean pairwise cosine of latents.
+
+    A subclass encodes a batch, and contrasts what it has encoded in the precision of the parameters. Images must
+    already be augmented, each independently.
+    """
+
+    default_out_keys = ("loss_contrast", "embedding_cosine")
+
+    def _encode(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
+        raise NotImplementedError
+
+    def _contrast(self, *encoded: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the loss, and latents at unit length."""
+        raise NotImplementedError
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the loss and diagnostics of one batch; see the class."""
+        encoded = self._encode(tensordict)
+        with torch.autocast(device_type=encoded[0].device.type, enabled=False):
+            loss, unit = self._contrast(*encoded)
+            out = {"loss_contrast": loss, "embedding_cosine": mean_pairwise_cosine(unit.detach())}
+        return TensorDict(out, batch_size=[])
+
+
+class ATCLoss(ContrastiveLoss):
+    r"""Augmented temporal contrast (ATC, arXiv 2009.08319; astooke/rlpyt ``ul/algos/ul_for_rl``).
+
+    With anchors :math:`a = g_\theta(f_\theta(x_t))` and positives
+    :math:`p = g_{\bar\theta}(f_{\bar\theta}(x_{t+1}))` (no gradient), neither normalised,
+
+    .. math:: L = -\frac1B\sum_i \log\mathrm{softmax}_j\big(W(a_i + \mathrm{MLP}(a_i))\cdot p_j\big)_i .
+
+    There is no temperature. A loss that stays at ln B (6.238 for a batch of 512) says that anchors are not told apart.
+    In TorchRL batches ``("next", "pixels")`` is the true successor, so ends of episodes need no mask as in the source.
+    Default heads are ``Projector(encoder.feature_dim, latent_dim)`` with ATC's Kaiming-normal weights, and
+    ``AnchorHead(latent_dim, hidden_dim)``; heads of different latent lengths are a ``ValueError``.
+    """
+
+    anchor_head: nn.Module
+    anchor_head_params: Any
+    target_anchor_head_params: Any
+
+    def __init__(
+        self,
+        encoder: nn.Module,
+        *,
+        projector: nn.Module | None = None,
+        anchor_head: nn.Module | None = None,
+        latent_dim: int = 128,
+        hidden_dim: int = 512,
+    ) -> None:
+        super().__init__()
+        projector = projector or Projector(cast(int, encoder.feature_dim), latent_dim, init="kaiming")
+        anchor_head = anchor_head or AnchorHead(latent_dim, hidden_dim)
+        require_one_latent_dim(projector=projector, anchor_head=anchor_head)
+        self._convert(("encoder", "projector"), encoder=encoder, projector=projector, anchor_head=anchor_head)
+        # What an artifact's card needs to build the anchor head again.
+        self.latent_dim = latent_dim_of(anchor_head) or latent_dim
+        self.hidden_dim = getattr(anchor_head, "config", {}).get("hidden_dim", hidden_dim)
+
+    def _encode(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
+        anchors = self._latents(self._read(tensordict, self.tensor_keys.observation))
+        positives = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))
+        return self._apply_network("anchor_head", anchors), positives, anchors
+
+    def _contrast(self, *encoded: Tensor) -> tuple[Tensor, Tensor]:
+        queries, positives, anchors = encoded
+        return info_nce(queries, positives.to(queries.dtype)), F.normalize(anchors.detach(), dim=-1)
+
+
+class SimCLRLoss(ContrastiveLoss):
+    r"""Contrast of two independently shifted views, without target network (APT, arXiv 2103.04551).
+
+    Views :math:`z = g_\theta(f_\theta(\cdot))/\|\cdot\|` of both images of B observations; each of the 2B has the
+    other view of its observation as positive and the remaining 2B - 2 as negatives:
+
+    .. math:: L = -\frac1{2B}\sum_i \log\frac{\exp(z_i\cdot z_{p(i)}/\tau)}{\sum_{j\ne i}\exp(z_i\cdot z_j/\tau)} .
+
+    It says in :attr:`views` that ``pixels_view`` is a second view of ``pixels``; :func:`~crptpro.training.pretrain`
+    makes it by shifting the same images again.
+
+    Deviation: APT has published no code for DeepMind Control; loss and temperature are those of the authors' code
+    for Atari, the head (``Projector(encoder.feature_dim, latent_dim)``) is the one that every method here has.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        observation: NestedKey = "pixels"  # images
+        observation_view: NestedKey = "pixels_view"  # the same images, augmented independently
+
+    default_keys = _AcceptedKeys
+    _schedulable_buffers = frozenset({"temperature"})
+
+    def __init__(
+        self,
+        encoder: nn.Module,
+        *,
+        projector: nn.Module | None = None,
+        latent_dim: int = 128,
+        temperature: float = 0.07,
+    ) -> None:
+        super().__init__()
+        require_positive(temperature=temperature)
+        projector = projector or Projector(cast(int, encoder.feature_dim), latent_dim)
+        self._convert(encoder=encoder, projector=projector)
+        self.latent_dim = latent_dim_of(projector) or latent_dim
+        self._register_coefficients(temperature=temperature)
+
+    @property
+    def views(self) -> dict[NestedKey, NestedKey]:
+        """The second view of the observation, by its key."""
+        return {self.tensor_keys.observation_view: self.tensor_keys.observation}
+
+    def _encode(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
+        keys = (self.tensor_keys.observation, self.tensor_keys.observation_view)
+        return (self._latents(torch.cat([self._read(tensordict, key) for key in keys])),)
+
+    def _contrast(self, *encoded: Tensor) -> tuple[Tensor, Tensor]:
+        one, two = F.normalize(encoded[0], dim=-1).chunk(2)
+        return info_nce(one, two, temperature=self.temperature, negatives="both"), one
+
+
+class BeCLLoss(ContrastiveLoss):
+    r"""Behaviour contrastive learning (BeCL, arXiv 2305.04477; Rooshy-yang/BeCL ``agent/becl.py``).
+
+    :func:`~crptpro.objectives.functional.becl_loss` of :math:`F = h(f_\theta(x'))` with the head h, by default
+    ``SkillHead(encoder.feature_dim, skill_dim, hidden_dim)``, as ``projector``: for every row, one other row of the
+    same skill is told from all other rows. :math:`x'` is the next observation (three agent steps ahead with the
+    method's n-step batches). All rows should come from one domain, where skills are comparable. A batch of one has the
+    loss 0.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        next_observation: NestedKey = ("next", "pixels")  # images that the skill led to
+        skill: NestedKey = "skill"  # one-hot [B, K], floating
+
+    default_keys = _AcceptedKeys
+    _schedulable_buffers = frozenset({"temperature"})
+
+    def __init__(
+        self,
+        encoder: nn.Module,
+        *,
+        projector: nn.Module | None = None,
+        skill_dim: int = 16,
+        hidden_dim: int = 1024,
+        temperature: float = 0.5,
+    ) -> None:
+        super().__init__()
+        require_positive(temperature=temperature)
+        projector = projector or SkillHead(cast(int, encoder.feature_dim), skill_dim, hidden_dim)
+        self._convert(encoder=encoder, projector=projector)
+        self.skill_dim = latent_dim_of(projector) or skill_dim
+        self._register_coefficients(temperature=temperature)
+
+    def _encode(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
+        latents = self._latents(self._read(tensordict, self.tensor_keys.next_observation))
+        return latents, self._read(tensordict, self.tensor_keys.skill, event_dims=1).argmax(dim=-1)
+
+    def _contrast(self, *encoded: Tensor) -> tuple[Tensor, Tensor]:
+        latents, skills = encoded
+        unit = F.normalize(latents.detach(), dim=-1)
+        if len(latents) < 2:
+            return 0 * latents.sum(), unit  # nothing to contrast with
+        return becl_loss(latents, skills, temperature=self.temperature), unit
