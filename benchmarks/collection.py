@@ -80,16 +80,12 @@ def main(settings: Settings) -> dict[str, Any]:
             os.sched_setaffinity(0, cores)
         total, domain = settings.worker_transitions, settings.domains[0]
         calls = {
-            f"{count} workers": collecting(
-                domain, Path(directory) / str(count), total, settings, workers=count
-            )
+            f"{count} workers": collecting(domain, Path(directory) / str(count), total, settings, workers=count)
             for count in settings.workers
         }
         if calls:
             timings = side_by_side(calls, rounds=2, warmup=0, per_call=total)
-            results["workers"] = table(
-                timings, unit=f"transition of {domain}, with the start", to=next(iter(calls))
-            )
+            results["workers"] = table(timings, unit=f"transition of {domain}, with the start", to=next(iter(calls)))
     save("collection", settings, results, settings.out)
     return results
 
@@ -120,9 +116,7 @@ def compare(domain: str, settings: Settings, place: Path) -> dict[str, Any]:
     return found
 
 
-def collecting(
-    domain: str, root: Path, transitions: int, settings: Settings, **options: Any
-) -> Callable[[], Any]:
+def collecting(domain: str, root: Path, transitions: int, settings: Settings, **options: Any) -> Callable[[], Any]:
     """Return a call that collects a dataset in a directory of its own."""
     numbers = itertools.count()
     sizes = {"transitions": transitions, "image_size": settings.image_size, "progress": False}

@@ -127,9 +127,7 @@ def downstream(
     last = "wait for the image" if has_stages else "update"
     with ExitStack() as stack:
         stack.enter_context(laps.clock(FrameReplay, "sample", begin, "sample" if has_stages else ""))
-        stack.enter_context(
-            laps.clock(FrameReplay, STORE, lambda *_: laps.lap(last, waits=True), after="store")
-        )
+        stack.enter_context(laps.clock(FrameReplay, STORE, lambda *_: laps.lap(last, waits=True), after="store"))
         if has_stages:
             stack.callback(register_optimizer_step_post_hook(lambda *_: laps.lap("learn")).remove)
         train_downstream(

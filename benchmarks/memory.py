@@ -59,11 +59,7 @@ def main(settings: Settings) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="crptpro-memory-", dir=settings.scratch) as directory:
         work = Path(directory)
         peaks["imports"] = peak_bytes("nothing")
-        collected: dict[str, Any] = {
-            "task": settings.task,
-            "transitions": settings.collect_transitions,
-            **image,
-        }
+        collected: dict[str, Any] = {"task": settings.task, "transitions": settings.collect_transitions, **image}
         peaks["collection"] = peak_bytes("rendering", root=work / "collected", **collected)
         disk["dataset"] = disk_bytes(work / "collected") / settings.collect_transitions
         sizes: dict[str, Any] = {**image, "transitions": settings.dataset_transitions}

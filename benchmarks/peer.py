@@ -65,9 +65,7 @@ def load(directory: Path) -> dict[str, ModuleType]:
         try:
             modules = {name: importlib.import_module(name) for name in names}
         except Exception as reason:
-            raise CRPTproError(
-                f"{directory} cannot be imported: {type(reason).__name__}: {reason}."
-            ) from reason
+            raise CRPTproError(f"{directory} cannot be imported: {type(reason).__name__}: {reason}.") from reason
     if not hasattr(modules["proto"], "ProtoAgent"):
         raise CRPTproError(f"{directory / 'proto.py'} defines no ProtoAgent: this is another repository.")
     return modules

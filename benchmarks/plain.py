@@ -174,9 +174,7 @@ class PlainDownstream:
         """Draw a row of the batch for every prototype, from scores ``[M, B]``."""
         return torch.multinomial(F.softmax(scores, dim=1), 1).squeeze(1)
 
-    def critic_loss(
-        self, h: Tensor, action: Tensor, reward: Tensor, next_h: Tensor, not_terminated: Tensor
-    ) -> Tensor:
+    def critic_loss(self, h: Tensor, action: Tensor, reward: Tensor, next_h: Tensor, not_terminated: Tensor) -> Tensor:
         """Sum of both heads' mean squared errors; ``h`` and ``next_h`` are features ``[B, D]``."""
         with torch.no_grad():
             next_action, log_prob = self.actor.sample(next_h, generator=self.generator)

@@ -83,19 +83,13 @@ def main(settings: Settings) -> dict[str, Any]:
             common: dict[str, Any] = {"source": root, "python": interpreter, "threads": settings.threads}
             with Loop("datasets", root=place, **images, **common):
                 paths = sorted(place.iterdir())
-            more = {
-                "pretraining": {"datasets": paths},
-                "sampling": {"path": paths[0]},
-                "opening": {"path": paths[0]},
-            }
+            more = {"pretraining": {"datasets": paths}, "sampling": {"path": paths[0]}, "opening": {"path": paths[0]}}
             own[which] = {**more, "collecting": {"root": place / "collected"}, "common": common}
         for name in settings.only:
             item, laps, sizes = items[name]
             with ExitStack() as stack:
                 loops = {
-                    which: stack.enter_context(
-                        Loop(item, of=laps, **sizes, **mine.get(item, {}), **mine["common"])
-                    )
+                    which: stack.enter_context(Loop(item, of=laps, **sizes, **mine.get(item, {}), **mine["common"]))
                     for which, mine in own.items()
                 }
                 timings = side_by_side(loops, rounds=settings.rounds, warmup=settings.warmup)

@@ -91,10 +91,7 @@ def main(settings: Settings) -> dict[str, Any]:
     results: dict[str, Any] = {}
     with tempfile.TemporaryDirectory(prefix="crptpro-updates-") as directory:
         scratch = Path(directory)
-        sizes: dict[str, Any] = {
-            "transitions": settings.dataset_transitions,
-            "image_size": settings.image_size,
-        }
+        sizes: dict[str, Any] = {"transitions": settings.dataset_transitions, "image_size": settings.image_size}
         datasets = [path.resolve() for path in settings.dataset] or [
             drifting_dataset(scratch, seed=seed, **sizes) for seed in range(3)
         ]
@@ -121,9 +118,7 @@ def time_pretraining(settings: Settings, datasets: list[Path]) -> dict[str, Any]
     candidates: dict[str, Callable[[], Any]] = {"plain fp32": lambda: plain.update(store.sample(batch_size))}
     if settings.peer is not None:
         theirs = released(settings, store, task_agnostic=True)
-        candidates["released agent"] = lambda: theirs(
-            2
-        )  # an even number: every gate of the schedules is open
+        candidates["released agent"] = lambda: theirs(2)  # an even number: every gate of the schedules is open
     with ExitStack() as stack:
         for precision in precisions():
             candidates[f"ours {precision}"] = stack.enter_context(
@@ -139,9 +134,7 @@ def time_downstream(settings: Settings, dataset: Path) -> dict[str, Any]:
     store = Batch.of(FrameDataset.open(dataset), settings.update_transitions)
     sizes = pretrained.encoder.feature_dim, ACTION_DIM
     plain = PlainDownstream(pretrained, SquashedGaussianActor(*sizes), TwinCritic(*sizes))
-    ways: dict[str, Callable[[int], Any]] = {
-        "plain fp32": lambda step: plain.update(store.sample(batch_size), step)
-    }
+    ways: dict[str, Callable[[int], Any]] = {"plain fp32": lambda step: plain.update(store.sample(batch_size), step)}
     if settings.peer is not None:
         ways["released agent"] = released(settings, store, task_agnostic=False)
     candidates: dict[str, Callable[[], Any]] = {name: twice(update) for name, update in ways.items()}

@@ -28,9 +28,7 @@ root_doc = "docs/index"
 include_patterns = ["*.md", "docs/*.md", "benchmarks/README.md", "results/README.md", "results/*/README.md",
                     "results/*/report.md"]  # fmt: skip
 root = Path(__file__).resolve().parent.parent
-exclude_patterns = [
-    p.name for p in root.iterdir() if p.is_dir() and p.name not in ("docs", "benchmarks", "results")
-]
+exclude_patterns = [p.name for p in root.iterdir() if p.is_dir() and p.name not in ("docs", "benchmarks", "results")]
 suppress_warnings = ["toc.not_included"]  # the README, and what results link to
 
 myst_heading_anchors = 4
@@ -123,9 +121,7 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-process-docstring", restore_attribute, priority=600)
     app.connect("autodoc-process-signature", short_factories)
     app.connect("missing-reference", check_reference)
-    app.add_html_math_renderer(
-        "mathml", inline_renderers=(visit_math, None), block_renderers=(visit_math, None)
-    )
+    app.add_html_math_renderer("mathml", inline_renderers=(visit_math, None), block_renderers=(visit_math, None))
 
 
 html_math_renderer = "mathml"

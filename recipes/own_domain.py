@@ -43,9 +43,7 @@ class NextLatentLoss(LossModule):
         super().__init__()
         projector = Projector(encoder.feature_dim, 128)
         # Asking for target parameters is all it takes: the training loop moves them.
-        self.convert_to_functional(
-            nn.Sequential(encoder, projector), "encoder_network", create_target_params=True
-        )
+        self.convert_to_functional(nn.Sequential(encoder, projector), "encoder_network", create_target_params=True)
         self.predictor = Predictor(128, 256)
         self.__dict__.update(encoder=encoder, projector=projector)  # what save_pretrained keeps
 
@@ -64,9 +62,7 @@ class NextLatentLoss(LossModule):
         return TensorDict({"loss_prediction": loss, "embedding_cosine": cosine}, batch_size=[])
 
 
-register_method(
-    "next-latent", NextLatentLoss, updates=300, batch_size=128, learning_rate=3e-4, encoder_tau=0.05
-)
+register_method("next-latent", NextLatentLoss, updates=300, batch_size=128, learning_rate=3e-4, encoder_tau=0.05)
 
 
 @dataclass
@@ -104,14 +100,12 @@ def main(config: Config) -> None:
     seed, out = config.seed, config.out
     dataset = collect_random(
         config.world, out / "data", transitions=config.transitions, seed=seed, workers=config.workers
-    )  # fmt: skip
+    )
     seed_everything(seed)
     loss = NextLatentLoss(PixelEncoder())
     result = pretrain(loss, dataset, run_dir=out / "pretrain", config=replace(config.pretrain, seed=seed))
     encoder = save_pretrained(result, out / "encoder")
-    train_downstream(
-        config.world, encoder, run_dir=out / "downstream", config=replace(config.downstream, seed=seed)
-    )  # fmt: skip
+    train_downstream(config.world, encoder, run_dir=out / "downstream", config=replace(config.downstream, seed=seed))
 
 
 if __name__ == "__main__":

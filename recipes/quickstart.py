@@ -82,7 +82,7 @@ def main(config: Config) -> None:
     logger.info("1/4 collect %d random transitions per domain", config.transitions)
     datasets = collect_group(
         config.domains, config.out / "data", transitions=config.transitions, workers=config.workers, **world
-    )  # fmt: skip
+    )
 
     logger.info("2/4 pre-train one encoder on all of them")
     seed_everything(config.seed)
@@ -97,7 +97,7 @@ def main(config: Config) -> None:
     for name, pretrained in {"crptpro": encoder, "random-encoder": "random-encoder"}.items():
         run = train_downstream(
             config.task, pretrained, run_dir=config.out / name, config=replace(config.downstream, **world)
-        )  # fmt: skip
+        )
         last = [row["episode_return"] for row in run.evaluations if row["env_steps"] == run.env_steps]
         scores[name] = {"mean": sum(last) / len(last), "min": min(last), "max": max(last)}
 

@@ -76,13 +76,7 @@ def test_a_damaged_or_missing_card_is_named(tmp_path: Path, text: str | None, me
 
 
 def test_every_number_in_a_card_is_the_plain_number_it_means_or_refused_by_name(tmp_path: Path) -> None:
-    given = {
-        "size": np.int64(84),
-        "rate": torch.tensor(0.5),
-        "shape": (np.uint8(3), 2),
-        "out": Path("a"),
-        "no": None,
-    }
+    given = {"size": np.int64(84), "rate": torch.tensor(0.5), "shape": (np.uint8(3), 2), "out": Path("a"), "no": None}
     write_json(tmp_path / "card.json", {"config": given, "ok": np.bool_(True)})
     assert read_json(tmp_path / "card.json") == {
         "config": {"size": 84, "rate": 0.5, "shape": [3, 2], "out": "a", "no": None}, "ok": True,
@@ -158,12 +152,7 @@ def test_what_is_no_artifact_of_this_kind_is_not_replaced(tmp_path: Path) -> Non
     ("os.rename", OSError(errno.EIO, "Input/output error"), OSError, "error: '{}"),
 ])  # fmt: skip
 def test_a_failed_write_keeps_the_old_artifact_and_names_it(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    step: str,
-    error: Exception,
-    kind: type[Exception],
-    message: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, error: Exception, kind: type[Exception], message: str
 ) -> None:
     write(tmp_path / "a", 1.0)
 
@@ -209,9 +198,7 @@ def test_the_directory_that_one_is_in_is_read_and_written_like_any_other(
     assert value_of(tmp_path / "a") == 2
 
 
-def test_a_kill_between_the_two_renames_loses_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kill_between_the_two_renames_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path / "a", 1.0)
     rename, seen = os.rename, []
 

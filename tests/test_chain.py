@@ -17,9 +17,7 @@ from crptpro.training import evaluate, load_agent, pretrain, train_downstream
 
 
 def test_collect_pretrain_freeze_and_learn(tmp_path: Path) -> None:
-    paths = collect_group(
-        [FIXED, VARIABLE], tmp_path / "data", transitions=100, image_size=12, progress=False
-    )
+    paths = collect_group([FIXED, VARIABLE], tmp_path / "data", transitions=100, image_size=12, progress=False)
     encoder = PixelEncoder(channels=(4, 4), strides=(2, 1), image_size=12)
     loss = ProtoLoss(encoder, num_prototypes=8, latent_dim=4, hidden_dim=16)
     before = encoder.convs[0].weight.clone()

@@ -99,10 +99,7 @@ def test_a_line_does_not_break_a_running_bar(capsys: pytest.CaptureFixture[str])
 
 def python(code: str, **environment: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(
-        [sys.executable, "-c", code],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env={**os.environ, **environment},
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ, **environment}
     )
 
 
@@ -130,8 +127,6 @@ def test_what_a_terminal_cannot_show_is_printed_as_escapes() -> None:
         "def main():\n print('3 \\xb1 1'); logging.getLogger('crptpro').info('4 \\xb1 1')\n"
         "run_main(main)"
     )
-    with python(
-        program, LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0", PYTHONIOENCODING="ascii"
-    ) as process:
+    with python(program, LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0", PYTHONIOENCODING="ascii") as process:
         assert process.communicate() == (b"3 \\xb1 1\n", b"4 \\xb1 1\n")
     assert process.returncode == 0

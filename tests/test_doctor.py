@@ -75,9 +75,7 @@ def test_a_machine_on_which_nothing_renders_is_not_ok_and_told_why(
     monkeypatch: pytest.MonkeyPatch, code: str, gl: str | None, parts: tuple[str, ...]
 ) -> None:
     probe_with(monkeypatch, code)
-    os.environ.update(
-        {"MUJOCO_GL": gl} if gl else {}, **{rendering.TIMEOUT_VARIABLE: "0.5"} if "sleep" in code else {}
-    )
+    os.environ.update({"MUJOCO_GL": gl} if gl else {}, **{rendering.TIMEOUT_VARIABLE: "0.5"} if "sleep" in code else {})
     report = run_doctor(["cartpole"])
     assert not report.ok
     for part in (*parts, "would not work"):
@@ -85,9 +83,7 @@ def test_a_machine_on_which_nothing_renders_is_not_ok_and_told_why(
 
 
 def test_one_backend_is_enough(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-    probe_with(
-        monkeypatch, f"import os\nif os.environ['MUJOCO_GL'] == 'egl': raise SystemExit('no EGL')\n{PROBE}"
-    )
+    probe_with(monkeypatch, f"import os\nif os.environ['MUJOCO_GL'] == 'egl': raise SystemExit('no EGL')\n{PROBE}")
     report = run_doctor(["cartpole"])
     assert report.ok
     assert "rendering with osmesa" in report.text()
@@ -173,12 +169,7 @@ def test_a_domain_that_raises_is_reported_and_what_it_lacks_is_not_blamed_on_the
 
 def test_a_domain_that_crashes_or_hangs_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
-    found = {
-        "walker": (1, "", "a\nboom\n"),
-        "dog": (-11, "", ""),
-        "fish": (None, "", ""),
-        "finger": (0, "{}\n", ""),
-    }
+    found = {"walker": (1, "", "a\nboom\n"), "dog": (-11, "", ""), "fish": (None, "", ""), "finger": (0, "{}\n", "")}
     asked: list[str] = []
 
     def run_isolated(commands: Any, backend: str, *, timeout_s: float) -> Any:

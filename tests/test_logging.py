@@ -138,9 +138,7 @@ def test_the_state_of_one_stream_leaves_the_others_alone(tmp_path: Path) -> None
         assert [row["env_steps"] for row in logger.rows("eval")] == [5]
 
 
-def test_a_record_shorter_than_its_checkpoint_is_announced(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_record_shorter_than_its_checkpoint_is_announced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with RunLogger(tmp_path) as logger:
         logger.log({"a": 1}, stream="train", updates=1)
         logger.load_state_dict({"train": 5})
@@ -176,9 +174,7 @@ def test_a_process_killed_while_logging_leaves_whole_rows(tmp_path: Path) -> Non
     assert [int(row["updates"]) for row in table(tmp_path, "train")] == list(range(count + 1))
 
 
-def test_a_full_disk_is_one_clear_error_without_half_a_row(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_one_clear_error_without_half_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real_open = open
 
     class HalfFile:
@@ -285,9 +281,7 @@ def test_a_mirror_begins_with_the_first_row(tmp_path: Path, fake_wandb: list[Fak
     assert len(fake_wandb) == 1
 
 
-def test_wandb_gets_metrics_against_their_counter_under_one_identity(
-    tmp_path: Path, fake_wandb: list[FakeRun]
-) -> None:
+def test_wandb_gets_metrics_against_their_counter_under_one_identity(tmp_path: Path, fake_wandb: list[FakeRun]) -> None:
     for start in (0, 1):
         with RunLogger(tmp_path, wandb=WandbOptions(tags=("t",)), config={"lr": 1}) as logger:
             logger.log({"loss": 1.0, "note": "x"}, stream="pretrain", updates=start + 1)
@@ -297,14 +291,8 @@ def test_wandb_gets_metrics_against_their_counter_under_one_identity(
             logger.log({"score": 2.0}, stream="eval", episodes=1, env_steps=10)
     first, second = fake_wandb
     assert first.options["id"] == second.options["id"]
-    assert (first.options["mode"], first.options["tags"], first.options["config"]) == (
-        "offline",
-        ["t"],
-        {"lr": 1},
-    )
-    assert first.axes == {
-        "updates": None, "pretrain/*": "updates", "env_steps": None, "eval/*": "env_steps",
-    }  # fmt: skip
+    assert (first.options["mode"], first.options["tags"], first.options["config"]) == ("offline", ["t"], {"lr": 1})
+    assert first.axes == {"updates": None, "pretrain/*": "updates", "env_steps": None, "eval/*": "env_steps"}
     assert first.rows[0] == ({"updates": 1, "pretrain/loss": 1.0, "pretrain/note": "x"}, {"step": 0})
     assert first.rows[1] == first.rows[2]  # repeated rows come under the same step
     assert second.rows[0][1] == {"step": 2}
@@ -344,9 +332,7 @@ def test_a_failing_mirror_is_switched_off_with_one_warning_and_the_record_is_com
         for updates in (1, 2, 3):
             logger.log({"loss": 1.0}, stream="train", updates=updates)
     assert len(table(tmp_path, "train")) == 3
-    assert [
-        sum(name in r.message for r in caplog.records) for name in ("no route", "TensorBoard is off")
-    ] == [1, 1]
+    assert [sum(name in r.message for r in caplog.records) for name in ("no route", "TensorBoard is off")] == [1, 1]
     assert len(caplog.records) == 2
 
 

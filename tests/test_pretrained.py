@@ -22,13 +22,7 @@ from crptpro import pretrained
 from crptpro.errors import CRPTproError, PretrainedError
 from crptpro.modules import PixelEncoder, SquashedGaussianActor
 from crptpro.objectives import BeCLLoss, ProtoLoss, SimCLRLoss
-from crptpro.pretrained import (
-    Pretrained,
-    load_pretrained,
-    random_pretrained,
-    save_pretrained,
-    shipped_encoders,
-)
+from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained, save_pretrained, shipped_encoders
 from crptpro.training import PretrainResult, finetune, pretrain
 from crptpro.training.agent import PixelAgent, save_agent
 
@@ -182,9 +176,7 @@ def test_slim_leaves_out_what_only_training_reads_and_is_named_as_what_it_comes_
 
 
 @pytest.mark.parametrize("loss_class", [SimCLRLoss, BeCLLoss])
-def test_without_prototypes_slim_keeps_the_encoder_alone(
-    loss_class: type[LossModule], tmp_path: Path
-) -> None:
+def test_without_prototypes_slim_keeps_the_encoder_alone(loss_class: type[LossModule], tmp_path: Path) -> None:
     loss = loss_class(PixelEncoder(**TINY))
     for slim in (False, True):
         save_pretrained(loss, tmp_path / str(slim), slim=slim)
@@ -218,9 +210,7 @@ def test_an_encoder_that_ships_is_loaded_by_name_and_an_unknown_name_lists_them(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(pretrained, "SHIPPED", tmp_path / "package" / "encoders")
     assert shipped_encoders() == []
-    with pytest.raises(
-        PretrainedError, match=r"nowhere does not exist, and no encoder .* those that do: none"
-    ):
+    with pytest.raises(PretrainedError, match=r"nowhere does not exist, and no encoder .* those that do: none"):
         load_pretrained("nowhere")
     shutil.copytree(kept, pretrained.SHIPPED / "group-a")
     (pretrained.SHIPPED / "notes").mkdir()
@@ -280,9 +270,7 @@ def test_each_kind_of_damage_is_named(saved: Path, damage: Any, message: str) ->
         load_pretrained(saved)
 
 
-def test_what_is_no_pretrained_encoder_is_named_for_what_it_is(
-    saved: Path, trained: ProtoLoss, tmp_path: Path
-) -> None:
+def test_what_is_no_pretrained_encoder_is_named_for_what_it_is(saved: Path, trained: ProtoLoss, tmp_path: Path) -> None:
     with pytest.raises(PretrainedError, match=r"Did you mean .*encoder\?"):
         load_pretrained(saved.parent)
     actor = SquashedGaussianActor(trained.encoder.feature_dim, 2, hidden_dim=8)
@@ -340,9 +328,7 @@ def test_finetuning_starts_from_the_artifact_with_its_targets_and_fresh_adam(kep
     assert result.updates == 1
     assert result.training["started_from"] == loaded.identity()
     assert result.training["previous_training"] == loaded.card["training"]
-    assert Pretrained(loss.encoder, card={"method": "crptpro", "training": result.training}).label.endswith(
-        "-finetune"
-    )
+    assert Pretrained(loss.encoder, card={"method": "crptpro", "training": result.training}).label.endswith("-finetune")
 
 
 def test_finetuning_resumes_only_from_the_same_artifact(kept: Path, tmp_path: Path) -> None:

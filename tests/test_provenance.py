@@ -11,9 +11,7 @@ from crptpro import provenance
 
 def test_provenance_names_every_package_that_can_change_a_number() -> None:
     content = provenance.provenance()
-    assert {"torch", "torchrl", "tensordict", "dm-control", "mujoco", "crptpro", "python"} <= set(
-        content["versions"]
-    )
+    assert {"torch", "torchrl", "tensordict", "dm-control", "mujoco", "crptpro", "python"} <= set(content["versions"])
     assert "not installed" not in [content["versions"][p] for p in ("torch", "torchrl", "crptpro")]
     assert content["hardware"]["ram_bytes"] > 0
     json.dumps(content)

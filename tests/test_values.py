@@ -12,18 +12,14 @@ import torch
 from crptpro.values import as_float, as_int, as_path, check_numbers
 
 
-@pytest.mark.parametrize(
-    "value", [3, 3.0, np.int64(3), np.float32(3), np.array(3), torch.tensor(3), torch.tensor(3.0)]
-)
+@pytest.mark.parametrize("value", [3, 3.0, np.int64(3), np.float32(3), np.array(3), torch.tensor(3), torch.tensor(3.0)])
 def test_a_number_of_any_library_is_taken_as_the_plain_number_it_means(value: Any) -> None:
     whole, real = as_int(value, "count"), as_float(value, "rate")
     assert (type(whole), whole, type(real), real) == (int, 3, float, 3.0)
     assert json.dumps([whole, real]) == "[3, 3.0]"
 
 
-@pytest.mark.parametrize(
-    "value", [2.5, "3", None, True, float("nan"), float("inf"), [3], np.array([3]), torch.ones(2)]
-)
+@pytest.mark.parametrize("value", [2.5, "3", None, True, float("nan"), float("inf"), [3], np.array([3]), torch.ones(2)])
 def test_what_is_no_whole_number_is_refused_with_its_name_and_value(value: Any) -> None:
     with pytest.raises(ValueError, match="`transitions` must be a whole number, got"):
         as_int(value, "transitions")

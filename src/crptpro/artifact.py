@@ -202,14 +202,10 @@ def _read(
     from safetensors.torch import load
 
     if not path.is_dir():
-        raise error(
-            f"{path} does not exist or is not a directory; expected one with {WEIGHTS_FILE} and {CARD_FILE}."
-        )
+        raise error(f"{path} does not exist or is not a directory; expected one with {WEIGHTS_FILE} and {CARD_FILE}.")
     card = read_json(path / CARD_FILE, error=error)
     if card.get("format") != format_name:
-        raise error(
-            f"{path} is a {card.get('format', 'directory of unknown format')!r}, expected {format_name!r}."
-        )
+        raise error(f"{path} is a {card.get('format', 'directory of unknown format')!r}, expected {format_name!r}.")
     if card.get("version", 0) > version:
         raise error(
             f"{path} has format version {card['version']}; this crptpro reads up to {version}. Upgrade crptpro."

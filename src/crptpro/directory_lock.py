@@ -30,9 +30,7 @@ class DirectoryLock:
         CRPTproError: (or ``error``) if another process holds the directory, or it cannot be written.
     """
 
-    def __init__(
-        self, directory: str | Path, *, error: type[CRPTproError] = CRPTproError, is_reentrant: bool = False
-    ):
+    def __init__(self, directory: str | Path, *, error: type[CRPTproError] = CRPTproError, is_reentrant: bool = False):
         path = as_path(directory)
         self._lock: FileLock | None = None
         try:
@@ -47,9 +45,7 @@ class DirectoryLock:
         except OSError as reason:
             if reason.errno not in _NO_LOCKS:
                 raise error(f"{path} cannot be written: {reason}.") from reason
-            _LOG.warning(
-                "%s cannot be locked (%s): see to it that no two processes write to it.", path, reason
-            )
+            _LOG.warning("%s cannot be locked (%s): see to it that no two processes write to it.", path, reason)
 
     def release(self) -> None:
         """Free the directory, once its last holder does; calling it twice is harmless."""

@@ -98,11 +98,7 @@ def run_doctor(domains: Iterable[str] | None = None) -> DoctorReport:
     declared = importlib.metadata.requires("crptpro") if "crptpro" in installed else None
     requirements = [text for text in declared or () if "extra ==" not in text]
     drawn, problems = _check_rendering(names, has_gpu=bool(gpus))
-    findings = [
-        *check_versions(installed, requirements),
-        *_check_machine(free_ram, free_disk, gpus),
-        *problems,
-    ]
+    findings = [*check_versions(installed, requirements), *_check_machine(free_ram, free_disk, gpus), *problems]
     findings.sort(key=lambda finding: ("error", "warning", "note").index(finding.severity))
     return DoctorReport((*facts, *drawn), tuple(findings))
 
@@ -147,9 +143,7 @@ def _check_machine(free_ram: int, free_disk: int, gpus: Sequence[str]) -> list[F
         what = f"{free_disk / _GB:.1f} GB of disk are free here; three domains of 100,000 transitions take 6."
         remedy = "Free space, write to another disk, or collect fewer transitions."
         findings.append(Finding("error" if free_disk < 0.5 * _GB else "warning", what, remedy))
-    remedy = (
-        "Repair its driver (nvidia-smi), or hide it with CUDA_VISIBLE_DEVICES; --device cpu always works."
-    )
+    remedy = "Repair its driver (nvidia-smi), or hide it with CUDA_VISIBLE_DEVICES; --device cpu always works."
     unusable = [gpu for gpu in gpus if gpu.startswith(provenance.UNUSABLE)]
     findings += [Finding("warning", f"torch cannot use a GPU: {gpu}.", remedy) for gpu in unusable]
     if not gpus:
@@ -173,8 +167,7 @@ def _check_rendering(names: Sequence[str], *, has_gpu: bool) -> tuple[list[str],
     if has_gpu and gl["gl_kind"] == "software":
         what = f"There is a GPU, but {backend} renders in software, about twenty times slower."
         remedy = (
-            "Install the GL parts of the GPU's driver; in a container start it with "
-            "NVIDIA_DRIVER_CAPABILITIES=all."
+            "Install the GL parts of the GPU's driver; in a container start it with NVIDIA_DRIVER_CAPABILITIES=all."
         )
         findings.append(Finding("warning", what, remedy))
     for entry in render_domains(names, backend, rendering.default_timeout_s() + _DOMAIN_S):
@@ -245,9 +238,7 @@ def check_domain(name: str) -> dict[str, Any]:
         return _failed(name, error, remedy="" if is_told else _OTHER_BACKEND)
     if first["pixels"].unique().numel() == 1 or first["pixels"].equal(last["pixels"]):
         return _failed(name, "its pixels are constant or do not change")
-    return {
-        "domain": name, "error": "", "reset_ms": reset_s * 1e3, "agent_step_ms": agent_step_s * 1e3,
-    }  # fmt: skip
+    return {"domain": name, "error": "", "reset_ms": reset_s * 1e3, "agent_step_ms": agent_step_s * 1e3}
 
 
 def _failed(name: str, error: str, *, remedy: str = _OTHER_BACKEND) -> dict[str, Any]:

@@ -74,12 +74,11 @@ PAPER_DOMAINS: dict[str, Domain] = {
         _suite("quadruped", "quadruped_run", camera=2),
         _suite("cartpole", "cartpole_swingup_sparse"),
         _suite("pendulum", "pendulum_swingup"),
-        Domain("manipulation", "reach_duplo", camera="front_close", episode_env_steps=250,
-               source="manipulation"),
+        Domain("manipulation", "reach_duplo", camera="front_close", episode_env_steps=250, source="manipulation"),
         _suite("hopper", "hopper_hop"),
         _suite("finger", "finger_spin"),
     )
-}  # fmt: skip
+}
 
 #: The paper's pre-training groups, by domain name.
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -158,14 +157,10 @@ def register_domain(domain: Domain) -> Domain:
         CRPTproError: the domain has no ``make``, or its name belongs to the paper's domains or tasks.
     """
     if domain.make is None and domain.source == "own":
-        raise CRPTproError(
-            f"Domain {domain.name!r} has no make; pass make=<function that builds the environment>."
-        )
+        raise CRPTproError(f"Domain {domain.name!r} has no make; pass make=<function that builds the environment>.")
     for name in (domain.name, domain.task):
         if name in PAPER_DOMAINS or name in TASKS or name.startswith(GYMNASIUM_PREFIX):
-            raise CRPTproError(
-                f"{name!r} is one of the built-in names; register the domain under another one."
-            )
+            raise CRPTproError(f"{name!r} is one of the built-in names; register the domain under another one.")
     for key in (domain.task, domain.name):
         _registered[key] = domain
     return domain

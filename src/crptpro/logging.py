@@ -74,12 +74,7 @@ class RunLogger:
     """
 
     def __init__(
-        self,
-        run_dir: str | Path,
-        *,
-        config: Any = None,
-        wandb: WandbOptions | None = None,
-        tensorboard: bool = False,
+        self, run_dir: str | Path, *, config: Any = None, wandb: WandbOptions | None = None, tensorboard: bool = False
     ) -> None:
         self.run_dir = as_path(run_dir, "run_dir")
         self.path = self.run_dir / JSONL_NAME
@@ -123,9 +118,7 @@ class RunLogger:
             if key in RESERVED or (key in counters and key in metrics):
                 raise ValueError(f"{key!r} cannot name a metric of {stream!r}: it is reserved, or a counter.")
             if not isinstance(key, str) or not key.isprintable() or re.search('[,"]', key):
-                raise ValueError(
-                    f"{key!r} cannot name a metric of {stream!r}: it would not fit a CSV header."
-                )
+                raise ValueError(f"{key!r} cannot name a metric of {stream!r}: it would not fit a CSV header.")
         where = {name: as_int(value, name) for name, value in counters.items()}
         values = {key: _scalar(key, value) for key, value in metrics.items() if value is not None}
         if not self._has_begun:
@@ -167,9 +160,7 @@ class RunLogger:
         """
         for name, count in state.items():
             if (missing := count - len(self.rows(name))) > 0:
-                _LOG.warning(
-                    "%s: %d rows of %r are missing that the checkpoint counted.", self.path, missing, name
-                )
+                _LOG.warning("%s: %d rows of %r are missing that the checkpoint counted.", self.path, missing, name)
         before, seen, kept = self._streams(), Counter[str](), []
         for row in self._rows:
             seen[row["stream"]] += 1
@@ -290,9 +281,7 @@ class _Wandb(_Mirror):
         except Exception as reason:
             if mode != "online":
                 raise
-            _LOG.warning(
-                "W&B cannot be reached (%s); logging offline, `wandb sync` uploads it later.", reason
-            )
+            _LOG.warning("W&B cannot be reached (%s); logging offline, `wandb sync` uploads it later.", reason)
             self._logger = start("offline")
         self._run = self._logger.experiment
         self._streams: set[str] = set()
@@ -381,9 +370,7 @@ def _cell(value: Any) -> Any:
 
 def _csv_text(rows: Iterable[Iterable[Any]]) -> str:
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(
-        [["" if c is None else _cell(c) for c in row] for row in rows]
-    )
+    csv.writer(text, lineterminator="\n").writerows([["" if c is None else _cell(c) for c in row] for row in rows])
     return text.getvalue()
 
 

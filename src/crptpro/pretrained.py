@@ -45,10 +45,8 @@ SHIPPED = Path(__file__).parent / "encoders"
 
 _CLASSES: dict[str, type[nn.Module]] = {
     cls.__name__: cls
-    for cls in (
-        PixelEncoder, Projector, Predictor, Prototypes, SkillHead, SquashedGaussianActor, DeterministicActor,
-    )
-}  # fmt: skip
+    for cls in (PixelEncoder, Projector, Predictor, Prototypes, SkillHead, SquashedGaussianActor, DeterministicActor)
+}
 _LOG = logging.getLogger(__name__)
 
 
@@ -317,9 +315,7 @@ def _as_pretrained(trained: Any, actor: nn.Module | None) -> Pretrained:
     if isinstance(trained, nn.Module):
         result: dict[str, Any] = {"loss": trained, "method": method_of(trained).name}
     else:
-        result = {
-            name: getattr(trained, name, None) for name in ("loss", "method", "training", "actor", "queue")
-        }
+        result = {name: getattr(trained, name, None) for name in ("loss", "method", "training", "actor", "queue")}
     loss = result["loss"]
     if not isinstance(loss, nn.Module):
         raise PretrainedError(
@@ -335,9 +331,7 @@ def _as_pretrained(trained: Any, actor: nn.Module | None) -> Pretrained:
         if online is not None and (state := _target_state(loss, target)):
             targets[target] = copy.deepcopy(online)
             targets[target].load_state_dict(state)
-    covered = tuple(
-        f"{role}{suffix}" for role in ("encoder", *HEADS, *TARGETS) for suffix in (".", "_params.")
-    )
+    covered = tuple(f"{role}{suffix}" for role in ("encoder", *HEADS, *TARGETS) for suffix in (".", "_params."))
     rest = {
         key: value
         for key, value in loss.state_dict().items()
@@ -345,10 +339,7 @@ def _as_pretrained(trained: Any, actor: nn.Module | None) -> Pretrained:
     }
     card = {
         "method": result["method"],
-        "loss": {
-            "class": f"{type(loss).__module__}.{type(loss).__qualname__}",
-            "config": _loss_options(loss),
-        },
+        "loss": {"class": f"{type(loss).__module__}.{type(loss).__qualname__}", "config": _loss_options(loss)},
         "training": result.get("training"),
     }
     actor = result.get("actor") if actor is None else actor
@@ -428,9 +419,7 @@ def _rebuilt(
     modules: dict[str, Any] = {}
     for role, description in described.items():
         if role not in NETWORKS or not isinstance(description, dict):
-            raise PretrainedError(
-                f"The card of {path} describes an unknown {role!r}; it is damaged or too new."
-            )
+            raise PretrainedError(f"The card of {path} describes an unknown {role!r}; it is damaged or too new.")
         name = str(description.get("class"))
         if name not in classes:
             raise PretrainedError(

@@ -13,9 +13,7 @@ from typing import Any
 import psutil
 import torch
 
-PACKAGES = (
-    "crptpro", "torch", "torchrl", "tensordict", "dm-control", "mujoco", "gymnasium", "numpy", "wandb",
-)  # fmt: skip
+PACKAGES = ("crptpro", "torch", "torchrl", "tensordict", "dm-control", "mujoco", "gymnasium", "numpy", "wandb")
 
 UNUSABLE = "unusable"
 """How the name of a GPU begins that torch sees and cannot use."""

@@ -156,9 +156,7 @@ def check_numbers(config: Any, *, counts: Mapping[str, int], rates: Mapping[str,
         object.__setattr__(config, name, value)
 
 
-def _require_range(
-    number: float, value: Any, name: str, minimum: float | None, maximum: float | None
-) -> None:
+def _require_range(number: float, value: Any, name: str, minimum: float | None, maximum: float | None) -> None:
     if minimum is not None and number < minimum:
         raise ValueError(f"`{name}` must be at least {minimum}, got {value!r}.")
     if maximum is not None and number > maximum:

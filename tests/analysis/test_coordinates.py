@@ -13,9 +13,7 @@ JOINTS = (Joint("root", "free"), Joint("knee", "hinge"), Joint("wheel", "turning
 
 def positions(*, turn: float = 0.3, wheel: float = 0.5, sign: float = 1.0) -> dict[str, float]:
     quaternion = [sign * math.cos(turn / 2), 0.0, 0.0, sign * math.sin(turn / 2)]
-    names, values = position_coordinates(
-        torch.tensor([[1.0, 2.0, 3.0, *quaternion, 0.7, wheel, -4.0]]), JOINTS
-    )
+    names, values = position_coordinates(torch.tensor([[1.0, 2.0, 3.0, *quaternion, 0.7, wheel, -4.0]]), JOINTS)
     assert values.dtype == torch.float64
     return dict(zip(names, values[0].tolist()))
 

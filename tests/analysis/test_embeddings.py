@@ -42,9 +42,7 @@ def test_embeddings_are_features_or_projections_encoded_where_the_encoder_lives_
 
 def test_the_seed_chooses_the_observations_whatever_was_sampled_before() -> None:
     buffer = ReplayBuffer(storage=LazyTensorStorage(10))
-    buffer.extend(
-        TensorDict({"pixels": torch.arange(10).view(10, 1, 1, 1).expand(10, 9, 8, 8).clone()}, [10])
-    )
+    buffer.extend(TensorDict({"pixels": torch.arange(10).view(10, 1, 1, 1).expand(10, 9, 8, 8).clone()}, [10]))
     first, second, other = (sample_pixels(buffer, 50, seed=seed) for seed in (1, 1, 2))
     assert first.shape == (50, 9, 8, 8)
     assert torch.equal(first, second)

@@ -14,14 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from toy_world import random_episode, write_dataset
 
-from crptpro.analysis.probe import (
-    PENALTIES,
-    ProbeResult,
-    ProbeSamples,
-    probe,
-    probe_embeddings,
-    probe_samples,
-)
+from crptpro.analysis.probe import PENALTIES, ProbeResult, ProbeSamples, probe, probe_embeddings, probe_samples
 from crptpro.data import FrameDataset
 from crptpro.errors import DatasetError
 
@@ -105,9 +98,7 @@ def test_where_nothing_varies_there_is_nothing_to_know(dataset: FrameDataset) ->
     assert math.isnan(result.velocity_r2)
 
 
-def test_data_that_cannot_be_split_or_have_no_state_are_refused(
-    dataset: FrameDataset, tmp_path: Path
-) -> None:
+def test_data_that_cannot_be_split_or_have_no_state_are_refused(dataset: FrameDataset, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"3 samples.*Collect more episodes"):
         probe_samples(dataset, samples=3)
     write_dataset(tmp_path / "stateless", [random_episode(10, state=False)] * 2)
@@ -157,9 +148,7 @@ def test_it_is_ridge_regression_with_the_penalty_that_predicts_the_validation_ro
     def predicted(penalty: float, rows: Tensor, asked: Tensor) -> Tensor:
         own, mean = x[rows] - x[rows].mean(0), targets[rows].mean(0)
         scale = own.square().sum() / len(rows)
-        weights = torch.linalg.solve(
-            own.T @ own + penalty * scale * torch.eye(6), own.T @ (targets[rows] - mean)
-        )
+        weights = torch.linalg.solve(own.T @ own + penalty * scale * torch.eye(6), own.T @ (targets[rows] - mean))
         return (x[asked] - x[rows].mean(0)) @ weights + mean
 
     def error(penalty: float) -> float:

@@ -168,9 +168,7 @@ def test_a_decision_by_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_sampling_beside_torchrls_ways(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    settings = sampling.Settings(
-        transitions=30, batch_size=8, rounds=1, image_size=12, scratch=tmp_path, out=tmp_path
-    )
+    settings = sampling.Settings(transitions=30, batch_size=8, rounds=1, image_size=12, scratch=tmp_path, out=tmp_path)
     sampling.main(settings)
     results, told = written(tmp_path / "sampling.json"), capsys.readouterr().out
     assert all(told.count(f"| {name} |") == 2 for name in (sampling.OURS, *sampling.WAYS))
@@ -218,13 +216,7 @@ def test_memory_and_disk_of_every_stage(
 def test_collection_beside_torchrls(tmp_path: Path) -> None:
     threads = torch.get_num_threads()
     settings = collection.Settings(
-        domains=("cartpole",),
-        block=2,
-        rounds=1,
-        workers=(1,),
-        worker_transitions=4,
-        scratch=tmp_path,
-        out=tmp_path,
+        domains=("cartpole",), block=2, rounds=1, workers=(1,), worker_transitions=4, scratch=tmp_path, out=tmp_path
     )
     collection.main(settings)
     results = written(tmp_path / "collection.json")
@@ -238,9 +230,7 @@ def test_collection_beside_torchrls(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_the_gpu_benchmark_runs_through_at_a_toy_size(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_gpu_benchmark_runs_through_at_a_toy_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     gpu.main(gpu.Settings(tiny=True, compile=False, out=tmp_path))
     results, told = written(tmp_path / "gpu.json"), capsys.readouterr().out
     assert set(results) == {"parity", "pretrain", "downstream", "sustained"}

@@ -90,9 +90,7 @@ def test_a_peer_imports_without_its_packages_and_leaves_no_trace(checkout: Path)
         ("import a_package_nobody_has\n", r"ModuleNotFoundError: .*a_package_nobody_has"),
     ],
 )
-def test_what_is_no_released_agent_is_one_clear_error(
-    checkout: Path, content: str | None, message: str
-) -> None:
+def test_what_is_no_released_agent_is_one_clear_error(checkout: Path, content: str | None, message: str) -> None:
     (checkout / "proto.py").unlink()
     if content is not None:
         (checkout / "proto.py").write_text(content)

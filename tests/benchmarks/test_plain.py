@@ -120,10 +120,7 @@ def test_the_plain_features_critic_actor_and_temperature_are_ours_in_losses_and_
     assert_all_close([td["features"], td["next", "features"]], [agents.h, agents.next_h])
     qvalue_losses = agents.critic_losses()
     out = ours.actor_and_temperature_loss(td)
-    pairs = [
-        qvalue_losses,
-        *zip((out["loss_actor"], out["loss_alpha"]), plain.actor_loss(agents.h), strict=True),
-    ]
+    pairs = [qvalue_losses, *zip((out["loss_actor"], out["loss_alpha"]), plain.actor_loss(agents.h), strict=True)]
     networks = [(ours.critic, plain.critic), (ours.actor, plain.actor)]
     for (one, other), compared in zip(pairs, [networks[0], networks[1], None], strict=True):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)

@@ -17,9 +17,7 @@ class SlownessLoss(LossModule):
     in_keys = ("pixels", ("next", "pixels"))
     out_keys = ("loss_slow",)
 
-    def __init__(
-        self, encoder: PixelEncoder, *, projector: Projector | None = None, margin: float = 1.0
-    ) -> None:
+    def __init__(self, encoder: PixelEncoder, *, projector: Projector | None = None, margin: float = 1.0) -> None:
         super().__init__()
         self.encoder, self.projector = encoder, projector or Projector(encoder.feature_dim, 4)
         self.margin = margin
@@ -49,9 +47,6 @@ register_method(
     loss_options={"margin": 0.5},
     encoder_options=SMALL,
     exploration=Exploration(
-        reward=lambda loss, generator: Activity(),
-        env_steps=60,
-        encoder_update_interval=5,
-        random_agent_steps=10,
+        reward=lambda loss, generator: Activity(), env_steps=60, encoder_update_interval=5, random_agent_steps=10
     ),
 )

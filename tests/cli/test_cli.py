@@ -17,9 +17,7 @@ from crptpro.data import FrameDataset
 from crptpro.pretrained import load_pretrained
 from crptpro.training import load_agent
 
-COMMANDS = (
-    "doctor", "collect", "pretrain", "finetune", "downstream", "evaluate", "probe", "reproduce", "report",
-)  # fmt: skip
+COMMANDS = ("doctor", "collect", "pretrain", "finetune", "downstream", "evaluate", "probe", "reproduce", "report")
 
 
 # --- help ---------------------------------------------------------------------------------------------------------
@@ -64,9 +62,7 @@ def test_the_installed_command_is_this_one() -> None:
     (("collect", "walker", "--quality", "best"), "best"),
     (("dance",), "dance"),
 ])  # fmt: skip
-def test_what_the_parser_cannot_read_is_named_with_status_2(
-    call: Call, arguments: tuple[str, ...], named: str
-) -> None:
+def test_what_the_parser_cannot_read_is_named_with_status_2(call: Call, arguments: tuple[str, ...], named: str) -> None:
     status, out, err = call(*arguments)
     assert status == 2
     assert out == ""
@@ -81,19 +77,9 @@ def test_every_command_does_its_part_on_a_world_without_a_simulator(
     call: Call, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = tmp_path / "runs"
-    first_path, tuned_path, agent = (
-        runs / name for name in ("pretrain/encoder", "fine/encoder", "down/agent")
-    )
+    first_path, tuned_path, agent = (runs / name for name in ("pretrain/encoder", "fine/encoder", "down/agent"))
     few = ("--updates", 2, "--batch-size", 4, "--log-interval", 1)
-    first_stage = (
-        "pretrain",
-        dataset,
-        "--out",
-        runs / "pretrain",
-        *few,
-        "--loss",
-        "assignment_temperature=0.05",
-    )
+    first_stage = ("pretrain", dataset, "--out", runs / "pretrain", *few, "--loss", "assignment_temperature=0.05")
     assert call(*first_stage)[0] == 0
     first = load_pretrained(first_path)
     assert first.card["training"]["updates"] == 2
@@ -167,15 +153,7 @@ def test_an_untrained_encoder_is_written_as_any_other(call: Call, dataset: Path,
 
 
 def test_a_real_process_ends_with_the_same_line(tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        "-c",
-        "from crptpro.cli import main; main()",
-        "collect",
-        "walkr",
-        "--out",
-        "data",
-    ]
+    command = [sys.executable, "-c", "from crptpro.cli import main; main()", "collect", "walkr", "--out", "data"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path, check=False)
     assert "Nearest: walker" in refused((done.returncode, done.stdout, done.stderr))
     assert list(tmp_path.iterdir()) == []
@@ -247,9 +225,7 @@ def test_an_evaluation_that_cannot_run_says_why(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_datasets_that_do_not_fit_are_refused(
-    call: Call, dataset: Path, encoder: Path, tmp_path: Path
-) -> None:
+def test_datasets_that_do_not_fit_are_refused(call: Call, dataset: Path, encoder: Path, tmp_path: Path) -> None:
     other, out = toy_dataset(tmp_path / "data" / "other", SIZE + 2), tmp_path / "out"
     line = refused(call("pretrain", dataset, other, "--out", out))
     assert f"{dataset} has 16 px" in line
@@ -275,16 +251,7 @@ def test_mirrors_begin_with_the_run_and_get_its_record(
     import wandb
 
     monkeypatch.setattr(wandb, "init", lambda **_: pytest.fail("W&B was asked for a run"))
-    refusal = (
-        "downstream",
-        TASK,
-        "--pretrained",
-        "random-encoder",
-        "--discount",
-        "2",
-        "--out",
-        tmp_path / "no",
-    )
+    refusal = ("downstream", TASK, "--pretrained", "random-encoder", "--discount", "2", "--out", tmp_path / "no")
     refused(call(*refusal, "--logging.wandb", "offline", "--logging.tensorboard"))
     assert not (tmp_path / "no").exists()
     few = ("--updates", 2, "--batch-size", 4, "--log-interval", 1)

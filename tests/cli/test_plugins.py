@@ -50,9 +50,7 @@ def test_a_registration_in_a_file_of_the_users_makes_a_method(
     assert pretrain(loss, dataset, progress=False).updates == 2
 
 
-def test_a_method_of_the_users_explores_for_a_reward_of_its_own(
-    call: Call, tmp_path: Path, plugin: Path
-) -> None:
+def test_a_method_of_the_users_explores_for_a_reward_of_its_own(call: Call, tmp_path: Path, plugin: Path) -> None:
     out = tmp_path / "out"
     own = ("--plugin", plugin, "pretrain", TASK, "--out", out, "--method", "slowness-active")
     few = ("--log-interval", 1, "--hidden-dim", 8, "--replay-capacity", 40)
@@ -76,9 +74,7 @@ def test_a_method_of_the_users_explores_for_a_reward_of_its_own(
     assert (out / "pretrain.csv").read_bytes() == before
 
 
-def test_a_plugin_that_cannot_be_imported_says_so(
-    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_plugin_that_cannot_be_imported_says_so(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", list(sys.path))
     (tmp_path / "needs_more.py").write_text("import a_package_that_nobody_has")
     (tmp_path / "json.py").write_text("")
@@ -122,9 +118,7 @@ def test_a_plugins_world_is_collected_and_learned_with_evaluating_processes(
     assert "MUJOCO" not in err
 
 
-def test_the_doctor_looks_at_a_plugins_world(
-    call: Call, world: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_doctor_looks_at_a_plugins_world(call: Call, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plugins.load_plugin(str(world))
     (entry,) = doctor.render_domains((f"gymnasium:{WORLD}",), "egl", 100.0)
     assert entry["error"] == ""

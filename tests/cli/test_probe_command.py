@@ -41,9 +41,7 @@ def test_an_encoder_and_the_control_are_probed_with_table_and_csv(
     file = tmp_path / "new" / "probe.csv"
     status, out, _ = call("probe", encoder, dataset, "--csv", file)
     assert status == 0
-    assert [line[:5] for line in table(out)] == [
-        ["crptpro", "toy", "yes", "normal", z] for z in ("features", "z")
-    ]
+    assert [line[:5] for line in table(out)] == [["crptpro", "toy", "yes", "normal", z] for z in ("features", "z")]
     found = pd.read_csv(file)
     own = found[found["embedding"] == "z"].fillna("")
     assert list(zip(own["measure"], own["coordinate"])) == [

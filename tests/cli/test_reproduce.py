@@ -50,9 +50,7 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(call: Call, tmp_path: Path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_all_means_the_experiments_that_have_something_of_what_is_asked_for(
-    call: Call, tmp_path: Path
-) -> None:
+def test_all_means_the_experiments_that_have_something_of_what_is_asked_for(call: Call, tmp_path: Path) -> None:
     options = ("--scale", "tiny", "--dry-run", "--out", tmp_path)
     status, out, err = call("reproduce", "all", "--groups", "B", *options)
     assert status == 0, err
@@ -99,9 +97,7 @@ def test_what_the_machine_lacks_is_said_after_the_plan_and_nothing_is_written(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_failures_are_listed_with_their_logs(
-    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failures_are_listed_with_their_logs(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lost = Failure("run-a", "it will never do", tmp_path / "log.txt", 3)
     monkeypatch.setattr(launch, "run_jobs", lambda *_, **__: [lost, Failure("run-b", "needs run-a")])
     status, out, _ = call("reproduce", "seen", "--scale", "tiny", *PART, "--out", tmp_path / "root")
@@ -186,11 +182,7 @@ def test_every_cell_of_a_reproduction_is_filled_and_reported(tiny: Path, tmp_pat
         assert not {"checkpoints", "clock.json", "timed"} & {each.name for each in path.iterdir()}
     runs = files(tiny, "run", "eval.csv")
     assert [{*rows.env_steps} for rows in runs] == [{0, 24}] * 3
-    assert {method for rows in runs for method in rows.method} == {
-        "crptpro-finetune",
-        "drq",
-        "random-encoder",
-    }
+    assert {method for rows in runs for method in rows.method} == {"crptpro-finetune", "drq", "random-encoder"}
     text = build_report(tiny, out=tmp_path).with_name("report.md").read_text()
     assert text.count(" numbers are there.") == 6
     assert "Missing" not in text
@@ -231,9 +223,7 @@ def test_timings_are_projected_to_whole_budgets(tiny: Path) -> None:
     found = pd.concat(files(tiny, "timing", "timing.csv")).set_index("method")
     assert {*found.index} == {"crptpro", "proto-rl-s"}
     assert (found.seconds_per_update > 0).all()
-    assert found.projected_hours.to_list() == pytest.approx(
-        found.seconds_per_update * found.budget_updates / 3600
-    )
+    assert found.projected_hours.to_list() == pytest.approx(found.seconds_per_update * found.budget_updates / 3600)
     assert (found.encoder_updates >= 1).all()
     assert (found.decisions > 0).to_dict() == {"crptpro": False, "proto-rl-s": True}
     assert found.paper_projected_hours.isna().all()  # this scale does not time the paper's batches

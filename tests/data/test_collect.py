@@ -20,31 +20,13 @@ import numpy as np
 import pytest
 import torch
 from torchrl.modules import RandomPolicy
-from toy_world import (
-    DYING,
-    FAILING,
-    FIXED,
-    SLOW,
-    VARIABLE,
-    ToyEnv,
-    collect_toy,
-    data_bytes,
-    make_toy,
-    variable_length,
-)
+from toy_world import DYING, FAILING, FIXED, SLOW, VARIABLE, ToyEnv, collect_toy, data_bytes, make_toy, variable_length
 
 from crptpro.data import FrameDataset, collect, collect_group, collect_random
 from crptpro.data.collect import dataset_path
 from crptpro.domains import Domain
 from crptpro.envs import make_env, rendering
-from crptpro.errors import (
-    CRPTproError,
-    DatasetError,
-    DiskSpaceError,
-    RenderingError,
-    WorkerLostError,
-    WorldFailedError,
-)
+from crptpro.errors import CRPTproError, DatasetError, DiskSpaceError, RenderingError, WorkerLostError, WorldFailedError
 from crptpro.seeding import derive_seed
 from crptpro.workers import Inline
 
@@ -68,9 +50,7 @@ def test_the_same_seed_gives_the_data_that_earlier_revisions_collected(collected
     assert found == FIRST_REVISION
 
 
-def test_other_colours_are_remembered_and_show_the_same_episodes(
-    collected: dict[str, Path], tmp_path: Path
-) -> None:
+def test_other_colours_are_remembered_and_show_the_same_episodes(collected: dict[str, Path], tmp_path: Path) -> None:
     normal = FrameDataset.open(collected["toy-fixed"])
     swapped = FrameDataset.open(collect_random(FIXED, tmp_path, colors="reversed_image", **ASKED))
     assert (normal.card["colors"], swapped.card["colors"]) == ("normal", "reversed_image")
@@ -140,9 +120,7 @@ def test_processes_that_hang_are_noticed(tmp_path: Path, monkeypatch: pytest.Mon
 # --- requests
 
 
-def test_a_complete_dataset_is_returned_as_it_is(
-    collected: dict[str, Path], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_complete_dataset_is_returned_as_it_is(collected: dict[str, Path], caplog: pytest.LogCaptureFixture) -> None:
     path = collected["toy-fixed"]
     written = {file: file.stat().st_mtime_ns for file in path.rglob("*")}
     with caplog.at_level(logging.INFO, "crptpro"):
@@ -154,12 +132,7 @@ def test_a_complete_dataset_is_returned_as_it_is(
 
 
 def test_numbers_are_taken_as_they_are_meant_and_the_dataset_can_be_read(tmp_path: Path) -> None:
-    meant = {
-        "transitions": 1e1,
-        "seed": np.int64(3),
-        "action_repeat": torch.tensor(1),
-        "image_size": np.float32(8),
-    }
+    meant = {"transitions": 1e1, "seed": np.int64(3), "action_repeat": torch.tensor(1), "image_size": np.float32(8)}
     path = collect_random(FIXED, tmp_path, workers=np.int32(1), progress=False, **meant)
     card = FrameDataset.open(path).card
     assert [card[name] for name in meant] == [10, 3, 1, 8]
@@ -191,9 +164,7 @@ def test_what_the_disk_cannot_hold_is_refused_and_does_not_block_less(tmp_path: 
     assert len(FrameDataset.open(collect_random(FIXED, tmp_path, transitions=5, **SMALL))) == 5
 
 
-def test_domains_are_collected_once_each_into_safe_directories(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_domains_are_collected_once_each_into_safe_directories(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(DatasetError, match="Two of the domains"):
         collect_group([FIXED, replace(FIXED, task="toy_other")], tmp_path, transitions=5, **SMALL)
     monkeypatch.setattr("crptpro.domains.GROUPS", {"X": (FIXED,), "Y": (FIXED, VARIABLE)})
@@ -211,9 +182,7 @@ def test_a_world_that_draws_by_itself_is_collected_without_gl_and_the_card_says_
     assert card["sessions"][0]["versions"] == card["versions"]
 
 
-def test_progress_is_logged_where_the_output_is_no_terminal(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_progress_is_logged_where_the_output_is_no_terminal(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, "crptpro"):
         collect_random(FIXED, tmp_path, transitions=100, image_size=8)
     lines = [record.message for record in caplog.records if "transitions/s" in record.message]
@@ -224,12 +193,8 @@ def test_progress_is_logged_where_the_output_is_no_terminal(
 # --- what goes wrong
 
 
-def test_a_world_that_fails_is_named_with_its_cause_and_does_not_block_the_repaired_one(
-    tmp_path: Path,
-) -> None:
-    with pytest.raises(
-        CRPTproError, match=r"Episode 0 of toy-failing failed: the simulator exploded"
-    ) as failure:
+def test_a_world_that_fails_is_named_with_its_cause_and_does_not_block_the_repaired_one(tmp_path: Path) -> None:
+    with pytest.raises(CRPTproError, match=r"Episode 0 of toy-failing failed: the simulator exploded") as failure:
         collect_random(FAILING, tmp_path, transitions=50, **SMALL)
     assert isinstance(failure.value.__cause__, WorldFailedError)
     assert isinstance(failure.value.__cause__.__cause__, ValueError)
@@ -276,13 +241,9 @@ PROGRAM = """
 """
 
 
-def start(
-    tmp_path: Path, root: Path, *, workers: int = 2, limit: str = "pass", more: str = ""
-) -> subprocess.Popen:
+def start(tmp_path: Path, root: Path, *, workers: int = 2, limit: str = "pass", more: str = "") -> subprocess.Popen:
     program = tmp_path / f"{root.name}.py"
-    text = PROGRAM.format(
-        here=str(Path(__file__).parent), root=str(root), workers=workers, limit=limit, more=more
-    )
+    text = PROGRAM.format(here=str(Path(__file__).parent), root=str(root), workers=workers, limit=limit, more=more)
     program.write_text(textwrap.dedent(text))
     # A group of its own, so that one kill ends the program and all its processes; and Ctrl-C heeded, although a
     # test suite that a script started in the background inherits that it is ignored.
@@ -324,9 +285,7 @@ def test_interrupted_or_killed_and_started_again_gives_the_same_bytes(tmp_path: 
     interrupted, killed = tmp_path / "interrupted", tmp_path / "killed"
     with ThreadPoolExecutor(2) as threads:
         stops = [
-            threads.submit(
-                stop_while_collecting, start(tmp_path, root), root / "toy-slow", how, whole_group=is_group
-            )
+            threads.submit(stop_while_collecting, start(tmp_path, root), root / "toy-slow", how, whole_group=is_group)
             for root, how, is_group in ((interrupted, signal.SIGINT, True), (killed, signal.SIGKILL, False))
         ]
     errors = stops[0].result()

@@ -114,12 +114,7 @@ def test_numbers_read_the_observations_of_a_sample(dataset: FrameDataset) -> Non
 
 def test_plain_torchrl_buffers_and_samplers_read_it(dataset: FrameDataset) -> None:
     options = {"storage": dataset.storage, "collate_fn": lambda rows: rows}
-    assert ReplayBuffer(sampler=RandomSampler(), batch_size=6, **options).sample()["pixels"].shape == (
-        6,
-        9,
-        6,
-        6,
-    )
+    assert ReplayBuffer(sampler=RandomSampler(), batch_size=6, **options).sample()["pixels"].shape == (6, 9, 6, 6)
     sampler = SliceSampler(slice_len=2, traj_key="episode", strict_length=False, truncated_key=None)
     assert ReplayBuffer(sampler=sampler, batch_size=8, **options).sample()["pixels"].shape[1:] == (9, 6, 6)
 
@@ -168,9 +163,7 @@ def test_a_copy_samples_what_the_original_samples(path: Path, copied: Any) -> No
     assert len(pickle.dumps(dataset.storage)) < 1000  # the receiver opens the files
 
 
-def test_a_checkpoint_refers_to_the_dataset(
-    dataset: FrameDataset, tmp_path: Path, episodes: list[TensorDict]
-) -> None:
+def test_a_checkpoint_refers_to_the_dataset(dataset: FrameDataset, tmp_path: Path, episodes: list[TensorDict]) -> None:
     dataset.dumps(tmp_path / "checkpoint")
     files = [file for file in (tmp_path / "checkpoint").rglob("*") if file.is_file()]
     assert sum(file.stat().st_size for file in files) < 10_000
@@ -183,15 +176,11 @@ def test_a_checkpoint_refers_to_the_dataset(
 # --- what is no dataset
 
 
-@pytest.mark.parametrize(
-    "file", ["frames/pixels.memmap", "frames/qpos.memmap", "transitions/next/done.memmap"]
-)
+@pytest.mark.parametrize("file", ["frames/pixels.memmap", "frames/qpos.memmap", "transitions/next/done.memmap"])
 def test_a_missing_or_truncated_file_is_named(duplicate: Path, file: str) -> None:
     content = (duplicate / file).read_bytes()
     (duplicate / file).write_bytes(content[:-1])
-    with pytest.raises(
-        DatasetError, match=f"{file} is truncated: {len(content) - 1:,} bytes.*{len(content):,}"
-    ):
+    with pytest.raises(DatasetError, match=f"{file} is truncated: {len(content) - 1:,} bytes.*{len(content):,}"):
         FrameDataset.open(duplicate)
     (duplicate / file).unlink()
     with pytest.raises(DatasetError, match=f"{file} is missing"):
@@ -348,9 +337,7 @@ def test_a_directory_with_something_else_or_another_writer_is_left_alone(tmp_pat
     FrameDataset.create(tmp_path / "toy", **collection_request()).writer.close()
 
 
-def test_a_full_disk_is_named_and_what_was_kept_continues(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_is_named_and_what_was_kept_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -369,9 +356,7 @@ def test_a_full_disk_is_named_and_what_was_kept_continues(
     ({"backend": "osmesa", "gl_renderer": "llvmpipe"}, "backend 'egl', now it is 'osmesa'.*MUJOCO_GL=egl"),
     ({"backend": "egl", "gl_renderer": "NVIDIA H200"}, "'llvmpipe', now it is 'NVIDIA H200'.*pixels differ"),
 ])  # fmt: skip
-def test_another_backend_or_renderer_may_not_continue(
-    tmp_path: Path, now: dict[str, str], message: str
-) -> None:
+def test_another_backend_or_renderer_may_not_continue(tmp_path: Path, now: dict[str, str], message: str) -> None:
     rendered = {"backend": "egl", "gl_renderer": "llvmpipe"}
     for renderer in (now, rendered):  # before the first episode any may begin
         dataset = FrameDataset.create(tmp_path, **collection_request())

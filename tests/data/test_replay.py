@@ -110,9 +110,7 @@ def test_content_is_the_newest_transitions_with_live_stacks_however_they_come(
 
 
 @pytest.mark.parametrize("stacked", [False, True])
-def test_what_a_torchrl_collector_hands_out_is_stored_and_sampled_as_catframes_showed_it(
-    stacked: bool,
-) -> None:
+def test_what_a_torchrl_collector_hands_out_is_stored_and_sampled_as_catframes_showed_it(stacked: bool) -> None:
     catframes = CatFrames(N=3, dim=-3, in_keys=["pixels"], padding="same")
     env, seen = TransformedEnv(ToyEnv(variable_length, seed=4), catframes), []
     replay = FrameReplay(100, frame_shape=(3, 8, 8), action_dim=2)
@@ -259,9 +257,7 @@ def test_threads_that_sample_two_views_or_extend_meanwhile_never_mix_what_they_g
 
 @pytest.mark.parametrize("on_disk", [False, True])
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda replay: pickle.loads(pickle.dumps(replay))])
-def test_copies_hold_what_the_original_holds_and_live_apart(
-    tmp_path: Path, on_disk: bool, copied: Any
-) -> None:
+def test_copies_hold_what_the_original_holds_and_live_apart(tmp_path: Path, on_disk: bool, copied: Any) -> None:
     replay = small(path=tmp_path if on_disk else None, generator=torch.Generator().manual_seed(3))
     driver = Driver(replay).write(33)
     other = copied(replay)
@@ -341,9 +337,7 @@ def test_a_ring_in_ram_carries_its_content_in_the_state(tmp_path: Path) -> None:
     assert len(replay) == 0
 
 
-def test_a_killed_process_leaves_a_ring_that_restores_and_half_a_file_that_any_replay_replaces(
-    tmp_path: Path,
-) -> None:
+def test_a_killed_process_leaves_a_ring_that_restores_and_half_a_file_that_any_replay_replaces(tmp_path: Path) -> None:
     program = f"""
         import os, signal, sys, torch
         sys.path.insert(0, {str(Path(__file__).parent)!r})
@@ -389,9 +383,7 @@ def test_what_the_disk_cannot_hold_is_refused_and_nothing_of_it_is_left(
 
 
 def test_a_buffer_of_single_frames_becomes_one_of_stacks() -> None:
-    live = TransformedEnv(
-        ToyEnv(variable_length, seed=2), CatFrames(N=4, dim=-3, in_keys=["pixels"], padding="same")
-    )
+    live = TransformedEnv(ToyEnv(variable_length, seed=2), CatFrames(N=4, dim=-3, in_keys=["pixels"], padding="same"))
     torch.manual_seed(0)
     expected = live.rollout(40, break_when_any_done=False)
     torch.manual_seed(0)

@@ -105,9 +105,7 @@ def make_toy(lengths: Callable[[int], int], on_step: Any = None, *, seed: int, i
     return ToyEnv(lengths, seed=seed, image_size=image_size, on_step=on_step)
 
 
-def make_physical(
-    lengths: Callable[[int], int], *, seed: int, image_size: int, physics_state: bool
-) -> EnvBase:
+def make_physical(lengths: Callable[[int], int], *, seed: int, image_size: int, physics_state: bool) -> EnvBase:
     return ToyEnv(lengths, seed=seed, image_size=image_size, physics_state=physics_state)
 
 
@@ -137,9 +135,7 @@ def rollout_of(
     return TensorDict({"pixels": frames[:-1], "action": action, "next": following, **extra}, [length])
 
 
-def random_episode(
-    length: int, *, size: int = 6, seed: int = 0, action_dim: int = 2, state: bool = True
-) -> TensorDict:
+def random_episode(length: int, *, size: int = 6, seed: int = 0, action_dim: int = 2, state: bool = True) -> TensorDict:
     """The rollout ``[length]`` of an episode of random bytes; ends by truncation."""
     rng = np.random.default_rng(seed)
     physics = {"qpos": rng.normal(size=(length + 1, 4)), "qvel": rng.normal(size=(length + 1, 3))}
@@ -166,9 +162,7 @@ def collection_request(**changes: Any) -> dict[str, Any]:
 def write_dataset(path: Path, episodes: Iterable[TensorDict], **request: Any) -> Path:
     """Write rollouts of whole episodes as collection does, as a complete dataset unless ``transitions`` are more."""
     episodes = list(episodes)
-    asked = collection_request(
-        transitions=sum(map(len, episodes)), image_size=episodes[0]["pixels"].shape[-1]
-    )
+    asked = collection_request(transitions=sum(map(len, episodes)), image_size=episodes[0]["pixels"].shape[-1])
     dataset = FrameDataset.create(path, **asked | request)
     for episode in episodes:
         dataset.extend(episode)

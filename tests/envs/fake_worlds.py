@@ -90,9 +90,7 @@ class OwnWorld(EnvBase):
         actions: int = 2,
     ):
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
-        self.pixels = pixels or (
-            lambda clock: torch.full((3, 8, 8), 10 * self.seed + clock, dtype=torch.uint8)
-        )
+        self.pixels = pixels or (lambda clock: torch.full((3, 8, 8), 10 * self.seed + clock, dtype=torch.uint8))
         self.reward, self.length, self.truncates, self.dtype_ = reward, length, truncates, dtype
         self.seed = self.clock = 0
         shown = self.pixels(0)

@@ -68,10 +68,7 @@ def test_frames_outlive_the_buffer_that_a_world_uses_again(library: str, frame_s
 def test_floats_between_0_and_1_are_scaled_once_and_said(
     library: str, dtype: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with (
-        caplog.at_level(logging.WARNING),
-        shows(lambda clock: grey(clock / 5, dtype), library=library) as env,
-    ):
+    with caplog.at_level(logging.WARNING), shows(lambda clock: grey(clock / 5, dtype), library=library) as env:
         shown = env.rollout(3)["next", "pixels"]
     assert shown.dtype == torch.uint8
     assert shown[:, -1, 0, 0].tolist() == [51, 102, 153]
@@ -153,9 +150,7 @@ def test_a_physical_state_that_is_not_finite_is_refused() -> None:
 
 
 @both
-def test_an_action_that_is_not_finite_names_world_episode_and_step_and_reaches_no_simulator(
-    library: str,
-) -> None:
+def test_an_action_that_is_not_finite_names_world_episode_and_step_and_reaches_no_simulator(library: str) -> None:
     with shows(grey, library=library) as env:
         td = env.reset().set("action", torch.tensor([0.0, np.nan]))
         with pytest.raises(NonFiniteError, match=r"action .*nan.* agent step 1 of episode 0"):
@@ -185,10 +180,7 @@ def test_an_exception_of_a_worlds_own_is_passed_on_with_its_name_and_the_call() 
     assert isinstance(caught.value.__cause__, ValueError)
     for part in ("the motor is on fire", "ValueError in render()", task, __file__):
         assert part in str(caught.value)
-    with (
-        painter(reward=explode) as task,
-        pytest.raises(WorldFailedError, match=r"ValueError in step\(\) of the world"),
-    ):
+    with painter(reward=explode) as task, pytest.raises(WorldFailedError, match=r"ValueError in step\(\) of the world"):
         make_env(task, seed=0, image_size=SIZE).rollout(3)
     with pytest.raises(WorldFailedError, match=r"on fire .*ValueError in step\(\) of the world 'mine_go'"):
         make_env(own(lambda: OwnWorld(reward=explode)), seed=0, image_size=SIZE).rollout(3)
@@ -209,9 +201,7 @@ def test_an_exception_of_a_worlds_own_is_never_taken_for_a_setting() -> None:
     def make(quality: str) -> EnvBase:
         raise ValueError("no such quality")
 
-    with pytest.raises(
-        WorldFailedError, match=r"no such quality \(ValueError in make\(\) of the world 'mine_go'"
-    ):
+    with pytest.raises(WorldFailedError, match=r"no such quality \(ValueError in make\(\) of the world 'mine_go'"):
         make_env(own(make), seed=0)
 
 
@@ -232,9 +222,7 @@ HUGE = float(np.finfo(np.float32).max)
     (Box(-np.inf, np.inf, (2,)), "without bounds"), (Box(0.0, HUGE, (2,)), "one side only"),
     (Box(1.0, 1.0, (2,)), "hold nothing"),
 ])  # fmt: skip
-def test_action_spaces_that_cannot_be_mapped_from_minus_1_to_1_are_refused_by_name(
-    space: Any, complaint: str
-) -> None:
+def test_action_spaces_that_cannot_be_mapped_from_minus_1_to_1_are_refused_by_name(space: Any, complaint: str) -> None:
     with painter(action_space=space) as task, pytest.raises(CRPTproError, match=rf"{task}.*{complaint}"):
         make_env(task, seed=0)
 
@@ -267,9 +255,7 @@ from crptpro.envs import make_env
 kept = [make_env(task, seed=0, frame_stack=1) for task in ("gymnasium:Reacher-v5", "cartpole")]
 print([tuple(env.reset()["pixels"].shape) for env in kept])
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
     assert "(3, 84, 84), (3, 84, 84)" in done.stdout
     assert done.stderr == ""
 
@@ -312,9 +298,7 @@ def frames_alone(task: str) -> torch.Tensor:
 @pytest.mark.parametrize("is_closed", [True, False])
 @pytest.mark.parametrize("other", ["cartpole_balance", "gymnasium:Reacher-v5"])
 @pytest.mark.parametrize("task", ["cartpole_balance", "gymnasium:Reacher-v5"])
-def test_worlds_that_come_and_go_in_a_thread_change_no_frame_of_another(
-    task: str, other: str, is_closed: bool
-) -> None:
+def test_worlds_that_come_and_go_in_a_thread_change_no_frame_of_another(task: str, other: str, is_closed: bool) -> None:
     beside: list[EnvBase] = []
 
     def come_and_go() -> None:

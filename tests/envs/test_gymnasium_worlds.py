@@ -71,9 +71,7 @@ def test_its_time_limit_truncates_and_its_own_end_terminates_and_both_stop_the_r
     assert not terminated["truncated"].any()
 
 
-def test_a_seed_waits_for_the_next_reset_is_used_by_it_alone_and_leaves_torchs_generator_alone(
-    task: str,
-) -> None:
+def test_a_seed_waits_for_the_next_reset_is_used_by_it_alone_and_leaves_torchs_generator_alone(task: str) -> None:
     env = make(task, frame_stack=1)
     first, second = env.reset()["pixels"], env.reset()["pixels"]
     state = torch.get_rng_state()
@@ -114,9 +112,7 @@ def test_resizing_averages_and_keeps_the_shape_of_the_scene() -> None:
 @pytest.mark.gl
 @pytest.mark.parametrize("env_id", ["Reacher-v5", "HalfCheetah-v5"])
 def test_a_mujoco_episode_is_drawn_the_same_whatever_was_drawn_before_it(env_id: str) -> None:
-    first, second = (
-        make_env(f"gymnasium:{env_id}", seed=seed, quality="fast", physics_state=True) for seed in (1, 2)
-    )
+    first, second = (make_env(f"gymnasium:{env_id}", seed=seed, quality="fast", physics_state=True) for seed in (1, 2))
     other, alone = first.reset(), second.reset()
     first.set_seed(2)
     again = first.reset()

@@ -73,9 +73,7 @@ def test_a_seed_waits_for_the_next_reset_and_the_physical_state_is_kept_on_reque
 @each_stack
 def test_entries_that_a_worlds_own_transforms_read_back_are_kept(frame_stack: int) -> None:
     parts = (StepCounter, RewardSum, InitTracker)
-    env = checked(
-        lambda: TransformedEnv(OwnWorld(), Compose(*(part() for part in parts))), frame_stack=frame_stack
-    )
+    env = checked(lambda: TransformedEnv(OwnWorld(), Compose(*(part() for part in parts))), frame_stack=frame_stack)
     assert set(env.observation_spec.keys()) == {"pixels", "step_count", "episode_reward", "is_init"}
     rollout = env.rollout(3)["next"]
     assert rollout["step_count"].flatten().tolist() == [1, 2, 3]
@@ -122,9 +120,7 @@ def test_an_option_that_make_does_not_take_is_said_to_do_nothing(caplog: pytest.
 
 
 @each_stack
-def test_float64_becomes_float32_and_an_environment_without_truncation_is_never_truncated(
-    frame_stack: int,
-) -> None:
+def test_float64_becomes_float32_and_an_environment_without_truncation_is_never_truncated(frame_stack: int) -> None:
     make = functools.partial(OwnWorld, length=3, truncates=False, dtype=torch.float64)
     rollout = checked(lambda: make(), frame_stack=frame_stack).rollout(10)
     assert rollout["action"].dtype == rollout["next", "reward"].dtype == torch.float32
@@ -133,9 +129,7 @@ def test_float64_becomes_float32_and_an_environment_without_truncation_is_never_
 
 
 @pytest.mark.parametrize("truncates", [True, False])
-def test_a_world_without_an_end_is_truncated_and_starts_again(
-    truncates: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_world_without_an_end_is_truncated_and_starts_again(truncates: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(factory, "LONGEST_EPISODE_AGENT_STEPS", 7)
     env = checked(lambda: OwnWorld(length=10**9, truncates=truncates))
     for _ in range(2):

@@ -17,17 +17,8 @@ from crptpro.envs import rendering
 from crptpro.envs.rendering import PROOF_VARIABLE, backend_card, first_frame_watchdog, select_backend
 from crptpro.errors import RenderingError
 
-LLVMPIPE = {
-    "gl_vendor": "Mesa", "gl_renderer": "llvmpipe", "gl_version": "4.5", "gl_kind": "software", "alive": True,
-}  # fmt: skip
-CLEARED = (
-    "MUJOCO_GL",
-    "MUJOCO_EGL_DEVICE_ID",
-    PROOF_VARIABLE,
-    "LP_NUM_THREADS",
-    "DISPLAY",
-    "WAYLAND_DISPLAY",
-)
+LLVMPIPE = {"gl_vendor": "Mesa", "gl_renderer": "llvmpipe", "gl_version": "4.5", "gl_kind": "software", "alive": True}
+CLEARED = ("MUJOCO_GL", "MUJOCO_EGL_DEVICE_ID", PROOF_VARIABLE, "LP_NUM_THREADS", "DISPLAY", "WAYLAND_DISPLAY")
 
 
 def answer(**changes: object) -> str:
@@ -54,18 +45,14 @@ def probe(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Probe:
     record.touch()
 
     def install(code: str) -> Callable[[], list[str]]:
-        prelude = (
-            f"import os, sys, time; b = os.environ['MUJOCO_GL']; open({str(record)!r}, 'a').write(b + ' ')\n"
-        )
+        prelude = f"import os, sys, time; b = os.environ['MUJOCO_GL']; open({str(record)!r}, 'a').write(b + ' ')\n"
         monkeypatch.setattr(rendering, "PROBE_COMMAND", (sys.executable, "-S", "-c", prelude + code))
         return lambda: record.read_text().split()
 
     return install
 
 
-def test_the_first_backend_that_renders_is_taken_and_proven_once_for_child_processes_too(
-    probe: Probe,
-) -> None:
+def test_the_first_backend_that_renders_is_taken_and_proven_once_for_child_processes_too(probe: Probe) -> None:
     started = probe(ANSWER)
     assert select_backend() == select_backend() == os.environ["MUJOCO_GL"] == "egl"
     assert started() == ["egl"]
@@ -73,9 +60,7 @@ def test_the_first_backend_that_renders_is_taken_and_proven_once_for_child_proce
     assert backend_card() == {"backend": "egl", **described}
 
 
-def test_a_proof_does_not_hold_on_another_machine_or_gpu(
-    probe: Probe, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_proof_does_not_hold_on_another_machine_or_gpu(probe: Probe, monkeypatch: pytest.MonkeyPatch) -> None:
     started = probe(ANSWER)
     select_backend()
     os.environ["MUJOCO_EGL_DEVICE_ID"] = "1"
@@ -102,12 +87,7 @@ def test_a_users_mujoco_gl_is_kept_and_proven(probe: Probe, spelling: str) -> No
     ("environment", "code", "complaint", "tried"),
     [
         # A user's choice is kept even if it does not render.
-        (
-            {"MUJOCO_GL": "egl"},
-            "sys.exit('no EGL display')",
-            r"=egl was set by you.*\n.*no EGL display",
-            ["egl"],
-        ),
+        ({"MUJOCO_GL": "egl"}, "sys.exit('no EGL display')", r"=egl was set by you.*\n.*no EGL display", ["egl"]),
         ({"MUJOCO_GL": "nonsense"}, ANSWER, r"MUJOCO_GL=nonsense .*egl.*osmesa.*glfw", []),
         ({"MUJOCO_GL": "off"}, ANSWER, "switches rendering off", []),
         # When nothing renders every reason is given; GLFW is only tried with a display.
@@ -175,9 +155,7 @@ def test_several_processes_are_proven_at_the_same_time(probe: Probe, tmp_path: P
     assert len(started()) == 3
 
 
-def test_a_backend_that_dm_control_was_imported_with_is_said(
-    probe: Probe, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_backend_that_dm_control_was_imported_with_is_said(probe: Probe, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rendering, "_imported_backend", lambda: "glfw")
     probe("sys.exit('no display')")
     with pytest.raises(RenderingError, match=r"(?s)imported with the backend 'glfw' before.*no display"):
@@ -188,8 +166,7 @@ def test_a_backend_that_dm_control_was_imported_with_is_said(
 
 
 @pytest.mark.parametrize(
-    ("kind", "threads", "expected"),
-    [("software", None, "1"), ("software", "4", "4"), ("hardware", None, None)],
+    ("kind", "threads", "expected"), [("software", None, "1"), ("software", "4", "4"), ("hardware", None, None)]
 )
 def test_software_gl_gets_one_thread_unless_the_user_says_otherwise(
     probe: Probe, kind: str, threads: str | None, expected: str | None

@@ -10,15 +10,7 @@ import pytest
 
 from crptpro.artifact import write_json
 from crptpro.errors import RecordError
-from crptpro.experiments.jobs import (
-    Job,
-    bytes_of,
-    describe,
-    is_finished,
-    load_results,
-    make_plan,
-    write_cells,
-)
+from crptpro.experiments.jobs import Job, bytes_of, describe, is_finished, load_results, make_plan, write_cells
 from crptpro.experiments.matrix import SMALL, dataset, encoder, probe, run
 
 SCALE = replace(SMALL, transitions=50, updates=100, batch_size=64)
@@ -109,11 +101,7 @@ def test_results_are_frames_of_cells_and_jobs(tmp_path: Path) -> None:
     job = results.jobs.loc[trained().key]
     assert (job.kind, job.done, job.seconds, job.attempts, job.threads) == ("encoder", True, 5.0, 2, 1)
     assert job.machine == "A, 2 cores, 16 GiB, no GPU"
-    assert {
-        "method": "crptpro",
-        "domains": ["walker", "cheetah"],
-        "updates": 100,
-    }.items() <= job.facts.items()
+    assert {"method": "crptpro", "domains": ["walker", "cheetah"], "updates": 100}.items() <= job.facts.items()
     assert job.needs == [needed.key for needed in trained().needs]
     assert job.path == tmp_path / "jobs" / trained().key
     assert load_results(tmp_path / "nothing").cells.empty

@@ -38,9 +38,7 @@ from crptpro.experiments.launch import (
 )
 
 ROOT = Path(crptpro.__file__).parents[1]
-UNTRAINED = Job(
-    "untrained", "u", ("pretrain", "--method", "random-encoder", "--out", "{out}", "--seed", "0"), {}
-)
+UNTRAINED = Job("untrained", "u", ("pretrain", "--method", "random-encoder", "--out", "{out}", "--seed", "0"), {})
 
 
 def job(name: str, *needs: Job, kind: str = "run") -> Job:
@@ -141,9 +139,9 @@ def test_a_queue_that_is_full_for_a_while_loses_nothing_but_one_that_takes_no_jo
         launched(tmp_path / "b", job("a"), launcher=Closed())
 
 
-@pytest.mark.parametrize(("number", "error"), [
-    (signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit), (signal.SIGHUP, SystemExit),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit), (signal.SIGHUP, SystemExit)]
+)
 def test_a_signal_stops_all_jobs_at_a_checkpoint_and_a_second_one_at_once(
     tmp_path: Path, number: signal.Signals, error: type[BaseException]
 ) -> None:
@@ -211,9 +209,7 @@ def test_an_attempt_says_in_its_log_why_it_failed_and_the_time_of_earlier_ones_c
         assert 150 <= done["seconds"] < 200
 
 
-def test_two_commands_on_one_root_do_not_run_a_job_twice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_commands_on_one_root_do_not_run_a_job_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("crptpro.cli.main", lambda: pytest.fail("it ran twice"))
     wanted = job("a")
     describe(tmp_path, make_plan([wanted], tmp_path))
@@ -250,9 +246,7 @@ def test_a_machine_is_divided_among_jobs(monkeypatch: pytest.MonkeyPatch) -> Non
     assert divided(device="cuda", jobs=3) == (2, 4, ("0", "1"))  # more would not find room
 
 
-def test_gpus_are_shared_evenly_and_jobs_have_their_threads(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gpus_are_shared_evenly_and_jobs_have_their_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     environments = []
 
     class Process:
@@ -275,9 +269,7 @@ def test_slurm_needs_its_commands(monkeypatch: pytest.MonkeyPatch) -> None:
         SlurmLauncher({})
 
 
-def test_a_slurm_job_asks_for_its_cores_and_a_refusal_is_said(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_slurm_job_asks_for_its_cores_and_a_refusal_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "bin"
     folder.mkdir()
     for name in ("sbatch", "srun", "scancel"):
@@ -376,9 +368,7 @@ def test_ray_runs_jobs_and_one_whose_worker_died_is_tried_again(
         handle, deadline = start(work, is_exclusive=is_exclusive), time.monotonic() + 120
         while not killed and time.monotonic() < deadline:
             if (directory / "log.txt").exists() and "process " in (directory / "log.txt").read_text():
-                process = psutil.Process(
-                    int((directory / "log.txt").read_text().split("process ")[1].split(",")[0])
-                )
+                process = psutil.Process(int((directory / "log.txt").read_text().split("process ")[1].split(",")[0]))
                 killed.append(process.ppid())
                 os.kill(process.ppid(), signal.SIGKILL)
             time.sleep(0.01)

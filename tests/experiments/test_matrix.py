@@ -163,9 +163,7 @@ def test_a_tiny_reproduction_needs_few_jobs_of_every_kind() -> None:
     assert all(place[needed.key] < place[job.key] for job in jobs for needed in job.needs)
 
 
-def test_a_method_of_the_users_takes_the_scale_of_its_kind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_method_of_the_users_takes_the_scale_of_its_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plugin = tmp_path / "mine.py"
     plugin.write_text("# first")
     monkeypatch.setattr(plugins, "_loaded", [str(plugin)])
@@ -189,9 +187,7 @@ def test_a_method_of_the_users_takes_the_scale_of_its_kind(
     ({"encoder_seeds": ()}, CRPTproError, "`encoder_seeds` must be"),
     ({"seeds": (1_000,)}, CRPTproError, "from 0 to 999"),
 ])  # fmt: skip
-def test_a_request_refuses_what_nobody_knows(
-    part: dict[str, Any], error: type[Exception], message: str
-) -> None:
+def test_a_request_refuses_what_nobody_knows(part: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         Request(SMALL, **part)
 

@@ -16,7 +16,7 @@ from crptpro.experiments.published import (
     SEEN_NORMALIZED_MEAN,
     UNSEEN,
     published_score,
-)  # fmt: skip
+)
 from crptpro.objectives import method_names
 
 
@@ -44,9 +44,7 @@ def test_the_printed_means_and_claims_follow_from_the_printed_cells() -> None:
     ratios = [means["crptpro"] / means["proto-rl-c"] for means in (SEEN_MEAN, SEEN_NORMALIZED_MEAN)]
     assert ratios == pytest.approx([1.238, 1.785], abs=5e-4)
     assert sum(row.scores["crptpro"].mean > row.scores["proto-rl-c"].mean for row in SEEN) == 11
-    assert EFFICIENCY["crptpro"].hours[2] / EFFICIENCY["proto-rl-c"].hours[2] == pytest.approx(
-        0.545, abs=5e-4
-    )
+    assert EFFICIENCY["crptpro"].hours[2] / EFFICIENCY["proto-rl-c"].hours[2] == pytest.approx(0.545, abs=5e-4)
     assert 50_000 + sum(FINETUNE_UPDATES.values()) == 58_500
     for method in ("crptpro", "proto-rl-c", "proto-rl-s"):
         assert all(a < b for a, b in zip(PROTOTYPE_METRICS[method, True], PROTOTYPE_METRICS[method, False]))

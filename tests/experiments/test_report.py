@@ -31,9 +31,7 @@ class Report:
         self.html, self.folder = page.read_text(), page.parent
         self.text = (page.parent / "report.md").read_text()
         self.tables: dict[str, pd.DataFrame] = {}
-        blocks = re.findall(
-            r"^(?:\*\*|<details><summary>)(.+?)(?:\*\*|</summary>)\n\n((?:\|.*\n)+)", self.text, re.M
-        )
+        blocks = re.findall(r"^(?:\*\*|<details><summary>)(.+?)(?:\*\*|</summary>)\n\n((?:\|.*\n)+)", self.text, re.M)
         for caption, table in blocks:
             lines = [re.split(r"(?<!\\)\|", line)[1:-1] for line in table.strip().split("\n")]
             head, _, *rows = [[cell.strip() for cell in line] for line in lines]
@@ -152,9 +150,7 @@ def test_measurements_of_encoders_and_data_are_those_of_their_records(seen: Repo
     ("Effective rank (at most the number of observations), features", "becl", "walker", "1631.4 · seen"),
     ("Mean pairwise cosine, embedding z", "apt-c", "cheetah", "0.0403 · seen"),
 ])  # fmt: skip
-def test_probes_have_every_domain_and_colours(
-    seen: Report, table: str, encoder: str, column: str, number: str
-) -> None:
+def test_probes_have_every_domain_and_colours(seen: Report, table: str, encoder: str, column: str, number: str) -> None:
     assert seen.cell(table, column, encoder) == number
 
 
@@ -192,41 +188,24 @@ class Reproduction:
         self.root = root
 
     def job(
-        self,
-        key: str,
-        kind: str,
-        needs: Iterable[str] = (),
-        *,
-        done: bool = True,
-        facts: Any = None,
-        **tables: Any,
+        self, key: str, kind: str, needs: Iterable[str] = (), *, done: bool = True, facts: Any = None, **tables: Any
     ) -> str:
         folder = self.root / "jobs" / key
         description = {"kind": kind, "command": [kind], "needs": list(needs), "facts": facts or {}}
         write_json(folder / "job.json", description)
         if done:
-            made = {
-                "seconds": 90.0,
-                "attempts": 1,
-                "device": "cpu",
-                "threads": 1,
-                "git_revision": "0123456789ab",
-            }
+            made = {"seconds": 90.0, "attempts": 1, "device": "cpu", "threads": 1, "git_revision": "0123456789ab"}
             write_json(folder / "done.json", {**made, "versions": {"torch": "2.13.0"}, "hardware": HARDWARE})
         for name, rows in tables.items():
             write_rows(folder / f"{name}.csv", rows)
         return key
 
-    def ask(
-        self, experiment: str, cells: Iterable[tuple[str, str, Mapping[str, Any]]], scale: str = "paper"
-    ) -> None:
+    def ask(self, experiment: str, cells: Iterable[tuple[str, str, Mapping[str, Any]]], scale: str = "paper") -> None:
         told = [{"label": label, "job": job, "place": dict(place)} for label, job, place in cells]
         content = {"experiment": experiment, "scale": scale, "request": {}, "cells": told}
         write_json(self.root / "experiments" / f"{len(list(self.root.glob('experiments/*')))}.json", content)
 
-    def runs(
-        self, label: str, task: str, scores: Iterable[float], **place: Any
-    ) -> list[tuple[str, str, dict]]:
+    def runs(self, label: str, task: str, scores: Iterable[float], **place: Any) -> list[tuple[str, str, dict]]:
         """Runs of a method, each on an encoder of its own."""
         cells = []
         for seed, score in enumerate(scores):
@@ -354,21 +333,15 @@ def test_the_same_records_give_the_same_files(made: Reproduction) -> None:
 ])  # fmt: skip
 def test_a_plateau_is_left_where_the_loss_stays_below_it(losses: tuple[float, ...], left: float) -> None:
     updates = [100.0 * (n + 1) for n in range(len(losses))]
-    record = pd.DataFrame(
-        {"updates": updates, "comp": [4.0 * share for share in losses], "ln_num_prototypes": 4.0}
-    )
+    record = pd.DataFrame({"updates": updates, "comp": [4.0 * share for share in losses], "ln_num_prototypes": 4.0})
     assert left_plateau(record) == pytest.approx(left, nan_ok=True)
 
 
 # --- the command, other directories, a browser ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "reason"), [("nowhere", "There is no directory"), ("", "holds nothing to report on")]
-)
-def test_a_directory_without_anything_is_refused_and_left_alone(
-    tmp_path: Path, name: str, reason: str
-) -> None:
+@pytest.mark.parametrize(("name", "reason"), [("nowhere", "There is no directory"), ("", "holds nothing to report on")])
+def test_a_directory_without_anything_is_refused_and_left_alone(tmp_path: Path, name: str, reason: str) -> None:
     with pytest.raises(RecordError, match=reason):
         build_report(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
@@ -409,9 +382,7 @@ BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-c
 
 
 @pytest.mark.parametrize("width", [1200, 400])
-def test_a_browser_shows_the_page_and_it_never_scrolls_sideways(
-    seen: Report, tmp_path: Path, width: int
-) -> None:
+def test_a_browser_shows_the_page_and_it_never_scrolls_sideways(seen: Report, tmp_path: Path, width: int) -> None:
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         pytest.skip(f"no browser was found ({', '.join(BROWSERS)})")

@@ -69,9 +69,7 @@ def perceptron(mlp: torch.nn.Module, inputs: torch.Tensor) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("has_tanh", [False, True])
-def test_actor_and_critic_are_linear_layernorm_and_three_layers_and_both_heads_share_one_trunk(
-    has_tanh: bool,
-) -> None:
+def test_actor_and_critic_are_linear_layernorm_and_three_layers_and_both_heads_share_one_trunk(has_tanh: bool) -> None:
     features, action = torch.rand(4, 40), torch.rand(4, 3) * 2 - 1
 
     def bottleneck(network: torch.nn.Module) -> torch.Tensor:
@@ -138,8 +136,7 @@ def test_leading_dimensions_are_kept_and_one_row_is_legal() -> None:
 
 
 @pytest.mark.parametrize(
-    "make",
-    [SquashedGaussianActor, TwinCritic, lambda *a, **k: DeterministicActor(*a, skill_dim=np.int8(4), **k)],
+    "make", [SquashedGaussianActor, TwinCritic, lambda *a, **k: DeterministicActor(*a, skill_dim=np.int8(4), **k)]
 )
 def test_sizes_of_any_number_type_become_plain_integers_in_the_card(make) -> None:
     module = make(np.int64(6), 2.0, hidden_dim=torch.tensor(8))

@@ -142,9 +142,7 @@ def test_floating_pixels_in_the_unit_interval_are_never_scaled_twice_and_that_is
         (torch.zeros(2, 3, 20, 20, dtype=torch.uint8), r"\[\*, 3, 21, 21\], got \(2, 3, 20, 20\)"),
     ],
 )
-def test_images_that_are_neither_uint8_nor_in_the_unit_interval_are_refused_by_name(
-    images: Tensor, named: str
-) -> None:
+def test_images_that_are_neither_uint8_nor_in_the_unit_interval_are_refused_by_name(images: Tensor, named: str) -> None:
     with pytest.raises(ValueError, match=named):
         small()(images)
 

@@ -26,9 +26,7 @@ def test_linear_layers_are_orthogonal_with_zero_bias(module: torch.nn.Module) ->
         assert not layer.bias.any()
 
 
-@pytest.mark.parametrize(
-    "make", [lambda init: Projector(2_000, 64, init), lambda init: PixelEncoder(init=init)]
-)
+@pytest.mark.parametrize("make", [lambda init: Projector(2_000, 64, init), lambda init: PixelEncoder(init=init)])
 def test_kaiming_weights_have_the_variance_two_over_fan_in(make) -> None:
     for layer in make("kaiming").modules():
         if isinstance(layer, (torch.nn.Linear, torch.nn.Conv2d)):

@@ -83,10 +83,7 @@ def test_a_compute_dtype_reaches_the_networks_that_a_loss_hides_and_ends_with_it
     encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=12)
     actor, critic = SquashedGaussianActor(6, 2, hidden_dim=8), TwinCritic(6, 2, hidden_dim=8)
     pretraining = ProtoLoss(encoder, num_prototypes=8, latent_dim=4, hidden_dim=8)
-    hidden = {
-        pretraining: (encoder, pretraining.projector),
-        RADSACLoss(actor, critic): (actor.trunk, critic.q2),
-    }
+    hidden = {pretraining: (encoder, pretraining.projector), RADSACLoss(actor, critic): (actor.trunk, critic.q2)}
     for loss, networks in hidden.items():
         with pytest.raises(RuntimeError, match="inside"), computing(loss, torch.bfloat16):  # noqa: PT012
             assert {network.compute_dtype for network in networks} == {torch.bfloat16}

@@ -120,10 +120,7 @@ def two_view_batch(count: int = 6, seed: int = 0) -> TensorDict:
 
 def pixel_batch(count: int = 6, seed: int = 0) -> TensorDict:
     td = transition_batch(count, seed).exclude("features", ("next", "features"))
-    for key, images in (
-        ("pixels", image_batch(count, seed)),
-        ("pixels_view", image_batch(count, seed + 100)),
-    ):
+    for key, images in (("pixels", image_batch(count, seed)), ("pixels_view", image_batch(count, seed + 100))):
         td[key], td["next", key] = images["pixels"], images["next", "pixels"]
     return td
 

@@ -148,9 +148,7 @@ def test_state_dict_round_trip_restores_outputs_and_targets(case: LossCase) -> N
 
 @each
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda loss: pickle.loads(pickle.dumps(loss))])
-def test_copies_are_equal_and_independent_and_their_networks_hold_their_parameters(
-    case: LossCase, duplicate
-) -> None:
+def test_copies_are_equal_and_independent_and_their_networks_hold_their_parameters(case: LossCase, duplicate) -> None:
     loss, td = case.make(), case.batch()
     expected = run(loss, td)
     twin = duplicate(loss)

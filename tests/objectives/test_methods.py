@@ -134,11 +134,7 @@ def test_downstream_settings_differ_from_crptpros_where_the_paper_says_so() -> N
         (lambda: Exploration(skill_dim=1), ValueError, "`skill_dim` must be at least 2"),
         (lambda: register_method("x", OwnLoss, batch_size=0), ValueError, "`batch_size` must be at least 1"),
         (lambda: register_method("x", OwnLoss, encoder_tau=1.5), ValueError, "`encoder_tau` must be at most"),
-        (
-            lambda: register_method("x", OwnLoss, schedule="cosine"),
-            ValueError,
-            "`schedule` must be 'constant",
-        ),
+        (lambda: register_method("x", OwnLoss, schedule="cosine"), ValueError, "`schedule` must be 'constant"),
     ],
 )
 def test_names_options_and_numbers_that_cannot_be_are_refused_with_a_remedy(act, error, message: str) -> None:

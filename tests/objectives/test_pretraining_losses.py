@@ -142,9 +142,7 @@ def test_before_update_gives_unit_rows_and_forward_does_not_need_it() -> None:
     torch.testing.assert_close(loss.prototypes.weight.detach().norm(dim=1), torch.ones(10))
 
 
-def test_coefficients_are_scheduled_in_place_and_the_assignments_follow_the_temperature_unless_given() -> (
-    None
-):
+def test_coefficients_are_scheduled_in_place_and_the_assignments_follow_the_temperature_unless_given() -> None:
     td = image_batch()
     same, cold = proto(), proto(assignment_temperature=0.02)
     assert same.assignment_temperature is None
@@ -213,11 +211,7 @@ def test_impossible_options_are_refused_by_name(make, options: dict, message: st
 
 @pytest.mark.parametrize(
     ("make", "batch", "missing"),
-    [
-        (proto, image_batch, ("next", "pixels")),
-        (simclr, view_batch, "pixels_view"),
-        (becl, skill_image_batch, "skill"),
-    ],
+    [(proto, image_batch, ("next", "pixels")), (simclr, view_batch, "pixels_view"), (becl, skill_image_batch, "skill")],
 )
 def test_a_missing_entry_is_named(make, batch, missing) -> None:
     with pytest.raises(KeyError) as caught:
@@ -277,11 +271,7 @@ def released_becl(loss: BeCLLoss, td: TensorDict):
 
 @pytest.mark.parametrize(
     ("make", "batch", "released"),
-    [
-        (atc, image_batch, released_atc),
-        (simclr, view_batch, released_simclr),
-        (becl, skill_image_batch, released_becl),
-    ],
+    [(atc, image_batch, released_atc), (simclr, view_batch, released_simclr), (becl, skill_image_batch, released_becl)],
 )
 def test_contrastive_losses_and_gradients_equal_the_released_updates(make, batch, released) -> None:
     loss, td = make(), batch(11)
@@ -295,10 +285,7 @@ def test_contrastive_losses_and_gradients_equal_the_released_updates(make, batch
 
 @pytest.mark.parametrize(
     ("make", "batch", "learning", "constant"),
-    [
-        (atc, image_batch, ["pixels"], [("next", "pixels")]),
-        (simclr, view_batch, ["pixels", "pixels_view"], []),
-    ],
+    [(atc, image_batch, ["pixels"], [("next", "pixels")]), (simclr, view_batch, ["pixels", "pixels_view"], [])],
 )
 def test_the_gradient_reaches_the_anchors_of_atc_and_both_views_of_simclr(
     make, batch, learning: list, constant: list

@@ -256,9 +256,7 @@ def test_skill_ddpg_equals_the_released_update_in_value_and_gradients() -> None:
             r"7 features, the encoder gives \d+; build it with feature_dim=",
         ),
         (
-            lambda: SkillDDPGLoss(
-                DeterministicActor(FEATURES, ACTIONS, skill_dim=3), TwinCritic(FEATURES, ACTIONS)
-            ),
+            lambda: SkillDDPGLoss(DeterministicActor(FEATURES, ACTIONS, skill_dim=3), TwinCritic(FEATURES, ACTIONS)),
             "built for 12 inputs, the actor sees 15",
         ),
         (lambda: skill_ddpg(noise_clip=-0.1), r"`noise_clip` must be at least 0, got -0\.1"),

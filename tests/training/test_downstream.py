@@ -67,12 +67,8 @@ def test_the_encoder_stays_as_it_was_and_sac_learns() -> None:
     assert not same_weights(result, train(None, pretrained, env_steps=20))
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, {"features": "reencode"}, {"features": "dense-bf16"}, {"method": "drq"}]
-)
-def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(
-    tmp_path: Path, settings: dict[str, Any]
-) -> None:
+@pytest.mark.parametrize("settings", [{}, {"features": "reencode"}, {"features": "dense-bf16"}, {"method": "drq"}])
+def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(tmp_path: Path, settings: dict[str, Any]) -> None:
     options, parts = dict(settings), tmp_path / "parts"
     pretrained = make_pretrained(options.pop("method", "crptpro"))
     whole = train(tmp_path / "whole", pretrained, **options)
@@ -115,9 +111,7 @@ def test_workers_of_their_own_evaluate_the_same_episodes(tmp_path: Path) -> None
     assert same_weights(here, beside)
 
 
-def test_the_bonus_is_added_where_there_are_prototypes_and_a_coefficient(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_the_bonus_is_added_where_there_are_prototypes_and_a_coefficient(caplog: pytest.LogCaptureFixture) -> None:
     bonus, none = train(None, env_steps=40), train(None, env_steps=40, intrinsic_reward_coef=0)
     assert not same_weights(bonus, none)
     encoder_only = dataclasses.replace(make_pretrained(), projector=None, prototypes=None)

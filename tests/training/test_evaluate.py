@@ -36,9 +36,7 @@ def test_an_evaluation_is_the_same_whatever_was_evaluated_before() -> None:
 
 def test_chance_is_uniform_and_seeded() -> None:
     env = make_toy_env()
-    one, two, other = (
-        evaluate(uniform_policy(env, seed=s), env, episodes=2, progress=False) for s in (0, 0, 1)
-    )
+    one, two, other = (evaluate(uniform_policy(env, seed=s), env, episodes=2, progress=False) for s in (0, 0, 1))
     assert one == two
     assert other != one
 

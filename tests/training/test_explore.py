@@ -34,9 +34,7 @@ def build(method: str) -> LossModule:
 def run(method: str, run_dir: Path | None = None, domains: Any = None, **options: Any) -> ExploreResult:
     loss = options.pop("loss", None) or build(method)
     domains = domains or (DOMAINS[:1] if method.endswith("-s") else DOMAINS)
-    return pretrain_active(
-        loss, domains, method=method, run_dir=run_dir, config=SMALL, progress=False, **options
-    )
+    return pretrain_active(loss, domains, method=method, run_dir=run_dir, config=SMALL, progress=False, **options)
 
 
 @pytest.mark.parametrize("method", ["proto-rl-c", "proto-rl-s", "apt-c", "apt-s", "becl"])

@@ -29,9 +29,7 @@ SETTINGS = PretrainConfig(
 def run(loss: LossModule, updates: int, run_dir: Path | None = None, **options: Any) -> PretrainResult:
     datasets = options.pop("datasets", None) or make_datasets()
     config = options.pop("config", SETTINGS)
-    return pretrain(
-        loss, datasets, updates=updates, run_dir=run_dir, config=config, progress=False, **options
-    )
+    return pretrain(loss, datasets, updates=updates, run_dir=run_dir, config=config, progress=False, **options)
 
 
 class Brightness(LossModule):
@@ -81,18 +79,14 @@ def test_training_lowers_the_loss_and_the_record_says_so(tmp_path: Path) -> None
     rows = record(tmp_path / "pretrain.csv")
     assert [int(row["updates"]) for row in rows] == list(range(4, 64, 4))
     assert float(rows[-1]["loss_comp"]) < float(rows[0]["loss_comp"])
-    assert {"loss", "loss/dark", "loss/bright", "cosine/dark", "cosine/bright", "prototype_kne_3"} <= {
-        *rows[0]
-    }
+    assert {"loss", "loss/dark", "loss/bright", "cosine/dark", "cosine/bright", "prototype_kne_3"} <= {*rows[0]}
     assert float(rows[0]["ln_num_prototypes"]) == pytest.approx(math.log(8))
     assert result.metrics["loss"] == pytest.approx(float(rows[-1]["loss"]))
     assert (result.updates, result.resumed_from, result.collapse["verdict"]) == (60, 0, "learning")
 
 
 @pytest.mark.parametrize("method", ["crptpro", "atc", "apt-c"])
-def test_a_resumed_run_gives_the_weights_and_the_record_of_an_uninterrupted_one(
-    tmp_path: Path, method: str
-) -> None:
+def test_a_resumed_run_gives_the_weights_and_the_record_of_an_uninterrupted_one(tmp_path: Path, method: str) -> None:
     def build() -> LossModule:
         torch.manual_seed(0)
         options = {"num_prototypes": 8, "hidden_dim": 16} if method == "crptpro" else {}
@@ -154,9 +148,7 @@ def test_a_schedule_over_the_run_cannot_be_extended(tmp_path: Path) -> None:
         ({"loss": lambda: make_loss(num_prototypes=16)}, "shape of"),
     ],
 )
-def test_a_run_of_other_settings_is_refused_by_name(
-    tmp_path: Path, changed: dict[str, Any], named: str
-) -> None:
+def test_a_run_of_other_settings_is_refused_by_name(tmp_path: Path, changed: dict[str, Any], named: str) -> None:
     run(make_loss(), 4, tmp_path)
     loss = changed.pop("loss", make_loss)()
     with pytest.raises(CheckpointError, match=named):
@@ -267,9 +259,7 @@ def test_an_impossible_setting_is_refused_by_name(setting: str, value: Any, mess
 
 def test_bf16_stays_within_the_spread_of_two_fp32_seeds() -> None:
     def curve(precision: str, seed: int) -> torch.Tensor:
-        config = PretrainConfig(
-            batch_size=16, learning_rate=1e-3, seed=seed, log_interval=10, precision=precision
-        )  # type: ignore[arg-type]
+        config = PretrainConfig(batch_size=16, learning_rate=1e-3, seed=seed, log_interval=10, precision=precision)  # type: ignore[arg-type]
         return torch.tensor([row["loss_comp"] for row in run(make_loss(seed), 100, config=config).history])
 
     reference, other_seed, fast = curve("fp32", 0), curve("fp32", 1), curve("bf16", 0)

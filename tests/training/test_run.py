@@ -93,9 +93,7 @@ def test_a_resumed_run_gives_the_numbers_and_the_record_of_an_uninterrupted_one(
         assert record(tmp_path / name / "train.csv") == record(tmp_path / "whole" / "train.csv")
 
 
-def test_a_crash_costs_the_updates_since_the_last_checkpoint_and_what_precedes_all_is_removed(
-    tmp_path: Path,
-) -> None:
+def test_a_crash_costs_the_updates_since_the_last_checkpoint_and_what_precedes_all_is_removed(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError):
         walk(tmp_path / "late", 18, on_update=crash_at(13))
     assert first_update(tmp_path / "late") == 10
@@ -159,9 +157,7 @@ def test_two_processes_in_one_directory_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1])
-def test_every_signal_that_asks_a_run_to_stop_leaves_a_checkpoint_first(
-    tmp_path: Path, number: signal.Signals
-) -> None:
+def test_every_signal_that_asks_a_run_to_stop_leaves_a_checkpoint_first(tmp_path: Path, number: signal.Signals) -> None:
     before = signal.getsignal(number)
     with pytest.raises((KeyboardInterrupt, SystemExit)) as left:
         walk(tmp_path, 18, on_update=lambda update: update == 2 and signal.raise_signal(number))

@@ -32,9 +32,7 @@ def small_encoder(**changes: object) -> PixelEncoder:
     return PixelEncoder(9, **config)
 
 
-def small_heads(
-    encoder: PixelEncoder, prototypes: int = 8, latent_dim: int = 5
-) -> tuple[Projector, Prototypes]:
+def small_heads(encoder: PixelEncoder, prototypes: int = 8, latent_dim: int = 5) -> tuple[Projector, Prototypes]:
     return Projector(encoder.feature_dim, latent_dim), Prototypes(prototypes, latent_dim)
 
 

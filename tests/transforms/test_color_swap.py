@@ -9,9 +9,7 @@ from crptpro.transforms import ColorSwap
 
 def test_every_frame_of_a_stack_has_its_channels_reversed_and_none_changes_place() -> None:
     stack = torch.arange(2 * 6 * 4 * 5, dtype=torch.uint8).view(2, 6, 4, 5)
-    td = ColorSwap()(
-        TensorDict({"pixels": stack.clone()}, [2])
-    )  # lacks ("next", "pixels"), which is no error
+    td = ColorSwap()(TensorDict({"pixels": stack.clone()}, [2]))  # lacks ("next", "pixels"), which is no error
     assert td["pixels"].dtype == torch.uint8
     assert torch.equal(td["pixels"], stack[:, [2, 1, 0, 5, 4, 3]])
     assert torch.equal(ColorSwap()(td)["pixels"], stack)

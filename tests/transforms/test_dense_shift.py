@@ -17,13 +17,7 @@ from toy_world import rollout_of
 
 from crptpro.data import FrameReplay
 from crptpro.modules import PixelEncoder
-from crptpro.transforms import (
-    DenseShiftFeatures,
-    FrozenEncoder,
-    RandomShift,
-    choose_feature_mode,
-    random_shift,
-)
+from crptpro.transforms import DenseShiftFeatures, FrozenEncoder, RandomShift, choose_feature_mode, random_shift
 from crptpro.transforms.dense_shift import (
     _crop_by_index,
     crop_features,
@@ -242,9 +236,7 @@ def test_numbers_that_go_back_are_encoded_anew_after_forget():
 
 
 def test_too_few_places_are_refused_instead_of_giving_features_of_another_observation():
-    dense = dense_of(
-        small_encoder(), FakeReplay(), observations=np.int64(4), in_keys="number", out_keys="features"
-    )
+    dense = dense_of(small_encoder(), FakeReplay(), observations=np.int64(4), in_keys="number", out_keys="features")
     assert dense(TensorDict({"number": torch.tensor([0, 5])}, [2]))["features"].shape[0] == 2
     with pytest.raises(ValueError, match="`observations` is 4, fewer than the replay holds"):
         dense(TensorDict({"number": torch.tensor([1, 5])}, [2]))

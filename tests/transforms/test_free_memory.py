@@ -22,11 +22,7 @@ def v2(limit: object, used: int, **more: object) -> Files:
     ("own", "groups", "left"),
     [
         # The second version counts the group's own limit and those around it.
-        (
-            "0::/job/step\n",
-            {"job/step": v2("max", 500), "job": v2(1000, 600), "": v2(5000, 700)},
-            [400, 4300],
-        ),
+        ("0::/job/step\n", {"job/step": v2("max", 500), "job": v2(1000, 600), "": v2(5000, 700)}, [400, 4300]),
         # The first version counts too.
         (
             "5:cpu,cpuacct:/slurm/job\n4:memory:/slurm/job\n1:name=systemd:/\n",

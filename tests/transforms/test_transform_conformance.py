@@ -62,10 +62,7 @@ CASES: dict[str, tuple[Callable[[], Transform], set]] = {
     "colors": (ColorSwap, IN_PLACE),
     "encoder": (lambda: FrozenEncoder(small_encoder()), {"features"}),
     "prototype": (partial(rewarding, prototype), REWARDED),
-    "new keys": (
-        partial(rewarding, prototype, **NEW_KEYS),
-        {("next", "z"), ("next", "bonus"), ("next", "reward")},
-    ),
+    "new keys": (partial(rewarding, prototype, **NEW_KEYS), {("next", "z"), ("next", "bonus"), ("next", "reward")}),
     "particle": (partial(rewarding, particle), REWARDED),
     "contrastive": (partial(rewarding, contrastive), REWARDED),
     "everything": (partial(rewarding, prototype, RandomShift), IN_PLACE | REWARDED),
@@ -96,9 +93,7 @@ def sampled() -> TensorDict:
 def changed(before: TensorDictBase, after: TensorDictBase) -> set:
     """Keys that are new, or hold other values than before."""
     known = set(before.keys(True, True))
-    return {
-        key for key in after.keys(True, True) if key not in known or not torch.equal(after[key], before[key])
-    }
+    return {key for key in after.keys(True, True) if key not in known or not torch.equal(after[key], before[key])}
 
 
 def assert_the_same(first: Transform, second: Transform) -> None:

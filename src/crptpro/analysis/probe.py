@@ -115,9 +115,7 @@ def probe_samples(
 
 
 @torch.no_grad()
-def probe(
-    samples: ProbeSamples, encoder: nn.Module, projector: nn.Module | None = None
-) -> dict[str, ProbeResult]:
+def probe(samples: ProbeSamples, encoder: nn.Module, projector: nn.Module | None = None) -> dict[str, ProbeResult]:
     """Predict the state from an encoder's frozen features, and from the projections z if there is a projector.
 
     Ridge regression on standardised features, in float64; nothing of the held-out episodes takes part in fitting,

@@ -76,9 +76,7 @@ class Logging:
             try:
                 yield logger
             except Exception:
-                if is_new and [path.name for path in run_dir.iterdir()] == [
-                    ".lock"
-                ]:  # the request was refused
+                if is_new and [path.name for path in run_dir.iterdir()] == [".lock"]:  # the request was refused
                     shutil.rmtree(run_dir)
                 raise
 
@@ -112,9 +110,9 @@ class Collect:
     """transitions per domain (21 KB each)"""
     seed: int = 0
     """the same seed gives the same data whatever the number of workers"""
-    workers: Annotated[
-        int, arg(help_behavior_hint=lambda cores: f"(default: one per core, {cores} here)")
-    ] = field(default_factory=cpu_cores)
+    workers: Annotated[int, arg(help_behavior_hint=lambda cores: f"(default: one per core, {cores} here)")] = field(
+        default_factory=cpu_cores
+    )
     """collecting processes, shared by all domains"""
     quality: Quality = "exact"
     """render quality; fast uses smaller shadow maps on software GL"""
@@ -229,9 +227,7 @@ class Finetune:
         with self.logging.records(self.out, self) as records:
             updates = self.config.updates or get_method("crptpro-finetune").updates
             config = replace(self.config, updates=updates)
-            result = training.finetune(
-                pretrained, self.dataset, run_dir=self.out, config=config, records=records
-            )
+            result = training.finetune(pretrained, self.dataset, run_dir=self.out, config=config, records=records)
             Pretraining.keep(self, result, records)  # type: ignore[arg-type]
 
 
@@ -246,9 +242,7 @@ class Downstream:
     `drq` to learn the encoder with the task"""
     out: Path
     """run directory: eval.csv, train.csv, checkpoints, and the agent in OUT/agent"""
-    config: Annotated[training.DownstreamConfig, arg(name="")] = field(
-        default_factory=training.DownstreamConfig
-    )
+    config: Annotated[training.DownstreamConfig, arg(name="")] = field(default_factory=training.DownstreamConfig)
     """every number of the stage"""
     logging: Logging = field(default_factory=Logging)
     """mirrors"""
@@ -317,9 +311,7 @@ class Evaluate:
             if self.csv is not None:
                 from crptpro.experiments import measure
 
-                measure.write_rows(
-                    self.csv, [{"task": task, "agent": self.agent, **vars(each)} for each in episodes]
-                )
+                measure.write_rows(self.csv, [{"task": task, "agent": self.agent, **vars(each)} for each in episodes])
             if self.video is not None:
                 frames: list[Any] = []
                 policy = agent or training.uniform_policy(env, seed=self.seed)
@@ -439,9 +431,7 @@ def named_values(option: str, words: Sequence[str]) -> dict[str, Any]:
 def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
     """Open every dataset and return the image size and frames per stack, which all must share."""
     if not datasets:
-        raise DatasetError(
-            "Name at least one dataset directory, e.g. data/walker (made by `crptpro collect`)."
-        )
+        raise DatasetError("Name at least one dataset directory, e.g. data/walker (made by `crptpro collect`).")
     for path in datasets:
         if not path.exists() and str(path) in (*GROUPS, *PAPER_DOMAINS, *TASKS):
             raise DatasetError(

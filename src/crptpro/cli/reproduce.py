@@ -41,8 +41,7 @@ class Reproduce:
     """
 
     experiments: Annotated[
-        Positional[tuple[str, ...]],
-        arg(metavar="EXPERIMENT [EXPERIMENT ...]", help_behavior_hint="(required)"),
+        Positional[tuple[str, ...]], arg(metavar="EXPERIMENT [EXPERIMENT ...]", help_behavior_hint="(required)")
     ]
     """which, e.g. `seen`, or several, or `all`"""
     scale: Literal["tiny", "small", "paper"]
@@ -53,9 +52,7 @@ class Reproduce:
     """only these pre-training groups, of A B C D"""
     tasks: Annotated[tuple[str, ...], _ITS_OWN] = ()
     """only these tasks, e.g. `walker_run`"""
-    seeds: Annotated[
-        tuple[int, ...], arg(help_behavior_hint="(default: as many as the scale has, from 0)")
-    ] = ()
+    seeds: Annotated[tuple[int, ...], arg(help_behavior_hint="(default: as many as the scale has, from 0)")] = ()
     """of downstream runs on each encoder"""
     encoder_seeds: tuple[int, ...] = (0,)
     """of data and pre-training"""
@@ -95,7 +92,7 @@ class Reproduce:
         slurm = self._checked_options()
         jobs, cores, gpus = launch.divide(
             self.launcher, device=self.device, jobs=self.jobs, cores=self.cores_per_job, jobs_per_gpu=self.jobs_per_gpu
-        )  # fmt: skip
+        )
         names = ("methods", "groups", "tasks", "encoder_seeds", "seeds", "device")
         request = Request(
             SCALES[self.scale],
@@ -123,12 +120,7 @@ class Reproduce:
             rows = [(cell.label, cell.job.key, cell.place) for cell in cells]
             write_cells(root, name, self.scale, asked, rows)
         if launcher is not None:
-            how: dict[str, Any] = {
-                "jobs": jobs,
-                "cores": cores,
-                "device": self.device,
-                "attempts": self.attempts,
-            }
+            how: dict[str, Any] = {"jobs": jobs, "cores": cores, "device": self.device, "attempts": self.attempts}
             failures = launch.run_jobs(plan, root, launcher, plugins=loaded_plugins(), **how)
             if failures:
                 print(failures_text(failures), flush=True)

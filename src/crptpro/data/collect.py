@@ -171,12 +171,7 @@ class _Job:
     """One dataset; its episodes are planned, and appended, in the order of their indices."""
 
     def __init__(
-        self,
-        domain: Domain,
-        dataset: FrameDataset,
-        make: Callable[[], EnvBase],
-        seed: int,
-        length: int | None,
+        self, domain: Domain, dataset: FrameDataset, make: Callable[[], EnvBase], seed: int, length: int | None
     ):
         self.domain, self.dataset, self.make, self.seed = domain, dataset, make, seed
         self.writer: Any = dataset.writer
@@ -228,9 +223,7 @@ def _collect(jobs: list[_Job], workers: int, progress: bool) -> None:
     with closing(_Crew({job.domain.name: job.make for job in jobs}, workers)) as crew:
         for job in jobs:
             name, writer = job.domain.name, job.writer
-            bar = Progress(
-                writer.target, writer.transitions, "transitions", label=name, is_shown=progress, lines=10
-            )
+            bar = Progress(writer.target, writer.transitions, "transitions", label=name, is_shown=progress, lines=10)
             while not job.dataset.is_complete:
                 for each in jobs:  # all workers on the first that needs one: each makes each environment once
                     while not job.queue or sum(len(other.queue) for other in jobs) < ahead:
@@ -267,9 +260,7 @@ class _Crew:
 
                 limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
                 hint = f"This shell allows {limit} open files: raise that (`ulimit -n 4096`), or use fewer workers."
-            raise CRPTproError(
-                f"{self.workers} collecting processes cannot be started: {reason}. {hint}"
-            ) from reason
+            raise CRPTproError(f"{self.workers} collecting processes cannot be started: {reason}. {hint}") from reason
 
     def result(self, future: Future, episode: str) -> bytes:
         """Wait for an episode as long as somebody works."""

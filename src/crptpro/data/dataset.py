@@ -231,9 +231,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
         # The lock, and half a collection.json, are what a kill at the very start leaves.
         found = [each for each in path.glob("*") if each.name != ".lock" and each.suffix != ".partial"]
         if found and path / COLLECTION_FILE not in found:
-            raise DatasetError(
-                f"{path} is not empty and not a collection. Choose another directory or empty it."
-            )
+            raise DatasetError(f"{path} is not empty and not a collection. Choose another directory or empty it.")
         self._lock = DirectoryLock(path, error=DatasetError)
         try:
             if not (path / CARD_FILE).exists():  # another process may have finished it just now
@@ -275,9 +273,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
             if begins:
                 self.end_episode()
                 if len(part.first_frames()) > 1:
-                    raise ValueError(
-                        "An episode of a dataset begins at its reset, with a stack of one frame."
-                    )
+                    raise ValueError("An episode of a dataset begins at its reset, with a stack of one frame.")
             self._pending.append(part)
             if part.columns["done"][-1] or self._taken == self.target:
                 self.end_episode()
@@ -378,9 +374,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
         for path, expected in _sizes(self.path, state).items():
             require_size(path, min(expected, path.stat().st_size if path.exists() else 0), expected)
         self.state = state | {"request": self.request}
-        logger.info(
-            "%s: continuing after %d of %d transitions", self.path.name, self.transitions, self.target
-        )
+        logger.info("%s: continuing after %d of %d transitions", self.path.name, self.transitions, self.target)
         if self.transitions >= self.target:
             self._finish()
 

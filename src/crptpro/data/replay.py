@@ -117,9 +117,7 @@ class FrameReplay(ReplayBuffer):
         frame_shape = tuple(as_int(size, "frame_shape", minimum=1) for size in frame_shape)  # type: ignore[assignment]
         extra = dict(extra_columns or {})
         if taken := sorted(_TAKEN & set(extra)):
-            raise ValueError(
-                f"extra_columns may not be named {taken}: a sample has those; choose other names."
-            )
+            raise ValueError(f"extra_columns may not be named {taken}: a sample has those; choose other names.")
         columns: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
             "pixels": (frame_shape, torch.uint8),
             "action": ((as_int(action_dim, "action_dim", minimum=1),), torch.float32),
@@ -260,9 +258,7 @@ class _RingWriter(ImmutableDatasetWriter):
         """Store transitions in temporal order; see :class:`FrameReplay`."""
         ring: RingStorage = self._storage
         channels = ring.pixels.shape[1]
-        rows = read_rows(
-            data, channels=channels, frame_stack=ring.frame_stack, extra=self._extra, what="A replay"
-        )
+        rows = read_rows(data, channels=channels, frame_stack=ring.frame_stack, extra=self._extra, what="A replay")
         for name, values in {"pixels": rows.following, **rows.columns}.items():
             if values.shape[1:] != ring.content[name].shape[1:]:
                 expected, got = tuple(ring.content[name].shape[1:]), tuple(values.shape[1:])

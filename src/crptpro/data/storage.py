@@ -16,14 +16,7 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, is_tensor_collecti
 from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
-from crptpro.errors import (
-    CheckpointError,
-    DatasetError,
-    DiskSpaceError,
-    NonFiniteError,
-    is_disk_full,
-    writing_error,
-)
+from crptpro.errors import CheckpointError, DatasetError, DiskSpaceError, NonFiniteError, is_disk_full, writing_error
 
 PIXELS_FILE = "frames/pixels.memmap"
 
@@ -48,9 +41,7 @@ def require_size(path: Path, size: int, expected: int | None) -> None:
     """Refuse a file of ``size`` bytes where ``expected`` belong, with a DatasetError."""
     if expected is not None and size != expected:
         kind = "truncated" if size < expected else "longer than it should be"
-        raise DatasetError(
-            f"{path} is {kind}: {size:,} bytes, {expected:,} belong there. Collect the dataset again."
-        )
+        raise DatasetError(f"{path} is {kind}: {size:,} bytes, {expected:,} belong there. Collect the dataset again.")
 
 
 def stack_rows(row: Tensor, step: Tensor, frame_stack: int) -> Tensor:

@@ -206,13 +206,11 @@ def _own(domain: Domain, **settings: Any) -> EnvBase:
     if settings["quality"] != "exact" and "quality" not in named:
         logger.warning(
             "The make of domain %r takes no quality: quality=%r changes nothing.", domain.name, settings["quality"]
-        )  # fmt: skip
+        )
     with passed_on(domain.task, "make"):
         env = make(**named)
     if broken := _broken_contract(env, settings["image_size"]):
-        raise CRPTproError(
-            f"The environment of domain {domain.name!r} {broken} (see crptpro.domains.Domain)."
-        )
+        raise CRPTproError(f"The environment of domain {domain.name!r} {broken} (see crptpro.domains.Domain).")
     state = ("qpos", "qvel") if settings["physics_state"] else ()
     present = set(env.observation_spec.keys(True, True))
     kept = [key for key in ("pixels", *state, *_read_back(env)) if key in present]
@@ -264,9 +262,7 @@ def _broken_contract(env: Any, image_size: int) -> str:
     if pixels.dtype != torch.uint8 and not pixels.dtype.is_floating_point:
         return f"emits pixels of {pixels.dtype}; they must be torch.uint8, or floats in [0, 1]"
     if tuple(pixels.shape) not in shapes:
-        return (
-            f"emits pixels of shape {tuple(pixels.shape)}; expected one RGB image, {shapes[0]} or {shapes[1]}"
-        )
+        return f"emits pixels of shape {tuple(pixels.shape)}; expected one RGB image, {shapes[0]} or {shapes[1]}"
     action = env.action_spec
     low: Any = getattr(action.space, "low", None)
     high: Any = getattr(action.space, "high", None)

@@ -29,9 +29,7 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
     messages.
     """
 
-    def __init__(
-        self, env: Any, *, world: str, image_size: int, action_repeat: int, physics_state: bool, render: bool
-    ):
+    def __init__(self, env: Any, *, world: str, image_size: int, action_repeat: int, physics_state: bool, render: bool):
         super().__init__(env)
         self.episode_seed: int | None = None
         self._world, self._image_size, self._action_repeat = world, image_size, action_repeat
@@ -155,9 +153,7 @@ def resize(frame: Tensor, size: int) -> Tensor:
     """
     if frame.shape[1:] == (size, size):
         return frame
-    small = F.interpolate(
-        frame[None].float(), (size, size), mode="bilinear", antialias=True, align_corners=False
-    )
+    small = F.interpolate(frame[None].float(), (size, size), mode="bilinear", antialias=True, align_corners=False)
     return small[0].round_().clamp_(0, 255).to(torch.uint8)
 
 

@@ -224,12 +224,7 @@ def run_isolated(
         for command in commands:
             out, err = (stack.enter_context(tempfile.TemporaryFile()) for _ in range(2))
             process = subprocess.Popen(
-                command,
-                env=environment,
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=err,
-                start_new_session=True,
+                command, env=environment, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True
             )
             stack.callback(_kill, process)
             jobs.append((process, out, err))
@@ -259,9 +254,7 @@ def _prove(backend: str, *, timeout_s: float, processes: int) -> dict[str, Any]:
         lines = [line.strip() for line in stderr.splitlines() if line.strip()]
         if status is None:
             where = f" from each of {processes} simultaneous processes" if processes > 1 else ""
-            raise RenderingError(
-                f"{backend}: the first frame did not arrive{where} within {timeout_s:g} s. {HANG}"
-            )
+            raise RenderingError(f"{backend}: the first frame did not arrive{where} within {timeout_s:g} s. {HANG}")
         if status < 0:
             reason = f"the GL driver crashed the process ({signal.Signals(-status).name})"
         elif status > 0:
@@ -295,9 +288,7 @@ def _requested_backend() -> str | None:
         return None
     backend = canonical_backend(text)
     if backend == "off":
-        raise RenderingError(
-            f"MUJOCO_GL={text} switches rendering off; unset it, or set it to egl or osmesa."
-        )
+        raise RenderingError(f"MUJOCO_GL={text} switches rendering off; unset it, or set it to egl or osmesa.")
     return backend
 
 

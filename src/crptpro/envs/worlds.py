@@ -50,9 +50,7 @@ class CheckedWorld:
     _has_warned = False
     _was_closed = False
 
-    def watch(
-        self, card: dict[str, Any], *, agent_step_limit: int | None = None, checks_frames: bool = True
-    ) -> None:
+    def watch(self, card: dict[str, Any], *, agent_step_limit: int | None = None, checks_frames: bool = True) -> None:
         """Set the card, whose ``task`` is the name in messages, and what is checked."""
         self._card, self.world = card, card["task"]
         self.agent_step_limit, self.checks_frames = agent_step_limit, checks_frames
@@ -182,9 +180,7 @@ class FrameReader:
             raise self._refusal(f"holds {dtype} from {low:g} to {high:g}", "uint8, or floats in [0, 1]")
         if not self._has_scaled:
             self._has_scaled = True
-            logger.warning(
-                "The world %r shows %s in [0, 1]; its frames are multiplied by 255.", self.world, dtype
-            )
+            logger.warning("The world %r shows %s in [0, 1]; its frames are multiplied by 255.", self.world, dtype)
         return (pixels * 255).round().to(torch.uint8).contiguous()
 
     def _refusal(self, what: str, expected: str) -> WorldError:
@@ -207,9 +203,7 @@ class ActionRange:
         bounds = f"low {low.tolist()}, high {high.tolist()}"
         wrong = ""
         if not np.issubdtype(dtype, np.floating):
-            wrong = (
-                f"has actions of {np.dtype(dtype)}; wrap it in one that takes floats and rounds as it should"
-            )
+            wrong = f"has actions of {np.dtype(dtype)}; wrap it in one that takes floats and rounds as it should"
         elif not low.size:
             wrong = f"has an empty action, shape {low.shape}: nothing to learn"
         elif (no_low != no_high).any():

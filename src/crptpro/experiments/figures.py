@@ -104,9 +104,7 @@ def draw(
                 if kind == "cloud":
                     style = {**style, "linestyle": "none", "alpha": 0.6}
                 spaced = max(1, len(own) // 12) if kind == "line" else 1
-                (handle,) = axis.plot(
-                    own["x"], own["y"], **style, linewidth=1.5, markersize=4, markevery=spaced
-                )
+                (handle,) = axis.plot(own["x"], own["y"], **style, linewidth=1.5, markersize=4, markevery=spaced)
                 handles.setdefault(name, handle)
                 if own["low"].notna().any():
                     axis.fill_between(own["x"], own["low"], own["high"], color=style["color"], alpha=0.15)
@@ -122,7 +120,5 @@ def draw(
             axis.set_axis_off()
         across = max(1, min(len(handles), int(width * columns / (0.6 + 0.062 * max(map(len, handles))))))
         figure.set_figheight(height * rows + 0.17 * math.ceil(len(handles) / across) + 0.1)
-        figure.legend(
-            handles.values(), handles, loc="outside lower center", ncols=across, fontsize=8, frameon=False
-        )
+        figure.legend(handles.values(), handles, loc="outside lower center", ncols=across, fontsize=8, frameon=False)
     return figure

@@ -128,8 +128,7 @@ def _has_what(root: Path, job: Job, reader: Job) -> bool:
     paths = [directory_of(root, job.key) / name for name in named]
     content = (WEIGHTS_FILE, PIXELS_FILE)
     return all(
-        path.exists()
-        and (not (path / "card.json").exists() or any((path / file).exists() for file in content))
+        path.exists() and (not (path / "card.json").exists() or any((path / file).exists() for file in content))
         for path in paths
     )
 
@@ -274,16 +273,12 @@ def load_results(root: str | Path) -> Results:
             about = {name: content[name] for name in ("experiment", "scale")}
             for cell in content["cells"]:
                 done = rows.get(cell["job"], {}).get("done", False)
-                cells.append(
-                    {**about, "label": cell["label"], "job": cell["job"], "done": done} | cell["place"]
-                )
+                cells.append({**about, "label": cell["label"], "job": cell["job"], "done": done} | cell["place"])
         except (KeyError, TypeError) as reason:
             raise RecordError(f"{path} does not say what was asked for ({reason!r}); remove it.") from None
     columns = None if cells else ["experiment", "scale", "label", "job", "done"]
     table = pd.DataFrame(cells, columns=columns, dtype=object).astype({"done": bool})
-    jobs = pd.DataFrame.from_dict(
-        rows, orient="index", columns=[*DESCRIBED, *MADE, "path", "done", "machine"]
-    )
+    jobs = pd.DataFrame.from_dict(rows, orient="index", columns=[*DESCRIBED, *MADE, "path", "done", "machine"])
     return Results(table, jobs.rename_axis("key"))
 
 
@@ -294,11 +289,7 @@ def _job_row(path: Path) -> dict[str, Any]:
         row = {name: content[name] for name in DESCRIBED} | {name: done.get(name) for name in MADE}
     except KeyError as reason:
         raise RecordError(f"{path} does not describe a job: it has no {reason}.") from None
-    return row | {
-        "path": path.parent,
-        "done": done_path.exists(),
-        "machine": machine(done.get("hardware") or {}),
-    }
+    return row | {"path": path.parent, "done": done_path.exists(), "machine": machine(done.get("hardware") or {})}
 
 
 def machine(hardware: Mapping[str, Any]) -> str:

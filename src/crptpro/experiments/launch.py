@@ -33,18 +33,7 @@ from filelock import FileLock, Timeout
 
 from crptpro.artifact import read_json, write_json
 from crptpro.errors import CRPTproError, RecordError, SubmissionError
-from crptpro.experiments.jobs import (
-    CLOCK,
-    DESCRIPTION,
-    DONE,
-    LOCK,
-    LOG,
-    OWN,
-    Job,
-    Plan,
-    describe,
-    directory_of,
-)
+from crptpro.experiments.jobs import CLOCK, DESCRIPTION, DONE, LOCK, LOG, OWN, Job, Plan, describe, directory_of
 from crptpro.provenance import cpu_cores, provenance
 
 logger = logging.getLogger(__name__)
@@ -254,9 +243,7 @@ class SlurmLauncher:
         except FailedJobError as reason:
             shutil.rmtree(folder, ignore_errors=True)
             said = (str(reason).strip().splitlines() or ["it gave no reason"])[-1]
-            raise SubmissionError(
-                f"sbatch refused a job: {said} Change --partition, --hours or --sbatch."
-            ) from reason
+            raise SubmissionError(f"sbatch refused a job: {said} Change --partition, --hours or --sbatch.") from reason
 
 
 @dataclass(frozen=True)
@@ -393,9 +380,7 @@ def run_jobs(
         KeyboardInterrupt: after Ctrl-C, when all jobs have ended; likewise SystemExit.
     """
     describe(root, plan)
-    queue = _Queue(
-        plan, Work(str(root.resolve()), "", device, cores, cores, plugins), launcher, jobs, attempts
-    )
+    queue = _Queue(plan, Work(str(root.resolve()), "", device, cores, cores, plugins), launcher, jobs, attempts)
     with _signals_end_it():
         try:
             while queue.waiting or queue.running:
@@ -550,9 +535,7 @@ def divide(
         names = map(str, range(torch.cuda.device_count())) if listed is None else listed.split(",")
         gpus = tuple(filter(None, (name.strip() for name in names)))
         if not gpus or not torch.cuda.device_count():
-            raise CRPTproError(
-                "--device cuda: this machine has no GPU that torch can use; --device cpu always works."
-            )
+            raise CRPTproError("--device cuda: this machine has no GPU that torch can use; --device cpu always works.")
     if device.startswith("cuda"):
         room = jobs_per_gpu * max(1, len(gpus))
         jobs = min(jobs or room, room)
@@ -573,9 +556,7 @@ def slurm_parameters(
         {'time': 120, 'mem': '8192M', 'partition': 'short', 'additional_parameters': {'qos': 'high'}}
     """
     if not (hours * 60 >= 1 and memory_gb >= 1):
-        raise CRPTproError(
-            f"--hours {hours:g} --memory-gb {memory_gb:g}: a job needs a minute and 1 GB at least."
-        )
+        raise CRPTproError(f"--hours {hours:g} --memory-gb {memory_gb:g}: a job needs a minute and 1 GB at least.")
     found: dict[str, Any] = {"time": round(hours * 60), "mem": f"{round(memory_gb * 1024)}M"}
     found |= {} if partition is None else {"partition": partition}
     found |= {"gpus_per_node": 1} if has_gpu else {}

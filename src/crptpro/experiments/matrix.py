@@ -380,9 +380,7 @@ def spread(base: Job) -> Job:
     return Job("prototypes", title, command, facts, (base,))
 
 
-def comparison(
-    kind: str, base: Job, explorer: Job, datasets: Sequence[Job], *, samples: int, seed: int
-) -> Job:
+def comparison(kind: str, base: Job, explorer: Job, datasets: Sequence[Job], *, samples: int, seed: int) -> Job:
     """Return what compares an explorer's data with random data: ``coverage`` or ``embeddings``."""
     replays = [f"{{{explorer.key}}}/replay/{domain}" for domain in explorer.facts["domains"]]
     command = ["measure", kind, "--encoder", _encoder_of(base), "--explorer", _encoder_of(explorer)]
@@ -438,9 +436,7 @@ def _experiment(title: str) -> Callable[[Callable[[Request], Iterator[Cell]]], N
 
     def register(cells: Callable[[Request], Iterator[Cell]]) -> None:
         summary = " ".join((cells.__doc__ or "").split())
-        EXPERIMENTS[cells.__name__.strip("_")] = Experiment(
-            title, summary, lambda request: list(cells(request))
-        )
+        EXPERIMENTS[cells.__name__.strip("_")] = Experiment(title, summary, lambda request: list(cells(request)))
 
     return register
 
@@ -591,9 +587,7 @@ def _trained(
     """Encoders of methods with prototypes, or what is measured of them."""
     for group, seed in product(request.groups or "A", request.encoder_seeds):
         for system in request.methods or variants:
-            for domains, (label, loss) in product(
-                _domain_sets(request, group, system), variants.get(system, ())
-            ):
+            for domains, (label, loss) in product(_domain_sets(request, group, system), variants.get(system, ())):
                 trained = encoder(request.scale, system, domains, seed, loss=loss)
                 yield _measured(label, measure(trained), group, seed, domains)
 

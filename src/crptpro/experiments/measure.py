@@ -214,9 +214,7 @@ def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
                 points = embed_pixels(pretrained.encoder, pixels, projector=pretrained.projector)
                 found = {"source": source, "method": "" if is_random else explored.method, "domain": domain}
                 found["env_steps"] = training["env_steps"] * end // total
-                rows.append(
-                    {**found, "coverage": particle_estimate(F.normalize(points, dim=-1)), "samples": samples}
-                )
+                rows.append({**found, "coverage": particle_estimate(F.normalize(points, dim=-1)), "samples": samples})
     columns = ("source", "method", "domain", "env_steps", "coverage", "samples")
     write_rows(of.out / "coverage.csv", rows, columns)
 
@@ -283,10 +281,7 @@ def timing(
             "paper_decisions": paper.decisions, "paper_projected_hours": paper_each * paper.updates / 3600,
             "collection_seconds": sum(collected) if collected else math.nan,
         })  # fmt: skip
-    total: dict[str, Any] = {
-        "method": here.stage.method,
-        **pd.DataFrame(rows, dtype=object).sum(skipna=False),
-    }
+    total: dict[str, Any] = {"method": here.stage.method, **pd.DataFrame(rows, dtype=object).sum(skipna=False)}
     total["seconds_per_update"] = 3600 * total["projected_hours"] / total["budget_updates"]
     total["paper_seconds_per_update"] = 3600 * total["paper_projected_hours"] / total["paper_updates"]
     per_decision = total["seconds_per_update"] * total["encoder_updates"]

@@ -332,9 +332,7 @@ def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     table = table[(table != "").any(axis=1)]
     if len(table):
         paper = {budget: told for budget, (*_, told) in BUDGETS.items()}
-        table["the paper's"] = [
-            paper.get(name, "not printed, at least 6 evaluations") for name in table.index
-        ]
+        table["the paper's"] = [paper.get(name, "not printed, at least 6 evaluations") for name in table.index]
         page.table("Budgets beside the paper's.", table.reset_index(names="budget"))
         page.text(
             "What this cannot show: which method is ahead after all of the budget, for methods that learn late look "
@@ -481,10 +479,7 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
     rows = list[dict[str, Any]]()
     for label in labels:
         own, own_normal = (frame[frame["label"] == label] for frame in (kept, normal))
-        found, encoders = (
-            stats.estimate(stats.mean, own),
-            own.loc[own["encoder"] != own["run"], "encoder"].nunique(),
-        )
+        found, encoders = (stats.estimate(stats.mean, own), own.loc[own["encoder"] != own["run"], "encoder"].nunique())
         line = {"method": label, "tasks": len(shared), "runs": found.runs, "encoders": encoders}
         line["mean score"] = _beside(f"{found:.0f}", _paper_mean(label, places))
         for title, statistic in NORMALIZED.items() if len(normal) else ():
@@ -492,9 +487,7 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
         if len(normal):
             line["mean / DrQ"] = _beside(line["mean / DrQ"], _paper_mean(label, places, normalized=True))
         if (drq["score"] > 0).all() and len(drq):
-            line["mean / DrQ here"] = (
-                "1" if label == "drq" else f"{stats.estimate(stats.relative_mean, own, drq):.3f}"
-            )
+            line["mean / DrQ here"] = "1" if label == "drq" else f"{stats.estimate(stats.relative_mean, own, drq):.3f}"
         rows.append(line)
     page.table(
         f"Over the {_count(len(shared), 'task')} that all methods share. A task counts once per group and colours, a "
@@ -593,9 +586,9 @@ def _efficiency(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) 
     if rows.empty:
         return
     rows["collecting"] = rows["collection_seconds"].astype(float) / 3600
-    rows["hours"] = rows["paper_projected_hours"] + (rows["collecting"] * rows["job"].map(
-        lambda job: _papers_data(job, jobs)
-    )).fillna(0)  # fmt: skip
+    rows["hours"] = rows["paper_projected_hours"] + (
+        rows["collecting"] * rows["job"].map(lambda job: _papers_data(job, jobs))
+    ).fillna(0)
     table = []
     groups = rows.groupby(["device", "threads", "method", "domains"], sort=False)
     for (device, threads, method, count), own in groups:
@@ -709,10 +702,7 @@ def _embeddings(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -
         shares = _json(jobs.loc[job, "path"] / "explained.json").get("explained_variance_ratio", ())
         axes = {f"pc{i}": f"component {i} ({share:.0%})" for i, share in enumerate(shares, 1)}
         points = pd.DataFrame({"label": own["source"]})
-        pairs = [
-            points.assign(x=own[x], y=own[y], panel=f"{axes[y]} over {axes[x]}")
-            for x, y in combinations(axes, 2)
-        ]
+        pairs = [points.assign(x=own[x], y=own[y], panel=f"{axes[y]} over {axes[x]}") for x, y in combinations(axes, 2)]
         about = "{}, group {}, encoder seed {}".format(*own[["label", "group", "encoder_seed"]].iloc[0])
         caption = f"{about}: principal components of {len(own)} embeddings, with their share of the variance."
         page.figure(f"{name}-{place}", caption, draw(pd.concat(pairs), kind="cloud"))

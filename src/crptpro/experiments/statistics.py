@@ -136,9 +136,7 @@ def estimate(
     return Estimate(value, low, high, runs, encoders)
 
 
-def _resample(
-    tasks: Sequence[pd.DataFrame], replicates: int, rng: np.random.Generator
-) -> list[NDArray[np.int64]]:
+def _resample(tasks: Sequence[pd.DataFrame], replicates: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
     """Draw encoders with replacement, jointly for the tasks that share them, and then runs of those drawn.
 
     A task keeps its places: the first encoder's ``n`` runs become ``n`` runs of the first encoder drawn, redrawn with

@@ -76,10 +76,7 @@ class SquashedGaussianActor(LinearNetwork):
         if not low < high:
             raise ValueError(f"log_std_bounds must be (low, high) with low < high, got {log_std_bounds}.")
         sizes = plain_sizes(
-            feature_dim=feature_dim,
-            action_dim=action_dim,
-            bottleneck_dim=bottleneck_dim,
-            hidden_dim=hidden_dim,
+            feature_dim=feature_dim, action_dim=action_dim, bottleneck_dim=bottleneck_dim, hidden_dim=hidden_dim
         )
         feature_dim, self.action_dim, bottleneck_dim, hidden_dim = sizes.values()
         self.config: dict[str, Any] = {**sizes, "log_std_bounds": [low, high], "has_tanh": bool(has_tanh)}
@@ -126,10 +123,7 @@ class TwinCritic(LinearNetwork):
     ) -> None:
         super().__init__()
         sizes = plain_sizes(
-            feature_dim=feature_dim,
-            action_dim=action_dim,
-            bottleneck_dim=bottleneck_dim,
-            hidden_dim=hidden_dim,
+            feature_dim=feature_dim, action_dim=action_dim, bottleneck_dim=bottleneck_dim, hidden_dim=hidden_dim
         )
         feature_dim, self.action_dim, bottleneck_dim, hidden_dim = sizes.values()
         self.config: dict[str, Any] = {**sizes, "has_tanh": bool(has_tanh)}

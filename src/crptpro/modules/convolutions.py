@@ -25,9 +25,7 @@ ChunkFunction = Callable[[Tensor, Sequence[Tensor]], Tensor]
 START_TIMEOUT_S = 60.0
 
 
-def apply_to_chunks(
-    function: ChunkFunction, chunks: Sequence[Tensor], parameters: Sequence[Tensor]
-) -> Tensor:
+def apply_to_chunks(function: ChunkFunction, chunks: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
     """Return ``torch.cat([function(chunk, parameters) for chunk in chunks])``, computed side by side.
 
     In PyTorch all cores share every operation and wait for each other at its end; here they meet once per batch. The
@@ -69,9 +67,7 @@ class _Chunks(torch.autograd.Function):
             # Kept, because the caller may ask the outer graph for a second pass; it is freed together with that one.
             return torch.autograd.grad(output, leaves, part, retain_graph=True)
 
-        sums = iter(
-            [sum(found[1:], found[0]) for found in zip(*_map(differentiate, list(zip(graphs, parts))))]
-        )
+        sums = iter([sum(found[1:], found[0]) for found in zip(*_map(differentiate, list(zip(graphs, parts))))])
         return (None, None, *[next(sums) if need else None for need in ctx.needs])
 
 

@@ -78,9 +78,7 @@ class PixelEncoder(nn.Module):
         for stride in self.strides:
             size = (size - KERNEL_SIZE) // stride + 1
             if size < 1:
-                raise ValueError(
-                    f"image_size {image_size} is too small for strides {self.strides}; use larger images."
-                )
+                raise ValueError(f"image_size {image_size} is too small for strides {self.strides}; use larger images.")
         self.pixel_scale = as_float(pixel_scale, "pixel_scale")
         self.pixel_offset = as_float(pixel_offset, "pixel_offset")
         self.convs = nn.ModuleList(
@@ -122,8 +120,7 @@ class PixelEncoder(nn.Module):
             value = torch.as_tensor(value).to(like)
             if value.shape != (self.feature_dim,) or not bool(value.isfinite().all()):
                 raise ValueError(
-                    f"`{name}` must hold {self.feature_dim} finite numbers, one per feature, "
-                    f"got {tuple(value.shape)}."
+                    f"`{name}` must hold {self.feature_dim} finite numbers, one per feature, got {tuple(value.shape)}."
                 )
             if name == "scale" and not bool((value > 0).all()):
                 raise ValueError("`scale` must be positive; use 1 for constant features.")

@@ -62,9 +62,7 @@ class Projector(LinearNetwork):
     stay float32. ``init="kaiming"`` (normal, fan-in, for ReLU) is how ATC draws its own.
     """
 
-    def __init__(
-        self, feature_dim: int = 39_200, latent_dim: int = 128, init: WeightInit = "orthogonal"
-    ) -> None:
+    def __init__(self, feature_dim: int = 39_200, latent_dim: int = 128, init: WeightInit = "orthogonal") -> None:
         super().__init__()
         sizes = plain_sizes(feature_dim=feature_dim, latent_dim=latent_dim)
         self.config: dict[str, Any] = {**sizes, "init": init}

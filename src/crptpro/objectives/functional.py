@@ -36,11 +36,7 @@ def sinkhorn_knopp(scores: Tensor, *, temperature: float | Tensor = 0.1, iterati
 
 
 def comparative_loss(
-    student_scores: Tensor,
-    assignments: Tensor,
-    *,
-    temperature: float | Tensor = 0.1,
-    reduction: Reduction = "mean",
+    student_scores: Tensor, assignments: Tensor, *, temperature: float | Tensor = 0.1, reduction: Reduction = "mean"
 ) -> Tensor:
     r"""Cross-entropy between target assignments and predicted ones (CRPTpro Eq. 1 and 7), both ``[B, M]``, in nats.
 

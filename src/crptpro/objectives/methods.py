@@ -164,9 +164,7 @@ class Method:
         known = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY or p.name in options]
         unknown = sorted(set(options) - set(known))
         if unknown and not any(p.kind is p.VAR_KEYWORD for p in parameters):
-            raise ValueError(
-                f"The method {self.name!r} has no option {', '.join(unknown)}; it has {', '.join(known)}."
-            )
+            raise ValueError(f"The method {self.name!r} has no option {', '.join(unknown)}; it has {', '.join(known)}.")
         loss = self.loss_class(encoder, **{**self.loss_options, **options})
         loss.method_name = self.name  # by which method_of finds it
         return loss
@@ -223,10 +221,7 @@ TABLE = (
     replace(_APT_C, name="apt-s", updates=125_000, exploration=replace(_APT_EXPLORES, **_SINGLE_DOMAIN)),
     _PROTO_RL_C,
     replace(
-        _PROTO_RL_C,
-        name="proto-rl-s",
-        updates=125_000,
-        exploration=Exploration(transfers_actor=True, **_SINGLE_DOMAIN),
+        _PROTO_RL_C, name="proto-rl-s", updates=125_000, exploration=Exploration(transfers_actor=True, **_SINGLE_DOMAIN)
     ),
     # An update of BeCL's agent every second agent step brings three encoder updates: 150,000 for 50,000 of the agent.
     Method(
@@ -263,11 +258,7 @@ TABLE = (
     # Controls: the encoder as it is drawn, and with features of mean 0 and deviation 1.
     Method("random-encoder", None, updates=0, downstream=_NO_BONUS),
     Method(
-        "random-encoder-standardised",
-        None,
-        updates=0,
-        encoder_options={"standardised": True},
-        downstream=_NO_BONUS,
+        "random-encoder-standardised", None, updates=0, encoder_options={"standardised": True}, downstream=_NO_BONUS
     ),
 )
 
@@ -309,9 +300,7 @@ def get_method(name: str, *, besides: Iterable[str] = ()) -> Method:
 
 def method_names(*, presets: bool = False) -> list[str]:
     """Names of the methods that pre-train an encoder, sorted; with ``presets``, of every row of the table."""
-    return sorted(
-        name for name, row in _METHODS.items() if presets or not (row.is_preset or row.loss_class is None)
-    )
+    return sorted(name for name, row in _METHODS.items() if presets or not (row.is_preset or row.loss_class is None))
 
 
 def method_of(loss: LossModule | type[LossModule]) -> Method:

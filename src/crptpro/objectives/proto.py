@@ -100,9 +100,8 @@ class ProtoLoss(PretrainingLoss):
         prototypes = prototypes or Prototypes(num_prototypes, latent_dim)
         require_one_latent_dim(projector=projector, predictor=predictor, prototypes=prototypes)
         self._convert(
-            ("encoder", "projector"),
-            encoder=encoder, projector=projector, predictor=predictor, prototypes=prototypes,
-        )  # fmt: skip
+            ("encoder", "projector"), encoder=encoder, projector=projector, predictor=predictor, prototypes=prototypes
+        )
         self.sinkhorn_iterations = as_int(sinkhorn_iterations, "sinkhorn_iterations", minimum=0)
         self._register_coefficients(
             intr_loss_coef=intr_loss_coef,
@@ -130,9 +129,7 @@ class ProtoLoss(PretrainingLoss):
             latents, predictions, targets = (x.to(unit.dtype) for x in (latents, predictions, targets))
             assignments = functional.sinkhorn_knopp(
                 F.normalize(targets, dim=-1) @ unit.detach().T,
-                temperature=self.temperature
-                if self.assignment_temperature is None
-                else self.assignment_temperature,
+                temperature=self.temperature if self.assignment_temperature is None else self.assignment_temperature,
                 iterations=self.sinkhorn_iterations,
             )
             scores = F.normalize(predictions, dim=-1) @ unit.T  # (B, D) x (D, M) -> (B, M)

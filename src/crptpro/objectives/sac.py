@@ -253,9 +253,7 @@ class DrQLoss(AveragedSACLoss):
 
     default_keys = _AcceptedKeys
 
-    def __init__(
-        self, encoder: PixelEncoder, actor: SquashedGaussianActor, critic: TwinCritic, **options: Any
-    ) -> None:
+    def __init__(self, encoder: PixelEncoder, actor: SquashedGaussianActor, critic: TwinCritic, **options: Any) -> None:
         super().__init__(actor, PixelCritic(encoder, critic), **options)
 
     @property

@@ -45,9 +45,7 @@ class PixelAgent(nn.Module):
         return self.actor.mode(self._features(pixels)).squeeze(0).float().cpu()
 
     @torch.no_grad()
-    def explore(
-        self, pixels: Tensor, generator: torch.Generator, *, where: str, skill: Tensor | None = None
-    ) -> Tensor:
+    def explore(self, pixels: Tensor, generator: torch.Generator, *, where: str, skill: Tensor | None = None) -> Tensor:
         """Return a sample of the policy, float32 ``[A]`` in ``[-1, 1]``, for uint8 ``[C, H, W]``.
 
         ``skill`` is one-hot ``[S]``, for an actor that takes one.
@@ -107,9 +105,7 @@ def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[P
     Raises:
         CheckpointError: if the directory is missing, damaged, or not an agent.
     """
-    card, tensors = read_artifact(
-        path, format_name=AGENT_FORMAT, version=AGENT_VERSION, error=CheckpointError
-    )
+    card, tensors = read_artifact(path, format_name=AGENT_FORMAT, version=AGENT_VERSION, error=CheckpointError)
     if encoder is None and card.get("encoder_class") != PixelEncoder.__name__:
         raise CheckpointError(
             f"{path} acts on a {card.get('encoder_class')}, which only its author can build: pass encoder=."
@@ -145,11 +141,7 @@ class SACLearner:
         compile: bool = False,
     ) -> None:
         self.actor_interval, self.target_interval = actor_interval, target_interval
-        groups = {
-            "critic": loss.critic.parameters(),
-            "actor": loss.actor.parameters(),
-            "temperature": [loss.log_alpha],
-        }
+        groups = {"critic": loss.critic.parameters(), "actor": loss.actor.parameters(), "temperature": [loss.log_alpha]}
         self._begin(loss, groups, learning_rate, critic_tau)
         self._critic_loss = accelerate(loss.critic_loss, compile=compile)
         self._actor_loss = accelerate(loss.actor_and_temperature_loss, compile=compile)
@@ -157,8 +149,7 @@ class SACLearner:
     def _begin(self, loss: Any, groups: Mapping[str, Any], learning_rate: float, critic_tau: float) -> None:
         self.loss, self.targets = loss, SoftUpdate(loss, tau=critic_tau)
         self.optimizers = {
-            name: torch.optim.Adam(list(group), lr=learning_rate, fused=True)
-            for name, group in groups.items()
+            name: torch.optim.Adam(list(group), lr=learning_rate, fused=True) for name, group in groups.items()
         }
 
     def update(self, batch: TensorDictBase, *, agent_step: int) -> TensorDictBase:
@@ -225,13 +216,7 @@ def make_sac_loss(
 
 
 def make_skill_ddpg_loss(
-    feature_dim: int,
-    action_dim: int,
-    skill_dim: int,
-    *,
-    hidden_dim: int,
-    device: torch.device,
-    **options: Any,
+    feature_dim: int, action_dim: int, skill_dim: int, *, hidden_dim: int, device: torch.device, **options: Any
 ) -> SkillDDPGLoss:
     """Return the loss of BeCL's explorer with fresh networks on a device; ``options`` are the loss's."""
     actor = DeterministicActor(feature_dim, action_dim, skill_dim=skill_dim, hidden_dim=hidden_dim)

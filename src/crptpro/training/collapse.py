@@ -41,11 +41,7 @@ class CollapseMonitor:
     """
 
     def __init__(
-        self,
-        num_prototypes: int | None = None,
-        *,
-        patience_updates: int = 5_000,
-        cosine_threshold: float = 0.99,
+        self, num_prototypes: int | None = None, *, patience_updates: int = 5_000, cosine_threshold: float = 0.99
     ) -> None:
         self.floor = math.log(num_prototypes) if num_prototypes and num_prototypes > 1 else None
         self.patience_updates, self.cosine_threshold = patience_updates, cosine_threshold

@@ -33,13 +33,7 @@ from crptpro.training.evaluate import WORKER_BYTES, Episode, Evaluator, summariz
 from crptpro.training.pretrain import SHIFT_PAD, precision_name
 from crptpro.training.run import Generators, Run
 from crptpro.training.world import SPARE_FRAMES, EnvThread, make_replay
-from crptpro.transforms import (
-    DenseShiftFeatures,
-    FrozenEncoder,
-    PrototypeReward,
-    RandomShift,
-    choose_feature_mode,
-)
+from crptpro.transforms import DenseShiftFeatures, FrozenEncoder, PrototypeReward, RandomShift, choose_feature_mode
 from crptpro.transforms.free_memory import free_bytes
 from crptpro.transforms.rewards import warn_if_mostly_zero
 from crptpro.values import Colors, Quality, check_numbers
@@ -127,9 +121,7 @@ class DownstreamConfig:
         }  # fmt: skip
         check_numbers(self, counts=counts, rates=rates)
         if self.features not in ("auto", "dense", "dense-bf16", "reencode"):
-            raise ValueError(
-                f"`features` must be auto, dense, dense-bf16 or reencode, got {self.features!r}."
-            )
+            raise ValueError(f"`features` must be auto, dense, dense-bf16 or reencode, got {self.features!r}.")
         if self.replay_capacity is not None and self.replay_capacity < self.random_agent_steps:
             raise ValueError(
                 f"`replay_capacity` ({self.replay_capacity}) must hold the {self.random_agent_steps} transitions of "
@@ -236,18 +228,14 @@ def train_downstream(
                  replay=None if is_complete else replay)  # fmt: skip
 
         def start_evaluation() -> None:
-            if (
-                run.position != counters["last_evaluation"]
-            ):  # a shorter run has ended, and was evaluated, here
+            if run.position != counters["last_evaluation"]:  # a shorter run has ended, and was evaluated, here
                 agent_steps = run.position // repeat
                 evaluator.start(env_steps=run.position, agent_steps=agent_steps, updates=counters["updates"])
             counters["last_evaluation"] = run.position
             interval = settings.eval_interval_env_steps
             counters["next_evaluation"] = (run.position // interval + 1) * interval
 
-        for first in run.until(
-            settings.env_steps, checkpoint_interval=settings.checkpoint_interval_env_steps
-        ):
+        for first in run.until(settings.env_steps, checkpoint_interval=settings.checkpoint_interval_env_steps):
             if first >= counters["next_evaluation"]:
                 start_evaluation()
             td = env.reset(derive_seed(settings.seed, "downstream", "episode", counters["episodes"]))
@@ -278,10 +266,7 @@ def train_downstream(
                     row = run.write("train", updates=counters["updates"])
                     run.show(q=row["q_mean"])
             counters["episodes"] += 1
-            ended = {
-                "episode_return": episode_return,
-                "episode_agent_steps": (run.position - first) // repeat,
-            }
+            ended = {"episode_return": episode_return, "episode_agent_steps": (run.position - first) // repeat}
             run.write("episodes", ended, episodes=counters["episodes"])
 
         start_evaluation()
@@ -326,9 +311,7 @@ def _make_agent(
     return SACLearner(loss, compile=config.compile, **rates), PixelAgent(encoder, loss.actor)
 
 
-def _make_replay(
-    run: Run, env: EnvBase, config: Any, generator: torch.Generator, *, is_complete: bool
-) -> FrameReplay:
+def _make_replay(run: Run, env: EnvBase, config: Any, generator: torch.Generator, *, is_complete: bool) -> FrameReplay:
     """Return the replay below the run's directory; a complete run needs none."""
     path = None if run.run_dir is None or is_complete else run.run_dir / "replay"
     if path is not None and run.saved and not path.exists():

@@ -172,9 +172,7 @@ class Evaluator:
         try:
             episodes = [future.result() for future in futures]
         except (BrokenProcessPool, pickle.PicklingError, OSError) as reason:
-            logger.warning(
-                "The evaluating processes are lost (%s); evaluating in this process from here on.", reason
-            )
+            logger.warning("The evaluating processes are lost (%s); evaluating in this process from here on.", reason)
             self.workers, futures = 0, []
             self._end_pool()
         if not futures:

@@ -28,13 +28,7 @@ from crptpro.modules import computing, resolve_precision, set_compute_dtype, usa
 from crptpro.modules.precision import Precision
 from crptpro.objectives import AveragedSACLoss, Method, RADSACLoss, get_method, method_of
 from crptpro.seeding import derive_seed
-from crptpro.training.agent import (
-    PixelAgent,
-    SACLearner,
-    SkillDDPGLearner,
-    make_sac_loss,
-    make_skill_ddpg_loss,
-)
+from crptpro.training.agent import PixelAgent, SACLearner, SkillDDPGLearner, make_sac_loss, make_skill_ddpg_loss
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.pretrain import (
     SHIFT_PAD,
@@ -57,10 +51,7 @@ logger = logging.getLogger(__name__)
 
 PIXELS: dict[NestedKey, NestedKey] = {"pixels": "features", ("next", "pixels"): ("next", "features")}
 """Entries of a batch, with those of their features."""
-SECOND_VIEWS: dict[NestedKey, NestedKey] = {
-    "pixels_view": "pixels",
-    ("next", "pixels_view"): ("next", "pixels"),
-}
+SECOND_VIEWS: dict[NestedKey, NestedKey] = {"pixels_view": "pixels", ("next", "pixels_view"): ("next", "pixels")}
 DISCOUNT = 0.99
 
 
@@ -114,11 +105,7 @@ class ExploreConfig:
     def resolved(self, method: Method) -> Any:
         """Return the settings with the method's values where they were left open."""
         exploration = ("env_steps", "encoder_update_interval", "random_agent_steps", "replay_capacity")
-        homes = {
-            "batch_size": method,
-            "learning_rate": method,
-            **dict.fromkeys(exploration, method.exploration),
-        }
+        homes = {"batch_size": method, "learning_rate": method, **dict.fromkeys(exploration, method.exploration)}
         values = {name: getattr(home, name) for name, home in homes.items() if getattr(self, name) is None}
         return dataclasses.replace(self, **values)
 
@@ -154,9 +141,7 @@ class ExplorationPlan:
     def updates_at(self, agent_step: int) -> tuple[bool, bool]:
         """Return whether a domain's decision (from 0) comes with updates of the encoder, and of its agent."""
         intervals = (self.encoder_update_interval, self.agent_update_interval)
-        encoder, agent = (
-            agent_step >= self.first_update and agent_step % interval == 0 for interval in intervals
-        )
+        encoder, agent = (agent_step >= self.first_update and agent_step % interval == 0 for interval in intervals)
         return encoder, agent
 
 

@@ -69,9 +69,7 @@ class PretrainConfig:
 
     def __post_init__(self) -> None:
         """Convert numbers to plain values, or raise a ValueError that names the setting."""
-        counts = {
-            "updates": 1, "batch_size": 1, "warmup_updates": 0, "log_interval": 1, "checkpoint_interval": 1,
-        }  # fmt: skip
+        counts = {"updates": 1, "batch_size": 1, "warmup_updates": 0, "log_interval": 1, "checkpoint_interval": 1}
         check_numbers(self, counts=counts, rates={"learning_rate": None, "encoder_tau": 1})
 
     def resolved(self, method: Method) -> Any:
@@ -207,10 +205,7 @@ def pretrain(
         run.finish()
         if run.means("pretrain"):  # after the checkpoint: a longer run takes this shorter row back
             write_row(run, loss, monitor, batch, domain)
-        facts = {
-            "device": str(device),
-            "datasets": [_facts(name, buffer) for name, buffer in buffers.items()],
-        }
+        facts = {"device": str(device), "datasets": [_facts(name, buffer) for name, buffer in buffers.items()]}
         return PretrainResult(**ending(run, loss, recipe, monitor, run.position, facts))
 
 
@@ -249,9 +244,7 @@ def make_optimizer(
     """Return Adam, the learning-rate schedule over ``updates``, and the EMA of the target networks."""
     parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
     if not parameters:
-        raise ValueError(
-            f"{type(loss).__name__} has no parameters that require a gradient: nothing to train."
-        )
+        raise ValueError(f"{type(loss).__name__} has no parameters that require a gradient: nothing to train.")
     rate = torch.tensor(learning_rate, device=parameters[0].device) if cuda_graph else learning_rate
     optimizer = torch.optim.Adam(parameters, lr=rate, fused=True, capturable=cuda_graph)
 
@@ -264,9 +257,7 @@ def make_optimizer(
         return (1 + math.cos(math.pi * min(progress, 1.0))) / 2
 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
-    names = [
-        name for name, _ in loss.named_children() if name.startswith("target_") and name.endswith("_params")
-    ]
+    names = [name for name, _ in loss.named_children() if name.startswith("target_") and name.endswith("_params")]
     if not names or encoder_tau is None:
         return optimizer, schedule, None
     # SoftUpdate begins by copying the sources; fine-tuning goes on with the targets that were saved.
@@ -281,9 +272,7 @@ def total_loss(losses: TensorDictBase) -> Tensor:
     """Return the sum of the ``loss*`` terms, which must be scalars."""
     terms = {name: losses[name] for name in losses.keys() if name.startswith("loss")}  # noqa: SIM118
     if not terms:
-        raise ValueError(
-            f"The loss returned no `loss_*` entry, only {sorted(losses.keys())}: nothing to minimise."
-        )
+        raise ValueError(f"The loss returned no `loss_*` entry, only {sorted(losses.keys())}: nothing to minimise.")
     for name, term in terms.items():
         if term.numel() != 1:
             raise ValueError(f"{name} has shape {tuple(term.shape)}; a loss returns scalars.")
@@ -300,9 +289,7 @@ def scalars(losses: TensorDictBase, domain: str) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def write_row(
-    run: Run, loss: LossModule, monitor: CollapseMonitor, batch: TensorDictBase, domain: str
-) -> None:
+def write_row(run: Run, loss: LossModule, monitor: CollapseMonitor, batch: TensorDictBase, domain: str) -> None:
     """Write a row of the ``pretrain`` record with the prototypes' spread, and let the monitor judge it."""
     means, extra = run.means("pretrain"), {}
     weight = getattr(getattr(loss, "prototypes", None), "weight", None)
@@ -321,9 +308,7 @@ def write_row(
         if isinstance(embeddings, Tensor) and embeddings.ndim == 2:
             extra[f"cosine/{domain}"] = float(mean_pairwise_cosine(F.normalize(embeddings.float(), dim=-1)))
     row = run.write("pretrain", extra=extra)
-    cosines = {
-        name.removeprefix("cosine/"): value for name, value in row.items() if name.startswith("cosine/")
-    }
+    cosines = {name.removeprefix("cosine/"): value for name, value in row.items() if name.startswith("cosine/")}
     updates = run.counters.get("updates", run.position)
     monitor.observe(updates, comp=row.get("comp", row.get("loss_comp")), cosine=cosines)
     run.show(loss=row["loss"])
@@ -451,8 +436,4 @@ def _facts(name: str, buffer: ReplayBuffer) -> dict[str, Any]:
 def _identity(name: str, buffer: ReplayBuffer) -> dict[str, Any]:
     """Return what must agree for a run to be continued on a dataset."""
     card = json.dumps(_card(buffer), sort_keys=True, default=str)
-    return {
-        "name": name,
-        "transitions": len(buffer),
-        "card": hashlib.sha256(card.encode()).hexdigest()[:16],
-    }
+    return {"name": name, "transitions": len(buffer), "card": hashlib.sha256(card.encode()).hexdigest()[:16]}

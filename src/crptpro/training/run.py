@@ -30,18 +30,14 @@ logger = logging.getLogger(__name__)
 
 CHECKPOINT_SECONDS = 300.0
 """Between two checkpoints of a run that names no interval."""
-SIGNALS = [
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)
-]
+SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
 """Requests to stop: Ctrl-C, and what clusters send before they take a machine away."""
 
 
 class Generators(dict[str, torch.Generator]):
     """Random generators by name, each with its own seed, and on the CPU unless ``devices`` names another device."""
 
-    def __init__(
-        self, seed: int, *names: str, devices: Mapping[str, torch.device | None] | None = None
-    ) -> None:
+    def __init__(self, seed: int, *names: str, devices: Mapping[str, torch.device | None] | None = None) -> None:
         super().__init__()
         for name in names:
             generator = torch.Generator((devices or {}).get(name) or "cpu")
@@ -205,9 +201,7 @@ class Run:
             try:
                 self._checkpoint.load(self._latest)
             except Exception as reason:
-                raise CheckpointError(
-                    f"The checkpoint {self._latest} does not fit this run: {reason}"
-                ) from reason
+                raise CheckpointError(f"The checkpoint {self._latest} does not fit this run: {reason}") from reason
             self.position = self.resumed_from = self._row_position = self.saved["position"]
             self._earlier_seconds = self.saved["seconds"]
             self.tally.update(self.saved["tally"])
@@ -246,9 +240,7 @@ class Run:
                 self.save()
             if self._signal is not None:
                 kept = "a checkpoint was written" if self.run_dir else "nothing is kept without run_dir"
-                logger.warning(
-                    "Stopped at %s of %s %s; %s.", f"{self.position:,}", f"{total:,}", self.unit, kept
-                )
+                logger.warning("Stopped at %s of %s %s; %s.", f"{self.position:,}", f"{total:,}", self.unit, kept)
                 raise KeyboardInterrupt if self._signal == signal.SIGINT else SystemExit(128 + self._signal)
 
     def _receive(self, number: int, frame: object) -> None:
@@ -346,9 +338,7 @@ class Run:
         for module in self._modules:
             for name, parameter in module.named_parameters():
                 if not torch.isfinite(parameter.detach()).all():
-                    raise _not_finite(
-                        f"After {self.position:,} {self.unit} the parameter {name} is not finite"
-                    )
+                    raise _not_finite(f"After {self.position:,} {self.unit} the parameter {name} is not finite")
         self._saved_time = time.monotonic()
         if self.run_dir is None:
             return
@@ -366,9 +356,7 @@ class Run:
             for changed in (path, path.parent):
                 _sync(changed)
         except OSError as reason:
-            error, what = (
-                (DiskSpaceError, "the disk is full") if is_disk_full(reason) else (CheckpointError, reason)
-            )
+            error, what = (DiskSpaceError, "the disk is full") if is_disk_full(reason) else (CheckpointError, reason)
             raise error(
                 f"No checkpoint could be written to {self._rotation.directory}: {what}. Earlier ones are kept; mend "
                 "that and start the same command again."

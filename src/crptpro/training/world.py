@@ -34,9 +34,7 @@ class EnvThread:
     shows the images that the encoder takes.
     """
 
-    def __init__(
-        self, task: str | Domain, encoder: Any, config: Any, *, seed: int, action_repeat: int
-    ) -> None:
+    def __init__(self, task: str | Domain, encoder: Any, config: Any, *, seed: int, action_repeat: int) -> None:
         domain = get_domain(task)  # the object: its name may be registered in this process only
         self.make_env: Callable[[], EnvBase] = functools.partial(
             make_env,

@@ -127,9 +127,7 @@ def crop_features(maps: Tensor, rows: Tensor, offsets: Tensor, out: Tensor, *, p
     return out
 
 
-def _crop_by_index(
-    maps: Tensor, rows: Tensor, offsets: Tensor, phases: int, sizes: tuple[int, int, int]
-) -> Tensor:
+def _crop_by_index(maps: Tensor, rows: Tensor, offsets: Tensor, phases: int, sizes: tuple[int, int, int]) -> Tensor:
     origins, height, width = sizes
     slots, phase_count, channels = maps.shape[:3]
     row_stride, phase_stride, channel_stride, line, column = maps.stride()
@@ -201,9 +199,7 @@ class DenseShiftFeatures(Transform):
         computed = encoder.compute_dtype
         self.dtype = computed if dtype is None else dtype
         if computed != self.dtype and (self.dtype, computed) != (torch.bfloat16, torch.float32):
-            raise ValueError(
-                f"maps in {self.dtype} are read as {self.dtype}, or bfloat16 as float32; got {computed}."
-            )
+            raise ValueError(f"maps in {self.dtype} are read as {self.dtype}, or bfloat16 as float32; got {computed}.")
         # Hidden from nn.Module: the networks are somebody else's, and no part of a replay's state.
         self.__dict__["encoder"] = encoder
         self.__dict__["projector"] = projector
@@ -319,9 +315,7 @@ class DenseShiftFeatures(Transform):
 
     def transform_output_spec(self, output_spec: TensorSpec) -> TensorSpec:
         """Refuse to be part of an environment."""
-        raise NotImplementedError(
-            "DenseShiftFeatures reads a replay batch; on an environment use FrozenEncoder."
-        )
+        raise NotImplementedError("DenseShiftFeatures reads a replay batch; on an environment use FrozenEncoder.")
 
 
 def choose_feature_mode(

@@ -145,14 +145,10 @@ class PrototypeReward(IntrinsicReward):
         num_prototypes, latent_dim = weight.shape
         queue_size = as_int(queue_size, "queue_size", minimum=1)
         if queue_size % num_prototypes:
-            raise ValueError(
-                f"queue_size must be a multiple of num_prototypes, got {queue_size} and {num_prototypes}."
-            )
+            raise ValueError(f"queue_size must be a multiple of num_prototypes, got {queue_size} and {num_prototypes}.")
         start = torch.zeros(queue_size, latent_dim) if queue is None else queue
         if start.shape != (queue_size, latent_dim):
-            raise ValueError(
-                f"expected a queue of shape {(queue_size, latent_dim)}, got {tuple(start.shape)}."
-            )
+            raise ValueError(f"expected a queue of shape {(queue_size, latent_dim)}, got {tuple(start.shape)}.")
         if projector is not None:
             _check_latents(latent_dim_of(projector) or latent_dim, latent_dim)
         super().__init__({"projector": projector, "prototypes": prototypes}, coef=coef, **keys)
@@ -208,9 +204,7 @@ def draw_candidates(logits: Tensor, generator: torch.Generator | None = None) ->
     source = logits.device if generator is None else generator.device
     uniform = torch.rand(logits.shape[0], 1, generator=generator, device=source).to(logits.device)
     # Rounding must not carry a draw just below 1 past the last sample that can be drawn.
-    target = torch.minimum(
-        uniform * cumulative[:, -1:], torch.nextafter(cumulative[:, -1:], -uniform.new_ones(()))
-    )
+    target = torch.minimum(uniform * cumulative[:, -1:], torch.nextafter(cumulative[:, -1:], -uniform.new_ones(())))
     drawn = torch.searchsorted(cumulative, target, right=True)
     return drawn.squeeze(-1).clamp_max(logits.shape[1] - 1)
 
@@ -284,12 +278,7 @@ class ContrastiveReward(IntrinsicReward):
     head: nn.Module | None
 
     def __init__(
-        self,
-        head: nn.Module | None,
-        *,
-        temperature: float = 0.5,
-        skill_key: NestedKey = "skill",
-        **options: Any,
+        self, head: nn.Module | None, *, temperature: float = 0.5, skill_key: NestedKey = "skill", **options: Any
     ) -> None:
         require_positive(temperature=temperature)
         super().__init__({"head": head}, **options)
