@@ -143,7 +143,7 @@ def test_numbers_are_taken_as_they_are_meant_and_the_dataset_can_be_read(tmp_pat
     ({"transitions": 0}, "`transitions` must be at least 1, got 0"),
     ({"transitions": 1.5}, "`transitions` must be a whole number, got 1.5"),
     ({"workers": 0}, "`workers` must be at least 1, got 0"),
-    ({"seed": -1}, "`seed` must be from 0"),
+    ({"seed": -1}, "`seed` must be at least 0, got -1"),
     ({"root": ""}, "`root` is empty"),
     ({"root": "bad\udcff"}, "`root` is not UTF-8"),
 ])  # fmt: skip

@@ -139,6 +139,17 @@ def test_a_queue_that_is_full_for_a_while_loses_nothing_but_one_that_takes_no_jo
         launched(tmp_path / "b", job("a"), launcher=Closed())
 
 
+@pytest.fixture
+def usual_signals() -> Iterator[None]:
+    """Signals as a program in the foreground has them: under nohup, and in the background, some are ignored."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("usual_signals")
 @pytest.mark.parametrize(
     ("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit), (signal.SIGHUP, SystemExit)]
 )
