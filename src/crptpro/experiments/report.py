@@ -480,7 +480,7 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
     for label in labels:
         own, own_normal = (frame[frame["label"] == label] for frame in (kept, normal))
         found, encoders = (stats.estimate(stats.mean, own), own.loc[own["encoder"] != own["run"], "encoder"].nunique())
-        line = {"method": label, "tasks": len(shared), "runs": found.runs, "encoders": encoders or ""}
+        line: dict[str, Any] = {"method": label, "tasks": len(shared), "runs": found.runs, "encoders": encoders or ""}
         line["mean score"] = _beside(f"{found:.0f}", _paper_mean(label, places))
         for title, statistic in NORMALIZED.items() if len(normal) else ():
             line[title] = f"{stats.estimate(statistic, own_normal):.3f}"
