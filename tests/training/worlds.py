@@ -61,6 +61,20 @@ def make_toy(*, seed: int, image_size: int, action_repeat: int) -> EnvBase:
     return ToyEnv(fixed_length, seed=seed, image_size=image_size)
 
 
+class SmoothToyEnv(ToyEnv):
+    """Its pictures do not depend on the actions, and its rewards depend on them smoothly."""
+
+    def _observe(self) -> dict[str, torch.Tensor]:
+        total, self.total = self.total, 0.0
+        observed = super()._observe()
+        self.total = total
+        return observed
+
+
+def make_smooth(*, seed: int, image_size: int, action_repeat: int) -> EnvBase:
+    return SmoothToyEnv(fixed_length, seed=seed, image_size=image_size)
+
+
 def world(name: str, make: Callable[..., EnvBase] = make_toy) -> Domain:
     return Domain(name, f"{name}_go", make=make)
 

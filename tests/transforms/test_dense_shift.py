@@ -131,6 +131,17 @@ def test_each_observation_is_encoded_once_until_its_place_is_needed():
     assert set(replay.asked[12:]) <= set(range(12, 19))
 
 
+def test_a_policy_reads_the_features_of_an_unshifted_observation_that_batches_use_again():
+    encoder, replay = small_encoder(), FakeReplay(12)
+    dense = dense_of(encoder, replay)
+    found = dense.unshifted(5)
+    direct = encoder(replay.frames[5].unsqueeze(0)).detach()
+    torch.testing.assert_close(found, direct, rtol=0, atol=1e-6 * float(direct.abs().max()))
+    assert torch.equal(dense.generator.get_state(), seeded().get_state())  # acting draws no shift
+    dense(TensorDict({"number": torch.tensor([5]), "next": {"number": torch.tensor([6])}}, [1]))
+    assert replay.asked == [5, 6]
+
+
 def test_it_follows_a_frame_replay_around_its_ring_and_survives_a_resumption(tmp_path):
     encoder = small_encoder()
     kwargs = {"frame_shape": (3, SIZE, SIZE), "action_dim": 1, "slack": 40}

@@ -42,21 +42,28 @@ class PixelAgent(nn.Module):
     @torch.no_grad()
     def forward(self, pixels: Tensor) -> Tensor:
         """Return ``tanh`` of the mean, float32 ``[A]``, for uint8 ``[C, H, W]`` (no shift, no noise)."""
-        return self.actor.mode(self._features(pixels)).squeeze(0).float().cpu()
+        return self.actor.mode(self.encode(pixels)).squeeze(0).float().cpu()
 
     @torch.no_grad()
-    def explore(self, pixels: Tensor, generator: torch.Generator, *, where: str, skill: Tensor | None = None) -> Tensor:
-        """Return a sample of the policy, float32 ``[A]`` in ``[-1, 1]``, for uint8 ``[C, H, W]``.
+    def encode(self, pixels: Tensor) -> Tensor:
+        """Return the features, ``[1, feature_dim]`` on the actor's device, of uint8 ``[C, H, W]``."""
+        device = next(self.actor.parameters()).device
+        return self.encoder(pixels.unsqueeze(0).to(device))
+
+    @torch.no_grad()
+    def explore(
+        self, features: Tensor, generator: torch.Generator, *, where: str, skill: Tensor | None = None
+    ) -> Tensor:
+        """Return a sample of the policy, float32 ``[A]`` in ``[-1, 1]``, for features ``[1, feature_dim]``.
 
         ``skill`` is one-hot ``[S]``, for an actor that takes one.
 
         Raises:
             NonFiniteError: the policy has diverged; no simulator should see its actions. It says ``where``.
         """
-        inputs = self._features(pixels)
         if skill is not None:
-            inputs = torch.cat([inputs, skill.unsqueeze(0).to(inputs.device)], -1)
-        sampled = self.actor.sample(inputs, generator=generator)
+            features = torch.cat([features, skill.unsqueeze(0).to(features.device)], -1)
+        sampled = self.actor.sample(features, generator=generator)
         action = sampled if isinstance(sampled, Tensor) else sampled[0]
         action = action.squeeze(0).float().cpu().clamp(-1, 1)
         if not torch.isfinite(action).all():
@@ -70,10 +77,6 @@ class PixelAgent(nn.Module):
         """Return the agent as it is now; an encoder that is trained is copied, a frozen one is shared."""
         is_trained = any(parameter.requires_grad for parameter in self.encoder.parameters())
         return copy.deepcopy(self, {} if is_trained else {id(self.encoder): self.encoder})
-
-    def _features(self, pixels: Tensor) -> Tensor:
-        device = next(self.actor.parameters()).device
-        return self.encoder(pixels.unsqueeze(0).to(device))
 
 
 def save_agent(path: str | Path, agent: PixelAgent, *, card: Mapping[str, Any]) -> Path:

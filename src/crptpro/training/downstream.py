@@ -222,6 +222,7 @@ def train_downstream(
         replay = _make_replay(run, env.env, settings, generators["replay"], is_complete=is_complete)
         memory = attach_transforms(replay, artifact, encoder, settings, generators, run, dtype=dtype,
                                    reserved_bytes=evaluator.workers * WORKER_BYTES)  # fmt: skip
+        dense = next((each for each in replay.transform if isinstance(each, DenseShiftFeatures)), None)
         counters = run.tally
         counters.update(updates=0, episodes=0, next_evaluation=0, last_evaluation=-1)
         run.keep(**learner.components(), **memory, generators=generators, evaluator=evaluator,
@@ -239,14 +240,18 @@ def train_downstream(
             if first >= counters["next_evaluation"]:
                 start_evaluation()
             td = env.reset(derive_seed(settings.seed, "downstream", "episode", counters["episodes"]))
-            episode_return, done = 0.0, False
+            episode_return, done, number = 0.0, False, None
             while not done and run.position < settings.env_steps:
                 agent_step = run.position // repeat
                 if is_random := agent_step < settings.random_agent_steps:
                     td["action"] = env.uniform_action(generators["random_actions"])
                 else:
+                    if dense is None or number is None:  # the first observation of an episode is not stored yet
+                        features = agent.encode(td["pixels"])
+                    else:  # encoded once, for the policy and for the batches that will contain it
+                        features = dense.unshifted(number)
                     where = f"{name}, agent step {agent_step}"
-                    td["action"] = agent.explore(td["pixels"], generators["policy"], where=where)
+                    td["action"] = agent.explore(features, generators["policy"], where=where)
                 step = env.step(td)  # the next observation is drawn while the update computes
                 if not is_random:
                     # The sample has features under random shifts, and the bonus is part of its reward.
@@ -258,6 +263,7 @@ def train_downstream(
                     counters["updates"] += 1
                 transition = step.result()
                 replay.extend(transition)
+                number = replay.frames_written - 1
                 episode_return += transition["next", "reward"].item()
                 done = bool(transition["next", "done"].item())
                 td = step_mdp(transition)

@@ -362,9 +362,8 @@ class Explorer:
             td["action"] = self._env.uniform_action(self.generators["random_actions"])
         else:
             where = f"{self.name}, episode {self.episodes}, decision {len(self.actions)}"
-            td["action"] = self.agent.explore(
-                td["pixels"], self.generators["policy"], skill=td.get("skill", None), where=where
-            )
+            features, skill = self.agent.encode(td["pixels"]), td.get("skill", None)
+            td["action"] = self.agent.explore(features, self.generators["policy"], skill=skill, where=where)
         self._step = self._env.step(td)
 
     def end_step(self) -> dict[str, float] | None:

@@ -241,6 +241,18 @@ class DenseShiftFeatures(Transform):
                 tensordict.set(self.embedding_key, found.reshape(*lead, -1))
         return tensordict
 
+    @torch.no_grad()
+    def unshifted(self, number: int) -> Tensor:
+        """Return the features ``[1, feature_dim]`` of one observation without a shift, for a policy to act on.
+
+        Its maps are kept for the batches that will contain the observation.
+        """
+        numbers, centre = torch.tensor([number]), torch.full((1, 2), self.pad)
+        with self._lock:
+            maps, _ = self._encode_missing(numbers)
+            features = crop_features(maps, numbers % self.observations, centre, self._new_output(1), pad=self.pad)
+        return self.encoder.standardised(features)
+
     def _numbers(self, tensordict: TensorDictBase, key: NestedKey) -> tuple[Tensor, torch.Size]:
         value = read_entry(self, tensordict, key)
         # Replay buffers store a scalar per row as [*] or as [*, 1].
