@@ -1,11 +1,11 @@
-"""DrQ: SAC from pixels that learns its encoder along with the task; what every pre-trained method is measured by.
+"""DrQ: SAC from pixels that trains its encoder on the task; the reference for every pre-trained method.
 
     python recipes/drq.py                                      # every task of the paper at paper scale; needs a GPU
     python recipes/drq.py --tasks walker_run reach_duplo --downstream.device cuda --seed 1
 
 Every default is the number of the paper's comparison or, where the paper is silent, of denisyarats/drq. Disk: a replay
-of 2.3 GB per task. Killed at any moment, the same command continues. Ends with one eval.csv per task below OUT, a row
-per episode, written by the very loop that trains on pretrained encoders.
+of 2.3 GB per task. If killed, the same command resumes. Writes one eval.csv per task below OUT, a row per episode. The
+training loop is the one that pretrained encoders use.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ class Config:
     seed: int = 0
     """seeds everything"""
     downstream: DownstreamConfig = field(default_factory=DownstreamConfig)
-    """every number; what is left open is DrQ's"""
+    """every number (default: DrQ's)"""
 
 
 def main(config: Config) -> None:
-    """Learn every task; what is finished is found again."""
+    """Learn every task; finished ones are skipped."""
     for task in config.tasks:
         get_domain(task)  # an unknown name ends the recipe here, not hours later
     for task in config.tasks:

@@ -1,12 +1,12 @@
-"""A baseline that explores while it pre-trains (Proto-RL, APT, BeCL), then SAC on each task.
+"""A baseline with active pre-training (Proto-RL, APT, BeCL), then SAC on each task.
 
     python recipes/explore.py --method proto-rl-c --domains A     # one encoder for a group; days on two cores
     python recipes/explore.py --method apt-s --domains walker     # one encoder for one domain
     python recipes/explore.py --method becl --domains A
 
-One agent per domain explores for the method's intrinsic reward alone, and the encoder learns from what it sees. Every
-default is the method's number. Disk: a replay of 2.1 GB per domain and 1.3 GB per task. Killed at any moment, the same
-command continues. Ends with one eval.csv per task below OUT, a row per episode.
+One agent per domain explores for the intrinsic reward alone, and the encoder learns from its observations. Every default
+is the method's number. Disk: a replay of 2.1 GB per domain and 1.3 GB per task. If killed, the same command resumes.
+Writes one eval.csv per task below OUT, a row per episode.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from crptpro.training import DownstreamConfig, ExploreConfig, pretrain_active, t
 
 @dataclass
 class Config:
-    """What explores where; every number of a stage is below --explore.* and --downstream.*."""
+    """Method, domains and tasks; the numbers of a stage are below --explore.* and --downstream.*."""
 
     method: Literal["proto-rl-c", "proto-rl-s", "apt-c", "apt-s", "becl"] = "proto-rl-c"
     """-c: one encoder for several domains; -s: for one domain"""
@@ -48,7 +48,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Run the two stages; what is finished is found again."""
+    """Run the two stages; finished ones are skipped."""
     domains = expand_groups(config.domains)
     tasks = config.tasks or [get_domain(domain).task for domain in domains]
     for task in tasks:

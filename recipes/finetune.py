@@ -3,8 +3,8 @@
     python recipes/finetune.py runs/paper/crptpro_group_A_seed_0/encoder --domain pendulum
 
 The paper's updates from the encoder of group A: pendulum 2,000, manipulation 2,000, cartpole 3,000, cheetah 1,000,
-walker 500 (--pretrain.updates). Adam starts afresh; the target networks are kept. Disk: 2.1 GB for the domain's random
-data and 1.3 GB for the task. Another seed needs another --out, as its random data are others.
+walker 500 (--pretrain.updates). Adam is reset; the target networks are kept. Disk: 2.1 GB for the domain's random data
+and 1.3 GB for the task. Another seed needs another --out, because its random data differ.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from crptpro.training import DownstreamConfig, PretrainConfig, finetune, train_d
 
 @dataclass
 class Config:
-    """What is fine-tuned on what; every number of a stage is below --pretrain.* and --downstream.*."""
+    """Encoder, domain and task; the numbers of a stage are below --pretrain.* and --downstream.*."""
 
     pretrained: tyro.conf.Positional[str]
     """directory of the pretrained encoder, or the name of one that ships"""
     domain: str = "pendulum"
-    """the one domain"""
+    """domain to fine-tune on"""
     task: str | None = None
-    """what is learned then (default: the domain's task)"""
+    """downstream task (default: the domain's)"""
     out: Path = Path("runs/finetune")
     """everything is written below this directory"""
     seed: int = 0
@@ -49,9 +49,9 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Collect, fine-tune, learn; what is finished is found again."""
+    """Collect, fine-tune, learn; finished stages are skipped."""
     task = config.task or get_domain(config.domain).task
-    get_domain(task)  # what is wrong ends the recipe here, not hours later
+    get_domain(task)  # an unknown name ends the recipe here, not hours later
     pretrained = load_pretrained(config.pretrained)
     dataset = collect_random(
         config.domain,

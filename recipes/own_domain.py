@@ -1,11 +1,11 @@
-"""Your own world and your own loss: Gymnasium's HalfCheetah, pre-trained by a loss that this file writes.
+"""Your own environment and your own loss: Gymnasium's HalfCheetah, and a loss defined in this file.
 
     python recipes/own_domain.py                  # about five minutes on two CPU cores
 
-Nothing here is known to the library: the world is named by its Gymnasium id, and `NextLatentLoss` is a plain TorchRL
-LossModule. It keeps the contract of a pre-training loss (it takes an encoder, reads `pixels` and ("next", "pixels"),
-and returns `loss_*` terms), and so collection, pre-training, the artifact and the downstream stage work unchanged.
-It has no prototypes, hence no exploration bonus, which the downstream stage says.
+The library knows neither: a Gymnasium id names the environment, and `NextLatentLoss` is a plain TorchRL LossModule. It
+satisfies the contract of a pre-training loss: it takes an encoder, reads `pixels` and ("next", "pixels"), and returns
+`loss_*` terms. Collection, pre-training, the artifact and the downstream stage therefore work unchanged. Without
+prototypes there is no exploration bonus, as the log of the downstream stage says.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class NextLatentLoss(LossModule):
     def __init__(self, encoder: PixelEncoder) -> None:
         super().__init__()
         projector = Projector(encoder.feature_dim, 128)
-        # Asking for target parameters is all it takes: the training loop moves them.
+        # The training loop updates the target parameters.
         self.convert_to_functional(nn.Sequential(encoder, projector), "encoder_network", create_target_params=True)
         self.predictor = Predictor(128, 256)
-        self.__dict__.update(encoder=encoder, projector=projector)  # what save_pretrained keeps
+        self.__dict__.update(encoder=encoder, projector=projector)  # save_pretrained stores these
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Return ``loss_prediction``, 2 - 2 cos, and the mean pairwise cosine, 1 if everything collapsed."""
@@ -67,7 +67,7 @@ register_method("next-latent", NextLatentLoss, updates=300, batch_size=128, lear
 
 @dataclass
 class Config:
-    """A small run; raise the numbers for a real one."""
+    """A small run; increase the numbers for a real one."""
 
     world: str = "gymnasium:HalfCheetah-v5"
     """any Gymnasium id that renders RGB and has continuous actions"""
@@ -80,7 +80,7 @@ class Config:
     workers: int = 2
     """collecting processes"""
     pretrain: PretrainConfig = field(default_factory=PretrainConfig)
-    """pre-training; what is left open is what was registered above"""
+    """pre-training (default: as registered above)"""
     downstream: DownstreamConfig = field(
         default_factory=lambda: DownstreamConfig(
             env_steps=4_000,

@@ -5,9 +5,9 @@
     python recipes/paper.py --group C --tasks walker_run          # an unseen task on group C's encoder
     python recipes/paper.py --group A --method random-encoder     # the control: the same without pre-training
 
-Every default is the paper's number. Disk: 2.1 GB per domain and 1.3 GB per task. Memory: 4 GB, or 20 GB where the
-dense maps of all random shifts are kept. Killed at any moment, the same command continues; another seed needs another
---out, as its random data are others. Ends with one eval.csv per task below OUT, a row per episode.
+Every default is the paper's number. Disk: 2.1 GB per domain and 1.3 GB per task. Memory: 4 GB, or 20 GB with the dense
+maps of all random shifts. If killed, the same command resumes; another seed needs another --out, because its random
+data differ. Writes one eval.csv per task below OUT, a row per episode.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from crptpro.training import DownstreamConfig, PretrainConfig, pretrain, train_d
 
 @dataclass
 class Config:
-    """What is trained on what; every number of a stage is below --pretrain.* and --downstream.*."""
+    """Group, method and tasks; the numbers of a stage are below --pretrain.* and --downstream.*."""
 
     group: Literal["A", "B", "C", "D"] = "A"
     """domains to pre-train on: A cheetah walker quadruped, B cartpole pendulum manipulation, C manipulation hopper
@@ -56,7 +56,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Run the three stages; what is finished is found again."""
+    """Run the three stages; finished ones are skipped."""
     tasks = config.tasks or [get_domain(domain).task for domain in GROUPS[config.group]]
     for task in tasks:
         get_domain(task)  # an unknown name ends the recipe here, not hours later

@@ -1,4 +1,4 @@
-"""CRPTpro in TorchRL's idioms and this library's parts: ``python recipes/plain_torchrl.py --task walker_walk``."""
+"""CRPTpro from TorchRL's and this library's components: ``python recipes/plain_torchrl.py --task walker_walk``."""
 
 import torch
 import tyro
@@ -15,7 +15,7 @@ from crptpro.transforms import DenseShiftFeatures, PrototypeReward, RandomShift
 
 
 def main(task="walker_walk", *, transitions=2_000, updates=200, batch_size=64, agent_steps=2_000):
-    """Collect at random, pre-train, freeze, learn the task; the numbers are small ones."""
+    """Collect at random, pre-train, freeze, learn the task, at small scale."""
     env = make_env(task, seed=0)
     action_dim, views = env.action_spec.shape[-1], ["pixels", ("next", "pixels")]
 

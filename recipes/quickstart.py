@@ -1,11 +1,11 @@
-"""The whole of CRPTpro in small: collect at random, pre-train, freeze, learn a task, beside two controls.
+"""CRPTpro at small scale: collect at random, pre-train, freeze, learn a task, beside two controls.
 
     python recipes/quickstart.py                    # two CPU cores suffice; no GPU, no display
     python recipes/quickstart.py --out runs/other --seed 1
 
-The controls are the same agent on an encoder that was never trained, and the uniform random policy; all three are
-evaluated on the same episodes. Ends with OUT/report/index.html. Needs 1.2 GB of disk and 4 GB of memory. Killed at any
-moment, the same command continues where it stopped.
+The controls are the same agent on an untrained encoder, and the uniform random policy; all three are evaluated on the
+same episodes. Writes OUT/report/index.html. Needs 1.2 GB of disk and 4 GB of memory. If killed, the same command
+resumes.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ DOWNSTREAM = DownstreamConfig(env_steps=16_000, batch_size=128, learning_rate=1e
 
 @dataclass
 class Config:
-    """Every number of the small run; the paper's value is in brackets where it differs."""
+    """Every number of the small run; a different value of the paper is in brackets."""
 
     out: Path = Path("runs/quickstart")
     """everything is written below this directory"""
     task: str = "walker_stand"
-    """what is learned on the frozen encoder; an easy task"""
+    """task to learn on the frozen encoder; an easy one"""
     seed: int = 0
     """seeds every stage"""
     domains: tuple[str, ...] = ("walker", "cartpole", "finger")
@@ -62,11 +62,11 @@ class Config:
     quality: Literal["exact", "fast"] = "fast"
     """render quality; fast uses smaller shadow maps, less than 1 % of the pixels differ [exact]"""
     action_repeat: int = 4
-    """env steps per decision; fewer pictures per episode than with the paper's [2]"""
+    """env steps per decision; fewer renderings per episode than with the paper's [2]"""
     prototypes: int = 256
     """with more, batches of 128 would leave the exploration bonus mostly 0 [512]"""
     assignment_temperature: float = 0.05
-    """of Sinkhorn-Knopp; at the paper's the loss stands still for over a thousand updates first [0.1]"""
+    """of Sinkhorn-Knopp; with the paper's the loss stays on a plateau for over a thousand updates [0.1]"""
     pretrain: PretrainConfig = PRETRAIN
     """pre-training [50,000 updates of 512 transitions at 1e-4]"""
     downstream: DownstreamConfig = DOWNSTREAM
@@ -74,7 +74,7 @@ class Config:
 
 
 def main(config: Config) -> None:
-    """Run the stages; what is finished is found again."""
+    """Run the stages; finished ones are skipped."""
     get_domain(config.task)  # an unknown name ends the recipe here
     world = {"seed": config.seed, "quality": config.quality, "action_repeat": config.action_repeat}
     scores = {}
