@@ -4,9 +4,9 @@
     python recipes/explore.py --method apt-s --domains walker     # one encoder for one domain
     python recipes/explore.py --method becl --domains A
 
-One agent per domain explores for the intrinsic reward alone, and the encoder learns from its observations. Every default
-is the method's number. Disk: a replay of 2.1 GB per domain and 1.3 GB per task. If killed, the same command resumes.
-Writes one eval.csv per task below OUT, a row per episode.
+One agent per domain explores for the intrinsic reward alone, and the encoder learns from its observations. Every
+default is the method's number. Disk: a replay of 2.1 GB per domain and 1.3 GB per task. If killed, the same command
+resumes. Writes one eval.csv per task below OUT, a row per episode.
 """
 
 from __future__ import annotations
