@@ -1,11 +1,15 @@
-"""Tests marked `gpu` are left out where there is no CUDA device."""
+"""Tests marked `gpu` are left out without a CUDA device; `--precision` decides what `auto` means on a CPU."""
 
 from __future__ import annotations
 
 import logging
+import tempfile
+from pathlib import Path
 
 import pytest
 import torch
+
+from crptpro.modules import precision
 
 # Looking for doctests would import this file once more, under a name that another conftest.py has too.
 collect_ignore = ["conftest.py"]
@@ -17,6 +21,16 @@ def _log_is_as_a_library_has_it() -> None:
     library = logging.getLogger("crptpro")
     library.handlers.clear()
     library.propagate = True
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--precision", choices=("fp32", "bf16"), help="what `auto` means in the test process, on a CPU")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if (forced := config.getoption("--precision")) is not None:
+        precision.CPUINFO = Path(tempfile.mkdtemp()) / "cpuinfo"
+        precision.CPUINFO.write_text("flags: amx_bf16" if forced == "bf16" else "flags:")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
