@@ -1,4 +1,4 @@
-"""Checks of every world, whoever wrote it: frames that are images, finite numbers, errors with its name."""
+"""Checks of every environment: frames that are images, finite numbers, errors that name the environment."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from crptpro.errors import CRPTproError, NonFiniteError, WorldError, WorldFailed
 
 logger = logging.getLogger(__name__)
 
-#: Magnitude from which on a bound of an action means "none": MuJoCo's mjMAXVAL (float32's largest is above it).
+#: Action bounds of this magnitude mean "unbounded": MuJoCo's mjMAXVAL (float32's largest is above it).
 NO_BOUND = 1e10
-#: Agent steps from which on an episode that was left before its end is judged by its frames.
+#: Agent steps after which an unfinished episode is checked for still frames.
 LONG_EPISODE = 25
 
 _open: weakref.WeakSet[EnvBase] = weakref.WeakSet()
 
 
 class CheckedWorld:
-    """Mixed into the class that steps a world: checks what it returns, and names it in errors.
+    """Mixin of the class that steps an environment.
 
-    - An exception of the world's own code is raised again as :class:`~crptpro.errors.WorldFailedError`.
+    - An exception of the environment's code is raised as :class:`~crptpro.errors.WorldFailedError`.
     - An action, a reward or a physical state that is not finite raises :class:`~crptpro.errors.NonFiniteError` with
-      the episode and the agent step, before anything can store it.
-    - An episode whose frames are all alike is reported by one warning per environment.
+      the episode and the agent step.
+    - An episode of identical frames is reported by one warning per environment.
     - After ``agent_step_limit`` agent steps an episode is truncated. (TorchRL's ``StepCounter`` would add
-      ``step_count`` to every observation and read it back.)
+      ``step_count`` to every observation.)
     - The environment is closed at the interpreter's exit: a render context that is freed later prints errors.
     """
 
@@ -51,13 +51,13 @@ class CheckedWorld:
     _was_closed = False
 
     def watch(self, card: dict[str, Any], *, agent_step_limit: int | None = None, checks_frames: bool = True) -> None:
-        """Set the card, whose ``task`` is the name in messages, and what is checked."""
+        """Set the card, whose ``task`` is the name in messages, and the checks."""
         self._card, self.world = card, card["task"]
         self.agent_step_limit, self.checks_frames = agent_step_limit, checks_frames
         _open.add(cast(EnvBase, self))
 
     def card(self) -> dict[str, Any]:
-        """Return what shaped the pixels: task, camera, GL backend, quality, colours, action repeat."""
+        """Return the settings that determine the pixels: task, camera, GL backend, quality, colours, action repeat."""
         return dict(self._card)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
@@ -107,11 +107,11 @@ class CheckedWorld:
         )  # fmt: skip
 
     def read_obs(self, observations: dict[str, Any]) -> dict[str, Any]:
-        """Pass frames on; TorchRL's method would compare each of their bytes with the spec's bounds."""
+        """Return the observations; TorchRL's method would compare every byte with the spec's bounds."""
         return dict(observations)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free the world and its render context; calling it twice is harmless."""
+        """Free the environment and its render context; a second call does nothing."""
         _open.discard(cast(EnvBase, self))
         if not self._was_closed:
             self._was_closed = True
@@ -127,17 +127,14 @@ def _close_what_is_open() -> None:
 
 @contextmanager
 def passed_on(world: str, call: str) -> Iterator[None]:
-    """Raise exceptions of a world's own code in the body as ``WorldFailedError``, with the world's name and the call.
-
-    Errors of this library are left alone.
-    """
+    """Raise exceptions of an environment's code in the body as ``WorldFailedError``, with its name and the call."""
     try:
         yield
     except (CRPTproError, WorldFailedError):
         raise
     except Exception as reason:
         origin: BaseException = reason
-        while origin.__cause__ is not None:  # Gymnasium raises what a constructor raised once more
+        while origin.__cause__ is not None:  # Gymnasium re-raises exceptions of a constructor
             origin = origin.__cause__
         where = traceback.extract_tb(origin.__traceback__)[-1]
         raise WorldFailedError(
@@ -147,10 +144,7 @@ def passed_on(world: str, call: str) -> Iterator[None]:
 
 
 class FrameReader:
-    """Converts an image of a world to a frame: a copy, uint8 ``[3, H, W]``, because a world may reuse its buffer.
-
-    uint8 is kept; floats in [0, 1] are multiplied by 255, which is logged once.
-    """
+    """Copies an image to a frame, uint8 ``[3, H, W]``; floats in [0, 1] are multiplied by 255, which is logged once."""
 
     def __init__(self, world: str):
         self.world = world
@@ -169,7 +163,7 @@ class FrameReader:
         dtype = str(image.dtype).removeprefix("torch.")
         if dtype not in ("uint8", "float16", "float32", "float64"):
             raise self._refusal(f"has dtype {dtype}", "uint8, or floats in [0, 1]")
-        # torch cannot look at arrays that run backwards, or are read-only.
+        # The copy is for arrays that are read-only or have negative strides.
         pixels = image if isinstance(image, Tensor) else torch.from_numpy(image.copy())
         if pixels.shape[2] == 3:
             pixels = pixels.permute(2, 0, 1)
@@ -188,12 +182,12 @@ class FrameReader:
 
 
 class ActionRange:
-    """The affine map from [-1, 1] to a world's own bounds; without bounds an action is passed on as it is.
+    """The affine map from [-1, 1] to an environment's action bounds; an unbounded action stays as it is.
 
-    Integer or empty actions, bounds in the wrong order, or on one side only, are refused by name.
+    Integer or empty actions, and bounds in the wrong order or on one side only, raise ``CRPTproError``.
     """
 
-    def __init__(self, low: np.ndarray, high: np.ndarray, dtype: Any = np.float64, world: str = ""):
+    def __init__(self, low: np.ndarray, high: np.ndarray, dtype: Any, world: str):
         low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         no_low, no_high = ~(np.abs(low) < NO_BOUND), ~(np.abs(high) < NO_BOUND)
         self.unbounded = bool(no_low.any())
