@@ -1,14 +1,13 @@
-"""The methods by name: the loss of each, how it is trained, how it explores, what its downstream agents do otherwise.
+"""The table of methods: the loss of each, how it is trained, how it explores, and its downstream settings.
 
-A method of one's own takes two files: its loss, and a row here (or a call of :func:`register_method`).
+A new method takes two files: its loss, and a row here (or a call of :func:`register_method`).
 """
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -22,7 +21,7 @@ from crptpro.objectives.proto import ProtoLoss
 from crptpro.values import as_float, as_int
 
 
-def _plain(row: Any, minima: Mapping[str, int]) -> None:
+def _check_counts(row: Any, minima: Mapping[str, int]) -> None:
     for name, minimum in minima.items():
         if (value := getattr(row, name)) is not None:
             object.__setattr__(row, name, as_int(value, name, minimum=minimum))
@@ -30,16 +29,16 @@ def _plain(row: Any, minima: Mapping[str, int]) -> None:
 
 @dataclass(frozen=True)
 class Exploration:
-    """How a method explores while it pre-trains; the values here are Proto-RL's.
+    """How a method explores while it pre-trains; the defaults are Proto-RL's.
 
-    Every interval counts a domain's own agent steps, so that no domain is starved whatever their number.
+    Every interval counts the agent steps of one domain. A number out of its range is a ``ValueError``.
 
     Attributes:
-        reward: intrinsic reward that alone drives the exploration: ``"prototype"``, ``"particle"``,
+        reward: the intrinsic reward, the only one of the exploration: ``"prototype"``, ``"particle"``,
             ``"skill-contrast"``, or a function of the loss and a ``torch.Generator`` that returns a transform writing
             ``("next", "intrinsic_reward")``.
         agent: ``"rad-sac"``, ``"averaged-sac"`` (DrQ's K = M = 2 on detached features) or ``"skill-ddpg"``.
-        env_steps: simulator steps over all domains of a group, or of the one domain, random phases included.
+        env_steps: env steps over all domains, random phases included.
         is_single_domain: the (S) variants: pre-trained on one domain only.
         encoder_update_interval: agent steps between two encoder updates.
         encoder_updates_each: encoder updates every time, each on a fresh batch.
@@ -48,12 +47,9 @@ class Exploration:
         transfers_actor: the downstream agent starts from the exploring actor.
         n_step: agent steps from an observation to the "next" one in the agent's and the encoder's batches.
         skill_dim: number of skills, at least two; None for an agent without skills.
-        skill_agent_steps: agent steps that a skill is kept.
+        skill_agent_steps: agent steps between two changes of the skill.
         replay_capacity: transitions kept per domain.
         random_agent_steps: agent steps of uniformly random actions per domain, before its updates start.
-
-    Raises:
-        ValueError: a number out of its range.
     """
 
     reward: str | Callable[..., Any] = "prototype"
@@ -76,35 +72,30 @@ class Exploration:
             "env_steps", "encoder_update_interval", "encoder_updates_each", "agent_update_interval", "n_step",
             "skill_agent_steps", "replay_capacity",
         )  # fmt: skip
-        _plain(self, {**dict.fromkeys(counts, 1), "random_agent_steps": 0, "skill_dim": 2})
+        _check_counts(self, {**dict.fromkeys(counts, 1), "random_agent_steps": 0, "skill_dim": 2})
 
 
 @dataclass(frozen=True)
 class Method:
-    """A row of the table; the values here are CRPTpro's.
+    """A row of the table; the defaults are CRPTpro's. A number out of its range is a ``ValueError``.
 
     Attributes:
         name: unique name.
-        loss_class: the loss that pre-trains its encoder; None where nothing is pre-trained.
+        loss_class: the loss that pre-trains the encoder; None for a method without pre-training.
         loss_options: keyword arguments of ``loss_class``.
         encoder_options: keyword arguments of :class:`~crptpro.modules.PixelEncoder`.
         updates: encoder updates in total, over all domains.
         batch_size: transitions per update.
-        learning_rate: of Adam (its highest value, if scheduled).
+        learning_rate: of Adam; the peak of a schedule.
         encoder_tau: rate of the target networks, every update; None for a method without targets.
         schedule: ``"constant"`` or ``"warmup_cosine"``: learning rate over the updates.
-        warmup_updates: length of the linear warm-up of the learning rate from 0; 0 for none.
+        warmup_updates: length of the linear warm-up of the learning rate from 0.
         grad_clip: largest gradient norm; None for no clipping.
-        exploration: how it explores while it pre-trains; None if it learns from random datasets, or from nothing.
-        downstream: settings of downstream training that differ from CRPTpro's, such as
-            ``{"replay_capacity": 100_000}``.
-        starts_from: method whose encoder it takes: as it is where ``updates`` is 0, otherwise to train it on.
-        is_preset: a variant of another method: not listed among the methods, not what a loss built by hand is
-            trained like.
-        is_builtin: comes with the library, whose revision says what it is.
-
-    Raises:
-        ValueError: a number out of its range.
+        exploration: how it explores while it pre-trains; None for a method that does not explore.
+        downstream: settings of downstream training that differ from CRPTpro's.
+        starts_from: method whose encoder it takes, to train it further for ``updates``.
+        is_preset: a variant of another method, which :func:`method_names` and :func:`method_of` skip.
+        is_builtin: part of the library.
     """
 
     name: str
@@ -125,38 +116,23 @@ class Method:
     is_builtin: bool = False
 
     def __post_init__(self) -> None:
-        _plain(self, {"updates": 0, "batch_size": 1, "warmup_updates": 0})
+        _check_counts(self, {"updates": 0, "batch_size": 1, "warmup_updates": 0})
         for name, maximum in {"learning_rate": None, "encoder_tau": 1, "grad_clip": None}.items():
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, as_float(value, name, minimum=0, maximum=maximum))
         if self.schedule not in ("constant", "warmup_cosine"):
             raise ValueError(f"`schedule` must be 'constant' or 'warmup_cosine', got {self.schedule!r}.")
 
-    def describe(self) -> dict[str, Any]:
-        """Return all that was registered as plain values: what a record needs to tell two methods of one name apart.
-
-        The code of the loss is not part of it, only its class's name.
-        """
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        for name in ("name", "is_builtin", "is_preset"):
-            del values[name]
-        values = {key: dict(value) if isinstance(value, Mapping) else value for key, value in values.items()}
-        if self.loss_class is not None:
-            values["loss_class"] = f"{self.loss_class.__module__}.{self.loss_class.__qualname__}"
-        if self.exploration is not None:
-            values["exploration"] = dataclasses.asdict(self.exploration)
-        return values
-
     def build_encoder(self, in_channels: int = 9, image_size: int = 84, **options: Any) -> PixelEncoder:
-        """Build a fresh encoder of the kind that the method trains; ``options`` override the method's own."""
+        """Build the encoder that the method trains; ``options`` override the method's own."""
         return PixelEncoder(in_channels, image_size=image_size, **{**self.encoder_options, **options})
 
     def build(self, encoder: nn.Module, **options: Any) -> LossModule:
         """Build the loss on ``encoder``; ``options`` override the method's own.
 
         Raises:
-            CRPTproError: a method that pre-trains nothing.
-            ValueError: an option that the loss does not have.
+            CRPTproError: the method pre-trains nothing.
+            ValueError: the loss has no such option.
         """
         if self.loss_class is None:
             raise CRPTproError(f"The method {self.name!r} pre-trains nothing; it is for downstream training.")
@@ -166,14 +142,15 @@ class Method:
         if unknown and not any(p.kind is p.VAR_KEYWORD for p in parameters):
             raise ValueError(f"The method {self.name!r} has no option {', '.join(unknown)}; it has {', '.join(known)}.")
         loss = self.loss_class(encoder, **{**self.loss_options, **options})
-        loss.method_name = self.name  # by which method_of finds it
+        loss.method_name = self.name  # for method_of
         return loss
 
 
 _NO_BONUS = {"intrinsic_reward_coef": 0.0}
+_DRQ = {"algorithm": "drq", "env_steps": 1_000_000, "replay_capacity": 100_000, "learning_rate": 1e-3}
 _CRPTPRO = Method("crptpro", ProtoLoss)
 
-# ATC's own loss, head and schedule on the trunk (orthogonal weights), batch and budget that all methods share.
+# ATC's loss, head and schedule on the encoder (orthogonal weights), batch and budget that all methods share.
 _ATC = Method(
     "atc",
     ATCLoss,
@@ -185,13 +162,13 @@ _ATC = Method(
     downstream=_NO_BONUS,
 )
 
-# Active methods: four simulator steps per encoder update, 200,000 in total over a group (C) or 500,000 in one
-# domain (S). The paper's efficiency table has equal times for one to three domains, so (C) counts in total.
+# Active methods: four env steps per encoder update, 200,000 in total over a group (C) or 500,000 in one domain (S).
+# The paper's efficiency table has equal times for one to three domains, so (C) counts in total.
 _SINGLE_DOMAIN: dict[str, Any] = {"env_steps": 500_000, "is_single_domain": True}
+_PROTO_RL_S_EXPLORES = Exploration(transfers_actor=True, **_SINGLE_DOMAIN)
 _APT_EXPLORES = Exploration(reward="particle", agent="averaged-sac")
 _APT_C = Method("apt-c", SimCLRLoss, encoder_tau=None, exploration=_APT_EXPLORES, downstream=_NO_BONUS)
-# Deviation: the released code of Proto-RL has a predictor of width 512; the paper's table, which has it beside
-# CRPTpro, says 1024.
+# Deviation: Proto-RL's released code has a predictor of width 512; the paper's table lists 1024, also used here.
 _PROTO_RL_C = Method(
     "proto-rl-c",
     ProtoLoss,
@@ -205,12 +182,12 @@ def _preset(method: Method, name: str, **fields: Any) -> Method:
     return replace(method, name=name, is_preset=True, **fields)
 
 
-# The first method of a class that is no preset is what a loss of that class built by hand is trained like.
+# A loss built by hand is trained by the first row of its class that is no preset.
 TABLE = (
     _CRPTPRO,
     _preset(_CRPTPRO, "crptpro-no-bonus", updates=0, starts_from="crptpro", downstream=_NO_BONUS),
-    # Deviation: targets at half the student's temperature, which leave the plateau at ln M sooner, and three times the
-    # learning rate, which gets further once it is left (docs/study.md).
+    # Deviation: targets at half the student's temperature leave the plateau at ln M sooner; three times the learning
+    # rate gets further after it (docs/study.md).
     _preset(_CRPTPRO, "crptpro-fast", learning_rate=3e-4, loss_options={"assignment_temperature": 0.05}),
     _preset(_CRPTPRO, "crptpro-finetune", updates=2_000, starts_from="crptpro"),
     # The authors' published code where it differs from the paper: predictor width, and 3 x 16,666 updates.
@@ -220,10 +197,8 @@ TABLE = (
     _APT_C,
     replace(_APT_C, name="apt-s", updates=125_000, exploration=replace(_APT_EXPLORES, **_SINGLE_DOMAIN)),
     _PROTO_RL_C,
-    replace(
-        _PROTO_RL_C, name="proto-rl-s", updates=125_000, exploration=Exploration(transfers_actor=True, **_SINGLE_DOMAIN)
-    ),
-    # An update of BeCL's agent every second agent step brings three encoder updates: 150,000 for 50,000 of the agent.
+    replace(_PROTO_RL_C, name="proto-rl-s", updates=125_000, exploration=_PROTO_RL_S_EXPLORES),
+    # Three encoder updates per update of BeCL's agent, every second agent step: 150,000 for 50,000.
     Method(
         "becl",
         BeCLLoss,
@@ -242,20 +217,9 @@ TABLE = (
         ),
         downstream=_NO_BONUS,
     ),
-    # Trains its encoder end to end, with the critic.
-    Method(
-        "drq",
-        None,
-        updates=0,
-        downstream={
-            "algorithm": "drq",
-            "env_steps": 1_000_000,
-            "replay_capacity": 100_000,
-            "learning_rate": 1e-3,
-            **_NO_BONUS,
-        },
-    ),
-    # Controls: the encoder as it is drawn, and with features of mean 0 and deviation 1.
+    # Trains the encoder end to end, with the critic.
+    Method("drq", None, updates=0, downstream=_DRQ | _NO_BONUS),
+    # Controls: the encoder at initialisation, and with features of mean 0 and deviation 1.
     Method("random-encoder", None, updates=0, downstream=_NO_BONUS),
     Method(
         "random-encoder-standardised", None, updates=0, encoder_options={"standardised": True}, downstream=_NO_BONUS
@@ -269,13 +233,12 @@ def register_method(name: str, loss_class: type[LossModule], **fields: Any) -> M
     """Make a method available by name, on the command line too.
 
     Args:
-        name: unique name; registering a name again with another class is refused.
+        name: unique name.
         loss_class: built as ``loss_class(encoder, **loss_options)``.
         **fields: further fields of :class:`Method`, such as ``updates=10_000`` or ``exploration=Exploration()``.
 
     Raises:
-        ValueError: the name is taken by another class, or a number is out of its range.
-        TypeError: a field that :class:`Method` does not have.
+        ValueError: the name is registered for another class, or a number is out of its range.
     """
     taken = _METHODS.get(name)
     if taken is not None and taken.loss_class is not loss_class:
@@ -285,29 +248,25 @@ def register_method(name: str, loss_class: type[LossModule], **fields: Any) -> M
     return _METHODS[name]
 
 
-def get_method(name: str, *, besides: Iterable[str] = ()) -> Method:
-    """Look a method or preset up by name.
-
-    Raises:
-        UnknownNameError: with the nearest known names, of ``besides`` too.
-    """
+def get_method(name: str) -> Method:
+    """Return the method or preset of a name; an ``UnknownNameError`` suggests the nearest names."""
     if name not in _METHODS:
-        known = sorted({*_METHODS, *besides})
+        known = sorted(_METHODS)
         nearest = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
         raise UnknownNameError(f"There is no method {name!r}. Did you mean {', '.join(nearest or known)}?")
     return _METHODS[name]
 
 
 def method_names(*, presets: bool = False) -> list[str]:
-    """Names of the methods that pre-train an encoder, sorted; with ``presets``, of every row of the table."""
+    """Return the names of the methods that pre-train an encoder, sorted; with ``presets``, of every row."""
     return sorted(name for name, row in _METHODS.items() if presets or not (row.is_preset or row.loss_class is None))
 
 
 def method_of(loss: LossModule | type[LossModule]) -> Method:
-    """Return how a loss, or a class of them, is trained.
+    """Return the method that trains a loss, or a class of losses.
 
-    The method that built it by name; else the first method of its class or its nearest base class; else CRPTpro's
-    numbers. Of a loss built by hand that has targets, or has none, ``encoder_tau`` says so.
+    That is the method that built it, else the first of its class or nearest base class, else CRPTpro's numbers. For a
+    loss built by hand, ``encoder_tau`` is None exactly if the loss has no targets.
     """
     loss_class = loss if isinstance(loss, type) else type(loss)
     named = _METHODS.get(getattr(loss, "method_name", None) or "")

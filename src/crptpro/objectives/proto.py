@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
@@ -13,7 +12,7 @@ from torch import nn
 from crptpro.modules import Predictor, Projector, Prototypes
 from crptpro.modules.heads import require_one_latent_dim
 from crptpro.objectives import functional
-from crptpro.objectives.base import PretrainingLoss, require_positive
+from crptpro.objectives.base import PretrainingLoss, no_autocast, require_positive
 from crptpro.values import as_int
 
 
@@ -28,13 +27,13 @@ class ProtoLoss(PretrainingLoss):
       :math:`q = \mathrm{sinkhorn}(\hat z' C^T)` (no gradient),
     * :math:`L_{intr}` = :func:`~crptpro.objectives.functional.prototype_dispersion` of the prototypes.
 
-    Images must already be augmented. Call :meth:`before_update` before each forward of a training loop: it keeps the
-    prototype rows at unit length, as the released code does. ``forward`` itself never writes to a parameter.
+    Images must already be augmented. A training loop calls :meth:`before_update` before each forward, which keeps the
+    prototype rows at unit length as in the released code.
 
     ``forward`` returns scalars ``loss_comp`` and ``loss_intr`` (already times alpha; their sum is minimised) and,
     detached, ``comp``, ``intr`` (without alpha), ``assignment_entropy`` (nats), ``prototypes_in_use`` (count),
-    ``embedding_cosine`` (mean pairwise cosine of the online latents), ``prototype_ane``. ``loss_comp`` that stays at ln
-    M (6.238 for 512 prototypes), or ``embedding_cosine`` that stays near 1, is a dead run.
+    ``embedding_cosine`` (mean pairwise cosine of the online latents), ``prototype_ane``. A ``loss_comp`` that stays at
+    ln M (6.238 for 512 prototypes), or an ``embedding_cosine`` that stays near 1, is a collapse.
 
     Args:
         encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
@@ -62,15 +61,9 @@ class ProtoLoss(PretrainingLoss):
     target_prototypes_params: Any
 
     default_out_keys = (
-        "loss_comp",
-        "loss_intr",
-        "comp",
-        "intr",
-        "assignment_entropy",
-        "prototypes_in_use",
-        "embedding_cosine",
+        "loss_comp", "loss_intr", "comp", "intr", "assignment_entropy", "prototypes_in_use", "embedding_cosine",
         "prototype_ane",
-    )
+    )  # fmt: skip
     _schedulable_buffers = frozenset({"intr_loss_coef", "offset", "temperature", "assignment_temperature"})
 
     def __init__(
@@ -104,11 +97,9 @@ class ProtoLoss(PretrainingLoss):
         )
         self.sinkhorn_iterations = as_int(sinkhorn_iterations, "sinkhorn_iterations", minimum=0)
         self._register_coefficients(
-            intr_loss_coef=intr_loss_coef,
-            offset=offset,
-            temperature=temperature,
+            intr_loss_coef=intr_loss_coef, offset=offset, temperature=temperature,
             assignment_temperature=assignment_temperature,
-        )
+        )  # fmt: skip
 
     def before_update(self) -> ProtoLoss:
         """Scale the prototype rows to unit length in place, outside autograd. Returns self."""
@@ -122,8 +113,8 @@ class ProtoLoss(PretrainingLoss):
         latents = self._latents(self._read(tensordict, self.tensor_keys.observation))
         predictions = self._apply_network("predictor", latents)
         targets = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))
-        # The prototypes' precision from here on, also in a caller's autocast region or after a half-precision head.
-        with torch.autocast(device_type=latents.device.type, enabled=False):
+        # From here on in the precision of the prototypes, also under autocast or after a half-precision head.
+        with no_autocast(latents):
             with self._holding("prototypes"):
                 unit = self.prototypes.unit_weight()
             latents, predictions, targets = (x.to(unit.dtype) for x in (latents, predictions, targets))

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from crptpro.modules import DeterministicActor, TwinCritic
 from crptpro.objectives.base import NetworkLoss
-from crptpro.objectives.sac import squared_errors
+from crptpro.objectives.sac import REGRESSION_KEYS, squared_errors
 from crptpro.values import as_float
 
 
@@ -27,13 +27,12 @@ class SkillDDPGLoss(NetworkLoss):
     * ``loss_qvalue`` = MSE(Q1, y) + MSE(Q2, y), gradient to the critic only;
     * ``loss_actor`` = -mean(min(Q1, Q2)(s, a)), gradient to the actor only.
 
-    Both actions are the actor's with Gaussian noise clipped to ``noise_clip``, from ``generator`` (the target's first;
-    torch's global one if None). Only the critic has a target, and it ends its trunk with a tanh in the released code.
-    Features never receive a gradient. ``forward`` returns the diagnostics of :class:`~crptpro.objectives.RADSACLoss`
-    too.
+    Both actions have Gaussian noise clipped to ``noise_clip``, from ``generator`` (the target's first; torch's global
+    one if None). Only the critic has a target. In the released code the critic's trunk ends with a tanh. Features never
+    receive a gradient. ``forward`` also returns the diagnostics of :class:`~crptpro.objectives.RADSACLoss`.
 
     Raises:
-        ValueError: ``noise_clip`` negative, or a critic for other features than the actor's.
+        ValueError: a negative ``noise_clip``, or a critic that does not fit the actor.
     """
 
     @dataclass
@@ -46,7 +45,7 @@ class SkillDDPGLoss(NetworkLoss):
 
     default_keys = _AcceptedKeys
     tensor_keys: Any
-    default_out_keys = ("loss_actor", "loss_qvalue", "q_mean", "target_q_mean", "td_error")
+    default_out_keys = ("loss_actor", "loss_qvalue", *REGRESSION_KEYS)
 
     actor_network: DeterministicActor
     actor_network_params: Any
@@ -77,12 +76,12 @@ class SkillDDPGLoss(NetworkLoss):
 
     @property
     def actor(self) -> Any:
-        """The policy that is trained."""
+        """The policy."""
         return self.actor_network
 
     @property
     def critic(self) -> Any:
-        """The critic that is trained."""
+        """The critic."""
         return self.qvalue_network
 
     def _set_in_keys(self) -> None:
@@ -105,7 +104,7 @@ class SkillDDPGLoss(NetworkLoss):
         return squared_errors(values.unsqueeze(-2), target)
 
     def actor_loss(self, tensordict: TensorDictBase) -> Tensor:
-        """The actor's loss, against the critic as it is now."""
+        """Return the actor's loss."""
         inputs = self._inputs(tensordict, tensordict)
         action = self._act(inputs)
         # Detached weights: the gradient passes through Q to the action and to nothing else.
