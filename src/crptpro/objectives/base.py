@@ -36,10 +36,7 @@ class NetworkLoss(LossModule):
 
     @torch.no_grad()
     def reset_parameters_recursive(self) -> None:
-        """Re-initialise every network, and copy the new parameters into its target.
-
-        TorchRL's version initialises the targets independently and skips plain modules.
-        """
+        """Re-initialise all networks and copy them into their targets; TorchRL's version skips plain modules."""
         for name in self.network_names:
             with self._holding(name):
                 _reset(getattr(self, name))
@@ -89,10 +86,7 @@ class PretrainingLoss(NetworkLoss):
 
     @property
     def views(self) -> dict[NestedKey, NestedKey]:
-        """Entries of ``in_keys`` that are a second, independent augmentation of another: ``{"pixels_view": "pixels"}``.
-
-        The training loop makes them; no dataset holds them.
-        """
+        """Entries that training loops make by a second augmentation of another: ``{"pixels_view": "pixels"}``."""
         return {}
 
     def _convert(self, targets: Sequence[str] = (), **networks: nn.Module) -> None:
@@ -125,16 +119,11 @@ class PretrainingLoss(NetworkLoss):
         return value.reshape(-1, *value.shape[value.ndim - event_dims :])
 
 
-def require_positive(**values: float) -> None:
-    """Require positive numbers; otherwise a ``ValueError`` names the first."""
+def require_positive(**values: float | None) -> None:
+    """Require positive numbers, or None; otherwise a ``ValueError`` names the first."""
     for name, value in values.items():
-        if not as_float(value, name) > 0:
+        if value is not None and not as_float(value, name) > 0:
             raise ValueError(f"`{name}` must be positive, got {value}.")
-
-
-def no_autocast(like: Tensor) -> AbstractContextManager[Any]:
-    """Compute in the precision of the tensors in a block, also under autocast."""
-    return torch.autocast(device_type=like.device.type, enabled=False)
 
 
 def _reset(network: nn.Module) -> None:

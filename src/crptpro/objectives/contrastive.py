@@ -13,15 +13,12 @@ from torch import Tensor, nn
 
 from crptpro.modules import AnchorHead, Projector, SkillHead
 from crptpro.modules.heads import latent_dim_of, require_one_latent_dim
-from crptpro.objectives.base import PretrainingLoss, no_autocast, require_positive
+from crptpro.objectives.base import PretrainingLoss, require_positive
 from crptpro.objectives.functional import becl_loss, info_nce, mean_pairwise_cosine
 
 
 class ContrastiveLoss(PretrainingLoss):
-    """Scalar ``loss_contrast`` (nats), and detached ``embedding_cosine``, the mean pairwise cosine of latents.
-
-    Images must already be augmented, each independently.
-    """
+    """Gives ``loss_contrast`` (nats) and, detached, ``embedding_cosine`` (pairwise mean) of augmented images."""
 
     default_out_keys = ("loss_contrast", "embedding_cosine")
 
@@ -77,7 +74,7 @@ class ATCLoss(ContrastiveLoss):
         anchors = self._latents(self._read(tensordict, self.tensor_keys.observation))
         positives = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))
         queries = self._apply_network("anchor_head", anchors)
-        with no_autocast(queries):
+        with torch.autocast(queries.device.type, enabled=False):
             return info_nce(queries, positives.to(queries.dtype)), F.normalize(anchors.detach(), dim=-1)
 
 
@@ -88,8 +85,6 @@ class SimCLRLoss(ContrastiveLoss):
     other view of its observation as positive and the remaining 2B - 2 as negatives:
 
     .. math:: L = -\frac1{2B}\sum_i \log\frac{\exp(z_i\cdot z_{p(i)}/\tau)}{\sum_{j\ne i}\exp(z_i\cdot z_j/\tau)} .
-
-    :attr:`views` declares ``pixels_view`` as a second view of ``pixels``.
 
     Deviation: APT has published no code for DeepMind Control; loss and temperature are those of the authors' code
     for Atari, the head (``Projector(encoder.feature_dim, latent_dim)``) is that of the other methods here.
@@ -126,7 +121,7 @@ class SimCLRLoss(ContrastiveLoss):
     def _contrast(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         keys = (self.tensor_keys.observation, self.tensor_keys.observation_view)
         latents = self._latents(torch.cat([self._read(tensordict, key) for key in keys]))
-        with no_autocast(latents):
+        with torch.autocast(latents.device.type, enabled=False):
             one, two = F.normalize(latents, dim=-1).chunk(2)
             return info_nce(one, two, temperature=self.temperature, negatives="both"), one
 
@@ -167,7 +162,7 @@ class BeCLLoss(ContrastiveLoss):
     def _contrast(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         latents = self._latents(self._read(tensordict, self.tensor_keys.next_observation))
         skills = self._read(tensordict, self.tensor_keys.skill, event_dims=1).argmax(dim=-1)
-        with no_autocast(latents):
+        with torch.autocast(latents.device.type, enabled=False):
             unit = F.normalize(latents.detach(), dim=-1)
             if len(latents) < 2:
                 return 0 * latents.sum(), unit

@@ -120,15 +120,10 @@ def info_nce(
 ) -> Tensor:
     """Contrastive cross-entropy in nats; row i of the positives belongs to row i of the anchors, both ``[B, D]``.
 
-    Args:
-        anchors: normalised if the logits are to be cosines (SimCLR yes, ATC no).
-        positives: likewise.
-        temperature: divides the inner products.
-        negatives: ``"positives"`` compares each anchor with all B positives (ATC); ``"both"`` compares each
-            of the 2B views with the other 2B - 1 (SimCLR).
-        valid: ``[B]`` bool; rows that are False do not count, but their positives stay negatives of the others. With
-            ``"positives"`` their anchors may be NaN.
-        reduction: over the valid rows; ``"none"`` gives ``[B]`` (``"both"``: ``[2B]``), zero where invalid.
+    ``negatives="positives"`` compares each anchor with all B positives (ATC), ``"both"`` each of the 2B views, which
+    SimCLR normalises beforehand, with the other 2B - 1. Rows that are False in ``valid``, bool ``[B]``, do not count,
+    but their positives stay negatives of the others; with ``"positives"`` their anchors may be NaN. ``reduction`` is
+    over the valid rows; ``"none"`` gives ``[B]`` (``"both"``: ``[2B]``), zero where invalid.
     """
     count = anchors.shape[0]
     labels = torch.arange(count, device=anchors.device)
@@ -183,10 +178,7 @@ def assignment_entropy(assignments: Tensor) -> Tensor:
 
 @torch.no_grad()
 def prototypes_in_use(assignments: Tensor) -> Tensor:
-    """Number of prototypes that are the largest of some row of assignments ``[B, M]``, as a float scalar.
-
-    In a collapsed run all assignments tie, and the count is a rounding artefact.
-    """
+    """Number of prototypes that are the largest of some row ``[B, M]``, a float scalar; arbitrary after a collapse."""
     used = assignments.new_zeros(assignments.shape[-1])
     return used.index_fill(0, assignments.argmax(dim=-1), 1.0).sum()
 

@@ -6,9 +6,10 @@ A new method takes two files: its loss, and a row here (or a call of :func:`regi
 from __future__ import annotations
 
 import difflib
+import functools
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 from torch import nn
@@ -32,88 +33,51 @@ class Exploration:
     """How a method explores while it pre-trains; the defaults are Proto-RL's.
 
     Every interval counts the agent steps of one domain. A number out of its range is a ``ValueError``.
-
-    Attributes:
-        reward: the intrinsic reward, the only one of the exploration: ``"prototype"``, ``"particle"``,
-            ``"skill-contrast"``, or a function of the loss and a ``torch.Generator`` that returns a transform writing
-            ``("next", "intrinsic_reward")``.
-        agent: ``"rad-sac"``, ``"averaged-sac"`` (DrQ's K = M = 2 on detached features) or ``"skill-ddpg"``.
-        env_steps: env steps over all domains, random phases included.
-        is_single_domain: the (S) variants: pre-trained on one domain only.
-        encoder_update_interval: agent steps between two encoder updates.
-        encoder_updates_each: encoder updates every time, each on a fresh batch.
-        agent_update_interval: agent steps between two updates of the agent.
-        encodes_before_update: reward and agent see the features from before the encoder update of the same step.
-        transfers_actor: the downstream agent starts from the exploring actor.
-        n_step: agent steps from an observation to the "next" one in the agent's and the encoder's batches.
-        skill_dim: number of skills, at least two; None for an agent without skills.
-        skill_agent_steps: agent steps between two changes of the skill.
-        replay_capacity: transitions kept per domain.
-        random_agent_steps: agent steps of uniformly random actions per domain, before its updates start.
     """
 
+    #: The only reward of the exploration: ``"prototype"``, ``"particle"``, ``"skill-contrast"``, or a function of the
+    #: loss and a ``torch.Generator`` that returns a transform writing ``("next", "intrinsic_reward")``.
     reward: str | Callable[..., Any] = "prototype"
-    agent: str = "rad-sac"
-    env_steps: int = 200_000
-    is_single_domain: bool = False
-    encoder_update_interval: int = 2
-    encoder_updates_each: int = 1
-    agent_update_interval: int = 1
-    encodes_before_update: bool = False
-    transfers_actor: bool = False
-    n_step: int = 1
-    skill_dim: int | None = None
-    skill_agent_steps: int = 50
-    replay_capacity: int = 100_000
-    random_agent_steps: int = 1_000
+    agent: str = "rad-sac"  #: or ``"averaged-sac"`` (DrQ's K = M = 2 on detached features), or ``"skill-ddpg"``
+    env_steps: int = 200_000  #: over all domains, random phases included
+    is_single_domain: bool = False  #: the (S) variants: pre-trained on one domain only
+    encoder_update_interval: int = 2  #: agent steps between two encoder updates
+    encoder_updates_each: int = 1  #: encoder updates every time, each on a fresh batch
+    agent_update_interval: int = 1  #: agent steps between two updates of the agent
+    encodes_before_update: bool = False  #: reward and agent see features from before the encoder update of the step
+    transfers_actor: bool = False  #: the downstream agent starts from the exploring actor
+    n_step: int = 1  #: agent steps from an observation to the "next" one in batches of the agent and the encoder
+    skill_dim: int | None = None  #: number of skills, at least two; None for an agent without skills
+    skill_agent_steps: int = 50  #: agent steps between two changes of the skill
+    replay_capacity: int = 100_000  #: transitions kept per domain
+    random_agent_steps: int = 1_000  #: agent steps of uniformly random actions per domain, before its updates start
 
     def __post_init__(self) -> None:
-        counts = (
-            "env_steps", "encoder_update_interval", "encoder_updates_each", "agent_update_interval", "n_step",
-            "skill_agent_steps", "replay_capacity",
-        )  # fmt: skip
-        _check_counts(self, {**dict.fromkeys(counts, 1), "random_agent_steps": 0, "skill_dim": 2})
+        counts = {setting.name: 1 for setting in fields(self) if setting.type == "int"}
+        _check_counts(self, counts | {"random_agent_steps": 0, "skill_dim": 2})
 
 
 @dataclass(frozen=True)
 class Method:
-    """A row of the table; the defaults are CRPTpro's. A number out of its range is a ``ValueError``.
-
-    Attributes:
-        name: unique name.
-        loss_class: the loss that pre-trains the encoder; None for a method without pre-training.
-        loss_options: keyword arguments of ``loss_class``.
-        encoder_options: keyword arguments of :class:`~crptpro.modules.PixelEncoder`.
-        updates: encoder updates in total, over all domains.
-        batch_size: transitions per update.
-        learning_rate: of Adam; the peak of a schedule.
-        encoder_tau: rate of the target networks, every update; None for a method without targets.
-        schedule: ``"constant"`` or ``"warmup_cosine"``: learning rate over the updates.
-        warmup_updates: length of the linear warm-up of the learning rate from 0.
-        grad_clip: largest gradient norm; None for no clipping.
-        exploration: how it explores while it pre-trains; None for a method that does not explore.
-        downstream: settings of downstream training that differ from CRPTpro's.
-        starts_from: method whose encoder it takes, to train it further for ``updates``.
-        is_preset: a variant of another method, which :func:`method_names` and :func:`method_of` skip.
-        is_builtin: part of the library.
-    """
+    """A row of the table; the defaults are CRPTpro's. A number out of its range is a ``ValueError``."""
 
     name: str
-    loss_class: type[LossModule] | None
-    loss_options: Mapping[str, Any] = field(default_factory=dict)
+    loss_class: type[LossModule] | None  #: built as ``loss_class(encoder, **loss_options)``; None without pre-training
+    loss_options: Mapping[str, Any] = field(default_factory=dict)  #: keyword arguments of ``loss_class``
+    #: Keyword arguments of :class:`~crptpro.modules.PixelEncoder`.
     encoder_options: Mapping[str, Any] = field(default_factory=dict)
-    updates: int = 50_000
-    batch_size: int = 512
-    learning_rate: float = 1e-4
-    encoder_tau: float | None = 0.05
-    schedule: Literal["constant", "warmup_cosine"] = "constant"
-    warmup_updates: int = 0
-    grad_clip: float | None = None
-    exploration: Exploration | None = None
-    downstream: Mapping[str, Any] = field(default_factory=dict)
-    starts_from: str | None = None
-    is_preset: bool = False
-    is_builtin: bool = False
+    updates: int = 50_000  #: encoder updates in total, over all domains
+    batch_size: int = 512  #: transitions per update
+    learning_rate: float = 1e-4  #: of Adam; the peak of a schedule
+    encoder_tau: float | None = 0.05  #: rate of the target networks, every update; None for a method without targets
+    schedule: Literal["constant", "warmup_cosine"] = "constant"  #: of the learning rate over the updates
+    warmup_updates: int = 0  #: length of the linear warm-up of the learning rate from 0
+    grad_clip: float | None = None  #: largest gradient norm; None for no clipping
+    exploration: Exploration | None = None  #: None for a method that does not explore
+    downstream: Mapping[str, Any] = field(default_factory=dict)  #: downstream settings other than CRPTpro's
+    starts_from: str | None = None  #: method whose encoder it takes, to train it further for ``updates``
+    is_preset: bool = False  #: a variant of another method, which :func:`method_names` and :func:`method_of` skip
+    is_builtin: bool = False  #: part of the library
 
     def __post_init__(self) -> None:
         _check_counts(self, {"updates": 0, "batch_size": 1, "warmup_updates": 0})
@@ -128,19 +92,14 @@ class Method:
         return PixelEncoder(in_channels, image_size=image_size, **{**self.encoder_options, **options})
 
     def build(self, encoder: nn.Module, **options: Any) -> LossModule:
-        """Build the loss on ``encoder``; ``options`` override the method's own.
-
-        Raises:
-            CRPTproError: the method pre-trains nothing.
-            ValueError: the loss has no such option.
-        """
+        """Build the loss on ``encoder``; ``options`` override the method's own, an unknown one is a ``ValueError``."""
         if self.loss_class is None:
             raise CRPTproError(f"The method {self.name!r} pre-trains nothing; it is for downstream training.")
-        parameters = inspect.signature(self.loss_class.__init__).parameters.values()
-        known = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY or p.name in options]
-        unknown = sorted(set(options) - set(known))
-        if unknown and not any(p.kind is p.VAR_KEYWORD for p in parameters):
-            raise ValueError(f"The method {self.name!r} has no option {', '.join(unknown)}; it has {', '.join(known)}.")
+        parameters = inspect.signature(self.loss_class.__init__).parameters
+        unknown = sorted(set(options) - set(parameters))
+        if unknown and not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+            known = ", ".join(list(parameters)[2:])  # without self and the encoder
+            raise ValueError(f"The method {self.name!r} has no option {', '.join(unknown)}; it has {known}.")
         loss = self.loss_class(encoder, **{**self.loss_options, **options})
         loss.method_name = self.name  # for method_of
         return loss
@@ -152,15 +111,9 @@ _CRPTPRO = Method("crptpro", ProtoLoss)
 
 # ATC's loss, head and schedule on the encoder (orthogonal weights), batch and budget that all methods share.
 _ATC = Method(
-    "atc",
-    ATCLoss,
-    learning_rate=1e-3,
-    encoder_tau=0.01,
-    schedule="warmup_cosine",
-    warmup_updates=1_000,
-    grad_clip=10.0,
-    downstream=_NO_BONUS,
-)
+    "atc", ATCLoss, learning_rate=1e-3, encoder_tau=0.01, schedule="warmup_cosine", warmup_updates=1_000,
+    grad_clip=10.0, downstream=_NO_BONUS,
+)  # fmt: skip
 
 # Active methods: four env steps per encoder update, 200,000 in total over a group (C) or 500,000 in one domain (S).
 # The paper's efficiency table has equal times for one to three domains, so (C) counts in total.
@@ -170,53 +123,40 @@ _APT_EXPLORES = Exploration(reward="particle", agent="averaged-sac")
 _APT_C = Method("apt-c", SimCLRLoss, encoder_tau=None, exploration=_APT_EXPLORES, downstream=_NO_BONUS)
 # Deviation: Proto-RL's released code has a predictor of width 512; the paper's table lists 1024, also used here.
 _PROTO_RL_C = Method(
-    "proto-rl-c",
-    ProtoLoss,
-    loss_options={"intr_loss_coef": 0.0},
-    exploration=Exploration(),
+    "proto-rl-c", ProtoLoss, loss_options={"intr_loss_coef": 0.0}, exploration=Exploration(),
     downstream={"replay_capacity": 100_000},
-)
+)  # fmt: skip
+
+# Three encoder updates for each update of the agent, every second agent step: 150,000 for 50,000.
+_BECL_EXPLORES = Exploration(
+    reward="skill-contrast", agent="skill-ddpg", encoder_updates_each=3, encodes_before_update=True,
+    agent_update_interval=2, n_step=3, skill_dim=16, random_agent_steps=2_000,
+)  # fmt: skip
+_BECL = Method(
+    "becl", BeCLLoss, updates=150_000, encoder_tau=None, encoder_options={"pixel_offset": 0.5},
+    exploration=_BECL_EXPLORES, downstream=_NO_BONUS,
+)  # fmt: skip
 
 
-def _preset(method: Method, name: str, **fields: Any) -> Method:
-    return replace(method, name=name, is_preset=True, **fields)
-
+_preset = functools.partial(replace, is_preset=True)
 
 # A loss built by hand is trained by the first row of its class that is no preset.
 TABLE = (
     _CRPTPRO,
-    _preset(_CRPTPRO, "crptpro-no-bonus", updates=0, starts_from="crptpro", downstream=_NO_BONUS),
+    _preset(_CRPTPRO, name="crptpro-no-bonus", updates=0, starts_from="crptpro", downstream=_NO_BONUS),
     # Deviation: targets at half the student's temperature leave the plateau at ln M sooner; three times the learning
     # rate gets further after it (docs/study.md).
-    _preset(_CRPTPRO, "crptpro-fast", learning_rate=3e-4, loss_options={"assignment_temperature": 0.05}),
-    _preset(_CRPTPRO, "crptpro-finetune", updates=2_000, starts_from="crptpro"),
+    _preset(_CRPTPRO, name="crptpro-fast", learning_rate=3e-4, loss_options={"assignment_temperature": 0.05}),
+    _preset(_CRPTPRO, name="crptpro-finetune", updates=2_000, starts_from="crptpro"),
     # The authors' published code where it differs from the paper: predictor width, and 3 x 16,666 updates.
-    _preset(_CRPTPRO, "released-code", updates=49_998, loss_options={"hidden_dim": 512}),
+    _preset(_CRPTPRO, name="released-code", updates=49_998, loss_options={"hidden_dim": 512}),
     _ATC,
-    _preset(_ATC, "atc-native", batch_size=256, encoder_options={"strides": (2, 2, 2, 1), "init": "kaiming"}),
+    _preset(_ATC, name="atc-native", batch_size=256, encoder_options={"strides": (2, 2, 2, 1), "init": "kaiming"}),
     _APT_C,
     replace(_APT_C, name="apt-s", updates=125_000, exploration=replace(_APT_EXPLORES, **_SINGLE_DOMAIN)),
     _PROTO_RL_C,
     replace(_PROTO_RL_C, name="proto-rl-s", updates=125_000, exploration=_PROTO_RL_S_EXPLORES),
-    # Three encoder updates per update of BeCL's agent, every second agent step: 150,000 for 50,000.
-    Method(
-        "becl",
-        BeCLLoss,
-        updates=150_000,
-        encoder_tau=None,
-        encoder_options={"pixel_offset": 0.5},
-        exploration=Exploration(
-            reward="skill-contrast",
-            agent="skill-ddpg",
-            encoder_updates_each=3,
-            encodes_before_update=True,
-            agent_update_interval=2,
-            n_step=3,
-            skill_dim=16,
-            random_agent_steps=2_000,
-        ),
-        downstream=_NO_BONUS,
-    ),
+    _BECL,
     # Trains the encoder end to end, with the critic.
     Method("drq", None, updates=0, downstream=_DRQ | _NO_BONUS),
     # Controls: the encoder at initialisation, and with features of mean 0 and deviation 1.
@@ -232,13 +172,8 @@ _METHODS: dict[str, Method] = {row.name: replace(row, is_builtin=True) for row i
 def register_method(name: str, loss_class: type[LossModule], **fields: Any) -> Method:
     """Make a method available by name, on the command line too.
 
-    Args:
-        name: unique name.
-        loss_class: built as ``loss_class(encoder, **loss_options)``.
-        **fields: further fields of :class:`Method`, such as ``updates=10_000`` or ``exploration=Exploration()``.
-
-    Raises:
-        ValueError: the name is registered for another class, or a number is out of its range.
+    ``fields`` are further fields of :class:`Method`, such as ``updates=10_000`` or ``exploration=Exploration()``. A
+    name that is registered for another class, or a number out of its range, is a ``ValueError``.
     """
     taken = _METHODS.get(name)
     if taken is not None and taken.loss_class is not loss_class:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, cast
 
+import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import dispatch
@@ -12,7 +13,7 @@ from torch import nn
 from crptpro.modules import Predictor, Projector, Prototypes
 from crptpro.modules.heads import require_one_latent_dim
 from crptpro.objectives import functional
-from crptpro.objectives.base import PretrainingLoss, no_autocast, require_positive
+from crptpro.objectives.base import PretrainingLoss, require_positive
 from crptpro.values import as_int
 
 
@@ -35,22 +36,11 @@ class ProtoLoss(PretrainingLoss):
     ``embedding_cosine`` (mean pairwise cosine of the online latents), ``prototype_ane``. A ``loss_comp`` that stays at
     ln M (6.238 for 512 prototypes), or an ``embedding_cosine`` that stays near 1, is a collapse.
 
-    Args:
-        encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
-        projector: features to latents ``[B, D]``; default ``Projector(encoder.feature_dim, latent_dim)``.
-        predictor: latents to latents; default ``Predictor(latent_dim, hidden_dim)``.
-        prototypes: default ``Prototypes(num_prototypes, latent_dim)``.
-        num_prototypes: M.
-        latent_dim: D.
-        hidden_dim: predictor width; 1024 in the paper's table, 512 in the released code.
-        intr_loss_coef: alpha, weight of the dispersion.
-        offset: w, denominator offset of the dispersion; larger than 1.
-        temperature: tau of the prediction.
-        assignment_temperature: tau of the assignments; None follows ``temperature``.
-        sinkhorn_iterations: scalings of the assignments.
-
-    Raises:
-        ValueError: a coefficient out of its range, or heads of different latent lengths.
+    The default heads are ``Projector(encoder.feature_dim, latent_dim)``, ``Predictor(latent_dim, hidden_dim)`` and
+    ``Prototypes(num_prototypes, latent_dim)``; ``hidden_dim`` is 1024 in the paper's table, 512 in the released code.
+    ``intr_loss_coef`` is alpha, ``offset`` > 1 and ``sinkhorn_iterations`` are those of the functions above, and
+    ``assignment_temperature`` replaces tau in the assignments. A coefficient out of its range, or heads of different
+    latent lengths, are a ``ValueError``.
     """
 
     predictor: nn.Module
@@ -85,9 +75,7 @@ class ProtoLoss(PretrainingLoss):
         super().__init__()
         if not offset > 1:
             raise ValueError(f"`offset` must exceed 1, the largest negative cosine, got {offset}.")
-        require_positive(temperature=temperature)
-        if assignment_temperature is not None:
-            require_positive(assignment_temperature=assignment_temperature)
+        require_positive(temperature=temperature, assignment_temperature=assignment_temperature)
         projector = projector or Projector(cast(int, encoder.feature_dim), latent_dim)
         predictor = predictor or Predictor(latent_dim, hidden_dim)
         prototypes = prototypes or Prototypes(num_prototypes, latent_dim)
@@ -114,7 +102,7 @@ class ProtoLoss(PretrainingLoss):
         predictions = self._apply_network("predictor", latents)
         targets = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))
         # From here on in the precision of the prototypes, also under autocast or after a half-precision head.
-        with no_autocast(latents):
+        with torch.autocast(latents.device.type, enabled=False):
             with self._holding("prototypes"):
                 unit = self.prototypes.unit_weight()
             latents, predictions, targets = (x.to(unit.dtype) for x in (latents, predictions, targets))

@@ -59,16 +59,9 @@ class RADSACLoss(NetworkLoss, SACLoss):
     ``forward`` returns the losses and, detached, ``alpha``, ``entropy`` (-log pi, nats), ``q_mean``, ``target_q_mean``,
     ``td_error`` (mean over rows of the larger of the two heads' absolute errors).
 
-    Args:
-        actor: on features.
-        critic: on features and actions; the target copies all of it.
-        gamma: discount per agent step, in [0, 1].
-        alpha_init: initial temperature, positive.
-        target_entropy: in nats; None for minus the action dimension.
-        generator: source of all action noise; torch's global one if None. Not part of the state dictionary.
-
-    Raises:
-        ValueError: ``gamma`` or ``alpha_init`` out of its range.
+    ``gamma`` in [0, 1] is the discount per agent step, ``alpha_init`` the initial temperature, ``target_entropy`` in
+    nats by default minus the action dimension. ``generator`` draws all action noise (torch's global one if None) and is
+    not part of the state dictionary.
     """
 
     @dataclass
@@ -95,15 +88,13 @@ class RADSACLoss(NetworkLoss, SACLoss):
         gamma = as_float(gamma, "gamma", minimum=0, maximum=1)
         require_positive(alpha_init=alpha_init)
         views = [self.default_keys().observation]
+        moments = ["loc", "scale"]
         policy = ProbabilisticActor(
-            TensorDictModule(actor, in_keys=views, out_keys=["loc", "scale"]),
-            in_keys=["loc", "scale"],
-            distribution_class=TanhNormal,
-            return_log_prob=True,
+            TensorDictModule(actor, views, moments), moments, distribution_class=TanhNormal, return_log_prob=True
         )
         super().__init__(
             policy,
-            TensorDictModule(critic, in_keys=[*views, "action"], out_keys=["state_action_value"]),
+            TensorDictModule(critic, [*views, "action"], ["state_action_value"]),
             # With any other count SACLoss stacks copies of the parameters, and initialises those of a single module
             # again, without orthogonal initialisation.
             num_qvalue_nets=0,
@@ -149,15 +140,12 @@ class RADSACLoss(NetworkLoss, SACLoss):
         loss_actor, log_prob = (self._alpha * log_prob - value).mean(), log_prob.detach()
         out = {
             "loss_actor": loss_actor,
-            "loss_alpha": self._alpha_loss(log_prob).mean(),
+            # SACLoss uses log_alpha in place of alpha.
+            "loss_alpha": (self.log_alpha.exp() * (-log_prob - self.target_entropy)).mean(),
             "alpha": self._alpha,
             "entropy": -log_prob.mean(),
         }
         return TensorDict(out, batch_size=[])
-
-    def _alpha_loss(self, log_prob: Tensor) -> Tensor:
-        # SACLoss uses log_alpha in place of alpha.
-        return self.log_alpha.exp() * (-log_prob - self.target_entropy).detach()
 
     @torch.no_grad()
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:

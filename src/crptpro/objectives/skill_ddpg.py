@@ -29,10 +29,8 @@ class SkillDDPGLoss(NetworkLoss):
 
     Both actions have Gaussian noise clipped to ``noise_clip``, from ``generator`` (the target's first; torch's global
     one if None). Only the critic has a target. In the released code the critic's trunk ends with a tanh. Features never
-    receive a gradient. ``forward`` also returns the diagnostics of :class:`~crptpro.objectives.RADSACLoss`.
-
-    Raises:
-        ValueError: a negative ``noise_clip``, or a critic that does not fit the actor.
+    receive a gradient. ``forward`` also returns the diagnostics of :class:`~crptpro.objectives.RADSACLoss`. A critic
+    that does not fit the actor is a ``ValueError``.
     """
 
     @dataclass
@@ -118,8 +116,8 @@ class SkillDDPGLoss(NetworkLoss):
         action = self._act(inputs)
         with self._holding("qvalue_network", target=True):
             value = self.qvalue_network(inputs, action).amin(-1)
-        names = (self.tensor_keys.reward, self.tensor_keys.discount)
-        reward, discount = (following.get(name).squeeze(-1) for name in names)
+        reward = following.get(self.tensor_keys.reward).squeeze(-1)
+        discount = following.get(self.tensor_keys.discount).squeeze(-1)
         return reward + discount * value
 
     def _act(self, inputs: Tensor) -> Tensor:
