@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, TypeVar
@@ -25,41 +26,33 @@ class Domain:
 
     The paper pre-trains on domains and evaluates on tasks; tasks of one domain share their pixels.
 
-    Args:
-        name: of the domain, and of its dataset directory.
-        task: used for collection, a name for :func:`crptpro.envs.make_env`.
-        action_repeat: default number of env steps per agent step.
-        camera: index or name of the default camera; ``None`` leaves it to the environment.
-        make: builds your own environment, an unbatched TorchRL one on the CPU. It gets, by keyword, those of ``seed``,
-            ``image_size``, ``action_repeat`` (otherwise an agent step is one env step), ``camera``, ``quality`` and
-            ``physics_state`` that its signature names. ``pixels`` is one RGB image ``[H, W, 3]`` or ``[3, H, W]`` with
-            ``H = W = image_size``, uint8 or floats in [0, 1]; ``action`` is a float vector in [-1, 1]; the reward has
-            shape ``[1]``. Without ``truncated`` in its ``done_spec``, episodes end by termination alone. With
-            ``physics_state`` it may emit ``qpos`` and ``qvel``; entries that its transforms read back (``step_count``)
-            stay, others are dropped. Its ``set_seed`` must make the next ``reset`` reproducible. For worker processes
-            it must be a function at a module's top level or a ``functools.partial`` of one.
-        episode_env_steps: env steps of a full episode; if ``None``, the time limit is 1000 agent steps.
-        source: library of ``task``; ``"own"`` with ``make``.
+    ``make`` builds your own environment, an unbatched TorchRL one on the CPU. It gets, by keyword, those of ``seed``,
+    ``image_size``, ``action_repeat`` (otherwise an agent step is one env step), ``camera``, ``quality`` and
+    ``physics_state`` that its signature names. ``pixels`` is one RGB image ``[H, W, 3]`` or ``[3, H, W]`` with
+    ``H = W = image_size``, uint8 or floats in [0, 1]; ``action`` is a float vector in [-1, 1]; the reward has shape
+    ``[1]``. Without ``truncated`` in its ``done_spec``, episodes end by termination alone. With ``physics_state`` it
+    may emit ``qpos`` and ``qvel``; entries that its transforms read back (``step_count``) stay, others are dropped. Its
+    ``set_seed`` must make the next ``reset`` reproducible. For worker processes ``make`` must be a function at a
+    module's top level or a ``functools.partial`` of one.
     """
 
-    name: str
-    task: str
-    action_repeat: int = 2
-    camera: int | str | None = 0
+    name: str  #: of the domain, and of its dataset directory
+    task: str  #: used for collection, a name for :func:`crptpro.envs.make_env`
+    action_repeat: int = 2  #: default number of env steps per agent step
+    camera: int | str | None = 0  #: index or name of the default camera; ``None`` leaves it to the environment
     make: Callable[..., EnvBase] | None = None
-    episode_env_steps: int | None = None
-    source: Literal["suite", "manipulation", "gymnasium", "own"] = "own"
+    episode_env_steps: int | None = None  #: of a full episode; if ``None``, the time limit is 1000 agent steps
+    source: Literal["suite", "manipulation", "gymnasium", "own"] = (
+        "own"  #: library of ``task``; ``"own"`` with ``make``
+    )
 
     def __post_init__(self) -> None:
         for name in ("action_repeat", "episode_env_steps"):
-            value = getattr(self, name)
-            if value is not None:
+            if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, as_int(value, name, minimum=1))
 
 
-def _suite(name: str, task: str, camera: int = 0) -> Domain:
-    return Domain(name, task, camera=camera, episode_env_steps=1000, source="suite")
-
+_suite = functools.partial(Domain, episode_env_steps=1000, source="suite")
 
 PAPER_DOMAINS: dict[str, Domain] = {
     domain.name: domain
@@ -144,10 +137,8 @@ def register_domain(domain: Domain) -> Domain:
 
     Several tasks may share the name of a domain, which then means the one registered last. A worker process starts
     without registered domains: pass the ``Domain`` itself, or call ``register_domain`` at the top level of the module
-    that defines ``make``, which unpickling imports.
-
-    Raises:
-        CRPTproError: the domain has no ``make``, or its name is a built-in one.
+    that defines ``make``, which unpickling imports. A domain without ``make``, or with a name of the paper's, is a
+    ``CRPTproError``.
     """
     if domain.make is None and domain.source == "own":
         raise CRPTproError(f"Domain {domain.name!r} has no make; pass make=<function that builds the environment>.")
@@ -162,10 +153,8 @@ def register_domain(domain: Domain) -> Domain:
 def get_domain(name: str | Domain) -> Domain:
     """Return the domain of a domain or task name, built in or registered, or of ``gymnasium:<id>``.
 
-    A task name gives its domain with that task; a ``Domain`` is returned as it is.
-
-    Raises:
-        UnknownNameError: with the nearest known names.
+    A task name gives its domain with that task; a ``Domain`` is returned as it is. An unknown name is an
+    ``UnknownNameError`` with the nearest known ones.
 
     Examples:
         >>> get_domain("cheetah").task
@@ -194,11 +183,7 @@ def get_domain(name: str | Domain) -> Domain:
 def expand_groups(names: Iterable[Named]) -> list[Named]:
     """Replace group letters by their domains, keeping order and dropping repeats.
 
-    Args:
-        names: of domains, tasks or groups, or :class:`Domain` objects.
-
-    Raises:
-        UnknownNameError: no name is given, or an unknown one.
+    No name, or an unknown one, is an ``UnknownNameError``; a :class:`Domain` stays.
 
     Examples:
         >>> expand_groups(["D", "walker", "finger"])
