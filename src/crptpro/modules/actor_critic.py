@@ -56,7 +56,7 @@ class SquashedGaussianActor(LinearNetwork):
     r"""Stochastic policy :math:`a = \tanh(u),\ u \sim \mathcal N(\mu, \sigma)` on features.
 
     The raw log standard deviation is squashed: ``log_std = lo + (hi - lo) / 2 * (tanh(raw) + 1)``, with (lo, hi)
-    ``log_std_bounds``. DrQ's trunk ``has_tanh``. Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
+    ``log_std_bounds``. Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
     """
 
     def __init__(
@@ -104,10 +104,7 @@ class SquashedGaussianActor(LinearNetwork):
 
 
 class TwinCritic(LinearNetwork):
-    """Two Q-functions with one shared trunk, as in denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
-
-    The trunks of DrQ and of URLB's DDPG have ``has_tanh``.
-    """
+    """Two Q-functions with one shared trunk, as in denisyarats/proto and liuxin0824/CRPTpro ``proto.py``."""
 
     def __init__(
         self,

@@ -29,17 +29,12 @@ class PixelEncoder(nn.Module):
     The input is ``pixels * pixel_scale - pixel_offset``. In bfloat16 it is the raw 0..255 values, which bfloat16 holds
     exactly, and the first kernel is scaled instead. Parameters and gradients stay float32.
 
-    Images are uint8, or floating in [0, 1], which count as already divided by 255 (one warning per encoder).
+    Images are uint8, or floating in [0, 1], which count as already divided by 255 (one warning per encoder). Other
+    images are a ``ValueError``.
 
-    Args:
-        in_channels: colour channels times stacked frames (3 x 3).
-        channels: output channels of each convolution.
-        strides: stride of each convolution.
-        image_size: height and width in pixels.
-        pixel_scale: factor on the 0..255 values.
-        pixel_offset: subtracted after scaling (0 here; 0.5 in URLB-style methods).
-        init: ``"orthogonal"``, or ``"kaiming"`` (normal, fan-in, for ReLU), as ATC's own encoder.
-        standardised: create the buffers of :meth:`standardise` (0 and 1), to load weights into.
+    ``in_channels`` are the colour channels times the stacked frames; ``pixel_offset`` is 0.5 in URLB-style methods;
+    ``init="kaiming"`` (normal, fan-in, for ReLU) is that of ATC's encoder; ``standardised`` creates the buffers of
+    :meth:`standardise` (0 and 1), to load weights into.
 
     Attributes:
         feature_dim: length of the output, the flattened ``feature_map_shape`` (C, H, W).
@@ -68,10 +63,10 @@ class PixelEncoder(nn.Module):
         if not len(channels) or len(channels) != len(strides):
             raise ValueError(f"channels and strides must be non-empty, of equal length, got {channels} and {strides}.")
         sizes = plain_sizes(in_channels=in_channels, image_size=image_size)
-        self.in_channels, self.image_size = in_channels, image_size = sizes.values()
+        self.in_channels, self.image_size = sizes.values()
         channels = [as_int(count, "channels", minimum=1) for count in channels]
         self.strides = tuple(as_int(stride, "strides", minimum=1) for stride in strides)
-        size = image_size
+        size = self.image_size
         for stride in self.strides:
             size = (size - KERNEL_SIZE) // stride + 1
             if size < 1:
@@ -80,7 +75,7 @@ class PixelEncoder(nn.Module):
         self.pixel_offset = as_float(pixel_offset, "pixel_offset")
         self.convs = nn.ModuleList(
             nn.Conv2d(c_in, c_out, KERNEL_SIZE, stride)
-            for c_in, c_out, stride in zip([in_channels, *channels[:-1]], channels, self.strides)
+            for c_in, c_out, stride in zip([self.in_channels, *channels[:-1]], channels, self.strides)
         )
         self.feature_map_shape: tuple[int, int, int] = (channels[-1], size, size)
         self.feature_dim: int = math.prod(self.feature_map_shape)
@@ -103,10 +98,7 @@ class PixelEncoder(nn.Module):
 
     @torch.no_grad()
     def standardise(self, mean: Tensor, scale: Tensor) -> PixelEncoder:
-        """Return ``(features - mean) / scale`` from now on, finite ``[feature_dim]``, scale positive; returns self.
-
-        Both become buffers ``feature_mean`` and ``feature_scale``, saved with the weights.
-        """
+        """Encode to ``(features - mean) / scale`` from now on, finite ``[feature_dim]`` and saved; return self."""
         for name, value in (("mean", mean), ("scale", scale)):
             value = torch.as_tensor(value).to(self.convs[0].weight)
             if value.shape != (self.feature_dim,) or not bool(value.isfinite().all()):
@@ -120,10 +112,7 @@ class PixelEncoder(nn.Module):
         return self
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Encode images ``[*, in_channels, image_size, image_size]`` to ``[*, feature_dim]`` in ``compute_dtype``.
-
-        Features are not negative unless standardised. Images of another shape or range are a ``ValueError``.
-        """
+        """Encode images ``[*, in_channels, image_size, image_size]`` to ``[*, feature_dim]`` in ``compute_dtype``."""
         expected = (self.in_channels, self.image_size, self.image_size)
         if tuple(pixels.shape[-3:]) != expected:
             shape = ", ".join(map(str, expected))

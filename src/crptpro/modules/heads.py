@@ -79,10 +79,7 @@ class Projector(LinearNetwork):
 
 
 class Predictor(LinearNetwork):
-    r"""Perceptron in the latent space, online branch only: :math:`v_\psi` (denisyarats/proto ``proto.py``).
-
-    ``hidden_dim`` is 1024 as in the paper's table; the released code has 512.
-    """
+    r"""Perceptron in the latent space, online branch only: :math:`v_\psi` (denisyarats/proto ``proto.py``)."""
 
     def __init__(self, latent_dim: int = 128, hidden_dim: int = 1024) -> None:
         super().__init__(latent_dim=latent_dim, hidden_dim=hidden_dim)

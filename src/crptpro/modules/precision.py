@@ -53,10 +53,7 @@ def _is_faster_in_bf16(device: torch.device) -> bool:
 
 
 def set_compute_dtype(module: _Module, dtype: torch.dtype) -> _Module:
-    """Set ``compute_dtype`` on every network inside a network or loss, and return it; parameters keep their dtype.
-
-    ``dtype`` is ``torch.bfloat16``, or ``torch.float32`` for that of the parameters; others are a ``ValueError``.
-    """
+    """Set ``compute_dtype``, float32 or bfloat16, on every network inside ``module``, a network or loss; return it."""
     if dtype not in (torch.float32, torch.bfloat16):
         raise ValueError(f"compute dtype must be torch.float32 or torch.bfloat16, got {dtype}.")
     for network in _networks_within(module):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -43,9 +44,6 @@ def cgroup_free_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> Iterator
                     left = int((directory / limit).read_text()) - int((directory / usage).read_text())
                 except (OSError, ValueError):  # "max" for no limit
                     continue
-                yield max(0, left + _statistic(directory / "memory.stat", cache))
-
-
-def _statistic(path: Path, name: str) -> int:
-    lines = path.read_text().splitlines() if path.exists() else []
-    return next((int(value) for key, value in map(str.split, lines) if key == name), 0)
+                statistics = directory / "memory.stat"
+                found = re.search(rf"^{cache} (\d+)$", statistics.read_text(), re.M) if statistics.exists() else None
+                yield max(0, left + int(found[1] if found else 0))

@@ -17,8 +17,7 @@ def draw_offsets(
 ) -> Tensor:
     """Draw one shift per sample, uniform over the ``(2 * pad + 1)**2`` integer offsets of up to ``pad`` pixels.
 
-    Returns int64 ``[batch, 2]``, (row, column), each in ``{0, ..., 2 * pad}``; ``(pad, pad)`` is no shift. A CPU
-    generator gives the same shifts on every device.
+    Returns int64 ``[batch, 2]``, (row, column) in ``{0, ..., 2 * pad}``; a CPU generator gives the same everywhere.
     """
     source = torch.device(device) if generator is None else generator.device
     return torch.randint(0, 2 * pad + 1, (batch, 2), generator=generator, device=source).to(device)
@@ -27,9 +26,8 @@ def draw_offsets(
 def random_shift(pixels: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
     """Crop every image ``[B, C, H, W]``, its border replicated ``pad`` times, at its own integer offset ``[B, 2]``.
 
-    This is the augmentation of DrQ (denisyarats/drq) as CRPTpro and Proto-RL use it. Offsets are (row, column) in ``{0,
-    ..., 2 * pad}`` (a ``ValueError`` otherwise, except on a GPU and under ``torch.compile``). Values are copied, never
-    interpolated.
+    This is the augmentation of DrQ (denisyarats/drq) as CRPTpro and Proto-RL use it. Offsets are (row, column) in
+    ``{0, ..., 2 * pad}``; others on a CPU are a ``ValueError``. Values are copied, never interpolated.
 
     On a CPU this copies slices, in half the time of padding and cropping. On other devices, under ``torch.compile``
     and for a gradient, it is one gather without host synchronisation.
@@ -100,12 +98,9 @@ class RandomShift(PixelTransform):
     Every key and every sample draws its own offset, common to all channels (stacked frames). The transform acts in
     evaluation mode too, into which TorchRL puts every attached transform.
 
-    Args:
-        pad: largest shift in pixels.
-        in_keys: images, required; by default ``"pixels"`` and, if present, ``("next", "pixels")``. On an environment
-            only the root keys are shifted.
-        out_keys: keys of the shifted images, by default ``in_keys``.
-        generator: source of the offsets, shared with clones and not part of the state dict; torch's global one if None.
+    ``in_keys`` are required; by default they are ``"pixels"`` and, if present, ``("next", "pixels")``. On an
+    environment only root keys are shifted. Without ``out_keys`` the images are replaced. ``generator`` draws the
+    offsets (torch's global one if None); clones share it, and the state dict excludes it.
     """
 
     def __init__(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
@@ -20,12 +20,8 @@ from crptpro.objectives.functional import becl_loss, knn_distance, knn_distances
 from crptpro.transforms.base import Keys, read_entry, require_pairs
 from crptpro.values import as_int
 
-if TYPE_CHECKING:
-    from typing import Self
-
 #: Subtracted from each scaled distance of a particle (rll-research/url_benchmark).
 PARTICLE_CLIP = 1e-4
-
 #: A smaller scale means that all particles coincide; their distances are 0, and so is the reward.
 SMALLEST_SCALE = 1e-8
 
@@ -35,20 +31,18 @@ logger = logging.getLogger(__name__)
 class IntrinsicReward(Transform):
     r"""Computes an intrinsic reward from the features of next observations: :math:`r = r_\mathrm{ext} + c \hat r`.
 
-    Args:
-        networks: networks by attribute name, which the state dictionary excludes.
-        coef: :math:`c`; None leaves the reward alone.
-        in_keys: one key, features ``[*, D]`` of the next observation.
-        out_keys: one key for :math:`\hat r`, of the reward's shape.
-        reward_key: :math:`r_\mathrm{ext}`, ``[*, 1]``, which :math:`r` replaces.
+    ``in_keys`` is one key, features ``[*, D]`` of the next observation, ``out_keys`` one key for :math:`\hat r`, of the
+    reward's shape. :math:`r` replaces ``reward_key`` ``[*, 1]``, unless ``coef``, :math:`c`, is None. ``projector`` is
+    a network on the features (None if they are projected already), which the state dictionary excludes.
     """
 
-    beside_keys: tuple[NestedKey, ...] = ()
+    projector: nn.Module | None
+    extra_keys: tuple[NestedKey, ...] = ()
     """Further entries that ``intrinsic_reward`` takes."""
 
     def __init__(
         self,
-        networks: dict[str, nn.Module | None],
+        projector: nn.Module | None,
         *,
         coef: float | None = None,
         in_keys: Keys = ("next", "features"),
@@ -59,21 +53,24 @@ class IntrinsicReward(Transform):
         require_pairs(self)
         if len(self.in_keys) != 1:
             raise ValueError(f"{type(self).__name__} reads and writes one key each, got {self.in_keys}.")
-        self.__dict__.update(networks)
+        self.__dict__["projector"] = projector
         self.coef = coef
         self.reward_key = reward_key
 
-    def intrinsic_reward(self, features: Tensor, *beside: Tensor) -> Tensor:
+    def intrinsic_reward(self, features: Tensor, *extra: Tensor) -> Tensor:
         """Return the reward of each row ``[B, D]`` of the batch before the coefficient, float32 ``[B]``."""
         raise NotImplementedError
+
+    def _project(self, features: Tensor) -> Tensor:
+        return (features if self.projector is None else self.projector(features)).float()
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the intrinsic reward of a batch and add it to the reward; stored rewards stay as they are."""
         features = read_entry(self, tensordict, self.in_keys[0])
         rows = features.reshape(-1, features.shape[-1])
-        beside = [read_entry(self, tensordict, key).reshape(len(rows), -1) for key in self.beside_keys]
-        intrinsic = self.intrinsic_reward(rows, *beside)
+        extra = [read_entry(self, tensordict, key).reshape(len(rows), -1) for key in self.extra_keys]
+        intrinsic = self.intrinsic_reward(rows, *extra)
         if self.coef is None:
             return tensordict.set(self.out_keys[0], intrinsic.reshape(*features.shape[:-1], 1))
         reward = read_entry(self, tensordict, self.reward_key)
@@ -120,7 +117,6 @@ class PrototypeReward(IntrinsicReward):
         **keys: ``in_keys``, ``out_keys`` and ``reward_key`` of :class:`~crptpro.transforms.rewards.IntrinsicReward`.
     """
 
-    projector: nn.Module | None
     prototypes: nn.Module
     queue: Tensor
     queue_pointer: Tensor
@@ -147,18 +143,18 @@ class PrototypeReward(IntrinsicReward):
             raise ValueError(f"expected a queue of shape {(queue_size, latent_dim)}, got {tuple(start.shape)}.")
         if projector is not None:
             _check_latents(latent_dim_of(projector) or latent_dim, latent_dim)
-        super().__init__({"projector": projector, "prototypes": prototypes}, coef=coef, **keys)
+        super().__init__(projector, coef=coef, **keys)
+        self.__dict__["prototypes"] = prototypes
         self.knn_k = as_int(knn_k, "knn_k", minimum=1, maximum=queue_size)
         self.generator = generator
         self.register_buffer("queue", start.detach().to(weight.device, torch.float32, copy=True))
         self.register_buffer("queue_pointer", torch.tensor(0, device=weight.device))
 
     @torch.no_grad()
-    def intrinsic_reward(self, features: Tensor, *beside: Tensor) -> Tensor:
+    def intrinsic_reward(self, features: Tensor, *extra: Tensor) -> Tensor:
         r"""Put candidates into the queue and return the reward of each row before :math:`\beta`."""
-        latents = features if self.projector is None else self.projector(features)
+        latents = F.normalize(self._project(features), dim=-1)
         _check_latents(latents.shape[-1], self.queue.shape[-1])
-        latents = F.normalize(latents.float(), dim=-1)
         weight = self.prototypes.get_parameter("weight")
         candidates = draw_candidates(F.normalize(weight.float(), dim=-1) @ latents.T, self.generator)
         count = candidates.shape[0]
@@ -218,16 +214,14 @@ class ParticleReward(IntrinsicReward):
     Deviation: a batch smaller than k uses all its rows, and a single row gets 0; the published code fails. While all
     distances are 0 the reward is 0; there it is NaN.
 
-    ``projector`` is None if ``in_keys`` already names projections; ``options`` are those of
-    :class:`~crptpro.transforms.rewards.IntrinsicReward`.
+    ``options`` are those of :class:`~crptpro.transforms.rewards.IntrinsicReward`.
     """
 
-    projector: nn.Module | None
     distance_mean: Tensor
     distance_count: Tensor
 
     def __init__(self, projector: nn.Module | None, *, k: int = 12, **options: Any) -> None:
-        super().__init__({"projector": projector}, **options)
+        super().__init__(projector, **options)
         self.k = as_int(k, "k", minimum=2)
         where = None if projector is None else device_of(projector)
         # The published start: mean 0 with a weight of 1e-4 distances.
@@ -235,9 +229,9 @@ class ParticleReward(IntrinsicReward):
         self.register_buffer("distance_count", torch.full((), 1e-4, dtype=torch.float64, device=where))
 
     @torch.no_grad()
-    def intrinsic_reward(self, features: Tensor, *beside: Tensor) -> Tensor:
+    def intrinsic_reward(self, features: Tensor, *extra: Tensor) -> Tensor:
         """Update the running mean with this batch, and return the reward of each row before the coefficient."""
-        latents = (features if self.projector is None else self.projector(features)).float()
+        latents = self._project(features)
         count = latents.shape[0]
         if count < 2:
             return latents.new_zeros(count)
@@ -263,25 +257,23 @@ class ContrastiveReward(IntrinsicReward):
 
     Deviation: a batch of one gets 0; the published code fails.
 
-    ``head`` is None if ``in_keys`` already names embeddings, ``skill_key`` the one-hot skill ``[*, K]`` at the root;
-    ``options`` are those of :class:`~crptpro.transforms.rewards.IntrinsicReward`.
+    ``head`` gives the embeddings, ``skill_key`` is the one-hot skill ``[*, K]`` at the root; ``options`` are those of
+    :class:`~crptpro.transforms.rewards.IntrinsicReward`.
     """
-
-    head: nn.Module | None
 
     def __init__(
         self, head: nn.Module | None, *, temperature: float = 0.5, skill_key: NestedKey = "skill", **options: Any
     ) -> None:
         require_positive(temperature=temperature)
-        super().__init__({"head": head}, **options)
+        super().__init__(head, **options)
         self.temperature = float(temperature)
-        self.beside_keys = (skill_key,)
+        self.extra_keys = (skill_key,)
 
     @torch.no_grad()
-    def intrinsic_reward(self, features: Tensor, *beside: Tensor) -> Tensor:
+    def intrinsic_reward(self, features: Tensor, *extra: Tensor) -> Tensor:
         """Return the reward of rows ``[B, D]`` and one-hot skills ``[B, K]`` before the coefficient."""
-        embeddings = (features if self.head is None else self.head(features)).float()
+        embeddings = self._project(features)
         if len(embeddings) < 2:
             return embeddings.new_zeros(len(embeddings))
-        skills = beside[0].argmax(dim=-1)
+        skills = extra[0].argmax(dim=-1)
         return becl_loss(embeddings, skills, temperature=self.temperature, reduction="none").neg().exp()
