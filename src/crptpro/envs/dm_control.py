@@ -34,10 +34,7 @@ def make_dm_control(domain: Domain, *, quality: Quality, **settings: Any) -> DMC
 
 
 def load_dm_env(domain: Domain) -> dm_env.Environment:
-    """Load ``domain.task`` from dm_control, without the camera observations of composer tasks.
-
-    The seed of the model is constant, so that an episode depends only on the seed before its reset.
-    """
+    """Load ``domain.task`` from dm_control with a constant seed, without the camera observations of composer tasks."""
     from dm_control import manipulation, suite
 
     route_mujoco_warnings()
@@ -108,8 +105,7 @@ class AgentSteps(dm_env.Environment):
     is rebuilt only with the model (in composer environments at every reset), and gives the same pixels in 7 to 16 %
     less time for cheetah or walker (software GL; no gain on manipulation).
 
-    The settings are those of :func:`crptpro.envs.make_env`; ``world`` is the name in messages, ``shadow_size`` the side
-    of the shadow map in texels.
+    The settings are those of :func:`crptpro.envs.make_env`; ``shadow_size`` is the side of the shadow map in texels.
     """
 
     def __init__(

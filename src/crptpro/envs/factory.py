@@ -37,8 +37,8 @@ def make_env(
 ) -> EnvBase:
     """Build an unbatched CPU environment that renders once per agent step.
 
-    It is TorchRL's ``DMControlWrapper`` or ``GymWrapper``, or what your ``make`` returns, with ``CatFrames``, and
-    checked as :class:`~crptpro.envs.worlds.CheckedWorld` says.
+    It is TorchRL's ``DMControlWrapper`` or ``GymWrapper``, or what your ``make`` returns, with ``CatFrames`` and the
+    checks of :class:`~crptpro.envs.worlds.CheckedWorld`.
 
     Output keys: ``pixels`` uint8 ``[3 * frame_stack, H, W]``, oldest to newest (a reset repeats its first
     frame); ``action`` float32 ``[A]`` in [-1, 1]; ``("next", "reward")`` float32 ``[1]``, summed over the
@@ -62,10 +62,8 @@ def make_env(
             rewards. It does not affect your own environments.
 
     Raises:
-        UnknownNameError: the task is unknown.
-        RenderingError: no GL backend renders.
         ValueError: a number is invalid or out of range.
-        CRPTproError: the options or your own environment cannot be used.
+        CRPTproError: an unknown task, unusable options or environment, or no GL backend that renders.
     """
     domain = get_domain(task)
     seed = as_int(seed, "seed", minimum=0, maximum=MAX_SEED)
@@ -83,8 +81,8 @@ def make_env(
             raise CRPTproError(f"{name} must be {' or '.join(map(repr, allowed))}, got {value!r}.")
     if colors == "reversed_background" and not is_dm_control:
         raise CRPTproError(
-            f"The background of {domain.name!r} is not known: only dm_control's worlds can have it reversed. "
-            "colors='reversed_image' reverses the colours of whole images in any world."
+            f"The background of {domain.name!r} is not known: only dm_control's environments can have it reversed. "
+            "colors='reversed_image' reverses the colours of whole images in any environment."
         )
     card = {"task": domain.task, "backend": "none", "colors": colors, **settings}
     if needs_gl(domain):

@@ -70,8 +70,8 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
                 if "expected 5" not in str(reason):
                     raise
                 raise WorldError(
-                    f"The world {self._world!r} does not answer step() with Gymnasium's five values (observation, "
-                    f"reward, terminated, truncated, info): {reason}. Worlds of the old API end with `done, info`."
+                    f"step() of the environment {self._world!r} does not return Gymnasium's five values (observation, "
+                    f"reward, terminated, truncated, info): {reason}. The old API ends with `done, info`."
                 ) from reason
             total += float(reward)
             if terminated or truncated:
@@ -80,12 +80,12 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._observe(), total, bool(terminated), bool(truncated and not terminated), {}
 
     def _observe(self) -> dict[str, Any]:
-        size = self._image_size
-        frame = self._draw() if self._renders else torch.zeros(3, size, size, dtype=torch.uint8)
         state = {name: torch.tensor(getattr(self._data, name)) for name in self._state_names}
-        return {"pixels": frame, **state}
+        return {"pixels": self._draw(), **state}
 
     def _draw(self) -> Tensor:
+        if not self._renders:
+            return torch.zeros(3, self._image_size, self._image_size, dtype=torch.uint8)
         viewer = getattr(getattr(self.env.unwrapped, "mujoco_renderer", None), "viewer", None)
         with (
             passed_on(self._world, "render"),
@@ -152,10 +152,7 @@ def resize(frame: Tensor, size: int) -> Tensor:
 
 
 def _fix_free_camera(env: Any) -> None:
-    """Point Gymnasium's free camera at the model's default pose, not at the first rendered state.
-
-    That state differs after a resumption.
-    """
+    """Point the free camera at the model's default pose; the first rendered state differs after a resumption."""
     renderer = getattr(env.unwrapped, "mujoco_renderer", None)
     config = getattr(renderer, "default_cam_config", None) or {}
     if renderer is None or "lookat" in config:

@@ -96,10 +96,8 @@ def select_backend(timeout_s: float | None = None, *, processes: int = 1) -> str
     order. The test is a frame with content from each of ``processes`` simultaneous processes (parallel collection needs
     several) within ``timeout_s``, by default 60 or ``CRPTPRO_GL_TIMEOUT_S``. It counts for this process and its
     children, on this machine and for one ``MUJOCO_EGL_DEVICE_ID``. With software GL, ``LP_NUM_THREADS=1`` is set unless
-    the user has set it: more threads cost a third more CPU time per frame and save hardly any time.
-
-    Raises:
-        RenderingError: naming, for every backend tried, the cause and the remedy.
+    the user has set it: more threads cost a third more CPU time per frame and save hardly any time. If no backend
+    renders, a ``RenderingError`` names cause and remedy for each.
     """
     timeout_s = default_timeout_s() if timeout_s is None else timeout_s
     proof, requested, imported = _proof(), _requested_backend(), _imported_backend()
@@ -245,11 +243,7 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 def _prove(backend: str, *, timeout_s: float, processes: int) -> dict[str, Any]:
-    """Render in ``processes`` simultaneous processes, and return the answer of the probe.
-
-    Raises:
-        RenderingError: with cause and remedy.
-    """
+    """Render in ``processes`` simultaneous processes, and return the answer of the last probe."""
     gl: dict[str, Any] = {}
     for status, stdout, stderr in run_isolated([PROBE_COMMAND] * processes, backend, timeout_s=timeout_s):
         if status is None:

@@ -47,7 +47,6 @@ class CheckedWorld:
     _agent_step = 0
     _first_frame: Tensor | None = None
     _is_still = False
-    _has_warned = False
     _was_closed = False
 
     def watch(self, card: dict[str, Any], *, agent_step_limit: int | None = None, checks_frames: bool = True) -> None:
@@ -89,19 +88,19 @@ class CheckedWorld:
             value = td.get(key, None)
             if value is not None and not value.isfinite().all():
                 raise NonFiniteError(
-                    f"The world {self.world!r} {verb} {key} {value.tolist()} in agent step {self._agent_step} of "
+                    f"The environment {self.world!r} {verb} {key} {value.tolist()} in agent step {self._agent_step} of "
                     f"episode {self._episode} (this environment's first is 0). Nothing of this step is stored; fix "
-                    "what computes it, or keep the actions where the world is stable."
+                    "what computes it, or keep the actions where the environment is stable."
                 )
 
     def _report_still_frames(self) -> None:
-        if not self._is_still or self._has_warned or self._agent_step < 2:
+        if not self._is_still or self._agent_step < 2:
             return
-        self._has_warned, self._is_still = True, False
+        self.checks_frames = self._is_still = False
         shade = cast(Tensor, self._first_frame).unique()
         what = f" ({'black' if not shade.any() else 'of one shade'})" if shade.numel() == 1 else ""
         logger.warning(
-            "All frames of a whole episode of the world %r are alike%s: %d agent steps, nothing moved. Look at what it "
+            "All frames of a whole episode of the environment %r are identical%s, over %d agent steps. Look at what it "
             "renders before you train on it.",
             self.world, what, self._agent_step,
         )  # fmt: skip
@@ -138,7 +137,7 @@ def passed_on(world: str, call: str) -> Iterator[None]:
             origin = origin.__cause__
         where = traceback.extract_tb(origin.__traceback__)[-1]
         raise WorldFailedError(
-            f"{reason} ({type(reason).__name__} in {call}() of the world {world!r}, {where.filename}, line "
+            f"{reason} ({type(reason).__name__} in {call}() of the environment {world!r}, {where.filename}, line "
             f"{where.lineno})"
         ) from reason
 
@@ -151,11 +150,7 @@ class FrameReader:
         self._has_scaled = False
 
     def __call__(self, image: Any) -> Tensor:
-        """Return the frame of an image ``[H, W, 3]`` or ``[3, H, W]`` (array or tensor).
-
-        Raises:
-            WorldError: for other shapes, other dtypes, and floats outside [0, 1] or NaN.
-        """
+        """Return the frame of an array or tensor ``[H, W, 3]`` or ``[3, H, W]``; others are a ``WorldError``."""
         if not isinstance(image, (np.ndarray, Tensor)):
             raise self._refusal(f"is {type(image).__name__}", "an RGB array [H, W, 3]")
         if image.ndim != 3 or 3 not in (image.shape[0], image.shape[2]):
@@ -174,11 +169,11 @@ class FrameReader:
             raise self._refusal(f"holds {dtype} from {low:g} to {high:g}", "uint8, or floats in [0, 1]")
         if not self._has_scaled:
             self._has_scaled = True
-            logger.warning("The world %r shows %s in [0, 1]; its frames are multiplied by 255.", self.world, dtype)
+            logger.warning("Frames of the environment %r are %s in [0, 1], multiplied by 255.", self.world, dtype)
         return (pixels * 255).round().to(torch.uint8).contiguous()
 
     def _refusal(self, what: str, expected: str) -> WorldError:
-        return WorldError(f"The image that the world {self.world!r} renders {what}; it must be {expected}.")
+        return WorldError(f"The image that the environment {self.world!r} renders {what}; it must be {expected}.")
 
 
 class ActionRange:
@@ -205,7 +200,7 @@ class ActionRange:
         elif not (self._half > 0).all():
             wrong = f"has action bounds that hold nothing: {bounds}"
         if wrong:
-            raise CRPTproError(f"The world {world!r} {wrong}.")
+            raise CRPTproError(f"The environment {world!r} {wrong}.")
 
     def __call__(self, action: np.ndarray) -> np.ndarray:
         """Map ``action``, float ``[A]`` in [-1, 1]."""
