@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.envs.libs.dm_control import DMControlWrapper
 
 from crptpro.domains import Domain
-from crptpro.envs.rendering import first_frame_watchdog, own_context
+from crptpro.envs.rendering import first_frame_watchdog, render_context
 from crptpro.envs.worlds import ActionRange, CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.values import Quality
@@ -28,7 +28,7 @@ FAST_SHADOW_SIZE = {"suite": 512, "manipulation": 1024}
 def make_dm_control(domain: Domain, *, quality: Quality, **settings: Any) -> DMControlPixelEnv:
     """Build an environment of the suite or of manipulation; the settings are those of :class:`AgentSteps`."""
     shadow_size = FAST_SHADOW_SIZE[domain.source] if quality == "fast" else None
-    with first_frame_watchdog(), own_context(None):  # composer renders once when it is built
+    with first_frame_watchdog(), render_context(None):  # composer renders once when it is built
         env = load_dm_env(domain)
     return DMControlPixelEnv(AgentSteps(env, world=domain.task, shadow_size=shadow_size, **settings))
 
@@ -148,7 +148,7 @@ class AgentSteps(dm_env.Environment):
     def reset(self) -> dm_env.TimeStep:
         """Start an episode."""
         is_same = self._camera is not None and self.physics.model is self._model
-        with own_context(self._make_current if is_same else None):  # quadruped_escape uploads its terrain
+        with render_context(self._make_current if is_same else None):  # quadruped_escape uploads its terrain
             self.env.reset()
         return dm_env.restart(self._observe())
 
@@ -177,7 +177,7 @@ class AgentSteps(dm_env.Environment):
         with passed_on(self._world, "render"), first_frame_watchdog() if is_first else nullcontext():
             if is_first:
                 self._prepare()  # a composer environment has compiled a new model
-            with own_context(self._make_current):
+            with render_context(self._make_current):
                 if is_first:
                     self._build_camera()
                 return self._read_frame(self._camera.render())

@@ -15,7 +15,7 @@ from torchrl.envs.libs.gym import GymWrapper
 
 from crptpro.domains import GYMNASIUM_PREFIX
 from crptpro.envs.dm_control import FAST_SHADOW_SIZE, route_mujoco_warnings
-from crptpro.envs.rendering import first_frame_watchdog, own_context
+from crptpro.envs.rendering import first_frame_watchdog, render_context
 from crptpro.envs.worlds import ActionRange, CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError, RenderingError, WorldError
 from crptpro.values import Quality
@@ -90,7 +90,7 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
         with (
             passed_on(self._world, "render"),
             nullcontext() if self._has_drawn else first_frame_watchdog(),
-            own_context(getattr(viewer, "make_context_current", None)),
+            render_context(getattr(viewer, "make_context_current", None)),
         ):
             try:
                 image = self.env.render()

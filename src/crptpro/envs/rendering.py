@@ -164,7 +164,7 @@ def first_frame_watchdog(timeout_s: float | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def own_context(make_current: Callable[[], Any] | None) -> Iterator[None]:
+def render_context(make_current: Callable[[], Any] | None) -> Iterator[None]:
     """Make a render context current in the body and none after it, because the contexts of a thread interfere.
 
     Freeing an environment frees its textures in whichever context is current, and then detaches that from the thread:
@@ -249,7 +249,7 @@ def _prove(backend: str, *, timeout_s: float, processes: int) -> dict[str, Any]:
         if status is None:
             limit = f"within {timeout_s:g} s ({processes} at the same time)"
             raise RenderingError(f"{backend}: the first frame did not arrive {limit}. {HANG}")
-        answer = re.search(r"^\{.*\}$", stdout, re.MULTILINE)
+        answer = re.search(r'^\{"gl_.*\}$', stdout, re.MULTILINE)
         gl = json.loads(answer[0]) if answer else {}
         if status < 0:
             reason = f"the GL driver crashed the process ({signal.Signals(-status).name})"

@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from crptpro.errors import CRPTproError
 
 Precision = Literal["auto", "fp32", "bf16"]
-
 CPUINFO = Path("/proc/cpuinfo")
 
 _Module = TypeVar("_Module", bound=nn.Module)
