@@ -125,7 +125,8 @@ class AgentSteps(dm_env.Environment):
         self._world, self._action_repeat = world, action_repeat
         self._image_size, self._camera_id, self._renders = image_size, camera, render
         self._shadow_size, self._reverses_background = shadow_size, reverses_background
-        self._read_frame, self._image_shape = FrameReader(world), (3, image_size, image_size)
+        self._image_shape = (3, image_size, image_size)
+        self._read_frame = FrameReader(world)
         self._camera: Any = None
         self._model: Any = None
         self._prepared: Any = None
@@ -192,7 +193,8 @@ class AgentSteps(dm_env.Environment):
         model = self.physics.model
         if model.ptr is self._prepared:
             return
-        self._prepared, visual = model.ptr, model.vis
+        self._prepared = model.ptr
+        visual = model.vis
         if self._shadow_size is not None:
             visual.quality.shadowsize = min(self._shadow_size, visual.quality.shadowsize)
         visual.global_.offwidth = max(self._image_size, visual.global_.offwidth)

@@ -169,7 +169,8 @@ class FrameTransform(Transform):
 
     def __init__(self, world: str, image_size: int):
         super().__init__(in_keys=["pixels"], out_keys=["pixels"])
-        self._read_frame, self._shape = FrameReader(world), (3, image_size, image_size)
+        self._read_frame = FrameReader(world)
+        self._shape = (3, image_size, image_size)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Set uint8 and channels first."""
@@ -253,9 +254,10 @@ def _broken_contract(env: Any, image_size: int) -> str:
     shown = env.observation_spec
     if "pixels" not in set(shown.keys()):
         return f"emits {sorted(map(str, shown.keys()))}, but no 'pixels'"
-    pixels, shapes = shown["pixels"], ((3, image_size, image_size), (image_size, image_size, 3))
-    if tuple(pixels.shape) not in shapes:
-        return f"emits pixels of shape {tuple(pixels.shape)}; expected one RGB image, {shapes[0]} or {shapes[1]}"
+    shape = tuple(shown["pixels"].shape)
+    allowed = ((3, image_size, image_size), (image_size, image_size, 3))
+    if shape not in allowed:
+        return f"emits pixels of shape {shape}; expected one RGB image, {allowed[0]} or {allowed[1]}"
     action = env.action_spec
     low: Any = getattr(action.space, "low", None)
     high: Any = getattr(action.space, "high", None)

@@ -32,7 +32,8 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         self.episode_seed: int | None = None
         self._world, self._image_size, self._action_repeat = world, image_size, action_repeat
-        self._renders, self._read_frame, self._has_drawn = render, FrameReader(world), False
+        self._renders, self._has_drawn = render, False
+        self._read_frame = FrameReader(world)
         action = env.action_space
         if not isinstance(action, spaces.Box):
             raise CRPTproError(

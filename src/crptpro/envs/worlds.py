@@ -66,7 +66,8 @@ class CheckedWorld:
         with passed_on(self.world, "reset"):
             found: TensorDictBase = super()._reset(tensordict, **kwargs)  # type: ignore[misc]
         self._require_finite(found, "answered with", "qpos", "qvel")
-        self._first_frame, self._is_still = found.get("pixels"), self.checks_frames
+        self._first_frame = found.get("pixels")
+        self._is_still = self.checks_frames
         return found
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -186,8 +187,8 @@ class ActionRange:
         low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         no_low, no_high = ~(np.abs(low) < NO_BOUND), ~(np.abs(high) < NO_BOUND)
         self.unbounded = bool(no_low.any())
-        self._low, high_ = np.where(no_low, -1.0, low), np.where(no_high, 1.0, high)
-        self._half = (high_ - self._low) / 2.0
+        self._low = np.where(no_low, -1.0, low)
+        self._half = (np.where(no_high, 1.0, high) - self._low) / 2.0
         self._dtype = dtype
         bounds = f"low {low.tolist()}, high {high.tolist()}"
         wrong = ""

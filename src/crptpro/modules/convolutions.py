@@ -11,14 +11,12 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-T = TypeVar("T")
-R = TypeVar("R")
 ChunkFunction = Callable[[Tensor, Sequence[Tensor]], Tensor]
 
 START_TIMEOUT_S = 60.0
@@ -69,11 +67,11 @@ class _Chunks(torch.autograd.Function):
         return (None, None, *[next(sums) if need else None for need in ctx.needs])
 
 
-def _map(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
+def _map(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
     threads = min(torch.get_num_threads(), len(items))
     is_recording = torch.is_grad_enabled()
 
-    def in_mode(item: T) -> R:
+    def in_mode(item: Any) -> Any:
         with torch.set_grad_enabled(is_recording):
             return work(item)
 

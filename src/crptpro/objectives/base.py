@@ -81,8 +81,7 @@ class PretrainingLoss(NetworkLoss):
     projector_params: Any
     target_projector_params: Any
 
-    method_name: str | None = None
-    """Method of the table that built this loss, if any."""
+    method_name: str | None = None  #: method of the table that built this loss, if any
 
     @property
     def views(self) -> dict[NestedKey, NestedKey]:

@@ -70,8 +70,7 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
     default_keys = _AcceptedKeys
     tensor_keys: Any
-    view_names: ClassVar[tuple[str, ...]] = ("observation",)
-    """Configurable keys of the views of an observation; the actor learns from the first."""
+    view_names: ClassVar[tuple[str, ...]] = ("observation",)  # configurable keys; the actor learns from the first
 
     default_out_keys = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy", *REGRESSION_KEYS)
 
@@ -137,13 +136,13 @@ class RADSACLoss(NetworkLoss, SACLoss):
         # Detached weights: the gradient passes through Q to the action and to nothing else.
         with self._cached_detached_qvalue_params.to_module(self.qvalue_network, preserve_module_state=False):
             value = self._q_values_on_features(features, action).amin(-1)
-        loss_actor, log_prob = (self._alpha * log_prob - value).mean(), log_prob.detach()
+        entropy = -log_prob.detach()
         out = {
-            "loss_actor": loss_actor,
+            "loss_actor": (self._alpha * log_prob - value).mean(),
             # SACLoss uses log_alpha in place of alpha.
-            "loss_alpha": (self.log_alpha.exp() * (-log_prob - self.target_entropy)).mean(),
+            "loss_alpha": (self.log_alpha.exp() * (entropy - self.target_entropy)).mean(),
             "alpha": self._alpha,
-            "entropy": -log_prob.mean(),
+            "entropy": entropy.mean(),
         }
         return TensorDict(out, batch_size=[])
 

@@ -23,8 +23,7 @@ class FrozenEncoder(PixelTransform):
         >>> from crptpro.modules import PixelEncoder
         >>> from tensordict import TensorDict
         >>> encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=16)
-        >>> pixels = torch.zeros(2, 3, 16, 16, dtype=torch.uint8)
-        >>> FrozenEncoder(encoder)(TensorDict(pixels=pixels))["features"].shape
+        >>> FrozenEncoder(encoder)(TensorDict(pixels=torch.zeros(2, 3, 16, 16, dtype=torch.uint8)))["features"].shape
         torch.Size([2, 100])
     """
 

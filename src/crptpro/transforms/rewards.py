@@ -37,8 +37,7 @@ class IntrinsicReward(Transform):
     """
 
     projector: nn.Module | None
-    extra_keys: tuple[NestedKey, ...] = ()
-    """Further entries that ``intrinsic_reward`` takes."""
+    extra_keys: tuple[NestedKey, ...] = ()  # further entries that ``intrinsic_reward`` takes
 
     def __init__(
         self,
