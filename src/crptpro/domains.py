@@ -1,8 +1,9 @@
-"""What a domain and a task are: the paper's domains and groups A-D, the rest of dm_control, and your own."""
+"""Domains and tasks: the paper's domains and groups A-D, the rest of dm_control, Gymnasium, and your own."""
 
 from __future__ import annotations
 
 import difflib
+import functools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, TypeVar
@@ -16,61 +17,50 @@ if TYPE_CHECKING:
 GYMNASIUM_PREFIX = "gymnasium:"
 
 LONGEST_EPISODE_AGENT_STEPS = 1000
-"""Where an episode is truncated whose world sets no limit of its own (LQR): one of 100,000 transitions would not fit in
-memory, and an evaluation would never end."""
+"""Time limit of an episode in an environment without one (LQR), whose evaluation would never end."""
 
 
 @dataclass(frozen=True)
 class Domain:
-    """A world that looks and moves in one way, and the task from which its frames are collected.
+    """An environment's appearance and dynamics, and the task for collecting its frames.
 
     The paper pre-trains on domains and evaluates on tasks; tasks of one domain share their pixels.
 
-    Args:
-        name: of the domain, and of its dataset directory.
-        task: used for collection, a name that :func:`crptpro.envs.make_env` understands.
-        action_repeat: default number of env steps per agent step.
-        camera: index or name of the camera that is rendered by default; ``None`` leaves it to the environment.
-        make: for a world of your own: builds an unbatched TorchRL environment on the CPU. It is given, by keyword,
-            those of ``seed``, ``image_size``, ``action_repeat``, ``camera``, ``quality`` and ``physics_state`` that its
-            signature names. ``pixels`` is one RGB image ``[H, W, 3]`` or ``[3, H, W]`` with ``H = W = image_size``,
-            uint8 or floats in [0, 1]; ``action`` is a float vector in [-1, 1]; the reward has shape ``[1]``. Without
-            ``truncated`` in its ``done_spec``, episodes end by termination alone. If it does not name
-            ``action_repeat``, an agent step is one env step. With ``physics_state`` it may also emit ``qpos`` and
-            ``qvel``; what its own transforms read back (``step_count``) stays, other entries are dropped. Its
-            ``set_seed`` must make the next ``reset`` reproducible. Worker processes can build it if it is a function at
-            a module's top level or a ``functools.partial`` of one.
-        episode_env_steps: env steps of a full episode; if ``None``, unknown or unlimited, an episode is truncated after
-            1000 agent steps.
-        source: library that ``task`` is loaded with; ``"own"`` goes with ``make``.
+    ``make`` builds your own environment, an unbatched TorchRL one on the CPU. It gets, by keyword, those of ``seed``,
+    ``image_size``, ``action_repeat`` (otherwise an agent step is one env step), ``camera``, ``quality`` and
+    ``physics_state`` that its signature names. ``pixels`` is one RGB image ``[H, W, 3]`` or ``[3, H, W]`` with
+    ``H = W = image_size``, uint8 or floats in [0, 1]; ``action`` is a float vector in [-1, 1]; the reward has shape
+    ``[1]``. Without ``truncated`` in its ``done_spec``, episodes end by termination alone. With ``physics_state`` it
+    may emit ``qpos`` and ``qvel``; entries that its transforms read back (``step_count``) stay, others are dropped. Its
+    ``set_seed`` must make the next ``reset`` reproducible. For worker processes ``make`` must be a function at a
+    module's top level or a ``functools.partial`` of one.
     """
 
-    name: str
-    task: str
-    action_repeat: int = 2
-    camera: int | str | None = 0
+    name: str  #: of the domain, and of its dataset directory
+    task: str  #: used for collection, a name for :func:`crptpro.envs.make_env`
+    action_repeat: int = 2  #: default number of env steps per agent step
+    camera: int | str | None = 0  #: index or name of the default camera; ``None`` leaves it to the environment
     make: Callable[..., EnvBase] | None = None
-    episode_env_steps: int | None = None
-    source: Literal["suite", "manipulation", "gymnasium", "own"] = "own"
+    episode_env_steps: int | None = None  #: of a full episode; if ``None``, the time limit is 1000 agent steps
+    source: Literal["suite", "manipulation", "gymnasium", "own"] = (
+        "own"  #: library of ``task``; ``"own"`` with ``make``
+    )
 
     def __post_init__(self) -> None:
         for name in ("action_repeat", "episode_env_steps"):
-            value = getattr(self, name)
-            if value is not None:
+            if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, as_int(value, name, minimum=1))
 
 
-def _suite(name: str, task: str, camera: int = 0) -> Domain:
-    return Domain(name, task, camera=camera, episode_env_steps=1000, source="suite")
-
+_suite = functools.partial(Domain, episode_env_steps=1000, source="suite")
 
 PAPER_DOMAINS: dict[str, Domain] = {
     domain.name: domain
     for domain in (
         _suite("cheetah", "cheetah_run"),
         _suite("walker", "walker_run"),
-        # Camera 2 follows the torso from the side, as in the released code. The floor's size depends on the
-        # task (run 100 m, walk 10 m), so the domain is collected from the task that is evaluated.
+        # Camera 2 follows the torso from the side, as in the released code. The floor's size depends on the task (run
+        # 100 m, walk 10 m), so data is collected from the evaluated task.
         _suite("quadruped", "quadruped_run", camera=2),
         _suite("cartpole", "cartpole_swingup_sparse"),
         _suite("pendulum", "pendulum_swingup"),
@@ -91,8 +81,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 #: The paper's eight tasks, each with its domain.
 TASKS: dict[str, str] = {domain.task: domain.name for domain in PAPER_DOMAINS.values()}
 
-#: Every task of dm_control's suite as ``domain_task``, by domain. Written out so that a name can be looked up
-#: without importing dm_control, which would fix the render backend.
+#: Every task of dm_control's suite as ``domain_task``, by domain: importing dm_control would fix the render backend.
 SUITE_TASKS: dict[str, tuple[str, ...]] = {
     domain: tuple(f"{domain}_{task}" for task in tasks.split())
     for domain, tasks in {
@@ -131,8 +120,7 @@ Named = TypeVar("Named", str, str | Domain)
 def _built_in() -> dict[str, Domain]:
     found: dict[str, Domain] = {}
     for name, tasks in SUITE_TASKS.items():
-        # Every task of the suite is limited to 1000 control steps, except LQR's, which have no time limit.
-        limit = None if name == "lqr" else 1000
+        limit = None if name == "lqr" else 1000  # LQR alone has no time limit
         domain = PAPER_DOMAINS.get(name) or Domain(name, tasks[0], episode_env_steps=limit, source="suite")
         found[name] = domain
         found |= {task: replace(domain, task=task) for task in tasks}
@@ -145,16 +133,12 @@ _registered: dict[str, Domain] = {}
 
 
 def register_domain(domain: Domain) -> Domain:
-    """Register a domain under its name and its task's name, in this process; returns it.
+    """Register a domain under its name and its task's name, in this process, and return it.
 
-    Further tasks of a domain are registered under its name with their own ``task``: all stay known, and the domain's
-    name stands for the one registered last.
-
-    A worker process starts without registered domains. Pass the ``Domain`` itself where a name is accepted, or call
-    ``register_domain`` at the top level of the module that defines ``make``, which unpickling imports.
-
-    Raises:
-        CRPTproError: the domain has no ``make``, or its name belongs to the paper's domains or tasks.
+    Several tasks may share the name of a domain, which then means the one registered last. A worker process starts
+    without registered domains: pass the ``Domain`` itself, or call ``register_domain`` at the top level of the module
+    that defines ``make``, which unpickling imports. A domain without ``make``, or with a name of the paper's, is a
+    ``CRPTproError``.
     """
     if domain.make is None and domain.source == "own":
         raise CRPTproError(f"Domain {domain.name!r} has no make; pass make=<function that builds the environment>.")
@@ -167,19 +151,14 @@ def register_domain(domain: Domain) -> Domain:
 
 
 def get_domain(name: str | Domain) -> Domain:
-    """Return the domain behind a domain name, a task name, ``gymnasium:<id>`` or a registered name.
+    """Return the domain of a domain or task name, built in or registered, or of ``gymnasium:<id>``.
 
-    A task's name gives its domain with that task in ``Domain.task``; a ``Domain`` is returned as it is.
-    dm_control is not imported, so that the render backend can still be chosen.
-
-    Raises:
-        UnknownNameError: with the nearest known names.
+    A task name gives its domain with that task; a ``Domain`` is returned as it is. An unknown name is an
+    ``UnknownNameError`` with the nearest known ones.
 
     Examples:
         >>> get_domain("cheetah").task
         'cheetah_run'
-        >>> get_domain("quadruped_walk").camera
-        2
         >>> get_domain("manip_reach_duplo").name
         'manipulation'
     """
@@ -192,22 +171,19 @@ def get_domain(name: str | Domain) -> Domain:
     bare = name.removeprefix("manipulation_").removeprefix("manip_").removesuffix("_vision")
     if bare in MANIPULATION_TASKS:
         return _BUILT_IN[bare]
-    near = difflib.get_close_matches(name.lower().replace("-", "_"), known_names(), n=5, cutoff=0.5)
+    known = sorted({*_BUILT_IN, *_registered})
+    near = difflib.get_close_matches(name.lower().replace("-", "_"), known, n=5, cutoff=0.5)
     hint = f"Nearest: {', '.join(near)}." if near else f"Domains: {', '.join(PAPER_DOMAINS)}."
     raise UnknownNameError(
         f"There is no domain or task {name!r}. {hint} Gymnasium environments are written gymnasium:<id>; "
-        "your own are made known with register_domain."
+        "register_domain adds your own."
     )
 
 
 def expand_groups(names: Iterable[Named]) -> list[Named]:
     """Replace group letters by their domains, keeping order and dropping repeats.
 
-    Args:
-        names: of domains, tasks or groups; a :class:`Domain` stands for itself.
-
-    Raises:
-        UnknownNameError: if no name is given, or one that nobody knows.
+    No name, or an unknown one, is an ``UnknownNameError``; a :class:`Domain` stays.
 
     Examples:
         >>> expand_groups(["D", "walker", "finger"])
@@ -221,11 +197,6 @@ def expand_groups(names: Iterable[Named]) -> list[Named]:
     for name in expanded:
         get_domain(name)
     return list(dict.fromkeys(expanded))
-
-
-def known_names() -> list[str]:
-    """Return every name :func:`get_domain` accepts, ``gymnasium:<id>`` and prefixed aliases excepted."""
-    return sorted({*_BUILT_IN, *_registered})
 
 
 def _gymnasium_domain(name: str) -> Domain:

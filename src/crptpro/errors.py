@@ -11,7 +11,7 @@ class CRPTproError(RuntimeError):
 
 
 class UnknownNameError(CRPTproError):
-    """A domain, task, group or method that is not registered; the message lists the nearest names."""
+    """An unknown domain, task, group or method; the message lists the nearest names."""
 
 
 class RenderingError(CRPTproError):
@@ -19,13 +19,13 @@ class RenderingError(CRPTproError):
 
 
 class WorldError(CRPTproError):
-    """A world returned an image or a step that cannot be used; the message names it."""
+    """An environment returned an unusable image or step; the message names it."""
 
 
 class WorldFailedError(RuntimeError):
-    """A world's own code raised an exception; the message adds the world's name and the call.
+    """The code of an environment raised an exception; the message adds the environment's name and the call.
 
-    It is a defect of the world, not a wrong setting, and keeps its traceback on the command line.
+    It is a defect of the environment, not a wrong setting, and keeps its traceback on the command line.
     """
 
 
@@ -38,7 +38,7 @@ class DatasetError(CRPTproError):
 
 
 class DiskSpaceError(CRPTproError):
-    """The disk is full, or cannot hold what is about to be written."""
+    """The disk is full, or too small for the next file."""
 
 
 class CheckpointError(CRPTproError):
@@ -50,11 +50,11 @@ class PretrainedError(CRPTproError):
 
 
 class RecordError(CRPTproError):
-    """The record of a run is missing, damaged, or lacks what is asked of it."""
+    """The record of a run is missing, damaged, or lacks a requested entry."""
 
 
 class NonFiniteError(CRPTproError):
-    """A loss, a gradient, a weight, or a value returned by a world became NaN or infinite."""
+    """A loss, a gradient, a weight, or a value from an environment became NaN or infinite."""
 
 
 class SubmissionError(CRPTproError):
@@ -66,17 +66,14 @@ class CompileError(CRPTproError):
 
 
 def is_disk_full(reason: BaseException) -> bool:
-    """Whether a write failed because the disk, or the quota of it, is full."""
+    """Return whether a write failed because the disk, or its quota, is full."""
     if isinstance(reason, OSError):
         return reason.errno in (errno.ENOSPC, errno.EDQUOT)
     return isinstance(reason, DiskSpaceError)
 
 
 def writing_error(path: Path, reason: OSError | DiskSpaceError) -> OSError | DiskSpaceError:
-    """Return the error to raise when ``path`` could not be written, which names the path.
-
-    The system names a file that it cannot open, but not one that is open.
-    """
+    """Return the error to raise after a failed write, with the path, which the system omits for open files."""
     if is_disk_full(reason):
         return DiskSpaceError(f"The disk is full: {path} cannot be written. Free space and start again.")
     if isinstance(reason, OSError) and reason.errno is not None and reason.filename is None:

@@ -180,9 +180,12 @@ def test_an_exception_of_a_worlds_own_is_passed_on_with_its_name_and_the_call() 
     assert isinstance(caught.value.__cause__, ValueError)
     for part in ("the motor is on fire", "ValueError in render()", task, __file__):
         assert part in str(caught.value)
-    with painter(reward=explode) as task, pytest.raises(WorldFailedError, match=r"ValueError in step\(\) of the world"):
+    with (
+        painter(reward=explode) as task,
+        pytest.raises(WorldFailedError, match=r"ValueError in step\(\) of the environment"),
+    ):
         make_env(task, seed=0, image_size=SIZE).rollout(3)
-    with pytest.raises(WorldFailedError, match=r"on fire .*ValueError in step\(\) of the world 'mine_go'"):
+    with pytest.raises(WorldFailedError, match=r"on fire .*ValueError in step\(\) of the environment 'mine_go'"):
         make_env(own(lambda: OwnWorld(reward=explode)), seed=0, image_size=SIZE).rollout(3)
 
 
@@ -201,7 +204,9 @@ def test_an_exception_of_a_worlds_own_is_never_taken_for_a_setting() -> None:
     def make(quality: str) -> EnvBase:
         raise ValueError("no such quality")
 
-    with pytest.raises(WorldFailedError, match=r"no such quality \(ValueError in make\(\) of the world 'mine_go'"):
+    with pytest.raises(
+        WorldFailedError, match=r"no such quality \(ValueError in make\(\) of the environment 'mine_go'"
+    ):
         make_env(own(make), seed=0)
 
 

@@ -157,7 +157,6 @@ def test_a_method_of_ones_own_is_found_by_name_and_class() -> None:
     assert "own" in method_names()
     assert not row.is_builtin
     assert type(row.updates) is int
-    assert row.describe()["loss_class"].endswith("OwnLoss")
     assert method_of(get_method("own").build(small_encoder())) is row
 
     class Derived(OwnLoss):

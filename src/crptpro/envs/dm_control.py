@@ -1,4 +1,4 @@
-"""dm_control worlds as TorchRL environments: ``DMControlWrapper`` over one step per decision and one kept camera."""
+"""dm_control environments: TorchRL's ``DMControlWrapper`` around one step per agent step and one persistent camera."""
 
 from __future__ import annotations
 
@@ -13,51 +13,46 @@ from dm_env import specs
 from torch import Tensor
 from torchrl.envs.libs.dm_control import DMControlWrapper
 
-from crptpro.domains import SUITE_TASKS, Domain
-from crptpro.envs.rendering import first_frame_watchdog, own_context
+from crptpro.domains import Domain
+from crptpro.envs.rendering import first_frame_watchdog, render_context
 from crptpro.envs.worlds import ActionRange, CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.values import Quality
 
 logger = logging.getLogger(__name__)
 
-#: Side of the shadow map, texels, with ``quality="fast"``; the models' own are 2048 (suite) and 4096 (manipulation).
+#: Side of the shadow map in texels for ``quality="fast"``; the models have 2048 (suite) and 4096 (manipulation).
 FAST_SHADOW_SIZE = {"suite": 512, "manipulation": 1024}
 
 
 def make_dm_control(domain: Domain, *, quality: Quality, **settings: Any) -> DMControlPixelEnv:
-    """Build a world of the suite or of manipulation; the settings are those of :class:`AgentSteps`."""
+    """Build an environment of the suite or of manipulation; the settings are those of :class:`AgentSteps`."""
     shadow_size = FAST_SHADOW_SIZE[domain.source] if quality == "fast" else None
-    with first_frame_watchdog(), own_context(None):  # composer renders once when it is built
+    with first_frame_watchdog(), render_context(None):  # composer renders once when it is built
         env = load_dm_env(domain)
     return DMControlPixelEnv(AgentSteps(env, world=domain.task, shadow_size=shadow_size, **settings))
 
 
 def load_dm_env(domain: Domain) -> dm_env.Environment:
-    """Load ``domain.task`` from dm_control, without the camera observations of composer tasks.
-
-    The model does not depend on a seed, so that an episode depends only on the seed given before its reset.
-    """
+    """Load ``domain.task`` from dm_control with a constant seed, without the camera observations of composer tasks."""
     from dm_control import manipulation, suite
 
     route_mujoco_warnings()
     if domain.source == "manipulation":
         env = manipulation.load(f"{domain.task}_vision", seed=0)
-        # The built-in camera renders at every env step, twice per agent step.
+        # The built-in camera would render at every env step.
         for observable in env.task.observables.values():
             observable.enabled = False
         return env
-    world = next((world for world, tasks in SUITE_TASKS.items() if domain.task in tasks), None)
-    if world is None:
+    # In the suite, lqr_2_1 is the task lqr_2_1 of the domain lqr.
+    tasks = {f"{world}_{task.removeprefix(f'{world}_')}": (world, task) for world, task in suite.ALL_TASKS}
+    if domain.task not in tasks:
         raise UnknownNameError(f"Domain {domain.name!r} has the task {domain.task!r}, which the suite lacks.")
-    name = domain.task.removeprefix(f"{world}_")
-    if (world, name) not in suite.ALL_TASKS:
-        name = domain.task  # lqr_2_1 is a task of the domain lqr under its full name
-    return suite.load(world, name, task_kwargs={"random": 0})
+    return suite.load(*tasks[domain.task], task_kwargs={"random": 0})
 
 
 def route_mujoco_warnings() -> None:
-    """Log MuJoCo's warnings, deprecations at debug level; call it after importing dm_control, which sends them to absl.
+    """Log MuJoCo's warnings, deprecations at debug level; call it after importing dm_control, which uses absl.
 
     Without a handler MuJoCo prints them and appends to ``MUJOCO_LOG.TXT`` in the working directory.
     """
@@ -71,16 +66,11 @@ def route_mujoco_warnings() -> None:
 
 
 def reverse_background(model: Any) -> None:
-    """Reverse the order of the red, green and blue values of the background of a ``mujoco.MjModel``, in place.
+    """Reverse the RGB values of the background of a ``mujoco.MjModel`` in place, before its render context is made.
 
-    The paper reverses the RGB values of the background without saying what that is. Here it is the skybox, and the
-    planes and height fields that are fixed to the world (floor, walls, terrain): their textures, materials and geoms. A
-    material or texture that something else uses too keeps its colours.
-
-    Call it once per compiled model, before its render context is made: that is when textures are copied to it.
-
-    Raises:
-        CRPTproError: the model has no background to reverse.
+    The paper does not define the background. Here it is the skybox, and the planes and height fields that are fixed to
+    the world (floor, walls, terrain): their textures, materials and geoms. Materials and textures that something else
+    uses too keep their colours. A model without a background is a ``CRPTproError``.
     """
     import mujoco
 
@@ -109,15 +99,13 @@ def reverse_background(model: Any) -> None:
 
 
 class AgentSteps(dm_env.Environment):
-    """A dm_control world of which one step is one agent step: repeated, summed, scaled, and rendered once.
+    """A dm_control environment in agent steps: actions repeated and scaled, rewards summed, one frame rendered.
 
-    Its camera is kept over steps and resets. ``physics.render``, which TorchRL's ``from_pixels`` calls, gives the same
-    pixels and builds a camera and its scene for every image; this one is rebuilt only when the model changes, as in
-    composer environments at every reset. A frame of cheetah or walker takes 7 to 16 % less time (software GL; no gain
-    on manipulation).
+    TorchRL's ``from_pixels`` calls ``physics.render``, which builds a camera and its scene for every image. This camera
+    is rebuilt only with the model (in composer environments at every reset), and gives the same pixels in 7 to 16 %
+    less time for cheetah or walker (software GL; no gain on manipulation).
 
-    The settings are those of :func:`crptpro.envs.make_env`; ``world`` is the name for messages, ``shadow_size`` the
-    side of the shadow map in texels.
+    The settings are those of :func:`crptpro.envs.make_env`; ``shadow_size`` is the side of the shadow map in texels.
     """
 
     def __init__(
@@ -137,7 +125,8 @@ class AgentSteps(dm_env.Environment):
         self._world, self._action_repeat = world, action_repeat
         self._image_size, self._camera_id, self._renders = image_size, camera, render
         self._shadow_size, self._reverses_background = shadow_size, reverses_background
-        self._read_frame, self._image_shape = FrameReader(world), (3, image_size, image_size)
+        self._image_shape = (3, image_size, image_size)
+        self._read_frame = FrameReader(world)
         self._camera: Any = None
         self._model: Any = None
         self._prepared: Any = None
@@ -145,11 +134,11 @@ class AgentSteps(dm_env.Environment):
         low, high = (np.broadcast_to(bound, spec.shape) for bound in (spec.minimum, spec.maximum))
         self._to_actuators = ActionRange(low, high, spec.dtype, world)
         if render:
-            self._prepare()  # quadruped_escape makes the render context while it starts an episode
+            self._prepare()  # quadruped_escape makes the render context in its reset
 
     @property
     def physics(self) -> Any:
-        """The simulation's state and model; composer environments make a new one at every reset."""
+        """State and model of the simulation; composer environments make a new one at every reset."""
         return self.env.physics
 
     def seed(self, seed: int) -> None:
@@ -160,7 +149,7 @@ class AgentSteps(dm_env.Environment):
     def reset(self) -> dm_env.TimeStep:
         """Start an episode."""
         is_same = self._camera is not None and self.physics.model is self._model
-        with own_context(self._make_current if is_same else None):  # quadruped_escape sends its terrain there
+        with render_context(self._make_current if is_same else None):  # quadruped_escape uploads its terrain
             self.env.reset()
         return dm_env.restart(self._observe())
 
@@ -188,8 +177,8 @@ class AgentSteps(dm_env.Environment):
         is_first = self.physics.model is not self._model
         with passed_on(self._world, "render"), first_frame_watchdog() if is_first else nullcontext():
             if is_first:
-                self._prepare()  # a composer environment has compiled a new model since
-            with own_context(self._make_current):
+                self._prepare()  # a composer environment has compiled a new model
+            with render_context(self._make_current):
                 if is_first:
                     self._build_camera()
                 return self._read_frame(self._camera.render())
@@ -197,14 +186,15 @@ class AgentSteps(dm_env.Environment):
     def _make_current(self) -> None:
         context = self.physics.contexts.gl
         with context.make_current() as thread:
-            thread.call(context._platform_make_current)  # dm_control knows of no context but its own
+            thread.call(context._platform_make_current)  # dm_control ignores the contexts of other libraries
 
     def _prepare(self) -> None:
-        """Set what a render context reads once, when it is made."""
+        """Set what a render context reads only when it is made."""
         model = self.physics.model
         if model.ptr is self._prepared:
             return
-        self._prepared, visual = model.ptr, model.vis
+        self._prepared = model.ptr
+        visual = model.vis
         if self._shadow_size is not None:
             visual.quality.shadowsize = min(self._shadow_size, visual.quality.shadowsize)
         visual.global_.offwidth = max(self._image_size, visual.global_.offwidth)
@@ -249,10 +239,10 @@ class AgentSteps(dm_env.Environment):
 
 
 class DMControlPixelEnv(CheckedWorld, DMControlWrapper):
-    """TorchRL's ``DMControlWrapper`` around :class:`AgentSteps`: float32 actions and rewards, seeds without a reset.
+    """TorchRL's ``DMControlWrapper`` around :class:`AgentSteps`.
 
-    ``DMControlEnv(from_pixels=True)`` renders 240 x 320 whatever is asked for, refuses composer tasks (manipulation),
-    and renders every env step of a repeated action, which doubles the time of an agent step.
+    ``DMControlEnv(from_pixels=True)`` always renders 240 x 320, refuses composer tasks (manipulation), and renders
+    every env step of a repeated action, which doubles the time of an agent step.
     """
 
     def _check_kwargs(self, kwargs: dict[str, Any]) -> None:

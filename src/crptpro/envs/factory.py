@@ -1,4 +1,4 @@
-"""From a task's name to a TorchRL environment that emits stacks of uint8 frames."""
+"""Build the TorchRL environment of a task, which emits stacks of uint8 frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from crptpro.domains import GYMNASIUM_PREFIX, LONGEST_EPISODE_AGENT_STEPS, Domai
 from crptpro.envs.rendering import backend_card, select_backend
 from crptpro.envs.worlds import CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError
-from crptpro.values import COLORS, QUALITIES, Colors, Quality, as_int
+from crptpro.values import COLORS, MAX_SEED, QUALITIES, Colors, Quality, as_int
 
 logger = logging.getLogger(__name__)
 
@@ -37,19 +37,18 @@ def make_env(
 ) -> EnvBase:
     """Build an unbatched CPU environment that renders once per agent step.
 
-    dm_control's worlds are TorchRL's ``DMControlWrapper`` (:class:`~crptpro.envs.dm_control.DMControlPixelEnv`),
-    Gymnasium's its ``GymWrapper``, your own what their ``make`` returns; ``CatFrames`` stacks the frames. All are
-    checked as :class:`~crptpro.envs.worlds.CheckedWorld` says.
+    It is TorchRL's ``DMControlWrapper`` or ``GymWrapper``, or what your ``make`` returns, with ``CatFrames`` and the
+    checks of :class:`~crptpro.envs.worlds.CheckedWorld`.
 
     Output keys: ``pixels`` uint8 ``[3 * frame_stack, H, W]``, oldest to newest (a reset repeats its first
     frame); ``action`` float32 ``[A]`` in [-1, 1]; ``("next", "reward")`` float32 ``[1]``, summed over the
-    repeated env steps; ``done``, ``terminated``, ``truncated`` (time limits truncate; where a world has none,
-    1000 agent steps do). ``env.set_seed(s)`` re-seeds the simulator without resetting; the next ``reset`` starts the
-    episode that belongs to ``s``. ``env.card()`` says what shaped the pixels (not in worlds of your own).
+    repeated env steps; ``done``, ``terminated``, ``truncated`` (by the time limit, or without one after 1000 agent
+    steps). ``env.set_seed(s)`` seeds the next ``reset`` without resetting. ``env.card()`` returns the settings that
+    determine the pixels (only the task for your own environments).
 
     Args:
         task: a name that :func:`crptpro.domains.get_domain` knows, or a :class:`~crptpro.domains.Domain`.
-        seed: of the simulator's first episode, from 0 to 2**32 - 1.
+        seed: of the first episode, from 0 to 2**32 - 1.
         image_size: H = W, pixels.
         action_repeat: env steps per agent step; ``None`` takes the domain's (2).
         frame_stack: frames per observation.
@@ -58,25 +57,23 @@ def make_env(
             pixels changed (quadruped_escape: 8 %).
         colors: ``"reversed_background"`` reverses the order of the RGB values of skybox and floor, the paper's unseen
             colours (dm_control only); ``"reversed_image"`` that of whole images.
-        physics_state: also emit ``qpos`` and ``qvel``, float64, where the world has a MuJoCo state.
-        render: ``False`` leaves every image black, for policies that do not look: ten times faster, with the same
-            rewards. Worlds of your own draw all the same.
+        physics_state: also emit ``qpos`` and ``qvel``, float64, of a MuJoCo environment.
+        render: ``False`` leaves every image black, for policies that ignore images: ten times faster, with the same
+            rewards. It does not affect your own environments.
 
     Raises:
-        UnknownNameError: the task is unknown.
-        RenderingError: no GL backend renders.
-        ValueError: a number is none, or out of range.
-        CRPTproError: options or a world of your own cannot be used.
+        ValueError: a number is invalid or out of range.
+        CRPTproError: an unknown task, unusable options or environment, or no GL backend that renders.
     """
     domain = get_domain(task)
-    seed = as_int(seed, "seed", minimum=0, maximum=2**32 - 1)
+    seed = as_int(seed, "seed", minimum=0, maximum=MAX_SEED)
     frame_stack = as_int(frame_stack, "frame_stack", minimum=1)
     camera = domain.camera if camera is None else camera
     if camera is not None and not isinstance(camera, str):
         camera = as_int(camera, "camera")
     settings: dict[str, Any] = {
         "image_size": as_int(image_size, "image_size", minimum=1), "camera": camera, "quality": quality,
-        "action_repeat": resolve_action_repeat(domain, action_repeat), "physics_state": physics_state,
+        "action_repeat": resolve_action_repeat(domain, action_repeat),
     }  # fmt: skip
     is_dm_control = domain.source in ("suite", "manipulation")
     for name, value, allowed in (("quality", quality, QUALITIES), ("colors", colors, COLORS)):
@@ -84,20 +81,18 @@ def make_env(
             raise CRPTproError(f"{name} must be {' or '.join(map(repr, allowed))}, got {value!r}.")
     if colors == "reversed_background" and not is_dm_control:
         raise CRPTproError(
-            f"The background of {domain.name!r} is not known: only dm_control's worlds can have it reversed. "
-            "colors='reversed_image' reverses the colours of whole images in any world."
+            f"The background of {domain.name!r} is not known: only dm_control's environments can have it reversed. "
+            "colors='reversed_image' reverses the colours of whole images in any environment."
         )
-    card = {
-        "task": domain.task, "image_size": settings["image_size"], "camera": camera, "backend": "none",
-        "quality": quality, "colors": colors, "action_repeat": settings["action_repeat"],
-    }  # fmt: skip
+    card = {"task": domain.task, "backend": "none", "colors": colors, **settings}
     if needs_gl(domain):
         select_backend()
         card |= backend_card()
+    settings["physics_state"] = physics_state
     world: Any
     if domain.source == "own":
         world = _own(domain, seed=seed, **settings)
-        card = {"task": domain.task}  # its make decides what the settings shape
+        card = {"task": domain.task}
     elif is_dm_control:
         # Imported late: dm_control keeps the GL backend that it is imported with.
         from crptpro.envs.dm_control import make_dm_control
@@ -112,7 +107,7 @@ def make_env(
     world.watch(card, agent_step_limit=limit, checks_frames=render or domain.source == "own")
     transforms: list[Transform] = []
     if colors == "reversed_image":
-        # Imported late: transforms depend on networks, which no environment needs.
+        # Imported late: the package of transforms imports the networks.
         from crptpro.transforms.color_swap import ColorSwap
 
         transforms.append(ColorSwap(in_keys=["pixels"]))
@@ -124,10 +119,10 @@ def make_env(
 
 
 def resolve_action_repeat(task: str | Domain, action_repeat: int | None = None) -> int:
-    """Return the env steps of one agent step: as asked, at least one, or the domain's.
+    """Return the env steps of one agent step: ``action_repeat``, or the domain's if None.
 
-    A world of your own whose ``make`` takes no ``action_repeat`` has 1, or what a ``partial`` of it binds; asked for
-    another number, it warns.
+    If ``make`` of your own environment does not take it, it is 1, or what a ``partial`` binds, and another value is
+    warned about.
     """
     if action_repeat is not None:
         action_repeat = as_int(action_repeat, "action_repeat", minimum=1)
@@ -152,7 +147,7 @@ def episode_length(task: str | Domain, *, action_repeat: int | None = None) -> i
 
 
 def needs_gl(task: str | Domain) -> bool:
-    """Whether MuJoCo renders the frames (dm_control's, and some of Gymnasium's), so that a GL backend is needed."""
+    """Return whether MuJoCo renders the frames (dm_control and some of Gymnasium), which needs a GL backend."""
     domain = get_domain(task)
     if domain.source != "gymnasium":
         return domain.source != "own"
@@ -163,21 +158,22 @@ def needs_gl(task: str | Domain) -> bool:
 
 
 class OwnEnv(CheckedWorld, TransformedEnv):
-    """A user's TorchRL environment, with transforms of its own inside and what makes it like all others outside."""
+    """A user's TorchRL environment inside the transforms that adapt it."""
 
 
 class FrameTransform(Transform):
-    """Makes ``pixels`` frames (:class:`~crptpro.envs.worlds.FrameReader`), and adds ``truncated`` if it is missing.
+    """Converts ``pixels`` with :class:`~crptpro.envs.worlds.FrameReader`, and adds ``truncated`` if it is missing.
 
-    TorchRL's ``PermuteTransform`` returns a view of the world's own buffer, ``ToTensorImage`` divides uint8 by 255.
+    TorchRL's ``PermuteTransform`` returns a view of the environment's buffer, ``ToTensorImage`` divides uint8 by 255.
     """
 
     def __init__(self, world: str, image_size: int):
         super().__init__(in_keys=["pixels"], out_keys=["pixels"])
-        self._read_frame, self._shape = FrameReader(world), (3, image_size, image_size)
+        self._read_frame = FrameReader(world)
+        self._shape = (3, image_size, image_size)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Make it uint8, channels first."""
+        """Set uint8 and channels first."""
         observation_spec["pixels"] = Bounded(0, 255, shape=self._shape, dtype=torch.uint8)
         return observation_spec
 
@@ -225,13 +221,13 @@ def _own(domain: Domain, **settings: Any) -> EnvBase:
 
 
 def _read_back(env: EnvBase) -> list[Any]:
-    """Return the observations that the environment reads at the next step: counts of ``StepCounter``, own states."""
+    """Return the entries that the next step reads: those of transforms such as ``StepCounter``, and states."""
     base = env
     while isinstance(base, TransformedEnv):
         base = base.base_env
     own = set(base.observation_spec.keys(True, True))
-    found = [key for key in env.observation_spec.keys(True, True) if key not in own]
-    return [*found, *env.full_state_spec.keys(True, True)]
+    added = [key for key in env.observation_spec.keys(True, True) if key not in own]
+    return [*added, *env.full_state_spec.keys(True, True)]
 
 
 def _bound(make: Any) -> dict[str, Any]:
@@ -239,8 +235,8 @@ def _bound(make: Any) -> dict[str, Any]:
 
 
 def _named_by(make: Any, settings: dict[str, Any]) -> dict[str, Any]:
-    """Settings that ``make`` names; what a ``partial`` has bound is decided and not asked for again."""
-    # TorchRL's metaclass hides what the constructor of an environment names.
+    """Return the settings that ``make`` names and that no ``partial`` has bound."""
+    # TorchRL's metaclass hides the signature of an environment's constructor.
     parameters = inspect.signature(make.__init__ if inspect.isclass(make) else make).parameters
     takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
     wanted = {name for name in settings if takes_all or name in parameters} - set(_bound(make))
@@ -248,7 +244,7 @@ def _named_by(make: Any, settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _broken_contract(env: Any, image_size: int) -> str:
-    """Return what is wrong with a user's environment, otherwise nothing."""
+    """Return how a user's environment breaks the contract of ``Domain.make``; empty if it does not."""
     if not isinstance(env, EnvBase):
         return f"is a {type(env).__name__}; make must return a TorchRL EnvBase"
     if env.device is not None and env.device.type != "cpu":
@@ -258,11 +254,10 @@ def _broken_contract(env: Any, image_size: int) -> str:
     shown = env.observation_spec
     if "pixels" not in set(shown.keys()):
         return f"emits {sorted(map(str, shown.keys()))}, but no 'pixels'"
-    pixels, shapes = shown["pixels"], ((3, image_size, image_size), (image_size, image_size, 3))
-    if pixels.dtype != torch.uint8 and not pixels.dtype.is_floating_point:
-        return f"emits pixels of {pixels.dtype}; they must be torch.uint8, or floats in [0, 1]"
-    if tuple(pixels.shape) not in shapes:
-        return f"emits pixels of shape {tuple(pixels.shape)}; expected one RGB image, {shapes[0]} or {shapes[1]}"
+    shape = tuple(shown["pixels"].shape)
+    allowed = ((3, image_size, image_size), (image_size, image_size, 3))
+    if shape not in allowed:
+        return f"emits pixels of shape {shape}; expected one RGB image, {allowed[0]} or {allowed[1]}"
     action = env.action_spec
     low: Any = getattr(action.space, "low", None)
     high: Any = getattr(action.space, "high", None)

@@ -1,4 +1,4 @@
-"""Gymnasium worlds that render RGB as TorchRL environments: ``GymWrapper`` over one step per decision."""
+"""Gymnasium environments that render RGB: TorchRL's ``GymWrapper`` around one step per agent step."""
 
 from __future__ import annotations
 
@@ -15,49 +15,47 @@ from torchrl.envs.libs.gym import GymWrapper
 
 from crptpro.domains import GYMNASIUM_PREFIX
 from crptpro.envs.dm_control import FAST_SHADOW_SIZE, route_mujoco_warnings
-from crptpro.envs.rendering import first_frame_watchdog, own_context
+from crptpro.envs.rendering import first_frame_watchdog, render_context
 from crptpro.envs.worlds import ActionRange, CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError, RenderingError, WorldError
 from crptpro.values import Quality
 
 
 class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """A Gymnasium world of which one step is one agent step: repeated, summed, scaled, and rendered once.
+    """A Gymnasium environment in agent steps: actions repeated and scaled, rewards summed, one frame rendered.
 
-    Gymnasium's own wrappers need OpenCV (``ResizeObservation``), render every repeated step (``AddRenderObservation``),
-    and none repeats an action. The settings are those of :func:`crptpro.envs.make_env`; ``world`` is the name for
-    messages.
+    Gymnasium's wrappers need OpenCV (``ResizeObservation``) or render every env step (``AddRenderObservation``), and
+    none repeats actions. The settings are those of :func:`crptpro.envs.make_env`; ``world`` is the name in messages.
     """
 
     def __init__(self, env: Any, *, world: str, image_size: int, action_repeat: int, physics_state: bool, render: bool):
         super().__init__(env)
         self.episode_seed: int | None = None
         self._world, self._image_size, self._action_repeat = world, image_size, action_repeat
-        self._renders, self._read_frame, self._has_drawn = render, FrameReader(world), False
+        self._renders, self._has_drawn = render, False
+        self._read_frame = FrameReader(world)
         action = env.action_space
         if not isinstance(action, spaces.Box):
             raise CRPTproError(
                 f"{world} has {type(action).__name__} actions. Only continuous actions (a Box) are supported; wrap it, "
-                "and make it known with register_domain."
+                "and register it with register_domain."
             )
         self._to_actuators = ActionRange(action.low, action.high, action.dtype, world)
         if self._to_actuators.unbounded:
             raise CRPTproError(
                 f"{world} has actions without bounds ({action}), which cannot be mapped from [-1, 1]; wrap it with "
-                "gymnasium.wrappers.RescaleAction or ClipAction, and make it known with register_domain."
+                "gymnasium.wrappers.RescaleAction or ClipAction, and register it with register_domain."
             )
         self.action_space = spaces.Box(-1.0, 1.0, (int(np.prod(action.shape)),), np.float32)
-        shown = spaces.Box(0, 255, (3, image_size, image_size), np.uint8)
-        observed: dict[str, spaces.Space[Any]] = {"pixels": shown}
         self._data: Any = getattr(env.unwrapped, "data", None)
-        has_state = hasattr(self._data, "qpos") and hasattr(self._data, "qvel")
-        self._state_names = ("qpos", "qvel") if physics_state and has_state else ()
+        self._state_names = [name for name in ("qpos", "qvel") if physics_state and hasattr(self._data, name)]
+        observed: dict[str, spaces.Space[Any]] = {"pixels": spaces.Box(0, 255, (3, image_size, image_size), np.uint8)}
         for name in self._state_names:
             observed[name] = spaces.Box(-np.inf, np.inf, getattr(self._data, name).shape, np.float64)
         self.observation_space = spaces.Dict(observed)
 
     def reset(self, **_: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode, of ``episode_seed`` if one was set since the last."""
+        """Start an episode, with ``episode_seed`` if one was set."""
         self.env.reset(seed=self.episode_seed)
         self.episode_seed = None
         return self._observe(), {}
@@ -73,8 +71,8 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
                 if "expected 5" not in str(reason):
                     raise
                 raise WorldError(
-                    f"The world {self._world!r} does not answer step() with Gymnasium's five values (observation, "
-                    f"reward, terminated, truncated, info): {reason}. Worlds of the old API end with `done, info`."
+                    f"step() of the environment {self._world!r} does not return Gymnasium's five values (observation, "
+                    f"reward, terminated, truncated, info): {reason}. The old API ends with `done, info`."
                 ) from reason
             total += float(reward)
             if terminated or truncated:
@@ -83,17 +81,17 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._observe(), total, bool(terminated), bool(truncated and not terminated), {}
 
     def _observe(self) -> dict[str, Any]:
-        size = self._image_size
-        frame = self._draw() if self._renders else torch.zeros(3, size, size, dtype=torch.uint8)
         state = {name: torch.tensor(getattr(self._data, name)) for name in self._state_names}
-        return {"pixels": frame, **state}
+        return {"pixels": self._draw(), **state}
 
     def _draw(self) -> Tensor:
+        if not self._renders:
+            return torch.zeros(3, self._image_size, self._image_size, dtype=torch.uint8)
         viewer = getattr(getattr(self.env.unwrapped, "mujoco_renderer", None), "viewer", None)
         with (
             passed_on(self._world, "render"),
             nullcontext() if self._has_drawn else first_frame_watchdog(),
-            own_context(getattr(viewer, "make_context_current", None)),
+            render_context(getattr(viewer, "make_context_current", None)),
         ):
             try:
                 image = self.env.render()
@@ -104,7 +102,7 @@ class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class GymnasiumPixelEnv(CheckedWorld, GymWrapper):
-    """TorchRL's ``GymWrapper`` whose seed waits for the next reset, the only moment at which Gymnasium takes one."""
+    """TorchRL's ``GymWrapper``; ``set_seed`` takes effect at the next reset, because Gymnasium seeds only there."""
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
@@ -123,7 +121,7 @@ def make_gymnasium(
     if camera is not None:
         options["camera_name" if isinstance(camera, str) else "camera_id"] = camera
     if str(gymnasium.spec(env_id).entry_point).startswith("gymnasium.envs.mujoco"):
-        # Their 480 x 480 by default costs twice the time on software GL and ends as the same few pixels.
+        # The default of 480 x 480 takes twice the time on software GL.
         options.update(width=2 * image_size, height=2 * image_size)
         route_mujoco_warnings()
     with passed_on(task, "make"):
@@ -131,14 +129,14 @@ def make_gymnasium(
             env: Any = gymnasium.make(env_id, render_mode="rgb_array", disable_env_checker=True, **options)
         except TypeError as reason:
             if not any(f"unexpected keyword argument '{option}'" in str(reason) for option in options):
-                raise  # the world's own
+                raise  # from the environment's code
             hint = " It takes no camera; leave camera unset." if camera is not None else ""
             raise CRPTproError(f"{task} cannot be made with rgb_array rendering: {reason}.{hint}") from reason
         except (ImportError, gymnasium.error.Error) as reason:
             raise CRPTproError(f"{task} cannot be made: {reason}") from reason
     model: Any = getattr(env.unwrapped, "model", None)
     if isinstance(camera, int) and not -1 <= camera < getattr(model, "ncam", camera + 1):
-        env.close()  # MuJoCo would end the process
+        env.close()  # rendering would end the process
         raise CRPTproError(f"{task} has no camera {camera}; its model has {model.ncam}, numbered from 0.")
     _fix_free_camera(env)
     if quality == "fast" and hasattr(model, "vis"):
@@ -147,10 +145,7 @@ def make_gymnasium(
 
 
 def resize(frame: Tensor, size: int) -> Tensor:
-    """Resize a uint8 frame ``[3, H, W]`` to ``[3, size, size]``, bilinear and antialiased (without torchvision).
-
-    A frame that is not square is squeezed, not cropped.
-    """
+    """Resize a uint8 frame ``[3, H, W]`` to ``[3, size, size]``, bilinear and antialiased, without cropping."""
     if frame.shape[1:] == (size, size):
         return frame
     small = F.interpolate(frame[None].float(), (size, size), mode="bilinear", antialias=True, align_corners=False)
@@ -158,10 +153,7 @@ def resize(frame: Tensor, size: int) -> Tensor:
 
 
 def _fix_free_camera(env: Any) -> None:
-    """Point Gymnasium's free camera at the model's default pose.
-
-    It would keep looking at the middle of the first state that is rendered, which differs after a resume.
-    """
+    """Point the free camera at the model's default pose; the first rendered state differs after a resumption."""
     renderer = getattr(env.unwrapped, "mujoco_renderer", None)
     config = getattr(renderer, "default_cam_config", None) or {}
     if renderer is None or "lookat" in config:

@@ -1,4 +1,4 @@
-"""Which GL backend renders: chosen once, proven by a frame under a time limit, written into every card."""
+"""The GL backend: chosen once, tested by a frame under a time limit, recorded in every card."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import gc
 import json
 import logging
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -23,17 +24,17 @@ from crptpro.errors import RenderingError
 logger = logging.getLogger(__name__)
 
 BACKENDS = ("egl", "osmesa", "glfw")
-#: Environment variable that carries the proof, as JSON, to this process's later calls and to its children. A cluster
-#: may hand the environment on to another machine, where the proof holds no longer.
+#: Environment variable with the passed test as JSON, for later calls and child processes. A cluster may copy the
+#: environment to another machine, where the test does not count.
 PROOF_VARIABLE = "CRPTPRO_GL_PROOF"
-#: Environment variable with the seconds a first frame may take, for slow disks and busy machines.
+#: Environment variable with the time limit of a first frame in seconds, for slow disks and busy machines.
 TIMEOUT_VARIABLE = "CRPTPRO_GL_TIMEOUT_S"
 
 HANG = (
-    "The usual cause is a GPU driver that hangs when several processes hold EGL contexts at once (NVIDIA "
-    "580.x does, google-deepmind/mujoco issue 3444), or one left behind by a killed run. "
-    "Alternatives: MUJOCO_GL=osmesa (software, no GPU driver involved), MUJOCO_EGL_DEVICE_ID=<number> "
-    f"(another GPU), fewer worker processes, or a longer {TIMEOUT_VARIABLE} on a machine that is merely slow."
+    "The usual cause is a GPU driver that hangs when several processes hold EGL contexts at once (NVIDIA 580.x does, "
+    "google-deepmind/mujoco issue 3444), or a context that a killed run left. Alternatives: MUJOCO_GL=osmesa "
+    "(software, no GPU driver involved), MUJOCO_EGL_DEVICE_ID=<number> (another GPU), fewer worker processes, or a "
+    f"longer {TIMEOUT_VARIABLE} on a slow machine."
 )
 REMEDIES = {
     "egl": "Install EGL (Debian, Ubuntu: apt-get install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri), or "
@@ -42,14 +43,14 @@ REMEDIES = {
     "glfw": "GLFW needs a display; on a machine without one use MUJOCO_GL=egl or MUJOCO_GL=osmesa.",
 }
 
-#: Values of MUJOCO_GL that dm_control knows beside the backends' names.
+#: Other values of MUJOCO_GL that MuJoCo accepts.
 _SYNONYMS = {
     **dict.fromkeys(("on", "enable", "enabled", "true", "1", ""), "glfw"),
     **dict.fromkeys(("disable", "disabled", "false", "0"), "off"),
 }
 
-#: Renders one small scene with the backend that MUJOCO_GL names and describes it as JSON. It imports MuJoCo alone, to
-#: stay below a second or two, and runs in a process of its own, because a broken GL driver may hang or crash.
+#: Renders one small scene with the backend of MUJOCO_GL and describes it as JSON. It runs in a separate process,
+#: because a broken GL driver may hang or crash, and imports MuJoCo alone, to take a second or two.
 _PROBE = """
 import importlib, json, os
 import mujoco
@@ -77,7 +78,7 @@ PROBE_COMMAND = (sys.executable, "-c", _PROBE)
 
 
 def canonical_backend(text: str) -> str:
-    """Return ``"egl"``, ``"osmesa"``, ``"glfw"`` or ``"off"`` for a value of ``MUJOCO_GL``, or refuse it."""
+    """Return ``"egl"``, ``"osmesa"``, ``"glfw"`` or ``"off"`` for a value of ``MUJOCO_GL``."""
     name = text.strip().lower()
     backend = _SYNONYMS.get(name, name)
     if backend not in (*BACKENDS, "off"):
@@ -89,17 +90,14 @@ def canonical_backend(text: str) -> str:
 
 
 def select_backend(timeout_s: float | None = None, *, processes: int = 1) -> str:
-    """Choose the GL backend, prove that it renders, set ``MUJOCO_GL``; call it before importing dm_control.
+    """Choose the GL backend, test that it renders, and set ``MUJOCO_GL``; call it before importing dm_control.
 
-    A ``MUJOCO_GL`` that the user has set is never overridden, only proven. Otherwise EGL, OSMesa and (with a display)
-    GLFW are tried in this order. The proof is a frame with content, rendered in a process of its own (or in as many at
-    the same time, as parallel collection needs) within ``timeout_s``, by default 60 or ``CRPTPRO_GL_TIMEOUT_S``. It
-    holds for this process and its children, on this machine and for one ``MUJOCO_EGL_DEVICE_ID``. With software GL,
-    ``LP_NUM_THREADS=1`` is set unless the user has set it: more threads cost a third more CPU time per frame and hardly
-    gain any.
-
-    Raises:
-        RenderingError: naming, for every backend tried, what went wrong and what to do.
+    A ``MUJOCO_GL`` of the user is tested and kept. Otherwise EGL, OSMesa and (with a display) GLFW are tried in this
+    order. The test is a frame with content from each of ``processes`` simultaneous processes (parallel collection needs
+    several) within ``timeout_s``, by default 60 or ``CRPTPRO_GL_TIMEOUT_S``. It counts for this process and its
+    children, on this machine and for one ``MUJOCO_EGL_DEVICE_ID``. With software GL, ``LP_NUM_THREADS=1`` is set unless
+    the user has set it: more threads cost a third more CPU time per frame and save hardly any time. If no backend
+    renders, a ``RenderingError`` names cause and remedy for each.
     """
     timeout_s = default_timeout_s() if timeout_s is None else timeout_s
     proof, requested, imported = _proof(), _requested_backend(), _imported_backend()
@@ -110,7 +108,7 @@ def select_backend(timeout_s: float | None = None, *, processes: int = 1) -> str
         )
     only = requested or imported
     candidates = (only,) if only else _platform_candidates()
-    if proof and proof["backend"] in candidates:
+    if proof.get("backend") in candidates:
         if proof["processes"] >= processes:
             os.environ["MUJOCO_GL"] = proof["backend"]
             return proof["backend"]
@@ -124,8 +122,7 @@ def select_backend(timeout_s: float | None = None, *, processes: int = 1) -> str
             continue
         for failure in failures:
             logger.warning("%s Rendering with %s instead.", failure, backend)
-        # A user's spelling ("EGL", "on") becomes the one that dm_control and Gymnasium both understand.
-        os.environ["MUJOCO_GL"] = backend
+        os.environ["MUJOCO_GL"] = backend  # in the spelling that dm_control and Gymnasium both accept
         if gl["gl_kind"] == "software":
             os.environ.setdefault("LP_NUM_THREADS", "1")
         gl |= {"backend": backend, "processes": processes, "chosen_by": "user" if requested else "crptpro"}
@@ -144,18 +141,16 @@ def select_backend(timeout_s: float | None = None, *, processes: int = 1) -> str
 
 
 def backend_card() -> dict[str, Any]:
-    """Return the backend that was proven, the GL vendor, renderer and version, and whether GL is soft- or hardware."""
-    proof = _proof() or {}
+    """Return the tested backend, the GL vendor, renderer and version, and whether GL is software or hardware."""
     keys = ("backend", "gl_vendor", "gl_renderer", "gl_version", "gl_kind")
-    return {key: proof.get(key, "unknown") for key in keys}
+    return {key: _proof().get(key, "unknown") for key in keys}
 
 
 @contextmanager
 def first_frame_watchdog(timeout_s: float | None = None) -> Iterator[None]:
-    """Log an error that names the cause if the body, which renders a first frame, does not return in time.
+    """Log an error with the likely cause if the body, which renders a first frame, does not return in time.
 
-    A call that hangs inside the driver cannot be interrupted from Python, so the process is left as it is;
-    what starts workers should end those that log this.
+    Python cannot interrupt a call that hangs in the driver: the process stays, and its parent should end it.
     """
     timeout_s = default_timeout_s() if timeout_s is None else timeout_s
     message = f"Process {os.getpid()} has waited {timeout_s:g} s for its first frame. {HANG}"
@@ -169,12 +164,12 @@ def first_frame_watchdog(timeout_s: float | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def own_context(make_current: Callable[[], Any] | None) -> Iterator[None]:
-    """Draw in the body into one's own render context, and leave none current: contexts share a thread.
+def render_context(make_current: Callable[[], Any] | None) -> Iterator[None]:
+    """Make a render context current in the body and none after it, because the contexts of a thread interfere.
 
-    What frees a world frees its textures and buffers in whichever context is current, and then takes that away from the
-    thread: the frames of another world would be black from there on. The garbage collector, which may free one at any
-    moment, waits until the body has ended. ``make_current`` is ``None`` before there is a context.
+    Freeing an environment frees its textures in whichever context is current, and then detaches that from the thread:
+    later frames of another environment would be black. The garbage collector, which may free one at any moment, is off
+    in the body. ``make_current`` is ``None`` before the context exists.
     """
     collects = gc.isenabled()
     gc.disable()
@@ -199,7 +194,7 @@ def _leave_none_current() -> None:
 
 
 def default_timeout_s() -> float:
-    """Return the seconds a first frame may take."""
+    """Return the time limit of a first frame in seconds."""
     text = os.environ.get(TIMEOUT_VARIABLE, "60")
     try:
         return float(text)
@@ -210,13 +205,13 @@ def default_timeout_s() -> float:
 def run_isolated(
     commands: list[tuple[str, ...]], backend: str, *, timeout_s: float
 ) -> list[tuple[int | None, str, str]]:
-    """Run commands at the same time with ``MUJOCO_GL=backend``; kill what is not done in time.
+    """Run commands simultaneously with ``MUJOCO_GL=backend``, and kill those that exceed the time limit.
 
-    Output goes through files, not pipes, and nobody waits for long for a killed process: one that hangs in the kernel
-    cannot be reaped. Returns of each command its exit status (``None``: killed), standard output and standard error.
+    Returns exit status (``None``: killed), standard output and standard error of each. Output goes to files, not pipes,
+    and a killed process is waited for only shortly, because one that hangs in the kernel cannot be reaped.
     """
     environment = {**os.environ, "MUJOCO_GL": backend}
-    if "OpenGL" in sys.modules:  # then dm_control or mujoco has set it here, for the backend of this process
+    if "OpenGL" in sys.modules:  # dm_control or mujoco has set it for the backend of this process
         environment.pop("PYOPENGL_PLATFORM", None)
     results: list[tuple[int | None, str, str]] = []
     with contextlib.ExitStack() as stack:
@@ -248,33 +243,31 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
 
 
 def _prove(backend: str, *, timeout_s: float, processes: int) -> dict[str, Any]:
-    """Render in ``processes`` simultaneous processes; return what the probe saw, or raise what is wrong."""
+    """Render in ``processes`` simultaneous processes, and return the answer of the last probe."""
     gl: dict[str, Any] = {}
     for status, stdout, stderr in run_isolated([PROBE_COMMAND] * processes, backend, timeout_s=timeout_s):
-        lines = [line.strip() for line in stderr.splitlines() if line.strip()]
         if status is None:
-            where = f" from each of {processes} simultaneous processes" if processes > 1 else ""
-            raise RenderingError(f"{backend}: the first frame did not arrive{where} within {timeout_s:g} s. {HANG}")
+            limit = f"within {timeout_s:g} s ({processes} at the same time)"
+            raise RenderingError(f"{backend}: the first frame did not arrive {limit}. {HANG}")
+        answer = re.search(r'^\{"gl_.*\}$', stdout, re.MULTILINE)
+        gl = json.loads(answer[0]) if answer else {}
         if status < 0:
             reason = f"the GL driver crashed the process ({signal.Signals(-status).name})"
         elif status > 0:
-            reason = lines[-1].rstrip(".") if lines else f"the probe ended with exit status {status}"
+            lines = stderr.strip().splitlines() or [f"the probe ended with exit status {status}"]
+            reason = lines[-1].strip().rstrip(".")
+        elif not gl:
+            reason = "the probe gave no answer"
+        elif not gl["alive"]:
+            reason = "the frame came back without content; the GL driver does not work"
         else:
-            try:
-                gl = json.loads(stdout.strip().splitlines()[-1])
-            except (json.JSONDecodeError, IndexError):
-                reason = "the probe gave no answer"
-            else:
-                if gl["alive"]:
-                    continue
-                reason = "the frame came back without content; the GL driver does not work"
+            continue
         remedy = "Unset PYOPENGL_PLATFORM." if "PYOPENGL_PLATFORM" in reason else REMEDIES[backend]
         raise RenderingError(f"{backend}: {reason}. {remedy}")
     return gl
 
 
 def _platform_candidates() -> tuple[str, ...]:
-    """Return the backends worth trying here, best first."""
     if not sys.platform.startswith("linux"):
         return ("glfw",)
     has_display = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -282,9 +275,9 @@ def _platform_candidates() -> tuple[str, ...]:
 
 
 def _requested_backend() -> str | None:
-    """Return the backend of a MUJOCO_GL that is not our own doing, here or where the environment comes from."""
-    text, proof = os.environ.get("MUJOCO_GL"), _carried_proof()
-    if text is None or (proof and proof["chosen_by"] == "crptpro" and text == proof["backend"]):
+    """Return the backend of a MUJOCO_GL that the user set, and not an earlier call, perhaps on another machine."""
+    text, proof = os.environ.get("MUJOCO_GL"), _proof(anywhere=True)
+    if text is None or (proof.get("chosen_by") == "crptpro" and text == proof["backend"]):
         return None
     backend = canonical_backend(text)
     if backend == "off":
@@ -297,17 +290,11 @@ def _imported_backend() -> str | None:
     return name if name in BACKENDS else None
 
 
-def _carried_proof() -> dict[str, Any] | None:
-    """Return the proof in the environment, wherever it was made."""
-    return json.loads(os.environ.get(PROOF_VARIABLE) or "null")
-
-
-def _proof() -> dict[str, Any] | None:
-    """Return the proof if it was made here: on this machine, for the same GPU."""
-    proof = _carried_proof()
-    return proof if proof and proof.items() >= _place().items() else None
+def _proof(*, anywhere: bool = False) -> dict[str, Any]:
+    """Return the passed test; an empty one if it was passed elsewhere, unless ``anywhere``."""
+    proof: dict[str, Any] = json.loads(os.environ.get(PROOF_VARIABLE) or "{}")
+    return proof if anywhere or proof.items() >= _place().items() else {}
 
 
 def _place() -> dict[str, Any]:
-    """Return what a proof is bound to."""
     return {"host": socket.gethostname(), "egl_device": os.environ.get("MUJOCO_EGL_DEVICE_ID")}

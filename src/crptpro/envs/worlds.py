@@ -1,4 +1,4 @@
-"""Checks of every world, whoever wrote it: frames that are images, finite numbers, errors with its name."""
+"""Checks of every environment: frames that are images, finite numbers, errors that name the environment."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from crptpro.errors import CRPTproError, NonFiniteError, WorldError, WorldFailed
 
 logger = logging.getLogger(__name__)
 
-#: Magnitude from which on a bound of an action means "none": MuJoCo's mjMAXVAL (float32's largest is above it).
+#: Action bounds of this magnitude mean "unbounded": MuJoCo's mjMAXVAL (float32's largest is above it).
 NO_BOUND = 1e10
-#: Agent steps from which on an episode that was left before its end is judged by its frames.
+#: Agent steps after which an unfinished episode is checked for still frames.
 LONG_EPISODE = 25
 
 _open: weakref.WeakSet[EnvBase] = weakref.WeakSet()
 
 
 class CheckedWorld:
-    """Mixed into the class that steps a world: checks what it returns, and names it in errors.
+    """Mixin of the class that steps an environment.
 
-    - An exception of the world's own code is raised again as :class:`~crptpro.errors.WorldFailedError`.
+    - An exception of the environment's code is raised as :class:`~crptpro.errors.WorldFailedError`.
     - An action, a reward or a physical state that is not finite raises :class:`~crptpro.errors.NonFiniteError` with
-      the episode and the agent step, before anything can store it.
-    - An episode whose frames are all alike is reported by one warning per environment.
+      the episode and the agent step.
+    - An episode of identical frames is reported by one warning per environment.
     - After ``agent_step_limit`` agent steps an episode is truncated. (TorchRL's ``StepCounter`` would add
-      ``step_count`` to every observation and read it back.)
+      ``step_count`` to every observation.)
     - The environment is closed at the interpreter's exit: a render context that is freed later prints errors.
     """
 
@@ -47,17 +47,16 @@ class CheckedWorld:
     _agent_step = 0
     _first_frame: Tensor | None = None
     _is_still = False
-    _has_warned = False
     _was_closed = False
 
     def watch(self, card: dict[str, Any], *, agent_step_limit: int | None = None, checks_frames: bool = True) -> None:
-        """Set the card, whose ``task`` is the name in messages, and what is checked."""
+        """Set the card, whose ``task`` is the name in messages, and the checks."""
         self._card, self.world = card, card["task"]
         self.agent_step_limit, self.checks_frames = agent_step_limit, checks_frames
         _open.add(cast(EnvBase, self))
 
     def card(self) -> dict[str, Any]:
-        """Return what shaped the pixels: task, camera, GL backend, quality, colours, action repeat."""
+        """Return the settings that determine the pixels: task, camera, GL backend, quality, colours, action repeat."""
         return dict(self._card)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
@@ -67,7 +66,8 @@ class CheckedWorld:
         with passed_on(self.world, "reset"):
             found: TensorDictBase = super()._reset(tensordict, **kwargs)  # type: ignore[misc]
         self._require_finite(found, "answered with", "qpos", "qvel")
-        self._first_frame, self._is_still = found.get("pixels"), self.checks_frames
+        self._first_frame = found.get("pixels")
+        self._is_still = self.checks_frames
         return found
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -89,29 +89,29 @@ class CheckedWorld:
             value = td.get(key, None)
             if value is not None and not value.isfinite().all():
                 raise NonFiniteError(
-                    f"The world {self.world!r} {verb} {key} {value.tolist()} in agent step {self._agent_step} of "
+                    f"The environment {self.world!r} {verb} {key} {value.tolist()} in agent step {self._agent_step} of "
                     f"episode {self._episode} (this environment's first is 0). Nothing of this step is stored; fix "
-                    "what computes it, or keep the actions where the world is stable."
+                    "what computes it, or keep the actions where the environment is stable."
                 )
 
     def _report_still_frames(self) -> None:
-        if not self._is_still or self._has_warned or self._agent_step < 2:
+        if not self._is_still or self._agent_step < 2:
             return
-        self._has_warned, self._is_still = True, False
+        self.checks_frames = self._is_still = False
         shade = cast(Tensor, self._first_frame).unique()
         what = f" ({'black' if not shade.any() else 'of one shade'})" if shade.numel() == 1 else ""
         logger.warning(
-            "All frames of a whole episode of the world %r are alike%s: %d agent steps, nothing moved. Look at what it "
+            "All frames of a whole episode of the environment %r are identical%s, over %d agent steps. Look at what it "
             "renders before you train on it.",
             self.world, what, self._agent_step,
         )  # fmt: skip
 
     def read_obs(self, observations: dict[str, Any]) -> dict[str, Any]:
-        """Pass frames on; TorchRL's method would compare each of their bytes with the spec's bounds."""
+        """Return the observations; TorchRL's method would compare every byte with the spec's bounds."""
         return dict(observations)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free the world and its render context; calling it twice is harmless."""
+        """Free the environment and its render context; a second call does nothing."""
         _open.discard(cast(EnvBase, self))
         if not self._was_closed:
             self._was_closed = True
@@ -127,41 +127,31 @@ def _close_what_is_open() -> None:
 
 @contextmanager
 def passed_on(world: str, call: str) -> Iterator[None]:
-    """Raise exceptions of a world's own code in the body as ``WorldFailedError``, with the world's name and the call.
-
-    Errors of this library are left alone.
-    """
+    """Raise exceptions of an environment's code in the body as ``WorldFailedError``, with its name and the call."""
     try:
         yield
     except (CRPTproError, WorldFailedError):
         raise
     except Exception as reason:
         origin: BaseException = reason
-        while origin.__cause__ is not None:  # Gymnasium raises what a constructor raised once more
+        while origin.__cause__ is not None:  # Gymnasium re-raises exceptions of a constructor
             origin = origin.__cause__
         where = traceback.extract_tb(origin.__traceback__)[-1]
         raise WorldFailedError(
-            f"{reason} ({type(reason).__name__} in {call}() of the world {world!r}, {where.filename}, line "
+            f"{reason} ({type(reason).__name__} in {call}() of the environment {world!r}, {where.filename}, line "
             f"{where.lineno})"
         ) from reason
 
 
 class FrameReader:
-    """Converts an image of a world to a frame: a copy, uint8 ``[3, H, W]``, because a world may reuse its buffer.
-
-    uint8 is kept; floats in [0, 1] are multiplied by 255, which is logged once.
-    """
+    """Copies an image to a frame, uint8 ``[3, H, W]``; floats in [0, 1] are multiplied by 255, which is logged once."""
 
     def __init__(self, world: str):
         self.world = world
         self._has_scaled = False
 
     def __call__(self, image: Any) -> Tensor:
-        """Return the frame of an image ``[H, W, 3]`` or ``[3, H, W]`` (array or tensor).
-
-        Raises:
-            WorldError: for other shapes, other dtypes, and floats outside [0, 1] or NaN.
-        """
+        """Return the frame of an array or tensor ``[H, W, 3]`` or ``[3, H, W]``; others are a ``WorldError``."""
         if not isinstance(image, (np.ndarray, Tensor)):
             raise self._refusal(f"is {type(image).__name__}", "an RGB array [H, W, 3]")
         if image.ndim != 3 or 3 not in (image.shape[0], image.shape[2]):
@@ -169,7 +159,7 @@ class FrameReader:
         dtype = str(image.dtype).removeprefix("torch.")
         if dtype not in ("uint8", "float16", "float32", "float64"):
             raise self._refusal(f"has dtype {dtype}", "uint8, or floats in [0, 1]")
-        # torch cannot look at arrays that run backwards, or are read-only.
+        # The copy is for arrays that are read-only or have negative strides.
         pixels = image if isinstance(image, Tensor) else torch.from_numpy(image.copy())
         if pixels.shape[2] == 3:
             pixels = pixels.permute(2, 0, 1)
@@ -180,25 +170,25 @@ class FrameReader:
             raise self._refusal(f"holds {dtype} from {low:g} to {high:g}", "uint8, or floats in [0, 1]")
         if not self._has_scaled:
             self._has_scaled = True
-            logger.warning("The world %r shows %s in [0, 1]; its frames are multiplied by 255.", self.world, dtype)
+            logger.warning("Frames of the environment %r are %s in [0, 1], multiplied by 255.", self.world, dtype)
         return (pixels * 255).round().to(torch.uint8).contiguous()
 
     def _refusal(self, what: str, expected: str) -> WorldError:
-        return WorldError(f"The image that the world {self.world!r} renders {what}; it must be {expected}.")
+        return WorldError(f"The image that the environment {self.world!r} renders {what}; it must be {expected}.")
 
 
 class ActionRange:
-    """The affine map from [-1, 1] to a world's own bounds; without bounds an action is passed on as it is.
+    """The affine map from [-1, 1] to an environment's action bounds; an unbounded action stays as it is.
 
-    Integer or empty actions, bounds in the wrong order, or on one side only, are refused by name.
+    Integer or empty actions, and bounds in the wrong order or on one side only, raise ``CRPTproError``.
     """
 
-    def __init__(self, low: np.ndarray, high: np.ndarray, dtype: Any = np.float64, world: str = ""):
+    def __init__(self, low: np.ndarray, high: np.ndarray, dtype: Any, world: str):
         low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         no_low, no_high = ~(np.abs(low) < NO_BOUND), ~(np.abs(high) < NO_BOUND)
         self.unbounded = bool(no_low.any())
-        self._low, high_ = np.where(no_low, -1.0, low), np.where(no_high, 1.0, high)
-        self._half = (high_ - self._low) / 2.0
+        self._low = np.where(no_low, -1.0, low)
+        self._half = (np.where(no_high, 1.0, high) - self._low) / 2.0
         self._dtype = dtype
         bounds = f"low {low.tolist()}, high {high.tolist()}"
         wrong = ""
@@ -211,7 +201,7 @@ class ActionRange:
         elif not (self._half > 0).all():
             wrong = f"has action bounds that hold nothing: {bounds}"
         if wrong:
-            raise CRPTproError(f"The world {world!r} {wrong}.")
+            raise CRPTproError(f"The environment {world!r} {wrong}.")
 
     def __call__(self, action: np.ndarray) -> np.ndarray:
         """Map ``action``, float ``[A]`` in [-1, 1]."""

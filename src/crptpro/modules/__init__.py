@@ -6,17 +6,6 @@ from crptpro.modules.heads import AnchorHead, Predictor, Projector, Prototypes, 
 from crptpro.modules.precision import computing, resolve_precision, set_compute_dtype, usable_device
 
 __all__ = [
-    "AnchorHead",
-    "DeterministicActor",
-    "PixelEncoder",
-    "Predictor",
-    "Projector",
-    "Prototypes",
-    "SkillHead",
-    "SquashedGaussianActor",
-    "TwinCritic",
-    "computing",
-    "resolve_precision",
-    "set_compute_dtype",
-    "usable_device",
-]
+    "AnchorHead", "DeterministicActor", "PixelEncoder", "Predictor", "Projector", "Prototypes", "SkillHead",
+    "SquashedGaussianActor", "TwinCritic", "computing", "resolve_precision", "set_compute_dtype", "usable_device",
+]  # fmt: skip

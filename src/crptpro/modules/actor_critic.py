@@ -1,29 +1,27 @@
 """Actors and critics: the "RAD-SAC" agent of CRPTpro and Proto-RL, DrQ's critic of images, BeCL's skill policy.
 
-Each is a trunk that brings ``feature_dim`` features down to ``bottleneck_dim``, and perceptrons of two hidden layers of
-``hidden_dim``. Each raises ``ValueError`` for a size that is no positive whole number, and keeps its arguments in
-``config``.
+Each is a trunk from ``feature_dim`` to ``bottleneck_dim``, and perceptrons with two hidden layers of ``hidden_dim``.
+Each keeps its arguments in ``config``. A size that is not a positive whole number is a ``ValueError``.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from crptpro.modules.encoder import PixelEncoder
-from crptpro.modules.heads import LinearNetwork, plain_sizes
+from crptpro.modules.heads import LinearNetwork
 from crptpro.modules.precision import linear_in
 from crptpro.values import as_float
 
 BOUND_MARGIN = 1e-6
 
 
-class FeatureTrunk(LinearNetwork):
-    """Linear layer and LayerNorm that bring long features down to a bottleneck; DrQ and URLB's DDPG end with a tanh."""
+class FeatureTrunk(nn.Module):
+    """Linear layer and LayerNorm from long features to a bottleneck; DrQ and URLB's DDPG end with a tanh."""
 
     def __init__(self, feature_dim: int, bottleneck_dim: int, *, has_tanh: bool) -> None:
         super().__init__()
@@ -38,7 +36,7 @@ class FeatureTrunk(LinearNetwork):
         return torch.tanh(bottleneck) if self.has_tanh else bottleneck
 
 
-class MLP(LinearNetwork):
+class MLP(nn.Module):
     """Three linear layers with ReLU between them; only the wide middle product runs in ``compute_dtype``."""
 
     def __init__(self, in_dim: int, hidden_dim: int, out_dim: int) -> None:
@@ -58,7 +56,7 @@ class SquashedGaussianActor(LinearNetwork):
     r"""Stochastic policy :math:`a = \tanh(u),\ u \sim \mathcal N(\mu, \sigma)` on features.
 
     The raw log standard deviation is squashed: ``log_std = lo + (hi - lo) / 2 * (tanh(raw) + 1)``, with (lo, hi)
-    ``log_std_bounds``. DrQ's trunk ``has_tanh``. Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
+    ``log_std_bounds``. Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
     """
 
     def __init__(
@@ -71,15 +69,14 @@ class SquashedGaussianActor(LinearNetwork):
         log_std_bounds: tuple[float, float] = (-10.0, 2.0),
         has_tanh: bool = False,
     ) -> None:
-        super().__init__()
+        super().__init__(
+            feature_dim=feature_dim, action_dim=action_dim, bottleneck_dim=bottleneck_dim, hidden_dim=hidden_dim
+        )
+        feature_dim, self.action_dim, bottleneck_dim, hidden_dim = self.config.values()
         low, high = (as_float(bound, "log_std_bounds") for bound in log_std_bounds)
         if not low < high:
             raise ValueError(f"log_std_bounds must be (low, high) with low < high, got {log_std_bounds}.")
-        sizes = plain_sizes(
-            feature_dim=feature_dim, action_dim=action_dim, bottleneck_dim=bottleneck_dim, hidden_dim=hidden_dim
-        )
-        feature_dim, self.action_dim, bottleneck_dim, hidden_dim = sizes.values()
-        self.config: dict[str, Any] = {**sizes, "log_std_bounds": [low, high], "has_tanh": bool(has_tanh)}
+        self.config |= {"log_std_bounds": [low, high], "has_tanh": bool(has_tanh)}
         self.log_std_bounds = (low, high)
         self.trunk = FeatureTrunk(feature_dim, bottleneck_dim, has_tanh=has_tanh)
         self.mlp = MLP(bottleneck_dim, hidden_dim, 2 * self.action_dim)
@@ -94,9 +91,9 @@ class SquashedGaussianActor(LinearNetwork):
     def sample(
         self, features: Tensor, *, noise: Tensor | None = None, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Draw reparameterised actions ``[*, A]`` in [-1, 1], and their ``log_prob`` ``[*]`` (nats, summed over A).
+        """Return reparameterised actions ``[*, A]`` in [-1, 1], and their ``log_prob`` ``[*]`` (nats, summed over A).
 
-        Of standard normal ``noise`` ``[*, A]``; drawn from ``generator``, or torch's global one, if None.
+        Standard normal ``noise`` ``[*, A]`` is drawn from ``generator`` (torch's global one if None) unless given.
         """
         loc, scale = self(features)
         return squashed_gaussian(loc, scale, standard_normal_like(loc, generator) if noise is None else noise)
@@ -107,10 +104,7 @@ class SquashedGaussianActor(LinearNetwork):
 
 
 class TwinCritic(LinearNetwork):
-    """Two Q-functions that share ONE trunk, as in the released code; a target network is a copy of all of it.
-
-    DrQ and URLB's DDPG have trunks with ``has_tanh``. Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``.
-    """
+    """Two Q-functions with one shared trunk, as in denisyarats/proto and liuxin0824/CRPTpro ``proto.py``."""
 
     def __init__(
         self,
@@ -121,12 +115,11 @@ class TwinCritic(LinearNetwork):
         hidden_dim: int = 1024,
         has_tanh: bool = False,
     ) -> None:
-        super().__init__()
-        sizes = plain_sizes(
+        super().__init__(
             feature_dim=feature_dim, action_dim=action_dim, bottleneck_dim=bottleneck_dim, hidden_dim=hidden_dim
         )
-        feature_dim, self.action_dim, bottleneck_dim, hidden_dim = sizes.values()
-        self.config: dict[str, Any] = {**sizes, "has_tanh": bool(has_tanh)}
+        feature_dim, self.action_dim, bottleneck_dim, hidden_dim = self.config.values()
+        self.config["has_tanh"] = bool(has_tanh)
         self.trunk = FeatureTrunk(feature_dim, bottleneck_dim, has_tanh=has_tanh)
         self.q1 = MLP(bottleneck_dim + self.action_dim, hidden_dim, 1)
         self.q2 = MLP(bottleneck_dim + self.action_dim, hidden_dim, 1)
@@ -140,7 +133,7 @@ class TwinCritic(LinearNetwork):
 
 
 class PixelCritic(nn.Module):
-    """Twin Q-functions of pixels; a target network is a copy of all of it, convolutions included."""
+    """Twin Q-functions of pixels."""
 
     def __init__(self, encoder: PixelEncoder, head: TwinCritic) -> None:
         super().__init__()
@@ -149,8 +142,7 @@ class PixelCritic(nn.Module):
                 f"The critic's head was built for {head.config['feature_dim']} features, the encoder gives "
                 f"{encoder.feature_dim}; build it with feature_dim={encoder.feature_dim}."
             )
-        self.encoder = encoder
-        self.head = head
+        self.encoder, self.head = encoder, head
 
     def forward(self, pixels: Tensor, action: Tensor) -> Tensor:
         """Return both action values ``[*, 2]`` of images ``[*, C, H, W]`` and actions ``[*, A]`` in [-1, 1]."""
@@ -158,10 +150,9 @@ class PixelCritic(nn.Module):
 
 
 class DeterministicActor(LinearNetwork):
-    r"""Policy :math:`a = \tanh(f([h, z]))` on features h and a one-hot skill z, plus Gaussian noise.
+    r"""Policy :math:`a = \tanh(f([h, z]))` on features h and a one-hot skill z, plus Gaussian noise: BeCL's explorer.
 
-    The trunk ends with a tanh; ``skill_dim`` is the number of skills K, ``noise_std`` the noise's standard deviation.
-    BeCL's exploring agent; source: rll-research/url_benchmark ``agent/ddpg.py``.
+    ``skill_dim`` is the number of skills K. Source: rll-research/url_benchmark ``agent/ddpg.py``.
     """
 
     def __init__(
@@ -174,17 +165,13 @@ class DeterministicActor(LinearNetwork):
         hidden_dim: int = 1024,
         noise_std: float = 0.2,
     ) -> None:
-        super().__init__()
-        sizes = plain_sizes(
-            feature_dim=feature_dim,
-            action_dim=action_dim,
-            skill_dim=skill_dim,
-            bottleneck_dim=bottleneck_dim,
+        super().__init__(
+            feature_dim=feature_dim, action_dim=action_dim, skill_dim=skill_dim, bottleneck_dim=bottleneck_dim,
             hidden_dim=hidden_dim,
-        )
-        feature_dim, self.action_dim, self.skill_dim, bottleneck_dim, hidden_dim = sizes.values()
+        )  # fmt: skip
+        feature_dim, self.action_dim, self.skill_dim, bottleneck_dim, hidden_dim = self.config.values()
         self.noise_std = as_float(noise_std, "noise_std", minimum=0)
-        self.config: dict[str, Any] = {**sizes, "noise_std": self.noise_std}
+        self.config["noise_std"] = self.noise_std
         self.trunk = FeatureTrunk(feature_dim + self.skill_dim, bottleneck_dim, has_tanh=True)
         self.mlp = MLP(bottleneck_dim, hidden_dim, self.action_dim)
         self.reset_parameters()
@@ -196,16 +183,16 @@ class DeterministicActor(LinearNetwork):
     def sample(
         self, inputs: Tensor, *, noise_clip: float | None = None, generator: torch.Generator | None = None
     ) -> Tensor:
-        """Return a noisy action, ``[*, A]`` in [-1 + 1e-6, 1 - 1e-6]; the gradient passes as if nothing were clamped.
+        """Return an action ``[*, A]`` in [-1 + 1e-6, 1 - 1e-6] with noise, of at most ``noise_clip`` in size.
 
-        The noise is drawn from ``generator`` (torch's global one if None), and at most ``noise_clip`` in size.
+        The noise is drawn from ``generator`` (torch's global one if None). The gradient ignores the bounds.
         """
         mean = self(inputs)
         noise = self.noise_std * standard_normal_like(mean, generator)
         if noise_clip is not None:
             noise = noise.clamp(-noise_clip, noise_clip)
         action = mean + noise
-        # Straight through: where the bound cuts, the mean still learns.
+        # Straight-through gradient.
         return action + (action.clamp(-1 + BOUND_MARGIN, 1 - BOUND_MARGIN) - action).detach()
 
 
@@ -213,7 +200,7 @@ def squashed_gaussian(loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor
     r"""Reparameterised tanh-Gaussian sample ``[*, A]`` and its log-density ``[*]``, of mean, deviation and noise.
 
     :math:`\log\pi(a) = \sum_A \log\mathcal N(u;\mu,\sigma) - 2(\log 2 - u - \mathrm{softplus}(-2u))` with
-    :math:`u = \mu + \sigma\epsilon`, before the tanh: finite, with the right gradient, where tanh rounds to 1.
+    :math:`u = \mu + \sigma\epsilon`: finite, with the right gradient, also where tanh rounds to 1.
     """
     pre_tanh = loc + scale * noise
     log_normal = -0.5 * noise.square() - scale.log() - 0.5 * math.log(2 * math.pi)
@@ -222,7 +209,7 @@ def squashed_gaussian(loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor
 
 
 def standard_normal_like(like: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Standard normal values shaped, typed and placed like ``like``, from a generator if one is given."""
+    """Return standard normal values with shape, dtype and device of ``like``, from a generator if one is given."""
     if generator is None:
         return torch.randn_like(like)
     values = torch.randn(like.shape, generator=generator, dtype=like.dtype, device=generator.device)

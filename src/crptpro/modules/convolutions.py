@@ -1,8 +1,7 @@
-"""Chunks of a batch through the encoder's convolutions, each on a thread of its own.
+"""Chunks of a batch through the encoder's convolutions, one thread per chunk.
 
-Kept for what it gains. A pre-training update of 512 transitions in float32 on two busy AVX2 cores took 6.0 s, against
-10.5 s with the chunks one after the other on both cores and 8.2 s in one piece; on one thread 12.3 s in chunks and
-14.9 s in one piece.
+A pre-training update of 512 transitions in float32 on two busy AVX2 cores took 6.0 s, against 10.5 s with the chunks
+one after the other on both cores and 8.2 s without chunks; on one thread 12.3 s with and 14.9 s without chunks.
 """
 
 from __future__ import annotations
@@ -12,24 +11,22 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-T = TypeVar("T")
-R = TypeVar("R")
 ChunkFunction = Callable[[Tensor, Sequence[Tensor]], Tensor]
 
 START_TIMEOUT_S = 60.0
 
 
 def apply_to_chunks(function: ChunkFunction, chunks: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
-    """Return ``torch.cat([function(chunk, parameters) for chunk in chunks])``, computed side by side.
+    """Return ``torch.cat([function(chunk, parameters) for chunk in chunks])``, computed in parallel.
 
-    In PyTorch all cores share every operation and wait for each other at its end; here they meet once per batch. The
-    gradient of a parameter is the sum over the chunks in their order, whatever the number of threads. Chunks have none.
+    PyTorch synchronises the cores after every operation, this function once per batch. The gradient of a parameter is
+    the sum over the chunks in order, whatever the number of threads. Chunks get no gradient.
     """
     if torch.is_grad_enabled() and any(parameter.requires_grad for parameter in parameters):
         return _Chunks.apply(function, chunks, *parameters)
@@ -37,7 +34,7 @@ def apply_to_chunks(function: ChunkFunction, chunks: Sequence[Tensor], parameter
 
 
 class _Chunks(torch.autograd.Function):
-    """Keeps one graph per chunk, so that the backward pass can go through them side by side too."""
+    """Keeps one graph per chunk, so that the backward pass is parallel too."""
 
     @staticmethod
     def forward(ctx: Any, function: ChunkFunction, chunks: Sequence[Tensor], *parameters: Tensor) -> Tensor:
@@ -49,8 +46,7 @@ class _Chunks(torch.autograd.Function):
                 return [leaf for leaf in leaves if leaf.requires_grad], function(chunk, leaves)
 
         graphs = _map(record, chunks)
-        # On a saved tensor and not on the context: autograd frees those after the backward pass, while the context
-        # lives as long as anybody holds the loss.
+        # Autograd frees saved tensors after the backward pass, but the context only with the loss.
         carrier: Any = torch.empty(0)
         carrier.graphs = graphs
         ctx.save_for_backward(carrier)
@@ -64,18 +60,18 @@ class _Chunks(torch.autograd.Function):
 
         def differentiate(job: tuple[tuple[list[Tensor], Tensor], Tensor]) -> tuple[Tensor, ...]:
             (leaves, output), part = job
-            # Kept, because the caller may ask the outer graph for a second pass; it is freed together with that one.
+            # The outer graph may be used for a second pass; both are freed together.
             return torch.autograd.grad(output, leaves, part, retain_graph=True)
 
         sums = iter([sum(found[1:], found[0]) for found in zip(*_map(differentiate, list(zip(graphs, parts))))])
         return (None, None, *[next(sums) if need else None for need in ctx.needs])
 
 
-def _map(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
+def _map(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
     threads = min(torch.get_num_threads(), len(items))
     is_recording = torch.is_grad_enabled()
 
-    def in_mode(item: T) -> R:
+    def in_mode(item: Any) -> Any:
         with torch.set_grad_enabled(is_recording):
             return work(item)
 
@@ -89,16 +85,16 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     together = threading.Barrier(threads)
 
     def compute_alone(_: int) -> None:
-        together.wait(START_TIMEOUT_S)  # so that every thread of the pool gets one of these calls
-        torch.get_num_threads()  # a thread's first question sets its number to the process's
+        together.wait(START_TIMEOUT_S)  # every thread of the pool must get one of these calls
+        torch.get_num_threads()  # a thread's first call sets its number to the process's
         torch.set_num_threads(1)
 
     pool = ThreadPoolExecutor(threads, thread_name_prefix="chunks")
     try:
         list(pool.map(compute_alone, range(threads)))
     finally:
-        together.abort()  # where not all could be started, those that were wait no longer
-        torch.set_num_threads(before)  # the number is kept per thread, but new threads take the last one set
+        together.abort()  # if a thread could not start, the others stop waiting
+        torch.set_num_threads(before)  # the number is per thread, but new threads take the last one set
     return pool
 
 

@@ -26,24 +26,18 @@ class PixelEncoder(nn.Module):
     84x84 -> 41 -> 39 -> 37 -> 35 with 32 channels gives 39,200 features. Weights are orthogonal on the flattened kernel
     (gain sqrt 2, not delta-orthogonal), biases zero, as in liuxin0824/CRPTpro and denisyarats/proto ``proto.py``.
 
-    The network sees ``pixels * pixel_scale - pixel_offset``. In bfloat16 it sees the raw 0..255 values, which bfloat16
-    holds exactly, and the scale is folded into the first kernel. Parameters and gradients stay float32 in both.
+    The input is ``pixels * pixel_scale - pixel_offset``. In bfloat16 it is the raw 0..255 values, which bfloat16 holds
+    exactly, and the first kernel is scaled instead. Parameters and gradients stay float32.
 
-    Images are uint8, or floating in [0, 1], which are taken as divided by 255 already; a warning says so once per
-    encoder. Everything else is refused.
+    Images are uint8, or floating in [0, 1], which count as already divided by 255 (one warning per encoder). Other
+    images are a ``ValueError``.
 
-    Args:
-        in_channels: colour channels times stacked frames (3 x 3).
-        channels: output channels of each convolution.
-        strides: stride of each convolution.
-        image_size: height and width in pixels.
-        pixel_scale: factor on the 0..255 values.
-        pixel_offset: subtracted after scaling (0 here; 0.5 in URLB-style methods).
-        init: ``"orthogonal"``, or ``"kaiming"`` (normal, fan-in, for ReLU), as ATC's own encoder.
-        standardised: have the buffers of :meth:`standardise` from the start (0 and 1), to load weights into.
+    ``in_channels`` are the colour channels times the stacked frames; ``pixel_offset`` is 0.5 in URLB-style methods;
+    ``init="kaiming"`` (normal, fan-in, for ReLU) is that of ATC's encoder; ``standardised`` creates the buffers of
+    :meth:`standardise` (0 and 1), to load weights into.
 
     Attributes:
-        feature_dim: length of the flattened output, in (C, H, W) order, the ``feature_map_shape``.
+        feature_dim: length of the output, the flattened ``feature_map_shape`` (C, H, W).
         config: the constructor arguments, JSON-able.
         compute_dtype: ``torch.float32`` (the parameters' own dtype) or ``torch.bfloat16``; also of the output.
         micro_batch: chunk length on a CPU, where chunks stay in cache and go to different cores.
@@ -67,14 +61,12 @@ class PixelEncoder(nn.Module):
     ) -> None:
         super().__init__()
         if not len(channels) or len(channels) != len(strides):
-            raise ValueError(
-                f"channels and strides must be non-empty and of equal length, got {channels} and {strides}."
-            )
+            raise ValueError(f"channels and strides must be non-empty, of equal length, got {channels} and {strides}.")
         sizes = plain_sizes(in_channels=in_channels, image_size=image_size)
-        self.in_channels, self.image_size = in_channels, image_size = sizes.values()
+        self.in_channels, self.image_size = sizes.values()
         channels = [as_int(count, "channels", minimum=1) for count in channels]
         self.strides = tuple(as_int(stride, "strides", minimum=1) for stride in strides)
-        size = image_size
+        size = self.image_size
         for stride in self.strides:
             size = (size - KERNEL_SIZE) // stride + 1
             if size < 1:
@@ -83,19 +75,14 @@ class PixelEncoder(nn.Module):
         self.pixel_offset = as_float(pixel_offset, "pixel_offset")
         self.convs = nn.ModuleList(
             nn.Conv2d(c_in, c_out, KERNEL_SIZE, stride)
-            for c_in, c_out, stride in zip([in_channels, *channels[:-1]], channels, self.strides)
+            for c_in, c_out, stride in zip([self.in_channels, *channels[:-1]], channels, self.strides)
         )
         self.feature_map_shape: tuple[int, int, int] = (channels[-1], size, size)
         self.feature_dim: int = math.prod(self.feature_map_shape)
         self.config: dict[str, Any] = {
-            **sizes,
-            "channels": channels,
-            "strides": list(self.strides),
-            "pixel_scale": self.pixel_scale,
-            "pixel_offset": self.pixel_offset,
-            "init": init,
-            "standardised": bool(standardised),
-        }
+            **sizes, "channels": channels, "strides": list(self.strides), "pixel_scale": self.pixel_scale,
+            "pixel_offset": self.pixel_offset, "init": init, "standardised": bool(standardised),
+        }  # fmt: skip
         self.compute_dtype = torch.float32
         self.micro_batch = 64
         self._has_warned = False
@@ -105,19 +92,15 @@ class PixelEncoder(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Draw the kernels (orthogonal ones with gain sqrt 2) and zero the biases."""
+        """Initialise the kernels (orthogonal ones with gain sqrt 2) and zero the biases."""
         for conv in self.convs:
             init_weights_(conv, self.config["init"], gain=math.sqrt(2.0))
 
     @torch.no_grad()
     def standardise(self, mean: Tensor, scale: Tensor) -> PixelEncoder:
-        """Give out ``(features - mean) / scale`` from now on, finite ``[feature_dim]``, scale positive; returns self.
-
-        Both become buffers ``feature_mean`` and ``feature_scale``, saved with the weights.
-        """
-        like = self.convs[0].weight
+        """Encode to ``(features - mean) / scale`` from now on, finite ``[feature_dim]`` and saved; return self."""
         for name, value in (("mean", mean), ("scale", scale)):
-            value = torch.as_tensor(value).to(like)
+            value = torch.as_tensor(value).to(self.convs[0].weight)
             if value.shape != (self.feature_dim,) or not bool(value.isfinite().all()):
                 raise ValueError(
                     f"`{name}` must hold {self.feature_dim} finite numbers, one per feature, got {tuple(value.shape)}."
@@ -129,19 +112,11 @@ class PixelEncoder(nn.Module):
         return self
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Encode images ``[*, in_channels, image_size, image_size]`` to ``[*, feature_dim]`` in ``compute_dtype``.
-
-        In bfloat16 floating values are rounded to eight significant bits. Not negative unless standardised.
-
-        Raises:
-            ValueError: images of another shape, or values that are neither uint8 nor in [0, 1].
-        """
+        """Encode images ``[*, in_channels, image_size, image_size]`` to ``[*, feature_dim]`` in ``compute_dtype``."""
         expected = (self.in_channels, self.image_size, self.image_size)
         if tuple(pixels.shape[-3:]) != expected:
-            raise ValueError(
-                f"PixelEncoder was built for pixels of shape [*, {', '.join(map(str, expected))}], "
-                f"got {tuple(pixels.shape)}."
-            )
+            shape = ", ".join(map(str, expected))
+            raise ValueError(f"PixelEncoder was built for pixels of shape [*, {shape}], got {tuple(pixels.shape)}.")
         return self.standardised(self.feature_map(pixels).flatten(-3))
 
     def standardised(self, features: Tensor) -> Tensor:
@@ -168,8 +143,8 @@ class PixelEncoder(nn.Module):
             return
         if not pixels.is_floating_point():
             raise ValueError(
-                f"Pixels must be uint8, or floating in [0, 1]; got {pixels.dtype}. Convert them with .to(torch.uint8) "
-                "if they lie in 0..255."
+                f"Pixels must be uint8, or floating in [0, 1]; got {pixels.dtype}. Values in 0..255 need "
+                ".to(torch.uint8)."
             )
         if torch.compiler.is_compiling() or not pixels.numel():
             return
@@ -186,7 +161,7 @@ class PixelEncoder(nn.Module):
             )
 
     def _convolve(self, images: Tensor, parameters: Sequence[Tensor]) -> Tensor:
-        """Encode one chunk with weights and biases given in turn; called from several threads at a time."""
+        """Encode one chunk with alternating weights and biases; several threads call it at a time."""
         weights, biases = list(parameters[::2]), list(parameters[1::2])
         scale = self.pixel_scale if images.dtype == torch.uint8 else 255 * self.pixel_scale
         if self.compute_dtype == torch.float32:
@@ -207,7 +182,7 @@ class PixelEncoder(nn.Module):
 
 
 def _can_chunk(device: torch.device) -> bool:
-    """On a CPU, where nobody watches or changes the operations, which other threads would not see."""
+    """Whether other threads may compute: autocast and functional transforms act on the calling thread alone."""
     return (
         device.type == "cpu"
         and not torch.compiler.is_compiling()

@@ -1,6 +1,6 @@
-"""What sits on the encoder during pre-training: the heads of CRPTpro and Proto-RL, of ATC, and of BeCL.
+"""Heads on the encoder for pre-training: those of CRPTpro and Proto-RL, of ATC, and of BeCL.
 
-Every head raises ``ValueError`` for a size that is no positive whole number, and keeps its arguments in ``config``.
+Every head keeps its arguments in ``config``. A size that is not a positive whole number is a ``ValueError``.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ NORM_EPS = 1e-12
 def init_weights_(layer: nn.Linear | nn.Conv2d, init: WeightInit = "orthogonal", gain: float = 1.0) -> None:
     """Initialise a layer in place, with zero bias.
 
-    ``"orthogonal"`` is on the flattened kernel, times ``gain``; ``"kaiming"`` is normal with variance 2 / fan-in
-    (rlpyt, the framework of ATC).
+    ``"orthogonal"`` acts on the flattened kernel, times ``gain``; ``"kaiming"`` is normal with variance 2 / fan-in.
     """
     if init not in get_args(WeightInit):
         raise ValueError(f"init must be one of {', '.join(get_args(WeightInit))}, got {init!r}.")
@@ -36,13 +35,23 @@ def init_weights_(layer: nn.Linear | nn.Conv2d, init: WeightInit = "orthogonal",
         nn.init.zeros_(layer.bias)
 
 
+def plain_sizes(**sizes: Any) -> dict[str, int]:
+    """Return sizes as plain positive integers, which JSON can hold."""
+    return {name: as_int(value, name, minimum=1) for name, value in sizes.items()}
+
+
 class LinearNetwork(nn.Module):
-    """Linear layers, drawn as ``init`` says (gain 1) with zero biases; LayerNorms start as the identity."""
+    """Linear layers, initialised by ``init`` with gain 1 and zero biases; LayerNorms start as the identity."""
 
     init: WeightInit = "orthogonal"
+    config: dict[str, Any]
+
+    def __init__(self, **sizes: Any) -> None:
+        super().__init__()
+        self.config = dict(plain_sizes(**sizes))
 
     def reset_parameters(self) -> None:
-        """Draw all weights anew."""
+        """Initialise all weights again."""
         for layer in self.modules():
             if isinstance(layer, nn.Linear):
                 init_weights_(layer, self.init)
@@ -50,24 +59,17 @@ class LinearNetwork(nn.Module):
                 layer.reset_parameters()
 
 
-def plain_sizes(**sizes: Any) -> dict[str, int]:
-    """Return sizes from users as plain positive integers, for a card to hold; anything else is refused by name."""
-    return {name: as_int(value, name, minimum=1) for name, value in sizes.items()}
-
-
 class Projector(LinearNetwork):
     r"""One linear layer from features to latents of length D, :math:`g_\theta` (denisyarats/proto ``proto.py``).
 
     The product runs in ``compute_dtype``; the result has the parameters' dtype, so normalisation, softmax and Sinkhorn
-    stay float32. ``init="kaiming"`` (normal, fan-in, for ReLU) is how ATC draws its own.
+    stay float32. ATC uses ``init="kaiming"`` (normal, fan-in, for ReLU).
     """
 
     def __init__(self, feature_dim: int = 39_200, latent_dim: int = 128, init: WeightInit = "orthogonal") -> None:
-        super().__init__()
-        sizes = plain_sizes(feature_dim=feature_dim, latent_dim=latent_dim)
-        self.config: dict[str, Any] = {**sizes, "init": init}
-        self.linear = nn.Linear(sizes["feature_dim"], sizes["latent_dim"])
-        self.init = init
+        super().__init__(feature_dim=feature_dim, latent_dim=latent_dim)
+        self.linear = nn.Linear(*self.config.values())
+        self.config["init"] = self.init = init
         self.compute_dtype = torch.float32
         self.reset_parameters()
 
@@ -77,14 +79,10 @@ class Projector(LinearNetwork):
 
 
 class Predictor(LinearNetwork):
-    r"""Perceptron in the latent space, online branch only: :math:`v_\psi` (denisyarats/proto ``proto.py``).
-
-    ``hidden_dim`` is 1024 as in the paper's table; the released code has 512.
-    """
+    r"""Perceptron in the latent space, online branch only: :math:`v_\psi` (denisyarats/proto ``proto.py``)."""
 
     def __init__(self, latent_dim: int = 128, hidden_dim: int = 1024) -> None:
-        super().__init__()
-        self.config = plain_sizes(latent_dim=latent_dim, hidden_dim=hidden_dim)
+        super().__init__(latent_dim=latent_dim, hidden_dim=hidden_dim)
         latent_dim, hidden_dim = self.config.values()
         self.hidden = nn.Linear(latent_dim, hidden_dim)
         self.output = nn.Linear(hidden_dim, latent_dim)
@@ -96,11 +94,10 @@ class Predictor(LinearNetwork):
 
 
 class Prototypes(nn.Module):
-    """M trainable vectors of length D; what matters of each is its direction.
+    """M trainable vectors of length D, of which only the direction counts (the idea is SwaV's, arXiv 2006.09882).
 
-    Orthogonal initialisation (a tight frame when M > D). Training keeps the rows at unit length by calling
-    :meth:`normalize_` before every update, as the released code does; every read goes through :meth:`unit_weight`.
-    Source: denisyarats/proto and liuxin0824/CRPTpro ``proto.py``; the idea is SwaV's (arXiv 2006.09882).
+    Orthogonal initialisation (a tight frame when M > D). :meth:`normalize_` before every update keeps the rows at unit
+    length, as in denisyarats/proto and liuxin0824/CRPTpro ``proto.py``; losses read :meth:`unit_weight`.
     """
 
     def __init__(self, num_prototypes: int = 512, latent_dim: int = 128) -> None:
@@ -111,7 +108,7 @@ class Prototypes(nn.Module):
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
-        """Draw an orthogonal matrix and scale its rows to unit length."""
+        """Set an orthogonal matrix with rows scaled to unit length."""
         nn.init.orthogonal_(self.weight)
         self.normalize_()
 
@@ -122,11 +119,7 @@ class Prototypes(nn.Module):
         return self
 
     def unit_weight(self) -> Tensor:
-        """Return the rows at unit length ``[M, D]``.
-
-        The length is a constant to autograd: the gradient reaches the raw weight as it does in the released code,
-        radial part included.
-        """
+        """Return the rows at unit length ``[M, D]``; as in the released code, the length is a constant to autograd."""
         return self.weight / self.weight.detach().norm(dim=-1, keepdim=True).clamp_min(NORM_EPS)
 
     def forward(self, latents: Tensor) -> Tensor:
@@ -135,10 +128,9 @@ class Prototypes(nn.Module):
 
 
 class AnchorHead(nn.Module):
-    r"""ATC's contrast model on the anchor's side: :math:`W(a + \mathrm{MLP}(a))`, online branch only.
+    r"""ATC's head of the anchors, :math:`W(a + \mathrm{MLP}(a))`, online branch only, with PyTorch's initialisation.
 
-    The logits are the inner products of the result with the positives' latents. PyTorch's default initialisation, as
-    in the source: astooke/rlpyt ``rlpyt/ul/models/ul/atc_models.py`` (ATC, arXiv 2009.08319).
+    Source: astooke/rlpyt ``rlpyt/ul/models/ul/atc_models.py`` (ATC, arXiv 2009.08319).
     """
 
     def __init__(self, latent_dim: int = 128, hidden_dim: int = 512) -> None:
@@ -157,14 +149,12 @@ class AnchorHead(nn.Module):
 class SkillHead(LinearNetwork):
     """BeCL's head: embedding of the features, then projection (Rooshy-yang/BeCL ``agent/becl.py``, arXiv 2305.04477).
 
-    features -> hidden ReLU -> hidden ReLU -> D (embedding) -> hidden ReLU -> D (projection). The product with the
-    features runs in ``compute_dtype``; everything after it, and the result, has the parameters' dtype. D is the number
-    of skills in the source.
+    features -> hidden ReLU -> hidden ReLU -> D (embedding) -> hidden ReLU -> D (projection), D the number of skills in
+    the source. Only the product with the features runs in ``compute_dtype``.
     """
 
     def __init__(self, feature_dim: int = 39_200, latent_dim: int = 16, hidden_dim: int = 1024) -> None:
-        super().__init__()
-        self.config = plain_sizes(feature_dim=feature_dim, latent_dim=latent_dim, hidden_dim=hidden_dim)
+        super().__init__(feature_dim=feature_dim, latent_dim=latent_dim, hidden_dim=hidden_dim)
         feature_dim, latent_dim, hidden_dim = self.config.values()
         self.embed_input = nn.Linear(feature_dim, hidden_dim)
         self.embed_hidden = nn.Linear(hidden_dim, hidden_dim)
@@ -182,16 +172,14 @@ class SkillHead(LinearNetwork):
 
 
 def latent_dim_of(head: nn.Module) -> int | None:
-    """Return the length D of the latents a head works in, where its ``config`` says so, else None."""
+    """Return the latent length D in the ``config`` of a head, or None."""
     config = getattr(head, "config", None)
     return config.get("latent_dim") if isinstance(config, dict) else None
 
 
 def require_one_latent_dim(**heads: nn.Module) -> None:
-    """Refuse heads that could not be multiplied; those that do not tell their length are left to the product."""
+    """Require that all heads with a known latent length share it."""
     dims = {name: dim for name, head in heads.items() if (dim := latent_dim_of(head)) is not None}
     if len(set(dims.values())) > 1:
-        told = ", ".join(f"{name} {dim}" for name, dim in dims.items())
-        raise ValueError(
-            f"The heads must share one latent length, got {told}; pass latent_dim= for those that are not given."
-        )
+        found = ", ".join(f"{name} {dim}" for name, dim in dims.items())
+        raise ValueError(f"The heads must share one latent length, got {found}; pass latent_dim= for the others.")

@@ -1,4 +1,4 @@
-"""How networks compute: number format and device."""
+"""Number format and device of the networks' computations."""
 
 from __future__ import annotations
 
@@ -15,19 +15,17 @@ from torch import Tensor, nn
 from crptpro.errors import CRPTproError
 
 Precision = Literal["auto", "fp32", "bf16"]
-
-#: Where Linux tells the processor's vendor and instructions.
 CPUINFO = Path("/proc/cpuinfo")
 
 _Module = TypeVar("_Module", bound=nn.Module)
 
 
 def resolve_precision(precision: Precision, device: torch.device | str) -> torch.dtype:
-    """Turn a precision name into the compute dtype for a device; an unknown name is a ``ValueError``.
+    """Return the compute dtype of a precision for a device; an unknown name is a ``ValueError``.
 
     ``"fp32"`` is the reference. ``"auto"`` is bf16 where the hardware is faster in it: CUDA of compute capability 8 or
-    newer, a CPU with AMX or AVX512-BF16. Where float32 comes out for a CUDA device, TF32 is switched off for the whole
-    process, so that fp32 means the same on every device.
+    newer, a CPU with AMX or AVX512-BF16. float32 on a CUDA device disables TF32 for the whole process, so that fp32
+    means the same on every device.
     """
     if precision not in ("auto", "fp32", "bf16"):
         raise ValueError(f"precision must be 'auto', 'fp32' or 'bf16', got {precision!r}.")
@@ -35,7 +33,7 @@ def resolve_precision(precision: Precision, device: torch.device | str) -> torch
     if precision == "bf16" or (precision == "auto" and _is_faster_in_bf16(device)):
         return torch.bfloat16
     if device.type == "cuda":
-        # The older switches: reading them fails after the newer ones (fp32_precision) were set for one operation only.
+        # Reading these older switches fails if the newer ones (fp32_precision) are set for one operation only.
         torch.backends.cudnn.allow_tf32 = False
         torch.backends.cuda.matmul.allow_tf32 = False
     return torch.float32
@@ -47,17 +45,14 @@ def _is_faster_in_bf16(device: torch.device) -> bool:
     if device.type != "cpu" or not CPUINFO.exists():
         return False
     text = CPUINFO.read_text(errors="replace")
-    # Intel's cores with AVX512-FP16 leave bf16 to AMX. Where a virtual machine hides it, AVX512-BF16 multiplied
+    # Intel's cores with AVX512-FP16 leave bf16 to AMX. On a virtual machine that hides AMX, AVX512-BF16 multiplied
     # matrices at 81 GFLOP/s and float32 at 154 (a core of 2023); AMD's cores are twice as fast in bf16.
     hides_amx = "GenuineIntel" in text and "avx512_fp16" in text
     return "amx_bf16" in text or ("avx512_bf16" in text and not hides_amx)
 
 
 def set_compute_dtype(module: _Module, dtype: torch.dtype) -> _Module:
-    """Set ``compute_dtype`` on every network inside ``module``, a network or a loss; parameters keep their dtype.
-
-    ``dtype`` is ``torch.bfloat16``, or ``torch.float32`` for that of the parameters; others are a ``ValueError``.
-    """
+    """Set ``compute_dtype``, float32 or bfloat16, on every network inside ``module``, a network or loss; return it."""
     if dtype not in (torch.float32, torch.bfloat16):
         raise ValueError(f"compute dtype must be torch.float32 or torch.bfloat16, got {dtype}.")
     for network in _networks_within(module):
@@ -68,7 +63,7 @@ def set_compute_dtype(module: _Module, dtype: torch.dtype) -> _Module:
 
 @contextlib.contextmanager
 def computing(module: nn.Module, dtype: torch.dtype) -> Iterator[None]:
-    """Have networks compute in a dtype (see :func:`set_compute_dtype`), and afterwards in float32 again."""
+    """Let networks compute in a dtype (see :func:`set_compute_dtype`) in the block, and in float32 after it."""
     try:
         set_compute_dtype(module, dtype)
         yield
@@ -77,7 +72,7 @@ def computing(module: nn.Module, dtype: torch.dtype) -> Iterator[None]:
 
 
 def _networks_within(module: nn.Module) -> Iterator[nn.Module]:
-    # LossModule.convert_to_functional hides networks in the instance dictionary, where modules() does not look.
+    # LossModule.convert_to_functional hides networks in the instance dictionary, which modules() ignores.
     seen: set[int] = set()
     waiting = [module]
     while waiting:
@@ -89,7 +84,7 @@ def _networks_within(module: nn.Module) -> Iterator[nn.Module]:
 
 
 def linear_in(inputs: Tensor, layer: nn.Linear, compute_dtype: torch.dtype) -> Tensor:
-    """Apply a linear layer whose product runs in ``compute_dtype``; its result and bias have the weight's dtype."""
+    """Apply a linear layer with the product in ``compute_dtype``; result and bias have the weight's dtype."""
     weight, bias = layer.weight, layer.bias
     if compute_dtype == torch.float32:
         return F.linear(inputs.to(weight.dtype), weight, bias)
@@ -98,13 +93,13 @@ def linear_in(inputs: Tensor, layer: nn.Linear, compute_dtype: torch.dtype) -> T
 
 
 def device_of(module: nn.Module) -> torch.device | None:
-    """Return the device of a network's first parameter or buffer; None if it has neither."""
+    """Return the device of a network's first parameter or buffer, or None."""
     first = next(chain(module.parameters(), module.buffers()), None)
     return None if first is None else first.device
 
 
 def usable_device(name: str | torch.device) -> torch.device:
-    """Return a device once a tensor could be put there, or raise a :class:`CRPTproError` with torch's reason."""
+    """Return a device on which a tensor can be created; otherwise a :class:`CRPTproError` gives torch's reason."""
     try:
         device = torch.device(name)
         torch.empty(1, device=device)

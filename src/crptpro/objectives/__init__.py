@@ -8,19 +8,6 @@ from crptpro.objectives.sac import AveragedSACLoss, DrQLoss, RADSACLoss
 from crptpro.objectives.skill_ddpg import SkillDDPGLoss
 
 __all__ = [
-    "ATCLoss",
-    "AveragedSACLoss",
-    "BeCLLoss",
-    "DrQLoss",
-    "Exploration",
-    "Method",
-    "PretrainingLoss",
-    "ProtoLoss",
-    "RADSACLoss",
-    "SimCLRLoss",
-    "SkillDDPGLoss",
-    "get_method",
-    "method_names",
-    "method_of",
-    "register_method",
-]
+    "ATCLoss", "AveragedSACLoss", "BeCLLoss", "DrQLoss", "Exploration", "Method", "PretrainingLoss", "ProtoLoss",
+    "RADSACLoss", "SimCLRLoss", "SkillDDPGLoss", "get_method", "method_names", "method_of", "register_method",
+]  # fmt: skip

@@ -1,4 +1,4 @@
-"""What losses share: networks that stay tied to their parameters, and the keys and latents of pre-training losses."""
+"""Base classes of the losses: copies and re-initialisation of networks, keys and latents of pre-training losses."""
 
 from __future__ import annotations
 
@@ -16,30 +16,27 @@ from crptpro.values import as_float
 
 
 class NetworkLoss(LossModule):
-    """A loss whose networks hold its own parameters, also in a copy, and are re-initialised together with its targets.
+    """A loss whose networks hold its parameters, in a copy too; re-initialising them updates the targets.
 
-    A subclass converts its networks with ``convert_to_functional`` and lists what ``forward`` returns.
+    A subclass converts its networks with ``convert_to_functional`` and lists the outputs of ``forward``.
     """
 
     default_out_keys: tuple[str, ...] = ()
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self.out_keys = list(self.default_out_keys)  # of the instance, where select_out_keys can change them
+        self.out_keys = list(self.default_out_keys)
         self._set_in_keys()
 
     @property
     def network_names(self) -> list[str]:
-        """The networks, in the order in which they were converted."""
+        """The networks in the order of their conversion."""
         names = [name for name, _ in self.named_children() if name.endswith("_params")]
         return [name.removesuffix("_params") for name in names if not name.startswith("target_")]
 
     @torch.no_grad()
     def reset_parameters_recursive(self) -> None:
-        """Re-initialise every network in turn, and copy the new parameters into its target.
-
-        TorchRL's version re-draws the targets independently and cannot reach plain modules.
-        """
+        """Re-initialise all networks and copy them into their targets; TorchRL's version skips plain modules."""
         for name in self.network_names:
             with self._holding(name):
                 _reset(getattr(self, name))
@@ -47,14 +44,14 @@ class NetworkLoss(LossModule):
                 target.data.update_(getattr(self, f"{name}_params").data)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore from a pickle or a deep copy, tying the networks to the copied parameters again."""
+        """Restore from a pickle or a deep copy; the networks hold the copied parameters."""
         super().__setstate__(state)
-        self._erase_cache()  # of detached views of the original's parameters
+        self._erase_cache()  # detached views of the original's parameters
         for name in self.network_names:
             getattr(self, f"{name}_params").to_module(getattr(self, name), preserve_module_state=False)
 
     def _holding(self, name: str, *, target: bool = False) -> AbstractContextManager[Any]:
-        """Have a network hold its parameters, or its target's, while a block runs."""
+        """Let a network hold its parameters, or its target's, in a block."""
         params = getattr(self, f"target_{name}_params" if target else f"{name}_params")
         return params.to_module(getattr(self, name), preserve_module_state=False)
 
@@ -63,15 +60,11 @@ class NetworkLoss(LossModule):
         self._set_in_keys()
 
     def _set_in_keys(self) -> None:
-        """All accepted keys, in the order of their definition."""
         self._in_keys = [getattr(self.tensor_keys, field.name) for field in fields(self.tensor_keys)]
 
 
 class PretrainingLoss(NetworkLoss):
-    """A self-supervised loss on pairs of consecutive observations.
-
-    A subclass writes ``forward``. Targets, where it has any, follow by ``SoftUpdate``.
-    """
+    """A self-supervised loss on pairs of consecutive observations; its targets are moved by ``SoftUpdate``."""
 
     @dataclass
     class _AcceptedKeys:
@@ -88,15 +81,11 @@ class PretrainingLoss(NetworkLoss):
     projector_params: Any
     target_projector_params: Any
 
-    method_name: str | None = None
-    """Registered method that built this loss, if it was built by name."""
+    method_name: str | None = None  #: method of the table that built this loss, if any
 
     @property
     def views(self) -> dict[NestedKey, NestedKey]:
-        """Entries of ``in_keys`` that are a second view of another one: ``{"pixels_view": "pixels"}``.
-
-        No dataset holds them: who trains the loss makes them by augmenting the named entry once more, independently.
-        """
+        """Entries that training loops make by a second augmentation of another: ``{"pixels_view": "pixels"}``."""
         return {}
 
     def _convert(self, targets: Sequence[str] = (), **networks: nn.Module) -> None:
@@ -104,7 +93,7 @@ class PretrainingLoss(NetworkLoss):
             self.convert_to_functional(network, name, create_target_params=name in targets)
 
     def _register_coefficients(self, **values: float | None) -> None:
-        # float64 scalars do not promote float32 tensors, and 0.1 stays 0.1.
+        # float64 scalars do not promote float32 tensors.
         for name, value in values.items():
             number = None if value is None else as_float(value, name)
             self.register_coeff_buffer(name, number, dtype=torch.float64)
@@ -122,17 +111,17 @@ class PretrainingLoss(NetworkLoss):
         return self._apply_network("projector", features, target=True)
 
     def _read(self, tensordict: TensorDictBase, key: NestedKey, *, event_dims: int = 3) -> Tensor:
-        """One entry with one batch dimension, its last ``event_dims`` as they are."""
+        """Return an entry with one batch dimension before its last ``event_dims``."""
         value = tensordict.get(key, None)
         if value is None:
             raise KeyError(f"{type(self).__name__} needs the entry {key!r}; set_keys() names another one.")
         return value.reshape(-1, *value.shape[value.ndim - event_dims :])
 
 
-def require_positive(**values: float) -> None:
-    """Refuse coefficients that would only show as NaN thousands of updates later, naming the first."""
+def require_positive(**values: float | None) -> None:
+    """Require positive numbers, or None; otherwise a ``ValueError`` names the first."""
     for name, value in values.items():
-        if not as_float(value, name) > 0:
+        if value is not None and not as_float(value, name) > 0:
             raise ValueError(f"`{name}` must be positive, got {value}.")
 
 

@@ -1,4 +1,4 @@
-"""Contrastive losses: ATC tells successors apart, SimCLR (APT's) second views, BeCL the observations of a skill."""
+"""Contrastive losses: the positives are successors in ATC, second views in SimCLR (APT), the same skill in BeCL."""
 
 from __future__ import annotations
 
@@ -18,28 +18,19 @@ from crptpro.objectives.functional import becl_loss, info_nce, mean_pairwise_cos
 
 
 class ContrastiveLoss(PretrainingLoss):
-    """One scalar, ``loss_contrast`` (nats), and detached ``embedding_cosine``, the mean pairwise cosine of latents.
-
-    A subclass encodes a batch, and contrasts what it has encoded in the precision of the parameters. Images must
-    already be augmented, each independently.
-    """
+    """Gives ``loss_contrast`` (nats) and, detached, ``embedding_cosine`` (pairwise mean) of augmented images."""
 
     default_out_keys = ("loss_contrast", "embedding_cosine")
 
-    def _encode(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
-        raise NotImplementedError
-
-    def _contrast(self, *encoded: Tensor) -> tuple[Tensor, Tensor]:
+    def _contrast(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return the loss, and latents at unit length."""
         raise NotImplementedError
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the loss and diagnostics of one batch; see the class."""
-        encoded = self._encode(tensordict)
-        with torch.autocast(device_type=encoded[0].device.type, enabled=False):
-            loss, unit = self._contrast(*encoded)
-            out = {"loss_contrast": loss, "embedding_cosine": mean_pairwise_cosine(unit.detach())}
+        loss, unit = self._contrast(tensordict)
+        out = {"loss_contrast": loss, "embedding_cosine": mean_pairwise_cosine(unit.detach())}
         return TensorDict(out, batch_size=[])
 
 
@@ -51,10 +42,10 @@ class ATCLoss(ContrastiveLoss):
 
     .. math:: L = -\frac1B\sum_i \log\mathrm{softmax}_j\big(W(a_i + \mathrm{MLP}(a_i))\cdot p_j\big)_i .
 
-    There is no temperature. A loss that stays at ln B (6.238 for a batch of 512) says that anchors are not told apart.
-    In TorchRL batches ``("next", "pixels")`` is the true successor, so ends of episodes need no mask as in the source.
-    Default heads are ``Projector(encoder.feature_dim, latent_dim)`` with ATC's Kaiming-normal weights, and
-    ``AnchorHead(latent_dim, hidden_dim)``; heads of different latent lengths are a ``ValueError``.
+    A loss of ln B (6.238 for a batch of 512) is chance. The source masks the ends of episodes; here ``("next",
+    "pixels")`` is the true successor also there. The default heads are ``Projector(encoder.feature_dim, latent_dim)``
+    with ATC's Kaiming-normal weights, and ``AnchorHead(latent_dim, hidden_dim)``; heads of different latent lengths are
+    a ``ValueError``.
     """
 
     anchor_head: nn.Module
@@ -75,18 +66,16 @@ class ATCLoss(ContrastiveLoss):
         anchor_head = anchor_head or AnchorHead(latent_dim, hidden_dim)
         require_one_latent_dim(projector=projector, anchor_head=anchor_head)
         self._convert(("encoder", "projector"), encoder=encoder, projector=projector, anchor_head=anchor_head)
-        # What an artifact's card needs to build the anchor head again.
+        # Recorded in the card of an artifact.
         self.latent_dim = latent_dim_of(anchor_head) or latent_dim
         self.hidden_dim = getattr(anchor_head, "config", {}).get("hidden_dim", hidden_dim)
 
-    def _encode(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
+    def _contrast(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         anchors = self._latents(self._read(tensordict, self.tensor_keys.observation))
         positives = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))
-        return self._apply_network("anchor_head", anchors), positives, anchors
-
-    def _contrast(self, *encoded: Tensor) -> tuple[Tensor, Tensor]:
-        queries, positives, anchors = encoded
-        return info_nce(queries, positives.to(queries.dtype)), F.normalize(anchors.detach(), dim=-1)
+        queries = self._apply_network("anchor_head", anchors)
+        with torch.autocast(queries.device.type, enabled=False):
+            return info_nce(queries, positives.to(queries.dtype)), F.normalize(anchors.detach(), dim=-1)
 
 
 class SimCLRLoss(ContrastiveLoss):
@@ -97,11 +86,8 @@ class SimCLRLoss(ContrastiveLoss):
 
     .. math:: L = -\frac1{2B}\sum_i \log\frac{\exp(z_i\cdot z_{p(i)}/\tau)}{\sum_{j\ne i}\exp(z_i\cdot z_j/\tau)} .
 
-    It says in :attr:`views` that ``pixels_view`` is a second view of ``pixels``; :func:`~crptpro.training.pretrain`
-    makes it by shifting the same images again.
-
     Deviation: APT has published no code for DeepMind Control; loss and temperature are those of the authors' code
-    for Atari, the head (``Projector(encoder.feature_dim, latent_dim)``) is the one that every method here has.
+    for Atari, the head (``Projector(encoder.feature_dim, latent_dim)``) is that of the other methods here.
     """
 
     @dataclass
@@ -132,23 +118,21 @@ class SimCLRLoss(ContrastiveLoss):
         """The second view of the observation, by its key."""
         return {self.tensor_keys.observation_view: self.tensor_keys.observation}
 
-    def _encode(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
+    def _contrast(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         keys = (self.tensor_keys.observation, self.tensor_keys.observation_view)
-        return (self._latents(torch.cat([self._read(tensordict, key) for key in keys])),)
-
-    def _contrast(self, *encoded: Tensor) -> tuple[Tensor, Tensor]:
-        one, two = F.normalize(encoded[0], dim=-1).chunk(2)
-        return info_nce(one, two, temperature=self.temperature, negatives="both"), one
+        latents = self._latents(torch.cat([self._read(tensordict, key) for key in keys]))
+        with torch.autocast(latents.device.type, enabled=False):
+            one, two = F.normalize(latents, dim=-1).chunk(2)
+            return info_nce(one, two, temperature=self.temperature, negatives="both"), one
 
 
 class BeCLLoss(ContrastiveLoss):
     r"""Behaviour contrastive learning (BeCL, arXiv 2305.04477; Rooshy-yang/BeCL ``agent/becl.py``).
 
-    :func:`~crptpro.objectives.functional.becl_loss` of :math:`F = h(f_\theta(x'))` with the head h, by default
-    ``SkillHead(encoder.feature_dim, skill_dim, hidden_dim)``, as ``projector``: for every row, one other row of the
-    same skill is told from all other rows. :math:`x'` is the next observation (three agent steps ahead with the
-    method's n-step batches). All rows should come from one domain, where skills are comparable. A batch of one has the
-    loss 0.
+    :func:`~crptpro.objectives.functional.becl_loss` of :math:`h(f_\theta(x'))`, where :math:`x'` is the next
+    observation (three agent steps ahead in the method's n-step batches) and the head h is ``projector``, by default
+    ``SkillHead(encoder.feature_dim, skill_dim, hidden_dim)``. All rows should come from one domain, where skills are
+    comparable. A batch of one has the loss 0.
     """
 
     @dataclass
@@ -175,13 +159,11 @@ class BeCLLoss(ContrastiveLoss):
         self.skill_dim = latent_dim_of(projector) or skill_dim
         self._register_coefficients(temperature=temperature)
 
-    def _encode(self, tensordict: TensorDictBase) -> tuple[Tensor, ...]:
+    def _contrast(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         latents = self._latents(self._read(tensordict, self.tensor_keys.next_observation))
-        return latents, self._read(tensordict, self.tensor_keys.skill, event_dims=1).argmax(dim=-1)
-
-    def _contrast(self, *encoded: Tensor) -> tuple[Tensor, Tensor]:
-        latents, skills = encoded
-        unit = F.normalize(latents.detach(), dim=-1)
-        if len(latents) < 2:
-            return 0 * latents.sum(), unit  # nothing to contrast with
-        return becl_loss(latents, skills, temperature=self.temperature), unit
+        skills = self._read(tensordict, self.tensor_keys.skill, event_dims=1).argmax(dim=-1)
+        with torch.autocast(latents.device.type, enabled=False):
+            unit = F.normalize(latents.detach(), dim=-1)
+            if len(latents) < 2:
+                return 0 * latents.sum(), unit
+            return becl_loss(latents, skills, temperature=self.temperature), unit

@@ -1,7 +1,7 @@
-"""The mathematics of every objective as free functions on plain tensors.
+"""The mathematics of every objective as pure functions on plain tensors.
 
-``scores`` are cosine similarities before division by a temperature. Nothing here holds state, mutates its
-input, synchronises with the host, or repairs bad numbers: non-finite input gives non-finite output.
+``scores`` are cosine similarities before division by a temperature. No function needs a host synchronisation;
+non-finite input gives non-finite output.
 """
 
 from __future__ import annotations
@@ -20,12 +20,11 @@ DispersionReduction = Literal["mean_all", "sum", "mean_offdiag"]
 def sinkhorn_knopp(scores: Tensor, *, temperature: float | Tensor = 0.1, iterations: int = 3) -> Tensor:
     r"""Soft assignments with evenly loaded prototypes (CRPTpro Eq. 4-6; SwaV, arXiv 2006.09882), ``[B, M]``.
 
-    Starts from :math:`\exp(s/\tau)` of cosine similarities ``[B, M]``, alternately scales the prototype marginal to 1/M
-    and the sample marginal to 1/B (0 ``iterations`` leave a softmax), and ends with each sample's assignments summing
-    to 1. No gradient. Computed in the log domain, in float32 or wider: equal to the released code's exponentiated form
-    wherever that is finite. One sample gives the uniform row.
+    From :math:`\exp(s/\tau)` of the scores ``[B, M]``, every iteration scales the prototype marginal to 1/M and the
+    sample marginal to 1/B (0 ``iterations`` give a softmax); rows of the result sum to 1. No gradient. Computed in the
+    log domain, in float32 or wider: equal to the released code's form wherever that is finite.
 
-    Deviation: the paper's Eq. 4 prints the scores without the exponential; it would divide by sums near 0.
+    Deviation: the paper's Eq. 4 prints the scores without the exponential, which would divide by sums near 0.
     """
     log_q = _at_least_float32(scores) / temperature
     for _ in range(iterations):
@@ -40,8 +39,8 @@ def comparative_loss(
 ) -> Tensor:
     r"""Cross-entropy between target assignments and predicted ones (CRPTpro Eq. 1 and 7), both ``[B, M]``, in nats.
 
-    :math:`L_{comp} = -\frac1B\sum_i\sum_j q_{ij}\log\mathrm{softmax}_j(s_{ij}/\tau)`, or ``[B]`` for ``"none"``. At
-    uniform prediction it equals ln M (6.238 for 512); a run that stays there has learned nothing.
+    :math:`L_{comp} = -\frac1B\sum_i\sum_j q_{ij}\log\mathrm{softmax}_j(s_{ij}/\tau)`, or ``[B]`` for ``"none"``.
+    Uniform prediction gives ln M (6.238 for 512).
     """
     log_p = F.log_softmax(_at_least_float32(student_scores) / temperature, dim=-1)
     return _reduced(-(assignments * log_p).sum(dim=-1), reduction)
@@ -52,12 +51,11 @@ def prototype_dispersion(
 ) -> Tensor:
     r"""Intrinsic loss that pushes prototypes apart (CRPTpro Eq. 9), of unit rows ``[M, D]``.
 
-    :math:`L_{intr} = \frac1{M^2}\sum_{j\ne k} \mathrm{sg}(c_j)\cdot c_k / (\mathrm{sg}(c_j\cdot c_k) + w)`, whose left
-    factor and denominator carry no gradient. About -0.0023 to -0.0028 at orthogonal initialisation of 512 x 128.
-    ``"mean_all"`` divides by M^2 (the zeroed diagonal counts), ``"mean_offdiag"`` by M(M-1), ``"sum"`` by nothing.
-    The ``offset`` w exceeds 1 so that the denominator stays positive.
+    :math:`L_{intr} = \frac1{M^2}\sum_{j\ne k} \mathrm{sg}(c_j)\cdot c_k / (\mathrm{sg}(c_j\cdot c_k) + w)`, about
+    -0.0023 to -0.0028 at orthogonal initialisation of 512 x 128. The ``offset`` w exceeds 1, so that the denominator is
+    positive. ``"mean_all"`` divides by M^2, ``"mean_offdiag"`` by M(M-1), ``"sum"`` by nothing.
 
-    Deviation: the paper prints a sum; its own table only fits the mean over all M x M entries, the default.
+    Deviation: the paper prints a sum, but its table only fits the mean over all M x M entries, the default.
     """
     count = prototypes.shape[0]
     divisors = {"mean_all": count * count, "mean_offdiag": max(count * (count - 1), 1), "sum": 1}
@@ -71,9 +69,8 @@ def prototype_dispersion(
 def knn_distances(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
     """Euclidean distances ``[N, k]`` of queries ``[N, D]`` to the k nearest of keys ``[K, D]``, ascending.
 
-    A query that is itself among the keys is its own nearest neighbour. The neighbours are found with a matrix product,
-    which cannot resolve distances near zero; the k distances are then taken again from the differences, so that a key
-    equal to the query is at exactly 0. Fewer keys than ``k`` are a ``ValueError``.
+    A matrix product finds the neighbours, but is inexact near zero. The k distances are recomputed from differences, so
+    that a key equal to the query is at exactly 0. Fewer keys than ``k`` are a ``ValueError``.
     """
     if not 1 <= k <= keys.shape[0]:
         raise ValueError(f"k must be between 1 and the number of keys {keys.shape[0]}, got {k}.")
@@ -83,7 +80,7 @@ def knn_distances(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
 
 
 def knn_distance(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
-    """Euclidean distance ``[N]`` to the k-th nearest key, copies of the query counted: CRPTpro's reward (Eq. 11)."""
+    """Euclidean distance ``[N]`` to the k-th nearest key, including copies of the query: CRPTpro's reward (Eq. 11)."""
     return knn_distances(queries, keys, k=k)[:, -1]
 
 
@@ -96,20 +93,18 @@ def particle_reward(
     scale: float | Tensor = 1.0,
     clip: float = 0.0,
 ) -> Tensor:
-    """Particle entropy ``[N]`` of features ``[N, D]`` among their k nearest of ``keys`` ``[K, D]``, or of themselves.
+    """Return :func:`particle_entropy` of features ``[N, D]``: of the distances to the k nearest of ``keys`` ``[K, D]``.
 
-    :func:`particle_entropy` of the k distances, or with ``average=False`` of the k-th alone; ``scale`` is their running
-    mean, kept by the caller.
+    The keys are by default the features; ``average=False`` uses the k-th distance alone.
     """
     distances = knn_distances(features, features if keys is None else keys, k=k)
     return particle_entropy(distances if average else distances[:, -1:], scale=scale, clip=clip)
 
 
 def particle_entropy(distances: Tensor, *, scale: float | Tensor = 1.0, clip: float = 0.0) -> Tensor:
-    r"""Return :math:`\log(1 + \overline{\mathrm{relu}(d/scale - clip)})`, ``[N]``, of distances ``[N, k]``.
+    r"""Return :math:`\log(1 + \overline{\mathrm{relu}(d/scale - clip)})`, ``[N]``, averaged over distances ``[N, k]``.
 
-    APT (arXiv 2103.04551) in the form of rll-research/url_benchmark ``utils.py``: division and clipping act on each
-    distance, the average over the k neighbours comes after, the logarithm last.
+    APT (arXiv 2103.04551) in the form of rll-research/url_benchmark ``utils.py``; ``scale`` is a running mean there.
     """
     return torch.log1p(F.relu(distances / scale - clip).mean(dim=-1))
 
@@ -123,24 +118,17 @@ def info_nce(
     valid: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
-    """Contrastive cross-entropy in nats of ``[B, D]`` each, in which row i's positive is row i of the other side.
+    """Contrastive cross-entropy in nats; row i of the positives belongs to row i of the anchors, both ``[B, D]``.
 
-    Normalise both beforehand where the method asks for cosines (SimCLR yes, ATC no).
-
-    Args:
-        anchors: ``[B, D]``.
-        positives: ``[B, D]``.
-        temperature: divides the inner products.
-        negatives: ``"positives"`` compares each anchor with all B positives (ATC); ``"both"`` compares each
-            of the 2B views with the other 2B - 1 (SimCLR).
-        valid: ``[B]`` bool; rows that are False do not count, but their positives stay as negatives. Rows of
-            both views for ``"both"``. Anchors of invalid rows may be NaN (not for ``"both"``: negatives too).
-        reduction: over the valid rows; ``"none"`` gives ``[B]`` (``"both"``: ``[2B]``), zero where invalid.
+    ``negatives="positives"`` compares each anchor with all B positives (ATC), ``"both"`` each of the 2B views, which
+    SimCLR normalises beforehand, with the other 2B - 1. Rows that are False in ``valid``, bool ``[B]``, do not count,
+    but their positives stay negatives of the others; with ``"positives"`` their anchors may be NaN. ``reduction`` is
+    over the valid rows; ``"none"`` gives ``[B]`` (``"both"``: ``[2B]``), zero where invalid.
     """
     count = anchors.shape[0]
     labels = torch.arange(count, device=anchors.device)
     if negatives == "positives":
-        # Masking the loss alone would leave NaN in the backward, where its zero gradient multiplies the row.
+        # Masking the loss alone would give NaN gradients, 0 times NaN.
         queries = anchors if valid is None else anchors.where(valid.unsqueeze(-1), 0.0)
         logits = queries @ positives.T / temperature  # (B, D) x (D, B) -> (B, B)
     elif negatives == "both":
@@ -165,8 +153,8 @@ def becl_loss(
     r"""Behaviour contrastive loss (Rooshy-yang/BeCL ``agent/becl.py``); the reward is ``exp(-loss)`` per row.
 
     :math:`\ell_i = -\log(pos_i / (\sum_{j\ne i} e^{s_{ij}} + \epsilon) + \epsilon)` of the cosines of features ``[B,
-    D]`` over the temperature, the row's maximum subtracted. The positive is the first other row with the same of the
-    skills ``[B]``, or, where no other row has it, the first other row, as in the released code. B is at least 2.
+    D]`` over the temperature, less the row's maximum. The positive is the first other row with the same of the skills
+    ``[B]``, or without one the first other row, as in the released code. B is at least 2.
     """
     count = features.shape[0]
     if count < 2:
@@ -184,26 +172,20 @@ def becl_loss(
 
 @torch.no_grad()
 def assignment_entropy(assignments: Tensor) -> Tensor:
-    """Mean entropy of assignments ``[B, M]`` in nats, in [0, ln M]; ln M means that they say nothing."""
+    """Mean entropy of assignments ``[B, M]`` in nats, in [0, ln M]; ln M is uniform."""
     return torch.special.entr(assignments).sum(dim=-1).mean()
 
 
 @torch.no_grad()
 def prototypes_in_use(assignments: Tensor) -> Tensor:
-    """Number of prototypes that are the largest of some row of assignments ``[B, M]``, as a float scalar.
-
-    In a collapsed run all assignments tie and the count is rounding; read it beside the entropy.
-    """
+    """Number of prototypes that are the largest of some row ``[B, M]``, a float scalar; arbitrary after a collapse."""
     used = assignments.new_zeros(assignments.shape[-1])
     return used.index_fill(0, assignments.argmax(dim=-1), 1.0).sum()
 
 
 @torch.no_grad()
 def mean_pairwise_cosine(unit_rows: Tensor) -> Tensor:
-    """Mean cosine over all ordered pairs of different unit rows ``[B, D]``; 1 means that all embeddings coincide.
-
-    Computed from the norm of the sum, O(BD). A single row gives 0.
-    """
+    """Mean cosine over all pairs of different unit rows ``[B, D]``, in O(BD); 0 for a single row."""
     count = unit_rows.shape[0]
     return _off_diagonal_sum(unit_rows) / max(count * (count - 1), 1)
 
@@ -219,7 +201,7 @@ def prototype_kne(prototypes: Tensor, *, k: int = 3) -> Tensor:
     """Mean over unit rows ``[M, D]`` of the cosine to the k-th nearest other one (the paper's KNE); k at most M - 1.
 
     The paper does not state k. With k = 3, 512 spread vectors in 128 dimensions give about +0.2; its negative
-    values only fit a median-like k near M / 2.
+    values only fit a k near M / 2.
     """
     count = prototypes.shape[0]
     if not 1 <= k < count:
@@ -230,7 +212,7 @@ def prototype_kne(prototypes: Tensor, *, k: int = 3) -> Tensor:
 
 @torch.no_grad()
 def prototype_metrics(prototypes: Tensor, *, offset: float = 1.5) -> dict[str, Tensor]:
-    """ANE, KNE at k = 3 and k = M / 2, and the dispersion (mean over all entries), of rows ``[M, D]`` of any length."""
+    """ANE, KNE at k = 3 and k = M / 2, and the dispersion loss, of rows ``[M, D]`` of any length."""
     unit = F.normalize(prototypes, dim=-1)
     return {
         "prototype_ane": prototype_ane(unit),

@@ -1,15 +1,15 @@
-"""The methods by name: the loss of each, how it is trained, how it explores, what its downstream agents do otherwise.
+"""The table of methods: the loss of each, how it is trained, how it explores, and its downstream settings.
 
-A method of one's own takes two files: its loss, and a row here (or a call of :func:`register_method`).
+A new method takes two files: its loss, and a row here (or a call of :func:`register_method`).
 """
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
+import functools
 import inspect
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 from torch import nn
@@ -22,7 +22,7 @@ from crptpro.objectives.proto import ProtoLoss
 from crptpro.values import as_float, as_int
 
 
-def _plain(row: Any, minima: Mapping[str, int]) -> None:
+def _check_counts(row: Any, minima: Mapping[str, int]) -> None:
     for name, minimum in minima.items():
         if (value := getattr(row, name)) is not None:
             object.__setattr__(row, name, as_int(value, name, minimum=minimum))
@@ -30,232 +30,136 @@ def _plain(row: Any, minima: Mapping[str, int]) -> None:
 
 @dataclass(frozen=True)
 class Exploration:
-    """How a method explores while it pre-trains; the values here are Proto-RL's.
+    """How a method explores while it pre-trains; the defaults are Proto-RL's.
 
-    Every interval counts a domain's own agent steps, so that no domain is starved whatever their number.
-
-    Attributes:
-        reward: intrinsic reward that alone drives the exploration: ``"prototype"``, ``"particle"``,
-            ``"skill-contrast"``, or a function of the loss and a ``torch.Generator`` that returns a transform writing
-            ``("next", "intrinsic_reward")``.
-        agent: ``"rad-sac"``, ``"averaged-sac"`` (DrQ's K = M = 2 on detached features) or ``"skill-ddpg"``.
-        env_steps: simulator steps over all domains of a group, or of the one domain, random phases included.
-        is_single_domain: the (S) variants: pre-trained on one domain only.
-        encoder_update_interval: agent steps between two encoder updates.
-        encoder_updates_each: encoder updates every time, each on a fresh batch.
-        agent_update_interval: agent steps between two updates of the agent.
-        encodes_before_update: reward and agent see the features from before the encoder update of the same step.
-        transfers_actor: the downstream agent starts from the exploring actor.
-        n_step: agent steps from an observation to the "next" one in the agent's and the encoder's batches.
-        skill_dim: number of skills, at least two; None for an agent without skills.
-        skill_agent_steps: agent steps that a skill is kept.
-        replay_capacity: transitions kept per domain.
-        random_agent_steps: agent steps of uniformly random actions per domain, before its updates start.
-
-    Raises:
-        ValueError: a number out of its range.
+    Every interval counts the agent steps of one domain. A number out of its range is a ``ValueError``.
     """
 
+    #: The only reward of the exploration: ``"prototype"``, ``"particle"``, ``"skill-contrast"``, or a function of the
+    #: loss and a ``torch.Generator`` that returns a transform writing ``("next", "intrinsic_reward")``.
     reward: str | Callable[..., Any] = "prototype"
-    agent: str = "rad-sac"
-    env_steps: int = 200_000
-    is_single_domain: bool = False
-    encoder_update_interval: int = 2
-    encoder_updates_each: int = 1
-    agent_update_interval: int = 1
-    encodes_before_update: bool = False
-    transfers_actor: bool = False
-    n_step: int = 1
-    skill_dim: int | None = None
-    skill_agent_steps: int = 50
-    replay_capacity: int = 100_000
-    random_agent_steps: int = 1_000
+    agent: str = "rad-sac"  #: or ``"averaged-sac"`` (DrQ's K = M = 2 on detached features), or ``"skill-ddpg"``
+    env_steps: int = 200_000  #: over all domains, random phases included
+    is_single_domain: bool = False  #: the (S) variants: pre-trained on one domain only
+    encoder_update_interval: int = 2  #: agent steps between two encoder updates
+    encoder_updates_each: int = 1  #: encoder updates every time, each on a fresh batch
+    agent_update_interval: int = 1  #: agent steps between two updates of the agent
+    encodes_before_update: bool = False  #: reward and agent see features from before the encoder update of the step
+    transfers_actor: bool = False  #: the downstream agent starts from the exploring actor
+    n_step: int = 1  #: agent steps from an observation to the "next" one in batches of the agent and the encoder
+    skill_dim: int | None = None  #: number of skills, at least two; None for an agent without skills
+    skill_agent_steps: int = 50  #: agent steps between two changes of the skill
+    replay_capacity: int = 100_000  #: transitions kept per domain
+    random_agent_steps: int = 1_000  #: agent steps of uniformly random actions per domain, before its updates start
 
     def __post_init__(self) -> None:
-        counts = (
-            "env_steps", "encoder_update_interval", "encoder_updates_each", "agent_update_interval", "n_step",
-            "skill_agent_steps", "replay_capacity",
-        )  # fmt: skip
-        _plain(self, {**dict.fromkeys(counts, 1), "random_agent_steps": 0, "skill_dim": 2})
+        counts = {setting.name: 1 for setting in fields(self) if setting.type == "int"}
+        _check_counts(self, counts | {"random_agent_steps": 0, "skill_dim": 2})
 
 
 @dataclass(frozen=True)
 class Method:
-    """A row of the table; the values here are CRPTpro's.
-
-    Attributes:
-        name: unique name.
-        loss_class: the loss that pre-trains its encoder; None where nothing is pre-trained.
-        loss_options: keyword arguments of ``loss_class``.
-        encoder_options: keyword arguments of :class:`~crptpro.modules.PixelEncoder`.
-        updates: encoder updates in total, over all domains.
-        batch_size: transitions per update.
-        learning_rate: of Adam (its highest value, if scheduled).
-        encoder_tau: rate of the target networks, every update; None for a method without targets.
-        schedule: ``"constant"`` or ``"warmup_cosine"``: learning rate over the updates.
-        warmup_updates: length of the linear warm-up of the learning rate from 0; 0 for none.
-        grad_clip: largest gradient norm; None for no clipping.
-        exploration: how it explores while it pre-trains; None if it learns from random datasets, or from nothing.
-        downstream: settings of downstream training that differ from CRPTpro's, such as
-            ``{"replay_capacity": 100_000}``.
-        starts_from: method whose encoder it takes: as it is where ``updates`` is 0, otherwise to train it on.
-        is_preset: a variant of another method: not listed among the methods, not what a loss built by hand is
-            trained like.
-        is_builtin: comes with the library, whose revision says what it is.
-
-    Raises:
-        ValueError: a number out of its range.
-    """
+    """A row of the table; the defaults are CRPTpro's. A number out of its range is a ``ValueError``."""
 
     name: str
-    loss_class: type[LossModule] | None
-    loss_options: Mapping[str, Any] = field(default_factory=dict)
+    loss_class: type[LossModule] | None  #: built as ``loss_class(encoder, **loss_options)``; None without pre-training
+    loss_options: Mapping[str, Any] = field(default_factory=dict)  #: keyword arguments of ``loss_class``
+    #: Keyword arguments of :class:`~crptpro.modules.PixelEncoder`.
     encoder_options: Mapping[str, Any] = field(default_factory=dict)
-    updates: int = 50_000
-    batch_size: int = 512
-    learning_rate: float = 1e-4
-    encoder_tau: float | None = 0.05
-    schedule: Literal["constant", "warmup_cosine"] = "constant"
-    warmup_updates: int = 0
-    grad_clip: float | None = None
-    exploration: Exploration | None = None
-    downstream: Mapping[str, Any] = field(default_factory=dict)
-    starts_from: str | None = None
-    is_preset: bool = False
-    is_builtin: bool = False
+    updates: int = 50_000  #: encoder updates in total, over all domains
+    batch_size: int = 512  #: transitions per update
+    learning_rate: float = 1e-4  #: of Adam; the peak of a schedule
+    encoder_tau: float | None = 0.05  #: rate of the target networks, every update; None for a method without targets
+    schedule: Literal["constant", "warmup_cosine"] = "constant"  #: of the learning rate over the updates
+    warmup_updates: int = 0  #: length of the linear warm-up of the learning rate from 0
+    grad_clip: float | None = None  #: largest gradient norm; None for no clipping
+    exploration: Exploration | None = None  #: None for a method that does not explore
+    downstream: Mapping[str, Any] = field(default_factory=dict)  #: downstream settings other than CRPTpro's
+    starts_from: str | None = None  #: method whose encoder it takes, to train it further for ``updates``
+    is_preset: bool = False  #: a variant of another method, which :func:`method_names` and :func:`method_of` skip
+    is_builtin: bool = False  #: part of the library
 
     def __post_init__(self) -> None:
-        _plain(self, {"updates": 0, "batch_size": 1, "warmup_updates": 0})
+        _check_counts(self, {"updates": 0, "batch_size": 1, "warmup_updates": 0})
         for name, maximum in {"learning_rate": None, "encoder_tau": 1, "grad_clip": None}.items():
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, as_float(value, name, minimum=0, maximum=maximum))
         if self.schedule not in ("constant", "warmup_cosine"):
             raise ValueError(f"`schedule` must be 'constant' or 'warmup_cosine', got {self.schedule!r}.")
 
-    def describe(self) -> dict[str, Any]:
-        """Return all that was registered as plain values: what a record needs to tell two methods of one name apart.
-
-        The code of the loss is not part of it, only its class's name.
-        """
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        for name in ("name", "is_builtin", "is_preset"):
-            del values[name]
-        values = {key: dict(value) if isinstance(value, Mapping) else value for key, value in values.items()}
-        if self.loss_class is not None:
-            values["loss_class"] = f"{self.loss_class.__module__}.{self.loss_class.__qualname__}"
-        if self.exploration is not None:
-            values["exploration"] = dataclasses.asdict(self.exploration)
-        return values
-
     def build_encoder(self, in_channels: int = 9, image_size: int = 84, **options: Any) -> PixelEncoder:
-        """Build a fresh encoder of the kind that the method trains; ``options`` override the method's own."""
+        """Build the encoder that the method trains; ``options`` override the method's own."""
         return PixelEncoder(in_channels, image_size=image_size, **{**self.encoder_options, **options})
 
     def build(self, encoder: nn.Module, **options: Any) -> LossModule:
-        """Build the loss on ``encoder``; ``options`` override the method's own.
-
-        Raises:
-            CRPTproError: a method that pre-trains nothing.
-            ValueError: an option that the loss does not have.
-        """
+        """Build the loss on ``encoder``; ``options`` override the method's own, an unknown one is a ``ValueError``."""
         if self.loss_class is None:
             raise CRPTproError(f"The method {self.name!r} pre-trains nothing; it is for downstream training.")
-        parameters = inspect.signature(self.loss_class.__init__).parameters.values()
-        known = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY or p.name in options]
-        unknown = sorted(set(options) - set(known))
-        if unknown and not any(p.kind is p.VAR_KEYWORD for p in parameters):
-            raise ValueError(f"The method {self.name!r} has no option {', '.join(unknown)}; it has {', '.join(known)}.")
+        parameters = inspect.signature(self.loss_class.__init__).parameters
+        unknown = sorted(set(options) - set(parameters))
+        if unknown and not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+            known = ", ".join(list(parameters)[2:])  # without self and the encoder
+            raise ValueError(f"The method {self.name!r} has no option {', '.join(unknown)}; it has {known}.")
         loss = self.loss_class(encoder, **{**self.loss_options, **options})
-        loss.method_name = self.name  # by which method_of finds it
+        loss.method_name = self.name  # for method_of
         return loss
 
 
 _NO_BONUS = {"intrinsic_reward_coef": 0.0}
+_DRQ = {"algorithm": "drq", "env_steps": 1_000_000, "replay_capacity": 100_000, "learning_rate": 1e-3}
 _CRPTPRO = Method("crptpro", ProtoLoss)
 
-# ATC's own loss, head and schedule on the trunk (orthogonal weights), batch and budget that all methods share.
+# ATC's loss, head and schedule on the encoder (orthogonal weights), batch and budget that all methods share.
 _ATC = Method(
-    "atc",
-    ATCLoss,
-    learning_rate=1e-3,
-    encoder_tau=0.01,
-    schedule="warmup_cosine",
-    warmup_updates=1_000,
-    grad_clip=10.0,
-    downstream=_NO_BONUS,
-)
+    "atc", ATCLoss, learning_rate=1e-3, encoder_tau=0.01, schedule="warmup_cosine", warmup_updates=1_000,
+    grad_clip=10.0, downstream=_NO_BONUS,
+)  # fmt: skip
 
-# Active methods: four simulator steps per encoder update, 200,000 in total over a group (C) or 500,000 in one
-# domain (S). The paper's efficiency table has equal times for one to three domains, so (C) counts in total.
+# Active methods: four env steps per encoder update, 200,000 in total over a group (C) or 500,000 in one domain (S).
+# The paper's efficiency table has equal times for one to three domains, so (C) counts in total.
 _SINGLE_DOMAIN: dict[str, Any] = {"env_steps": 500_000, "is_single_domain": True}
+_PROTO_RL_S_EXPLORES = Exploration(transfers_actor=True, **_SINGLE_DOMAIN)
 _APT_EXPLORES = Exploration(reward="particle", agent="averaged-sac")
 _APT_C = Method("apt-c", SimCLRLoss, encoder_tau=None, exploration=_APT_EXPLORES, downstream=_NO_BONUS)
-# Deviation: the released code of Proto-RL has a predictor of width 512; the paper's table, which has it beside
-# CRPTpro, says 1024.
+# Deviation: Proto-RL's released code has a predictor of width 512; the paper's table lists 1024, also used here.
 _PROTO_RL_C = Method(
-    "proto-rl-c",
-    ProtoLoss,
-    loss_options={"intr_loss_coef": 0.0},
-    exploration=Exploration(),
+    "proto-rl-c", ProtoLoss, loss_options={"intr_loss_coef": 0.0}, exploration=Exploration(),
     downstream={"replay_capacity": 100_000},
-)
+)  # fmt: skip
+
+# Three encoder updates for each update of the agent, every second agent step: 150,000 for 50,000.
+_BECL_EXPLORES = Exploration(
+    reward="skill-contrast", agent="skill-ddpg", encoder_updates_each=3, encodes_before_update=True,
+    agent_update_interval=2, n_step=3, skill_dim=16, random_agent_steps=2_000,
+)  # fmt: skip
+_BECL = Method(
+    "becl", BeCLLoss, updates=150_000, encoder_tau=None, encoder_options={"pixel_offset": 0.5},
+    exploration=_BECL_EXPLORES, downstream=_NO_BONUS,
+)  # fmt: skip
 
 
-def _preset(method: Method, name: str, **fields: Any) -> Method:
-    return replace(method, name=name, is_preset=True, **fields)
+_preset = functools.partial(replace, is_preset=True)
 
-
-# The first method of a class that is no preset is what a loss of that class built by hand is trained like.
+# A loss built by hand is trained by the first row of its class that is no preset.
 TABLE = (
     _CRPTPRO,
-    _preset(_CRPTPRO, "crptpro-no-bonus", updates=0, starts_from="crptpro", downstream=_NO_BONUS),
-    # Deviation: targets at half the student's temperature, which leave the plateau at ln M sooner, and three times the
-    # learning rate, which gets further once it is left (docs/study.md).
-    _preset(_CRPTPRO, "crptpro-fast", learning_rate=3e-4, loss_options={"assignment_temperature": 0.05}),
-    _preset(_CRPTPRO, "crptpro-finetune", updates=2_000, starts_from="crptpro"),
+    _preset(_CRPTPRO, name="crptpro-no-bonus", updates=0, starts_from="crptpro", downstream=_NO_BONUS),
+    # Deviation: targets at half the student's temperature leave the plateau at ln M sooner; three times the learning
+    # rate gets further after it (docs/study.md).
+    _preset(_CRPTPRO, name="crptpro-fast", learning_rate=3e-4, loss_options={"assignment_temperature": 0.05}),
+    _preset(_CRPTPRO, name="crptpro-finetune", updates=2_000, starts_from="crptpro"),
     # The authors' published code where it differs from the paper: predictor width, and 3 x 16,666 updates.
-    _preset(_CRPTPRO, "released-code", updates=49_998, loss_options={"hidden_dim": 512}),
+    _preset(_CRPTPRO, name="released-code", updates=49_998, loss_options={"hidden_dim": 512}),
     _ATC,
-    _preset(_ATC, "atc-native", batch_size=256, encoder_options={"strides": (2, 2, 2, 1), "init": "kaiming"}),
+    _preset(_ATC, name="atc-native", batch_size=256, encoder_options={"strides": (2, 2, 2, 1), "init": "kaiming"}),
     _APT_C,
     replace(_APT_C, name="apt-s", updates=125_000, exploration=replace(_APT_EXPLORES, **_SINGLE_DOMAIN)),
     _PROTO_RL_C,
-    replace(
-        _PROTO_RL_C, name="proto-rl-s", updates=125_000, exploration=Exploration(transfers_actor=True, **_SINGLE_DOMAIN)
-    ),
-    # An update of BeCL's agent every second agent step brings three encoder updates: 150,000 for 50,000 of the agent.
-    Method(
-        "becl",
-        BeCLLoss,
-        updates=150_000,
-        encoder_tau=None,
-        encoder_options={"pixel_offset": 0.5},
-        exploration=Exploration(
-            reward="skill-contrast",
-            agent="skill-ddpg",
-            encoder_updates_each=3,
-            encodes_before_update=True,
-            agent_update_interval=2,
-            n_step=3,
-            skill_dim=16,
-            random_agent_steps=2_000,
-        ),
-        downstream=_NO_BONUS,
-    ),
-    # Trains its encoder end to end, with the critic.
-    Method(
-        "drq",
-        None,
-        updates=0,
-        downstream={
-            "algorithm": "drq",
-            "env_steps": 1_000_000,
-            "replay_capacity": 100_000,
-            "learning_rate": 1e-3,
-            **_NO_BONUS,
-        },
-    ),
-    # Controls: the encoder as it is drawn, and with features of mean 0 and deviation 1.
+    replace(_PROTO_RL_C, name="proto-rl-s", updates=125_000, exploration=_PROTO_RL_S_EXPLORES),
+    _BECL,
+    # Trains the encoder end to end, with the critic.
+    Method("drq", None, updates=0, downstream=_DRQ | _NO_BONUS),
+    # Controls: the encoder at initialisation, and with features of mean 0 and deviation 1.
     Method("random-encoder", None, updates=0, downstream=_NO_BONUS),
     Method(
         "random-encoder-standardised", None, updates=0, encoder_options={"standardised": True}, downstream=_NO_BONUS
@@ -268,14 +172,8 @@ _METHODS: dict[str, Method] = {row.name: replace(row, is_builtin=True) for row i
 def register_method(name: str, loss_class: type[LossModule], **fields: Any) -> Method:
     """Make a method available by name, on the command line too.
 
-    Args:
-        name: unique name; registering a name again with another class is refused.
-        loss_class: built as ``loss_class(encoder, **loss_options)``.
-        **fields: further fields of :class:`Method`, such as ``updates=10_000`` or ``exploration=Exploration()``.
-
-    Raises:
-        ValueError: the name is taken by another class, or a number is out of its range.
-        TypeError: a field that :class:`Method` does not have.
+    ``fields`` are further fields of :class:`Method`, such as ``updates=10_000`` or ``exploration=Exploration()``. A
+    name that is registered for another class, or a number out of its range, is a ``ValueError``.
     """
     taken = _METHODS.get(name)
     if taken is not None and taken.loss_class is not loss_class:
@@ -285,29 +183,25 @@ def register_method(name: str, loss_class: type[LossModule], **fields: Any) -> M
     return _METHODS[name]
 
 
-def get_method(name: str, *, besides: Iterable[str] = ()) -> Method:
-    """Look a method or preset up by name.
-
-    Raises:
-        UnknownNameError: with the nearest known names, of ``besides`` too.
-    """
+def get_method(name: str) -> Method:
+    """Return the method or preset of a name; an ``UnknownNameError`` suggests the nearest names."""
     if name not in _METHODS:
-        known = sorted({*_METHODS, *besides})
+        known = sorted(_METHODS)
         nearest = difflib.get_close_matches(name, known, n=3, cutoff=0.4)
         raise UnknownNameError(f"There is no method {name!r}. Did you mean {', '.join(nearest or known)}?")
     return _METHODS[name]
 
 
 def method_names(*, presets: bool = False) -> list[str]:
-    """Names of the methods that pre-train an encoder, sorted; with ``presets``, of every row of the table."""
+    """Return the names of the methods that pre-train an encoder, sorted; with ``presets``, of every row."""
     return sorted(name for name, row in _METHODS.items() if presets or not (row.is_preset or row.loss_class is None))
 
 
 def method_of(loss: LossModule | type[LossModule]) -> Method:
-    """Return how a loss, or a class of them, is trained.
+    """Return the method that trains a loss, or a class of losses.
 
-    The method that built it by name; else the first method of its class or its nearest base class; else CRPTpro's
-    numbers. Of a loss built by hand that has targets, or has none, ``encoder_tau`` says so.
+    That is the method that built it, else the first of its class or nearest base class, else CRPTpro's numbers. For a
+    loss built by hand, ``encoder_tau`` is None exactly if the loss has no targets.
     """
     loss_class = loss if isinstance(loss, type) else type(loss)
     named = _METHODS.get(getattr(loss, "method_name", None) or "")

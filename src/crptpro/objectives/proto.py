@@ -28,30 +28,19 @@ class ProtoLoss(PretrainingLoss):
       :math:`q = \mathrm{sinkhorn}(\hat z' C^T)` (no gradient),
     * :math:`L_{intr}` = :func:`~crptpro.objectives.functional.prototype_dispersion` of the prototypes.
 
-    Images must already be augmented. Call :meth:`before_update` before each forward of a training loop: it keeps the
-    prototype rows at unit length, as the released code does. ``forward`` itself never writes to a parameter.
+    Images must already be augmented. A training loop calls :meth:`before_update` before each forward, which keeps the
+    prototype rows at unit length as in the released code.
 
     ``forward`` returns scalars ``loss_comp`` and ``loss_intr`` (already times alpha; their sum is minimised) and,
     detached, ``comp``, ``intr`` (without alpha), ``assignment_entropy`` (nats), ``prototypes_in_use`` (count),
-    ``embedding_cosine`` (mean pairwise cosine of the online latents), ``prototype_ane``. ``loss_comp`` that stays at ln
-    M (6.238 for 512 prototypes), or ``embedding_cosine`` that stays near 1, is a dead run.
+    ``embedding_cosine`` (mean pairwise cosine of the online latents), ``prototype_ane``. A ``loss_comp`` that stays at
+    ln M (6.238 for 512 prototypes), or an ``embedding_cosine`` that stays near 1, is a collapse.
 
-    Args:
-        encoder: images ``[B, C, H, W]`` to features ``[B, encoder.feature_dim]``.
-        projector: features to latents ``[B, D]``; default ``Projector(encoder.feature_dim, latent_dim)``.
-        predictor: latents to latents; default ``Predictor(latent_dim, hidden_dim)``.
-        prototypes: default ``Prototypes(num_prototypes, latent_dim)``.
-        num_prototypes: M.
-        latent_dim: D.
-        hidden_dim: predictor width; 1024 in the paper's table, 512 in the released code.
-        intr_loss_coef: alpha, weight of the dispersion.
-        offset: w, denominator offset of the dispersion; larger than 1.
-        temperature: tau of the prediction.
-        assignment_temperature: tau of the assignments; None follows ``temperature``.
-        sinkhorn_iterations: scalings of the assignments.
-
-    Raises:
-        ValueError: a coefficient out of its range, or heads of different latent lengths.
+    The default heads are ``Projector(encoder.feature_dim, latent_dim)``, ``Predictor(latent_dim, hidden_dim)`` and
+    ``Prototypes(num_prototypes, latent_dim)``; ``hidden_dim`` is 1024 in the paper's table, 512 in the released code.
+    ``intr_loss_coef`` is alpha, ``offset`` > 1 and ``sinkhorn_iterations`` are those of the functions above, and
+    ``assignment_temperature`` replaces tau in the assignments. A coefficient out of its range, or heads of different
+    latent lengths, are a ``ValueError``.
     """
 
     predictor: nn.Module
@@ -62,15 +51,9 @@ class ProtoLoss(PretrainingLoss):
     target_prototypes_params: Any
 
     default_out_keys = (
-        "loss_comp",
-        "loss_intr",
-        "comp",
-        "intr",
-        "assignment_entropy",
-        "prototypes_in_use",
-        "embedding_cosine",
+        "loss_comp", "loss_intr", "comp", "intr", "assignment_entropy", "prototypes_in_use", "embedding_cosine",
         "prototype_ane",
-    )
+    )  # fmt: skip
     _schedulable_buffers = frozenset({"intr_loss_coef", "offset", "temperature", "assignment_temperature"})
 
     def __init__(
@@ -92,9 +75,7 @@ class ProtoLoss(PretrainingLoss):
         super().__init__()
         if not offset > 1:
             raise ValueError(f"`offset` must exceed 1, the largest negative cosine, got {offset}.")
-        require_positive(temperature=temperature)
-        if assignment_temperature is not None:
-            require_positive(assignment_temperature=assignment_temperature)
+        require_positive(temperature=temperature, assignment_temperature=assignment_temperature)
         projector = projector or Projector(cast(int, encoder.feature_dim), latent_dim)
         predictor = predictor or Predictor(latent_dim, hidden_dim)
         prototypes = prototypes or Prototypes(num_prototypes, latent_dim)
@@ -104,11 +85,9 @@ class ProtoLoss(PretrainingLoss):
         )
         self.sinkhorn_iterations = as_int(sinkhorn_iterations, "sinkhorn_iterations", minimum=0)
         self._register_coefficients(
-            intr_loss_coef=intr_loss_coef,
-            offset=offset,
-            temperature=temperature,
+            intr_loss_coef=intr_loss_coef, offset=offset, temperature=temperature,
             assignment_temperature=assignment_temperature,
-        )
+        )  # fmt: skip
 
     def before_update(self) -> ProtoLoss:
         """Scale the prototype rows to unit length in place, outside autograd. Returns self."""
@@ -122,8 +101,8 @@ class ProtoLoss(PretrainingLoss):
         latents = self._latents(self._read(tensordict, self.tensor_keys.observation))
         predictions = self._apply_network("predictor", latents)
         targets = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))
-        # The prototypes' precision from here on, also in a caller's autocast region or after a half-precision head.
-        with torch.autocast(device_type=latents.device.type, enabled=False):
+        # From here on in the precision of the prototypes, also under autocast or after a half-precision head.
+        with torch.autocast(latents.device.type, enabled=False):
             with self._holding("prototypes"):
                 unit = self.prototypes.unit_weight()
             latents, predictions, targets = (x.to(unit.dtype) for x in (latents, predictions, targets))

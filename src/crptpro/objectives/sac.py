@@ -18,12 +18,16 @@ from crptpro.modules.actor_critic import PixelCritic, standard_normal_like
 from crptpro.objectives.base import NetworkLoss, require_positive
 from crptpro.values import as_float
 
+REGRESSION_KEYS = ("q_mean", "target_q_mean", "td_error")
+
 
 def squared_errors(values: Tensor, target: Tensor) -> TensorDict:
-    """Regression of the values ``[B, views, 2]`` of two heads on a target ``[B]``, and what a log tells of it."""
+    """Squared error of the values ``[B, views, 2]`` of two heads to a target ``[B]``, and diagnostics.
+
+    The loss is the mean over the batch of the sum over views and heads.
+    """
     errors = values - target[..., None, None]
     out = {
-        # Sum over the views and the two heads of the mean over the batch.
         "loss_qvalue": errors.square().sum((-2, -1)).mean(),
         "q_mean": values.detach().mean(-2).mean(),
         "target_q_mean": target.mean(),
@@ -42,29 +46,22 @@ class RADSACLoss(NetworkLoss, SACLoss):
     * ``loss_actor`` = mean(alpha log pi(a|h) - min(Q1, Q2)(h, a)), gradient to the actor only;
     * ``loss_alpha`` = mean(exp(log_alpha) * sg(-log pi - target_entropy)), gradient to ``log_alpha`` only.
 
-    Of n-step transitions, whose ``steps_to_next_obs`` TorchRL's ``MultiStepTransform`` writes, gamma is raised to n.
+    With the ``steps_to_next_obs`` of TorchRL's ``MultiStepTransform``, gamma is raised to the number n of steps.
 
-    Features never receive a gradient. What differs from ``SACLoss``: squared error; the temperature loss of the
+    Features never receive a gradient. Differences from ``SACLoss``: squared error; the temperature loss of the
     released code (not its logarithm); the log-std squash and pre-tanh log-probability of
-    :class:`~crptpro.modules.SquashedGaussianActor`; one trunk under both Q heads, so the critic is one network with
-    two outputs; and separate steps :meth:`critic_loss` and :meth:`actor_and_temperature_loss`, because actor,
-    temperature and target are updated every second time, against the critic just stepped.
+    :class:`~crptpro.modules.SquashedGaussianActor`; one critic network with two outputs and a shared trunk; and
+    separate :meth:`critic_loss` and :meth:`actor_and_temperature_loss`, because actor, temperature and target are
+    updated every second time, against the updated critic.
 
     Deviation: the released code always bootstraps; here ``terminated`` cuts it, which no task of the paper has.
 
     ``forward`` returns the losses and, detached, ``alpha``, ``entropy`` (-log pi, nats), ``q_mean``, ``target_q_mean``,
     ``td_error`` (mean over rows of the larger of the two heads' absolute errors).
 
-    Args:
-        actor: on features.
-        critic: on features and actions; the target is a copy of all of it.
-        gamma: discount per agent step, in [0, 1].
-        alpha_init: initial temperature, positive: its logarithm is what is learned.
-        target_entropy: in nats; None for minus the action dimension.
-        generator: source of all action noise; torch's global one if None. Not part of the state dictionary.
-
-    Raises:
-        ValueError: ``gamma`` or ``alpha_init`` out of its range.
+    ``gamma`` in [0, 1] is the discount per agent step, ``alpha_init`` the initial temperature, ``target_entropy`` in
+    nats by default minus the action dimension. ``generator`` draws all action noise (torch's global one if None) and is
+    not part of the state dictionary.
     """
 
     @dataclass
@@ -73,19 +70,9 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
     default_keys = _AcceptedKeys
     tensor_keys: Any
-    view_names: ClassVar[tuple[str, ...]] = ("observation",)
-    """Configurable keys of the views of an observation."""
+    view_names: ClassVar[tuple[str, ...]] = ("observation",)  # configurable keys; the actor learns from the first
 
-    default_out_keys = (
-        "loss_actor",
-        "loss_qvalue",
-        "loss_alpha",
-        "alpha",
-        "entropy",
-        "q_mean",
-        "target_q_mean",
-        "td_error",
-    )
+    default_out_keys = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy", *REGRESSION_KEYS)
 
     def __init__(
         self,
@@ -100,17 +87,15 @@ class RADSACLoss(NetworkLoss, SACLoss):
         gamma = as_float(gamma, "gamma", minimum=0, maximum=1)
         require_positive(alpha_init=alpha_init)
         views = [self.default_keys().observation]
+        moments = ["loc", "scale"]
         policy = ProbabilisticActor(
-            TensorDictModule(actor, in_keys=views, out_keys=["loc", "scale"]),
-            in_keys=["loc", "scale"],
-            distribution_class=TanhNormal,
-            return_log_prob=True,
+            TensorDictModule(actor, views, moments), moments, distribution_class=TanhNormal, return_log_prob=True
         )
         super().__init__(
             policy,
-            TensorDictModule(critic, in_keys=[*views, "action"], out_keys=["state_action_value"]),
-            # Not 1 or 2: any count makes SACLoss stack the parameters into new ones, and for a single module
-            # draw them anew, losing the orthogonal initialisation and the identity with ``critic``.
+            TensorDictModule(critic, [*views, "action"], ["state_action_value"]),
+            # With any other count SACLoss stacks copies of the parameters, and initialises those of a single module
+            # again, without orthogonal initialisation.
             num_qvalue_nets=0,
             loss_function="l2",
             alpha_init=float(alpha_init),
@@ -123,12 +108,12 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
     @property
     def actor(self) -> Any:
-        """The policy that is trained, on features."""
+        """The policy, on features."""
         return cast(Any, self.actor_network)[0].module
 
     @property
     def critic(self) -> Any:
-        """The critic that is trained."""
+        """The critic."""
         return cast(Any, self.qvalue_network).module
 
     @dispatch
@@ -151,18 +136,15 @@ class RADSACLoss(NetworkLoss, SACLoss):
         # Detached weights: the gradient passes through Q to the action and to nothing else.
         with self._cached_detached_qvalue_params.to_module(self.qvalue_network, preserve_module_state=False):
             value = self._q_values_on_features(features, action).amin(-1)
-        loss_actor, log_prob = (self._alpha * log_prob - value).mean(), log_prob.detach()
+        entropy = -log_prob.detach()
         out = {
-            "loss_actor": loss_actor,
-            "loss_alpha": self._alpha_loss(log_prob).mean(),
+            "loss_actor": (self._alpha * log_prob - value).mean(),
+            # SACLoss uses log_alpha in place of alpha.
+            "loss_alpha": (self.log_alpha.exp() * (entropy - self.target_entropy)).mean(),
             "alpha": self._alpha,
-            "entropy": -log_prob.mean(),
+            "entropy": entropy.mean(),
         }
         return TensorDict(out, batch_size=[])
-
-    def _alpha_loss(self, log_prob: Tensor) -> Tensor:
-        # SACLoss uses log_alpha in place of alpha.
-        return self.log_alpha.exp() * (-log_prob - self.target_entropy).detach()
 
     @torch.no_grad()
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
@@ -181,28 +163,25 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
     def _act(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return an action of the policy, and its log-probability."""
-        # The noise is drawn before the parameters are swapped in, where a compiler cannot pause for a generator.
+        # The noise is drawn before the parameters are swapped in, because a compiled graph cannot break inside.
         like = features.new_empty(*features.shape[:-1], self.actor.action_dim, dtype=self.log_alpha.dtype)
         noise = standard_normal_like(like, self.generator)
         with self._holding("actor_network"):
             return self.actor.sample(features, noise=noise)
 
     def _views(self, tensordict: TensorDictBase) -> list[Tensor]:
-        """The views of the observation; the first is the one that the actor learns from."""
         return [tensordict.get(getattr(self.tensor_keys, name)).detach() for name in self.view_names]
 
-    # What lies before the features; DrQ has an encoder there.
+    # DrQ overrides these two, because its views are images.
 
     def _policy_features(self, view: Tensor) -> Tensor:
-        """What the actor sees of a view, without gradient."""
         return view
 
     def _q_values_on_features(self, features: Tensor, action: Tensor) -> Tensor:
         return self.critic(features, action)
 
     def _make_vmap(self) -> None:
-        # SACLoss vectorises over a stack of critics; here there is one, and the vmap closure cannot be pickled.
-        pass
+        pass  # of SACLoss, for a stack of critics; its closure cannot be pickled
 
     def _set_in_keys(self) -> None:
         keys = self.tensor_keys
@@ -212,7 +191,7 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
     @torch.no_grad()
     def reset_parameters_recursive(self) -> None:
-        """Re-initialise actor and critic, copy the critic into its target, restore the first temperature."""
+        """Re-initialise actor and critic, copy the critic into its target, restore the initial temperature."""
         super().reset_parameters_recursive()
         self.log_alpha.copy_(self.alpha_init.log())
 
@@ -221,8 +200,8 @@ class AveragedSACLoss(RADSACLoss):
     """:class:`RADSACLoss` with two views of each observation (DrQ, arXiv 2004.13649, K = M = 2).
 
     Each view of the next observation has its own action; y is the mean of their targets. ``loss_qvalue`` is the sum,
-    not the mean, over the views, as in denisyarats/drq ``drq.py``; ``loss_actor`` and ``loss_alpha`` are on the first
-    view. A ``generator`` is asked for the next actions of the first view, of the second, then for the actor's.
+    not the mean, over the views, as in denisyarats/drq ``drq.py``; ``loss_actor`` and ``loss_alpha`` use the first
+    view. The noise is drawn for the next actions of the first and the second view, then for the actor.
 
     The exploration agent of APT learns with it on detached features (forhaoliu/mini_apt averages likewise).
     """
@@ -238,10 +217,9 @@ class AveragedSACLoss(RADSACLoss):
 class DrQLoss(AveragedSACLoss):
     """DrQ (arXiv 2004.13649; denisyarats/drq ``drq.py``): :class:`AveragedSACLoss` with the encoder inside.
 
-    Actor and critic share the convolutions, tied, and each has a head of its own. The convolutions learn from
-    ``loss_qvalue`` alone: the actor, its critic and the policy of the targets see detached features. The target critic
-    has its own copy of convolutions and head. Give actor and critic ``has_tanh=True``: DrQ's heads end with a tanh.
-    ``options`` are those of :class:`RADSACLoss`; a critic that does not fit the encoder is a ``ValueError``.
+    Actor and critic share the convolutions, which learn from ``loss_qvalue`` alone; the target critic copies
+    convolutions and head. In DrQ, actor and critic have ``has_tanh=True``. ``options`` are those of
+    :class:`RADSACLoss`; a critic that does not fit the encoder is a ``ValueError``.
 
     Deviation: as in :class:`RADSACLoss`, ``terminated`` cuts the bootstrap.
     """

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from crptpro.modules import DeterministicActor, TwinCritic
 from crptpro.objectives.base import NetworkLoss
-from crptpro.objectives.sac import squared_errors
+from crptpro.objectives.sac import REGRESSION_KEYS, squared_errors
 from crptpro.values import as_float
 
 
@@ -27,13 +27,10 @@ class SkillDDPGLoss(NetworkLoss):
     * ``loss_qvalue`` = MSE(Q1, y) + MSE(Q2, y), gradient to the critic only;
     * ``loss_actor`` = -mean(min(Q1, Q2)(s, a)), gradient to the actor only.
 
-    Both actions are the actor's with Gaussian noise clipped to ``noise_clip``, from ``generator`` (the target's first;
-    torch's global one if None). Only the critic has a target, and it ends its trunk with a tanh in the released code.
-    Features never receive a gradient. ``forward`` returns the diagnostics of :class:`~crptpro.objectives.RADSACLoss`
-    too.
-
-    Raises:
-        ValueError: ``noise_clip`` negative, or a critic for other features than the actor's.
+    Both actions have Gaussian noise clipped to ``noise_clip``, from ``generator`` (the target's first; torch's global
+    one if None). Only the critic has a target. In the released code the critic's trunk ends with a tanh. Features never
+    receive a gradient. ``forward`` also returns the diagnostics of :class:`~crptpro.objectives.RADSACLoss`. A critic
+    that does not fit the actor is a ``ValueError``.
     """
 
     @dataclass
@@ -46,7 +43,7 @@ class SkillDDPGLoss(NetworkLoss):
 
     default_keys = _AcceptedKeys
     tensor_keys: Any
-    default_out_keys = ("loss_actor", "loss_qvalue", "q_mean", "target_q_mean", "td_error")
+    default_out_keys = ("loss_actor", "loss_qvalue", *REGRESSION_KEYS)
 
     actor_network: DeterministicActor
     actor_network_params: Any
@@ -77,12 +74,12 @@ class SkillDDPGLoss(NetworkLoss):
 
     @property
     def actor(self) -> Any:
-        """The policy that is trained."""
+        """The policy."""
         return self.actor_network
 
     @property
     def critic(self) -> Any:
-        """The critic that is trained."""
+        """The critic."""
         return self.qvalue_network
 
     def _set_in_keys(self) -> None:
@@ -105,7 +102,7 @@ class SkillDDPGLoss(NetworkLoss):
         return squared_errors(values.unsqueeze(-2), target)
 
     def actor_loss(self, tensordict: TensorDictBase) -> Tensor:
-        """The actor's loss, against the critic as it is now."""
+        """Return the actor's loss."""
         inputs = self._inputs(tensordict, tensordict)
         action = self._act(inputs)
         # Detached weights: the gradient passes through Q to the action and to nothing else.
@@ -119,8 +116,8 @@ class SkillDDPGLoss(NetworkLoss):
         action = self._act(inputs)
         with self._holding("qvalue_network", target=True):
             value = self.qvalue_network(inputs, action).amin(-1)
-        names = (self.tensor_keys.reward, self.tensor_keys.discount)
-        reward, discount = (following.get(name).squeeze(-1) for name in names)
+        reward = following.get(self.tensor_keys.reward).squeeze(-1)
+        discount = following.get(self.tensor_keys.discount).squeeze(-1)
         return reward + discount * value
 
     def _act(self, inputs: Tensor) -> Tensor:

@@ -7,14 +7,6 @@ from crptpro.transforms.random_shift import RandomShift, draw_offsets, random_sh
 from crptpro.transforms.rewards import ContrastiveReward, ParticleReward, PrototypeReward
 
 __all__ = [
-    "ColorSwap",
-    "ContrastiveReward",
-    "DenseShiftFeatures",
-    "FrozenEncoder",
-    "ParticleReward",
-    "PrototypeReward",
-    "RandomShift",
-    "choose_feature_mode",
-    "draw_offsets",
-    "random_shift",
-]
+    "ColorSwap", "ContrastiveReward", "DenseShiftFeatures", "FrozenEncoder", "ParticleReward", "PrototypeReward",
+    "RandomShift", "choose_feature_mode", "draw_offsets", "random_shift",
+]  # fmt: skip

@@ -1,4 +1,4 @@
-"""What transforms share: the keys of images in replay batches and on environments."""
+"""Base of the transforms: keys of images in replay batches and on environments."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Keys = Any
 
 
 def read_entry(transform: Transform, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """Return an entry; a ``KeyError`` names what is there instead."""
+    """Return an entry; a ``KeyError`` lists the present ones."""
     value = tensordict.get(key, None)
     if value is None:
         present = list(tensordict.keys(True, True))
@@ -24,7 +24,7 @@ def read_entry(transform: Transform, tensordict: TensorDictBase, key: NestedKey)
 
 
 def require_pairs(transform: Transform) -> None:
-    """Refuse in and out keys that do not pair up."""
+    """Require as many out keys as in keys."""
     read, written = transform.in_keys, transform.out_keys
     if len(read) != len(written):
         raise ValueError(f"in_keys {read} and out_keys {written} must pair up.")
@@ -33,10 +33,9 @@ def require_pairs(transform: Transform) -> None:
 class PixelTransform(Transform):
     """Computes one entry from each image entry, in replay batches (``forward``) and in environments.
 
-    Keys under ``"next"`` belong to replay batches: on an environment only root keys count, at each reset and each step.
-    Without ``in_keys`` they are ``"pixels"`` and, where a batch has it, ``("next", "pixels")``; keys that are named
-    must be present. Without ``out_keys`` the images are replaced. A subclass writes ``_apply_transform`` and, where it
-    is not that of the image, :meth:`written_spec`.
+    Environments ignore keys under ``"next"``. ``in_keys`` are required; by default they are ``"pixels"`` and, if
+    present, ``("next", "pixels")``. Without ``out_keys`` the images are replaced. A subclass writes
+    ``_apply_transform`` and, if it is not that of the image, :meth:`written_spec`.
     """
 
     def __init__(self, in_keys: Keys | None, out_keys: Keys | None) -> None:
@@ -47,11 +46,11 @@ class PixelTransform(Transform):
         self._optional = next_pixels if in_keys is None else None
 
     def written_spec(self, read: Any) -> Any:
-        """Return the spec of what is written for an image of spec ``read``."""
+        """Return the spec of the output for an image of spec ``read``."""
         return read.clone()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Transform every key of a sampled batch, what is stored stays as it is; a missing key is a ``KeyError``."""
+        """Transform every key of a sampled batch; a missing key is a ``KeyError``."""
         return self._apply_to(tensordict, zip(self.in_keys, self.out_keys))
 
     def _apply_to(self, tensordict: TensorDictBase, pairs: Any) -> TensorDictBase:
@@ -71,7 +70,7 @@ class PixelTransform(Transform):
         return self._call(tensordict_reset)
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Register what the root keys write; an image that the environment lacks is a ``KeyError``."""
+        """Add the specs of the root keys; a missing image is a ``KeyError``."""
         output_spec = output_spec.clone()
         observations = output_spec["full_observation_spec"]
         for in_key, out_key in self._root_pairs():

@@ -12,9 +12,8 @@ CHANNELS = 3
 class ColorSwap(PixelTransform):
     """Reverses the channel order, RGB to BGR, of whole images: the simplest reading of the paper's unseen colours.
 
-    Everything changes its colour with it, the robot too; ``make_env(..., colors="reversed_background")`` changes the
-    background alone. For environments and replay batches, of RGB frames and stacks of them, ``[*, 3 k, H, W]``; keys as
-    of :class:`RandomShift`.
+    ``make_env(..., colors="reversed_background")`` changes the background alone. For environments and replay batches,
+    of RGB frames and stacks of them, ``[*, 3 k, H, W]``; keys as in :class:`RandomShift`.
     """
 
     def __init__(self, in_keys: Keys | None = None, out_keys: Keys | None = None) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Self
 
 import torch
 import torch.nn.functional as F
@@ -29,9 +29,6 @@ from crptpro.transforms.free_memory import free_bytes
 from crptpro.transforms.random_shift import as_numpy_bits, draw_offsets
 from crptpro.values import as_int
 
-if TYPE_CHECKING:
-    from typing import Self
-
 FeatureMode = Literal["auto", "dense", "reencode"]
 
 #: What dense maps may take of the memory that is free; the rest is for networks, batches and the page cache.
@@ -41,23 +38,17 @@ logger = logging.getLogger(__name__)
 
 
 class DenseShiftGeometry(NamedTuple):
-    """Sizes that follow from an encoder and a largest shift."""
+    """Sizes that follow from an encoder and a largest shift; in brackets those of the default encoder."""
 
-    phases: int
-    """Phases per axis: the encoder's total stride (2)."""
-
-    window: int
-    """Side in pixels of the image that each phase encodes (92)."""
-
-    maps_shape: tuple[int, int, int, int]
-    """``(phases**2, C, m, m)`` of the dense maps of one image (4, 32, 39, 39)."""
+    phases: int  # phases per axis: the encoder's total stride (2)
+    window: int  # side in pixels of the image that each phase encodes (92)
+    maps_shape: tuple[int, int, int, int]  # (phases**2, C, m, m) of the dense maps of one image (4, 32, 39, 39)
 
 
 def dense_shift_geometry(encoder: nn.Module, pad: int = 4) -> DenseShiftGeometry:
-    """Work out the dense maps of an encoder for shifts of up to ``pad`` pixels in each direction.
+    """Return the sizes of the dense maps of an encoder for shifts of up to ``pad`` pixels in each direction.
 
-    A ``ValueError`` says that the encoder is not known to be un-padded and convolutional throughout, or that its stride
-    leaves no shifts to share (then encoding every shift by itself costs the same).
+    An encoder that is no ``PixelEncoder``, or whose stride is too large for shifts to share maps, is a ``ValueError``.
     """
     if not isinstance(encoder, PixelEncoder):
         raise ValueError(
@@ -89,7 +80,7 @@ def dense_shift_maps(
     expected = (encoder.in_channels, encoder.image_size, encoder.image_size)
     if pixels.ndim != 4 or tuple(pixels.shape[1:]) != expected:
         raise ValueError(f"expected pixels of shape [B, {expected}], got {tuple(pixels.shape)}.")
-    # The last phase's window ends beyond the padded image; no crop that is ever read depends on those lines.
+    # The last phase's window ends beyond the padded image; no crop depends on those lines.
     far = pad + max(0, phases - 1 + window - (encoder.image_size + 2 * pad))
     padded = F.pad(pixels, (pad, far, pad, far), mode="replicate")
     origins = [(row, column) for row in range(phases) for column in range(phases)]
@@ -113,7 +104,7 @@ def crop_features(maps: Tensor, rows: Tensor, offsets: Tensor, out: Tensor, *, p
     height, width = maps.shape[-2] - extra, maps.shape[-1] - extra
     if maps.device.type != "cpu":
         return out.copy_(_crop_by_index(maps, rows, offsets, phases, (extra + 1, height, width)))
-    # In numpy, whose slices cost less: 512 float32 crops took 23 ms on one thread, torch.stack of slices 28 ms.
+    # numpy's slices are faster: 512 float32 crops took 23 ms on one thread, torch.stack of slices 28 ms.
     widens = out.dtype != maps.dtype
     source = as_numpy_bits(maps)
     target = out.view(torch.int32).numpy() if widens else as_numpy_bits(out)
@@ -341,20 +332,14 @@ def choose_feature_mode(
     latent_dim: int | None = None,
     device: torch.device | str = "cpu",
 ) -> tuple[Literal["dense", "reencode"], str]:
-    """Decide between dense maps and encoding shifted images anew; both give the same features.
+    """Choose dense maps or re-encoding of shifted images, which give the same features; returns mode and reason.
 
-    ``"auto"`` takes dense maps, of ``observations`` in ``dtype`` and of their projections of ``latent_dim`` if there
-    are to be any, where the encoder has the form and four fifths of the free memory suffice (measured on ``device`` if
-    it is not given). ``"dense"`` and ``"reencode"`` are obeyed.
-
-    Returns:
-        The mode, and the reason in one line, to be shown to the user.
-
-    Raises:
-        ValueError: ``"dense"`` for an encoder that is not of the form, or an unknown mode.
+    ``"auto"`` chooses dense maps for a suitable encoder if four fifths of the free memory (by default that of
+    ``device``) hold the maps of ``observations`` in ``dtype`` and, with ``latent_dim``, their projections. ``"dense"``
+    for an unsuitable encoder, or an unknown mode, is a ``ValueError``.
     """
     if mode == "reencode":
-        return "reencode", "re-encoding at every update, as asked"
+        return "reencode", "re-encoding at every update, as requested"
     if mode not in ("auto", "dense"):
         raise ValueError(f"mode must be 'auto', 'dense' or 'reencode', got {mode!r}.")
     try:
@@ -367,8 +352,8 @@ def choose_feature_mode(
     size = f"{needed / 2**30:.1f} GiB for {observations} observations, {available / 2**30:.1f} GiB free"
     if mode == "dense":
         if needed > available:
-            logger.warning("The dense-shift cache was asked for and may not fit: %s.", size)
-        return "dense", f"dense-shift cache, as asked ({size})"
+            logger.warning("The dense-shift cache was requested and may not fit: %s.", size)
+        return "dense", f"dense-shift cache, as requested ({size})"
     if needed <= MEMORY_SHARE * available:
         return "dense", f"dense-shift cache ({size})"
     in_bf16 = dense_maps_bytes(encoder, observations, torch.bfloat16, pad=pad, latent_dim=latent_dim)

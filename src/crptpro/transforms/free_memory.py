@@ -1,7 +1,8 @@
-"""How much memory a process may still take: the machine's, or less inside a container or a batch job."""
+"""The memory that a process may still take, in a container or batch job too."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import torch
 CGROUPS = Path("/sys/fs/cgroup")
 OWN_CGROUPS = Path("/proc/self/cgroup")
 
-# Version 2, then version 1: the limit, what is in use, and the file cache that would be given back first.
+# Version 2, then version 1: the limit, the memory in use, and the reclaimable file cache.
 _FILES = (
     ("memory.max", "memory.current", "inactive_file"),
     ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
@@ -26,10 +27,9 @@ def free_bytes(device: torch.device) -> int:
 
 
 def cgroup_free_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> Iterator[int]:
-    """Yield what each memory-limited cgroup around this process has left, in bytes; what is unreadable counts not.
+    """Yield the free bytes of each memory-limited cgroup around this process, which psutil ignores.
 
-    psutil does not look at them: inside a container it reports the machine. The process's groups stand in ``own``, one
-    ``number:controllers:path`` a line; they are mounted at ``root``.
+    ``own`` lists the groups of the process as ``number:controllers:path``; they are mounted at ``root``.
     """
     for line in own.read_text().splitlines() if own.exists() else []:
         _, controllers, group = line.split(":", 2)
@@ -44,9 +44,6 @@ def cgroup_free_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> Iterator
                     left = int((directory / limit).read_text()) - int((directory / usage).read_text())
                 except (OSError, ValueError):  # "max" for no limit
                     continue
-                yield max(0, left + _statistic(directory / "memory.stat", cache))
-
-
-def _statistic(path: Path, name: str) -> int:
-    lines = path.read_text().splitlines() if path.exists() else []
-    return next((int(value) for key, value in map(str.split, lines) if key == name), 0)
+                statistics = directory / "memory.stat"
+                found = re.search(rf"^{cache} (\d+)$", statistics.read_text(), re.M) if statistics.exists() else None
+                yield max(0, left + int(found[1] if found else 0))

@@ -1,4 +1,4 @@
-"""A frozen encoder as a TorchRL transform: pixels in, features out, never a gradient."""
+"""A frozen encoder as a TorchRL transform from pixels to features."""
 
 from __future__ import annotations
 
@@ -15,18 +15,15 @@ from crptpro.transforms.base import Keys, PixelTransform
 class FrozenEncoder(PixelTransform):
     """Encode images ``[*, C, H, W]`` without gradient, on environments (single and batched) and in replay buffers.
 
-    Any ``nn.Module`` that maps ``[N, C, H, W]`` to features ``[N, ...]`` will do, a ResNet or a vision transformer as
-    well as a :class:`~crptpro.modules.PixelEncoder`; whether it wants uint8 or scaled images is its own affair. It is
-    used by reference, in evaluation mode, so an encoder that a loss is still training can be looked through at any
-    time. Images are moved to the encoder's device, and the features, in its output dtype, back to where the images
-    were.
+    The encoder is any ``nn.Module`` from ``[N, C, H, W]`` to features ``[N, ...]``. It gets the images unscaled, is in
+    evaluation mode, and not copied: training it changes the features. Images are moved to its device, and the features,
+    in its output dtype, back to the device of the images.
 
     Examples:
         >>> from crptpro.modules import PixelEncoder
         >>> from tensordict import TensorDict
         >>> encoder = PixelEncoder(3, channels=(4, 4), strides=(2, 1), image_size=16)
-        >>> pixels = torch.zeros(2, 3, 16, 16, dtype=torch.uint8)
-        >>> FrozenEncoder(encoder)(TensorDict(pixels=pixels))["features"].shape
+        >>> FrozenEncoder(encoder)(TensorDict(pixels=torch.zeros(2, 3, 16, 16, dtype=torch.uint8)))["features"].shape
         torch.Size([2, 100])
     """
 
@@ -47,11 +44,11 @@ class FrozenEncoder(PixelTransform):
         if not isinstance(features, Tensor):
             raise TypeError(
                 f"The encoder {type(self.encoder).__name__} returned {type(features).__name__}, not a tensor of "
-                "features; wrap it in a module that returns what is to be learned from."
+                "features; wrap it in a module that returns a tensor."
             )
         return features.to(obs.device).reshape(*lead, *features.shape[1:])
 
     def written_spec(self, read: Any) -> Unbounded:
-        """Return the features' spec, found by encoding one blank image."""
+        """Return the spec of the features of a blank image."""
         features = self._apply_transform(torch.zeros(read.shape[-3:], dtype=read.dtype, device=read.device))
         return Unbounded(shape=(*read.shape[:-3], *features.shape), dtype=features.dtype, device=read.device)

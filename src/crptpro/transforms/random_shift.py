@@ -1,4 +1,4 @@
-"""Random shift: the one image augmentation of the method, exact on integer offsets and fast on a CPU."""
+"""Random shift, the image augmentation of all methods: exact on integer offsets and fast on a CPU."""
 
 from __future__ import annotations
 
@@ -17,22 +17,20 @@ def draw_offsets(
 ) -> Tensor:
     """Draw one shift per sample, uniform over the ``(2 * pad + 1)**2`` integer offsets of up to ``pad`` pixels.
 
-    Returns int64 ``[batch, 2]``, (row, column), each in ``{0, ..., 2 * pad}``; ``(pad, pad)`` is no shift. A generator
-    on another device is drawn from where it lives, so one CPU generator gives the same shifts on every device.
+    Returns int64 ``[batch, 2]``, (row, column) in ``{0, ..., 2 * pad}``; a CPU generator gives the same everywhere.
     """
     source = torch.device(device) if generator is None else generator.device
     return torch.randint(0, 2 * pad + 1, (batch, 2), generator=generator, device=source).to(device)
 
 
 def random_shift(pixels: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
-    """Shift every image ``[B, C, H, W]`` by its own integer offset ``[B, 2]``, repeating the border where nothing was.
+    """Crop every image ``[B, C, H, W]``, its border replicated ``pad`` times, at its own integer offset ``[B, 2]``.
 
-    A crop of the image with its border replicated ``pad`` times: the augmentation of DrQ (denisyarats/drq) as CRPTpro
-    and Proto-RL use it. Offsets are (row, column) in ``{0, ..., 2 * pad}`` (a ``ValueError`` otherwise, where they can
-    be read without waiting). Values are copied, never interpolated, so the result is exact in every dtype.
+    This is the augmentation of DrQ (denisyarats/drq) as CRPTpro and Proto-RL use it. Offsets are (row, column) in
+    ``{0, ..., 2 * pad}``; others on a CPU are a ``ValueError``. Values are copied, never interpolated.
 
     On a CPU this copies slices, in half the time of padding and cropping. On other devices, under ``torch.compile``
-    and where a gradient is wanted, it is one gather without host synchronisation.
+    and for a gradient, it is one gather without host synchronisation.
 
     Examples:
         >>> image = torch.arange(4).view(1, 1, 2, 2)
@@ -57,8 +55,7 @@ def random_shift(pixels: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
 
 
 def as_numpy_bits(tensor: Tensor) -> np.ndarray[Any, Any]:
-    """Return a numpy array over the same memory, good for copying but not for arithmetic."""
-    # numpy has no bfloat16; copying never looks at the values, so any type of the same width serves.
+    """Return a numpy array over the same memory, for copies only: numpy has no bfloat16, so it is int16."""
     return (tensor.view(torch.int16) if tensor.dtype == torch.bfloat16 else tensor).numpy()
 
 
@@ -82,8 +79,7 @@ def _shift_by_slices(pixels: Tensor, offsets: Tensor, pad: int) -> Tensor:
 
 
 def _copy_shifted(view: np.ndarray[Any, Any], image: np.ndarray[Any, Any], row: int, column: int) -> None:
-    # Copies the part of the image that stays in view, then repeats its outermost columns and rows: one pass over
-    # the data, where padding first would take two.
+    # Copies the visible part, then repeats its outermost columns and rows: one pass over the data, not two.
     height, width = image.shape[-2:]
     row, column = max(min(row, height - 1), 1 - height), max(min(column, width - 1), 1 - width)
     top, bottom = max(-row, 0), height - max(row, 0)
@@ -99,16 +95,12 @@ def _copy_shifted(view: np.ndarray[Any, Any], image: np.ndarray[Any, Any], row: 
 class RandomShift(PixelTransform):
     """Shift images ``[*, C, H, W]`` at random by up to ``pad`` pixels, for replay buffers and environments.
 
-    Every key and every sample draws its own offset; all channels (stacked frames) of a sample share it. The transform
-    acts whether or not it is in training mode, because TorchRL puts every attached transform into evaluation mode.
+    Every key and every sample draws its own offset, common to all channels (stacked frames). The transform acts in
+    evaluation mode too, into which TorchRL puts every attached transform.
 
-    Args:
-        pad: largest shift in pixels.
-        in_keys: images. By default ``"pixels"`` and, where present, ``("next", "pixels")``; keys that are named must be
-            present. On an environment only the root keys are shifted.
-        out_keys: where the shifted images go; in place of the originals by default.
-        generator: source of the offsets; torch's global generator when None. It is not part of the state
-            dict: whoever owns it saves it. Clones of the transform share it.
+    ``in_keys`` are required; by default they are ``"pixels"`` and, if present, ``("next", "pixels")``. On an
+    environment only root keys are shifted. Without ``out_keys`` the images are replaced. ``generator`` draws the
+    offsets (torch's global one if None); clones share it, and the state dict excludes it.
     """
 
     def __init__(

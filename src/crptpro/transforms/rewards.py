@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 import torch
 import torch.nn.functional as F
@@ -20,14 +20,10 @@ from crptpro.objectives.functional import becl_loss, knn_distance, knn_distances
 from crptpro.transforms.base import Keys, read_entry, require_pairs
 from crptpro.values import as_int
 
-if TYPE_CHECKING:
-    from typing import Self
-
 #: Subtracted from each scaled distance of a particle (rll-research/url_benchmark).
 PARTICLE_CLIP = 1e-4
-
-# Below this a scale says that all particles coincide; their distances are 0 too, and so is the bonus.
-_SMALLEST_SCALE = 1e-8
+#: A smaller scale means that all particles coincide; their distances are 0, and so is the reward.
+SMALLEST_SCALE = 1e-8
 
 logger = logging.getLogger(__name__)
 
@@ -35,19 +31,17 @@ logger = logging.getLogger(__name__)
 class IntrinsicReward(Transform):
     r"""Computes an intrinsic reward from the features of next observations: :math:`r = r_\mathrm{ext} + c \hat r`.
 
-    A subclass writes ``intrinsic_reward`` of the rows of a replay batch, which are compared with each other.
-
-    Args:
-        networks: that are read, by attribute name. They are somebody else's, and no part of the state dictionary.
-        coef: :math:`c`; None leaves the reward alone.
-        in_keys: one key, features ``[*, D]`` of the next observation.
-        out_keys: one key for :math:`\hat r`, of the reward's shape.
-        reward_key: :math:`r_\mathrm{ext}`, ``[*, 1]``, which :math:`r` replaces; read where there is a ``coef``.
+    ``in_keys`` is one key, features ``[*, D]`` of the next observation, ``out_keys`` one key for :math:`\hat r`, of the
+    reward's shape. :math:`r` replaces ``reward_key`` ``[*, 1]``, unless ``coef``, :math:`c`, is None. ``projector`` is
+    a network on the features (None if they are projected already), which the state dictionary excludes.
     """
+
+    projector: nn.Module | None
+    extra_keys: tuple[NestedKey, ...] = ()  # further entries that ``intrinsic_reward`` takes
 
     def __init__(
         self,
-        networks: dict[str, nn.Module | None],
+        projector: nn.Module | None,
         *,
         coef: float | None = None,
         in_keys: Keys = ("next", "features"),
@@ -58,22 +52,24 @@ class IntrinsicReward(Transform):
         require_pairs(self)
         if len(self.in_keys) != 1:
             raise ValueError(f"{type(self).__name__} reads and writes one key each, got {self.in_keys}.")
-        self.__dict__.update(networks)
+        self.__dict__["projector"] = projector
         self.coef = coef
         self.reward_key = reward_key
-        self.beside_keys: list[NestedKey] = []  # further entries that ``intrinsic_reward`` takes
 
-    def intrinsic_reward(self, features: Tensor, *beside: Tensor) -> Tensor:
+    def intrinsic_reward(self, features: Tensor, *extra: Tensor) -> Tensor:
         """Return the reward of each row ``[B, D]`` of the batch before the coefficient, float32 ``[B]``."""
         raise NotImplementedError
+
+    def _project(self, features: Tensor) -> Tensor:
+        return (features if self.projector is None else self.projector(features)).float()
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the intrinsic reward of a batch and add it to the reward; stored rewards stay as they are."""
         features = read_entry(self, tensordict, self.in_keys[0])
         rows = features.reshape(-1, features.shape[-1])
-        beside = [read_entry(self, tensordict, key).reshape(len(rows), -1) for key in self.beside_keys]
-        intrinsic = self.intrinsic_reward(rows, *beside)
+        extra = [read_entry(self, tensordict, key).reshape(len(rows), -1) for key in self.extra_keys]
+        intrinsic = self.intrinsic_reward(rows, *extra)
         if self.coef is None:
             return tensordict.set(self.out_keys[0], intrinsic.reshape(*features.shape[:-1], 1))
         reward = read_entry(self, tensordict, self.reward_key)
@@ -83,11 +79,11 @@ class IntrinsicReward(Transform):
         return tensordict.set(self.reward_key, reward + self.coef * intrinsic)
 
     def transform_output_spec(self, output_spec: TensorSpec) -> TensorSpec:
-        """Refuse to be part of an environment, whose single step has nothing to be compared with."""
+        """Refuse an environment, where there is no batch to compare with."""
         raise NotImplementedError(f"{type(self).__name__} rewards replay batches; attach it to a buffer.")
 
     def clone(self) -> Self:
-        """Return a transform without parent, with a state of its own; networks and generator are shared."""
+        """Return a transform without parent and with separate state; networks and generator are shared."""
         copy = super().clone()
         copy._buffers = {name: value.clone() for name, value in self._buffers.items() if value is not None}
         return copy
@@ -101,30 +97,25 @@ class PrototypeReward(IntrinsicReward):
 
     1. draws one candidate per prototype, :math:`i_j \sim \mathrm{Categorical}_i(\mathrm{softmax}_i(c_j \cdot z_i))`;
     2. puts the M vectors :math:`z_{i_j}` into the first-in-first-out queue Q;
-    3. then takes :math:`\hat r_i = \lVert z_i - \mathrm{NN}_k(z_i; Q) \rVert_2`, in [0, 2].
+    3. computes :math:`\hat r_i = \lVert z_i - \mathrm{NN}_k(z_i; Q) \rVert_2`, in [0, 2].
 
-    As in the released agent (liuxin0824/CRPTpro ``proto.py``), copies of a sample that were just drawn
-    count as neighbours, so a sample drawn k times or more gets exactly 0 (about 8 % of a batch of 512 with
-    512 prototypes and k = 3), and rows of the queue not yet filled are zero vectors at distance 1. A row that is not
-    finite is never drawn.
+    As in the released agent (liuxin0824/CRPTpro ``proto.py``), a sample drawn k times or more gets exactly 0 (about 8 %
+    of a batch of 512 with 512 prototypes and k = 3), because its copies in Q are its neighbours. Empty rows of Q are
+    zero vectors, at distance 1. Rows that are not finite are never drawn.
 
-    The candidates come from the batch at hand: one sample alone fills the queue with itself and earns 0.
-
-    Deviation: the released pre-training fills Q on the way and hands it over; here Q starts from zeros unless ``queue``
-    is given.
+    Deviation: the released pre-training hands its Q over; here Q starts from zeros unless ``queue`` is given.
 
     Args:
-        projector: maps features to the latent space, frozen; None if ``in_keys`` already names projections.
-        prototypes: :class:`~crptpro.modules.Prototypes`, rows of any length, as long as the projections.
+        projector: frozen map from features to latents; None if ``in_keys`` already names projections.
+        prototypes: :class:`~crptpro.modules.Prototypes`, not necessarily normalised.
         coef: :math:`\beta`; None writes :math:`\hat r` only.
-        knn_k: k, counted with copies of the sample itself; at most ``queue_size``.
+        knn_k: k, including copies of the sample itself; at most ``queue_size``.
         queue_size: length of Q, a multiple of M.
-        queue: ``[queue_size, D]`` to start from, the row that is overwritten first in front; zeros when None.
-        generator: source of the draws; the global generator of the device when None. Not part of the state dict.
+        queue: initial Q ``[queue_size, D]``, oldest row first; zeros when None.
+        generator: source of the draws, which the state dict excludes; the device's global one when None.
         **keys: ``in_keys``, ``out_keys`` and ``reward_key`` of :class:`~crptpro.transforms.rewards.IntrinsicReward`.
     """
 
-    projector: nn.Module | None
     prototypes: nn.Module
     queue: Tensor
     queue_pointer: Tensor
@@ -151,18 +142,18 @@ class PrototypeReward(IntrinsicReward):
             raise ValueError(f"expected a queue of shape {(queue_size, latent_dim)}, got {tuple(start.shape)}.")
         if projector is not None:
             _check_latents(latent_dim_of(projector) or latent_dim, latent_dim)
-        super().__init__({"projector": projector, "prototypes": prototypes}, coef=coef, **keys)
+        super().__init__(projector, coef=coef, **keys)
+        self.__dict__["prototypes"] = prototypes
         self.knn_k = as_int(knn_k, "knn_k", minimum=1, maximum=queue_size)
         self.generator = generator
         self.register_buffer("queue", start.detach().to(weight.device, torch.float32, copy=True))
         self.register_buffer("queue_pointer", torch.tensor(0, device=weight.device))
 
     @torch.no_grad()
-    def intrinsic_reward(self, features: Tensor, *beside: Tensor) -> Tensor:
-        r"""Insert this batch's candidates into the queue and return the bonus of each row before :math:`\beta`."""
-        latents = features if self.projector is None else self.projector(features)
+    def intrinsic_reward(self, features: Tensor, *extra: Tensor) -> Tensor:
+        r"""Put candidates into the queue and return the reward of each row before :math:`\beta`."""
+        latents = F.normalize(self._project(features), dim=-1)
         _check_latents(latents.shape[-1], self.queue.shape[-1])
-        latents = F.normalize(latents.float(), dim=-1)
         weight = self.prototypes.get_parameter("weight")
         candidates = draw_candidates(F.normalize(weight.float(), dim=-1) @ latents.T, self.generator)
         count = candidates.shape[0]
@@ -180,10 +171,10 @@ def _check_latents(length: int, expected: int) -> None:
 
 
 def warn_if_mostly_zero(num_prototypes: int, batch_size: int, knn_k: int) -> None:
-    """Say so where most rows will earn nothing: M prototypes draw from batches of B (the paper has B = M).
+    """Warn if most rows will get 0, for M prototypes and batches of B (the paper has B = M).
 
-    A row is drawn about Poisson(M / B) times, whose median is k from M / B = k - 1/3 on: with 512 prototypes, k = 3 and
-    batches of 128 three quarters of the rows get 0.
+    A row is drawn about Poisson(M / B) times, with a median of k from M / B = k - 1/3 on. With 512 prototypes, k = 3
+    and batches of 128 three quarters of the rows get 0.
     """
     too_few = int(num_prototypes / (knn_k - 1 / 3))
     if batch_size <= too_few:
@@ -197,13 +188,13 @@ def warn_if_mostly_zero(num_prototypes: int, batch_size: int, knn_k: int) -> Non
 def draw_candidates(logits: Tensor, generator: torch.Generator | None = None) -> Tensor:
     """Draw one sample per prototype, int64 ``[M]``, with probability softmax over the batch of logits ``[M, B]``.
 
-    By inversion of the cumulative distribution: one uniform number per prototype, no host synchronisation. Samples with
-    NaN are never drawn. The generator may be on any device; without one it is the global one of the logits' device.
+    Inversion of the cumulative distribution: one uniform number per prototype, no host synchronisation. Samples with
+    NaN are never drawn. The generator, by default the global one of the logits' device, may be on any device.
     """
     cumulative = logits.masked_fill(logits.isnan(), -torch.inf).softmax(dim=-1).cumsum(dim=-1)
     source = logits.device if generator is None else generator.device
     uniform = torch.rand(logits.shape[0], 1, generator=generator, device=source).to(logits.device)
-    # Rounding must not carry a draw just below 1 past the last sample that can be drawn.
+    # Rounding must not move a draw just below 1 past the last sample.
     target = torch.minimum(uniform * cumulative[:, -1:], torch.nextafter(cumulative[:, -1:], -uniform.new_ones(())))
     drawn = torch.searchsorted(cumulative, target, right=True)
     return drawn.squeeze(-1).clamp_max(logits.shape[1] - 1)
@@ -215,48 +206,42 @@ class ParticleReward(IntrinsicReward):
     .. math::
         \hat r_i = \log\Big(1 + \frac1k \sum_{j=1}^k \mathrm{relu}\big(d_{ij} / s - 10^{-4}\big)\Big)
 
-    with :math:`d_{ij}` the distance between a projection, not normalised, and its j-th nearest among the
-    projections of the same batch, itself included (:math:`d_{i1} = 0`), and s the running mean of these
-    distances over all calls. The mean takes the batch in before it is used; distances that are not finite do not enter
-    it. Source of this form: rll-research/url_benchmark ``utils.py`` (``PBE`` and ``RMS``).
+    with :math:`d_{ij}` the distance between a projection, not normalised, and its j-th nearest in the batch, itself
+    included (:math:`d_{i1} = 0`), and s the running mean of all finite distances so far, this batch included. Source of
+    this form: rll-research/url_benchmark ``utils.py`` (``PBE`` and ``RMS``).
 
-    Deviation: in a batch smaller than k the whole batch are the neighbours, and a single particle earns 0; the
-    published code fails there. Where all distances seen so far are 0 the bonus is 0; there it is not a number.
+    Deviation: a batch smaller than k uses all its rows, and a single row gets 0; the published code fails. While all
+    distances are 0 the reward is 0; there it is NaN.
 
-    ``projector`` is None if ``in_keys`` already names projections; ``options`` are those of
-    :class:`~crptpro.transforms.rewards.IntrinsicReward`.
+    ``options`` are those of :class:`~crptpro.transforms.rewards.IntrinsicReward`.
     """
 
-    projector: nn.Module | None
     distance_mean: Tensor
     distance_count: Tensor
 
     def __init__(self, projector: nn.Module | None, *, k: int = 12, **options: Any) -> None:
-        super().__init__({"projector": projector}, **options)
+        super().__init__(projector, **options)
         self.k = as_int(k, "k", minimum=2)
         where = None if projector is None else device_of(projector)
-        # The published starting point: mean 0, as if seen a ten-thousandth of a time.
+        # The published start: mean 0 with a weight of 1e-4 distances.
         self.register_buffer("distance_mean", torch.zeros((), dtype=torch.float64, device=where))
         self.register_buffer("distance_count", torch.full((), 1e-4, dtype=torch.float64, device=where))
 
     @torch.no_grad()
-    def intrinsic_reward(self, features: Tensor, *beside: Tensor) -> Tensor:
-        """Take this batch's distances into the running mean; return the reward of each row before the coefficient."""
-        latents = (features if self.projector is None else self.projector(features)).float()
+    def intrinsic_reward(self, features: Tensor, *extra: Tensor) -> Tensor:
+        """Update the running mean with this batch, and return the reward of each row before the coefficient."""
+        latents = self._project(features)
         count = latents.shape[0]
         if count < 2:
             return latents.new_zeros(count)
         distances = knn_distances(latents, latents, k=min(self.k, count))
-        self._take_in(distances.to(self.distance_mean))
-        scale = self.distance_mean.clamp_min(_SMALLEST_SCALE).to(distances)
-        return particle_entropy(distances, scale=scale, clip=PARTICLE_CLIP)
-
-    def _take_in(self, distances: Tensor) -> None:
-        # In float64 without reading from the device; one NaN taken in would stay for ever.
+        # In float64 and without host synchronisation. A NaN would stay in the mean for ever.
         finite = distances.isfinite()
         self.distance_count.add_(finite.sum())
-        deviations = torch.where(finite, distances - self.distance_mean, 0.0)
+        deviations = torch.where(finite, distances.to(self.distance_mean) - self.distance_mean, 0.0)
         self.distance_mean.add_(deviations.sum() / self.distance_count)
+        scale = self.distance_mean.clamp_min(SMALLEST_SCALE).to(distances)
+        return particle_entropy(distances, scale=scale, clip=PARTICLE_CLIP)
 
 
 class ContrastiveReward(IntrinsicReward):
@@ -265,31 +250,29 @@ class ContrastiveReward(IntrinsicReward):
     .. math::
         \hat r_i = e^{-\ell_i} = \frac{\exp(f_i \cdot f_{p(i)} / T)}{\sum_{j \ne i} \exp(f_i \cdot f_j / T)}
 
-    with :math:`f_i` the l2-normalised embeddings of a batch of next observations and p(i) the first other
-    element with the same skill, or the first other one where nobody shares it: the loss that BeCL trains its
-    embedding with (:func:`~crptpro.objectives.functional.becl_loss`), per row. It lies in (0, 1].
+    with :math:`\ell_i` the :func:`~crptpro.objectives.functional.becl_loss` of each row, :math:`f_i` the l2-normalised
+    embeddings of a batch of next observations and p(i) the first other row with the same skill, or without one the
+    first other row; in (0, 1].
 
-    Deviation: the published code fails on a batch of one; here that has nothing to be contrasted with and earns 0.
+    Deviation: a batch of one gets 0; the published code fails.
 
-    ``head`` is None if ``in_keys`` already names embeddings, ``skill_key`` the one-hot skill ``[*, K]`` that acted, at
-    the root; ``options`` are those of :class:`~crptpro.transforms.rewards.IntrinsicReward`.
+    ``head`` gives the embeddings, ``skill_key`` is the one-hot skill ``[*, K]`` at the root; ``options`` are those of
+    :class:`~crptpro.transforms.rewards.IntrinsicReward`.
     """
-
-    head: nn.Module | None
 
     def __init__(
         self, head: nn.Module | None, *, temperature: float = 0.5, skill_key: NestedKey = "skill", **options: Any
     ) -> None:
         require_positive(temperature=temperature)
-        super().__init__({"head": head}, **options)
+        super().__init__(head, **options)
         self.temperature = float(temperature)
-        self.beside_keys = [skill_key]
+        self.extra_keys = (skill_key,)
 
     @torch.no_grad()
-    def intrinsic_reward(self, features: Tensor, *beside: Tensor) -> Tensor:
+    def intrinsic_reward(self, features: Tensor, *extra: Tensor) -> Tensor:
         """Return the reward of rows ``[B, D]`` and one-hot skills ``[B, K]`` before the coefficient."""
-        embeddings = (features if self.head is None else self.head(features)).float()
+        embeddings = self._project(features)
         if len(embeddings) < 2:
             return embeddings.new_zeros(len(embeddings))
-        skills = beside[0].argmax(dim=-1)
+        skills = extra[0].argmax(dim=-1)
         return becl_loss(embeddings, skills, temperature=self.temperature, reduction="none").neg().exp()
