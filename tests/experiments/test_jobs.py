@@ -13,7 +13,7 @@ from crptpro.errors import RecordError
 from crptpro.experiments.jobs import Job, bytes_of, describe, is_finished, load_results, make_plan, write_cells
 from crptpro.experiments.matrix import SMALL, dataset, encoder, probe, run
 
-SCALE = replace(SMALL, transitions=50, updates=100, batch_size=64)
+SCALE = replace(SMALL, transitions=50, updates=100, training={"batch_size": 64})
 
 
 def trained(scale=SCALE, **changed) -> Job:
