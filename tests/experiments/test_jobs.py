@@ -51,8 +51,9 @@ def test_a_job_is_a_command_whose_key_names_its_directory() -> None:
 
 def test_another_command_is_another_job_and_so_is_what_needs_it() -> None:
     others = [
-        trained(replace(SCALE, updates=101)), trained(replace(SCALE, batch_size=65)), trained(transitions=51),
-        trained(loss={"num_prototypes": 17}), encoder(SCALE, "crptpro", ("walker", "cheetah"), 1), trained(),
+        trained(replace(SCALE, updates=101)), trained(replace(SCALE, training={"batch_size": 65})),
+        trained(transitions=51), trained(loss={"num_prototypes": 17}),
+        encoder(SCALE, "crptpro", ("walker", "cheetah"), 1), trained(),
     ]  # fmt: skip
     assert len({job.key for job in others}) == 6
     assert len({probe(SCALE, job, dataset(SCALE, "walker", 0)).key for job in others}) == 6

@@ -75,7 +75,7 @@ class FakeLauncher:
             write_json(work.directory / "done.json", {})
             return ""
 
-        return SimpleNamespace(poll=poll, stop=lambda: None)
+        return SimpleNamespace(poll=poll, stop=lambda at_once: None)
 
 
 @pytest.fixture(autouse=True)
@@ -156,7 +156,7 @@ def usual_signals() -> Iterator[None]:
 def test_a_signal_stops_all_jobs_at_a_checkpoint_and_a_second_one_at_once(
     tmp_path: Path, number: signal.Signals, error: type[BaseException]
 ) -> None:
-    stopped: list[str] = []
+    stopped: list[tuple[str, bool]] = []
 
     class Interrupted(FakeLauncher):
         def start(self, work: Work, *, is_exclusive: bool) -> Any:
@@ -165,11 +165,11 @@ def test_a_signal_stops_all_jobs_at_a_checkpoint_and_a_second_one_at_once(
                     signal.raise_signal(number)
                 return ""
 
-            return SimpleNamespace(poll=poll, stop=lambda: stopped.append(work.key))
+            return SimpleNamespace(poll=poll, stop=lambda at_once: stopped.append((work.key, at_once)))
 
     with pytest.raises(error):
         launched(tmp_path, job("a"), job("b"), job("c", job("a")), launcher=Interrupted(), jobs=2)
-    assert stopped == [job("a").key, job("b").key] * 2
+    assert stopped == [(job(name).key, at_once) for at_once in (False, True) for name in "ab"]
 
 
 def test_a_job_has_its_whole_command(tmp_path: Path) -> None:
