@@ -49,7 +49,7 @@ def test_what_a_picture_shows_is_found_and_what_only_marks_an_episode_is_not(dat
     samples = probe_samples(dataset)
     result = probe(samples, Flatten())["features"]
     assert set(result.positions) == {"qpos[0]", "qpos[1]", "qpos[2]"}
-    assert result.left_out == ("position qpos[3]",)
+    assert result.left_out == (("position", "qpos[3]"),)
     assert min(result.positions.values()) > 0.99
     # Every training row's velocity could be read off its episode's mark: memorising would give 1.
     assert result.velocity_r2 < 0.1

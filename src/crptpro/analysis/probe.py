@@ -54,7 +54,7 @@ class ProbeResult:
 
     positions: dict[str, float]
     velocities: dict[str, float]
-    left_out: tuple[str, ...]
+    left_out: tuple[tuple[str, str], ...]
     effective_rank: float
     mean_cosine: float
 
@@ -151,7 +151,7 @@ def probe_embeddings(samples: ProbeSamples, embeddings: Tensor) -> ProbeResult:
     return ProbeResult(
         positions={name: value for (kind, name), value in scores.items() if kind == "position"},
         velocities={name: value for (kind, name), value in scores.items() if kind == "velocity"},
-        left_out=tuple(f"{kind} {name}" for kind, name in names if (kind, name) not in scores),
+        left_out=tuple(name for name in names if name not in scores),
         effective_rank=effective_rank(embeddings),
         mean_cosine=mean_cosine(embeddings),
     )
