@@ -373,7 +373,7 @@ def run_jobs(
     second one at once.
 
     Returns:
-        Unfinished jobs: each failure, then the jobs that depend on it.
+        Unfinished jobs: failures, then the jobs that depend on them.
 
     Raises:
         SubmissionError: a queue refuses the first job.
@@ -384,13 +384,16 @@ def run_jobs(
     queue = _Queue(plan, usual, launcher, jobs, attempts)
     with _signals_end_it():
         try:
-            while queue.waiting or queue.running:
+            while queue.running or queue.ready():
                 queue.look()
                 if not queue.start():
                     time.sleep(POLL_S)
         except BaseException:
             queue.stop()
             raise
+    for job in queue.waiting:
+        missing = next(needed.key for needed in job.needs if needed.key not in queue.finished)
+        queue.failures.append(Failure(job.key, f"needs {missing}"))
     return queue.failures
 
 
@@ -426,11 +429,15 @@ class _Queue:
         self.is_stopping = False
         self.resumes = -math.inf
 
+    def ready(self) -> list[Job]:
+        """Return the waiting jobs whose needs are finished."""
+        return [job for job in self.waiting if all(needed.key in self.finished for needed in job.needs)]
+
     def start(self) -> bool:
         """Start the jobs that can start, and return whether there were any."""
         if time.monotonic() < self.resumes or any(job.is_exclusive for job in self.running):
             return False
-        ready = [job for job in self.waiting if all(needed.key in self.finished for needed in job.needs)]
+        ready = self.ready()
         chosen = [job for job in ready if not job.is_exclusive]
         if not chosen and not self.running:
             chosen = ready[:1]
@@ -481,16 +488,6 @@ class _Queue:
             else:
                 logger.error("%s: failed after %s: %s (log: %s)", job.key, took, reason, log)
                 self.failures.append(Failure(job.key, reason, log, tried))
-                self._skip({job.key})
-
-    def _skip(self, failed: set[str]) -> None:
-        """Drop the jobs that need a failed one, directly or not."""
-        for job in list(self.waiting):  # in order of their needs
-            cause = next((needed.key for needed in job.needs if needed.key in failed), None)
-            if cause is not None:
-                self.waiting.remove(job)
-                failed.add(job.key)
-                self.failures.append(Failure(job.key, f"needs {cause}"))
 
     def stop(self) -> None:
         """Stop all jobs at their next checkpoint and wait for them; interrupted once more, stop them at once."""

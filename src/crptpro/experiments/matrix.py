@@ -17,7 +17,7 @@ from crptpro.domains import GROUPS, get_domain
 from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.experiments.jobs import OWN, Job, options, plugins_digest
-from crptpro.experiments.published import FINETUNE_UPDATES
+from crptpro.experiments.published import COLORS, FINETUNE_UPDATES, UNSEEN, ScoreRow
 from crptpro.objectives import Method, get_method
 from crptpro.seeding import derive_seed
 from crptpro.training.explore import ExploreConfig, plan_exploration
@@ -37,14 +37,6 @@ PRETRAINED = ("crptpro", FAST, "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-
 """Systems with a pre-training of their own."""
 CROSS_DOMAIN = ("crptpro", FAST, "proto-rl-c", "atc", "apt-c", "becl", RANDOM)
 """Systems with one encoder for several domains, and the untrained control."""
-
-UNSEEN_TASKS = {
-    "A": ("pendulum_swingup", "finger_spin", "hopper_hop", "reach_duplo", "cartpole_swingup_sparse"),
-    "C": ("cheetah_run", "walker_run", "quadruped_run", "pendulum_swingup", "cartpole_swingup_sparse"),
-}
-"""Tasks of domains that a group's encoder never saw, in the paper's table."""
-COLORS_TASKS = {"C": ("reach_duplo", "pendulum_swingup", "cheetah_run")}
-"""Tasks with a reversed background, in the paper's table."""
 
 DISPERSION, NO_DISPERSION = {"intr_loss_coef": 5e-3}, {"intr_loss_coef": 0.0}
 VARIANTS: dict[str, tuple[tuple[str, Settings], ...]] = {
@@ -207,6 +199,10 @@ class Request:
         tasks = self.tasks or [get_domain(domain).task for domain in domains]
         return [task for task in tasks if get_domain(task).name in domains]
 
+    def seen_tasks(self, groups: Iterable[str]) -> list[tuple[str, str]]:
+        """Return requested groups, or these, with their tasks."""
+        return [(group, task) for group in self.groups or groups for task in self.tasks_in(GROUPS[group])]
+
     def encoders(
         self, systems: Iterable[str], groups: Iterable[str] = "A"
     ) -> Iterator[tuple[str, int, str, tuple[str, ...]]]:
@@ -278,10 +274,11 @@ def encoder(
     transitions: int | None = None,
     loss: Settings = NONE,
     explore: Settings = NONE,
+    data: Sequence[Job] = (),
 ) -> Job:
     """Return a system's encoder for domains, in ``<job>/encoder``.
 
-    `transitions`, `loss` and `explore` replace settings of the scale.
+    `transitions`, `loss` and `explore` replace settings of the scale, and `data` its datasets.
     """
     method = pretraining_of(system)
     names = [get_domain(domain).name for domain in domains]
@@ -298,7 +295,7 @@ def encoder(
     settings = {"loss": {k: v for k, v in chosen.items() if k not in defaults or defaults[k] != v}, **scale.training}
     facts |= {"domains": names, **settings}
     if method.exploration is None:
-        data = [dataset(scale, name, seed, transitions) for name in names]
+        data = data or [dataset(scale, name, seed, transitions) for name in names]
         facts |= {"updates": scale.updates, "transitions": data[0].facts["transitions"]}
         command = ["pretrain", *map(_dataset_of, data), *where]
         command += options(seed=seed, updates=scale.updates, **settings)
@@ -396,24 +393,17 @@ def timing(request: Request, system: str, domain_sets: Sequence[Sequence[str]], 
     command = ["measure", "timing", "--out", OWN]
     command += options(updates=scale.timing_updates, paper_updates=scale.paper_timing_updates, **where)
     trainings = [encoder(scale, system, domains, seed) for domains in domain_sets]
-    for trained, domains in zip(trainings, domain_sets):
-        whole = encoder(PAPER, system, domains, seed)
-        # The content of the data does not change the time: both are timed on this scale's.
-        command += ["--training", _as_word(trained, trained), "--paper-training", _as_word(whole, trained)]
-    domains = [domain for trained in trainings for domain in trained.facts["domains"]]
-    facts = {"method": trainings[0].facts["method"], "domains": domains, "seed": seed, **where}
-    needs = tuple(dict.fromkeys(needed for trained in trainings for needed in trained.needs))
-    title = f"{facts['method']} {'+'.join(domains)} {request.device} {request.threads}"
+    for training, domains in zip(trainings, domain_sets):
+        # The content of the data does not change the time: the paper's training is timed on this scale's.
+        paper_training = encoder(PAPER, system, domains, seed, data=training.needs)
+        for option, job in {"--training": training, "--paper-training": paper_training}.items():
+            at = job.command.index("--out")
+            command += [option, shlex.join(job.command[:at] + job.command[at + 2 :])]
+    names = [domain for domains in domain_sets for domain in domains]
+    facts = {"method": trainings[0].facts["method"], "domains": names, "seed": seed, **where}
+    needs = tuple(dict.fromkeys(needed for training in trainings for needed in training.needs))
+    title = f"{facts['method']} {'+'.join(names)} {request.device} {request.threads}"
     return Job("timing", title, tuple(command), facts, needs)
-
-
-def _as_word(job: Job, like: Job) -> str:
-    """Return a training's command as one word, on the data of another."""
-    command = list(job.command)
-    if job.needs:
-        command[1 : 1 + len(job.needs)] = map(_dataset_of, like.needs)
-    at = command.index("--out")
-    return shlex.join(command[:at] + command[at + 2 :])
 
 
 # --- experiments ----------------------------------------------------------------------------------------------------
@@ -467,39 +457,36 @@ def _scores(
 
 
 def _table(
-    request: Request, rows: Mapping[str, Sequence[str]], systems: Iterable[str], colors: str = "normal"
+    request: Request, tasks: Iterable[tuple[str, str]], systems: Iterable[str], colors: str = "normal"
 ) -> Iterator[Cell]:
-    """Yield the runs of all systems on tasks, by group."""
-    systems = list(systems)
-    for group, tasks in rows.items():
-        for task, system in product(tasks, systems):
-            yield from _scores(request, group, task, system, colors=colors)
+    """Yield the runs of all systems on tasks, each with its group."""
+    for (group, task), system in product(tasks, systems):
+        yield from _scores(request, group, task, system, colors=colors)
 
 
 def _elsewhere(
-    request: Request, rows: Mapping[str, Sequence[str]], systems: Iterable[str], colors: str = "normal"
+    request: Request, rows: Iterable[ScoreRow], systems: Iterable[str], colors: str = "normal"
 ) -> Iterator[Cell]:
-    """Yield the runs on requested tasks among these; no encoder is fine-tuned on them."""
-    requested = {
-        group: [task for task in tasks if task in (request.tasks or tasks)]
-        for group, tasks in rows.items()
-        if group in (request.groups or rows)
-    }
-    return _table(request, requested, [system for system in systems if system != FINETUNE], colors)
+    """Yield the runs on the requested rows of a table of the paper; no encoder is fine-tuned on them."""
+    tasks = [
+        (row.group, row.task)
+        for row in rows
+        if (not request.groups or row.group in request.groups) and (not request.tasks or row.task in request.tasks)
+    ]
+    return _table(request, tasks, [system for system in systems if system != FINETUNE], colors)
 
 
 @_experiment("Tasks of seen domains")
 def _seen(request: Request) -> Iterator[Cell]:
     """Tasks of the domains that the encoder was pre-trained on, for every method (section IV.B)."""
-    rows = {group: request.tasks_in(GROUPS[group]) for group in request.groups or GROUPS}
-    return _table(request, rows, request.methods or METHODS)
+    return _table(request, request.seen_tasks(GROUPS), request.methods or METHODS)
 
 
 @_experiment("Tasks of unseen domains")
 def _unseen(request: Request) -> Iterator[Cell]:
     """Tasks of domains that the encoder never saw, without fine-tuning (section IV.C)."""
     systems = [system for system in request.methods or CROSS_DOMAIN if not is_single_domain(system)]
-    return _elsewhere(request, UNSEEN_TASKS, systems)
+    return _elsewhere(request, UNSEEN, systems)
 
 
 @_experiment("Reversed background colours")
@@ -508,53 +495,52 @@ def _colors(request: Request) -> Iterator[Cell]:
 
     The paper does not say how it reverses them; whole images are the option.
     """
-    return _elsewhere(request, COLORS_TASKS, request.methods or CROSS_DOMAIN, request.colors)
+    return _elsewhere(request, COLORS, request.methods or CROSS_DOMAIN, request.colors)
 
 
 @_experiment("Fine-tuning on one domain")
 def _finetune(request: Request) -> Iterator[Cell]:
     """The encoder of group A trained further on one domain, beside single-domain methods and DrQ (section IV.D)."""
-    rows = {group: request.tasks_in(FINETUNE_UPDATES) for group in request.groups or "A"}
-    return _table(request, rows, request.methods or ("crptpro", FAST, FINETUNE, "proto-rl-s", "apt-s", DRQ))
+    tasks = product(request.groups or "A", request.tasks_in(FINETUNE_UPDATES))
+    return _table(request, tasks, request.methods or ("crptpro", FAST, FINETUNE, "proto-rl-s", "apt-s", DRQ))
 
 
 @_experiment("Ablation: dispersion loss, decoupled collection")
 def _ablation(request: Request) -> Iterator[Cell]:
     """With and without the dispersion loss, with and without decoupled collection (section IV.F)."""
     # Proto-RL(C) with the dispersion loss is CRPTpro without its decoupled collection.
-    for group in request.groups or ("A", "C"):
-        for task in request.tasks_in(GROUPS[group]):
-            for system in request.methods or VARIANTS:
-                explore, weight = NONE, DISPERSION["intr_loss_coef"]
-                if is_single_domain(system):
-                    domain = get_domain(task).name
-                    if domain not in SINGLE_DISPERSION and not request.tasks:
-                        continue  # the paper has two domains
-                    explore, weight = request.scale.single_ablation, SINGLE_DISPERSION.get(domain, weight)
-                for label, loss in VARIANTS.get(system, ((system, NONE),)):
-                    own = {"intr_loss_coef": weight} if loss == DISPERSION else loss
-                    yield from _scores(request, group, task, system, label=label, loss=own, explore=explore)
+    for (group, task), system in product(request.seen_tasks("AC"), request.methods or VARIANTS):
+        explore, weight = NONE, DISPERSION["intr_loss_coef"]
+        if is_single_domain(system):
+            domain = get_domain(task).name
+            if domain not in SINGLE_DISPERSION and not request.tasks:
+                continue  # the paper has two domains
+            explore = request.scale.single_ablation
+            weight = SINGLE_DISPERSION.get(domain, weight)
+        for label, loss in VARIANTS.get(system, ((system, NONE),)):
+            own = {"intr_loss_coef": weight} if loss == DISPERSION else loss
+            yield from _scores(request, group, task, system, label=label, loss=own, explore=explore)
 
 
 @_experiment("Sensitivity: weight of the dispersion loss, amount of data")
 def _sensitivity(request: Request) -> Iterator[Cell]:
     """The weight alpha of the dispersion loss, and the capacity b of the random datasets (section IV.F)."""
     scale = request.scale
-    sizes = sorted({*scale.capacities, scale.transitions})
-    for group in request.groups or "A":
-        for task in request.tasks_in(GROUPS[group]):
-            for system in request.methods or ("crptpro", "proto-rl-c"):
-                has_weight = "intr_loss_coef" in _loss_defaults(pretraining_of(system))
-                for weight in sorted({0.0, 5e-3, *scale.alphas}) if has_weight else ():
-                    yield from _scores(
-                        request, group, task, system, label=f"{system}, alpha {weight:g}",
-                        loss={"intr_loss_coef": weight}, place={"varied": "alpha", "value": f"{weight:g}"},
-                    )  # fmt: skip
-            for size in sizes if "crptpro" in (request.methods or ("crptpro",)) else ():
+    methods = request.methods or ("crptpro", "proto-rl-c")
+    for group, task in request.seen_tasks("A"):
+        for system in methods:
+            if "intr_loss_coef" not in _loss_defaults(pretraining_of(system)):
+                continue
+            for alpha in sorted({0.0, 5e-3, *scale.alphas}):
                 yield from _scores(
-                    request, group, task, "crptpro", label=f"crptpro, b {size:,}", transitions=size,
-                    place={"varied": "b", "value": str(size)},
+                    request, group, task, system, label=f"{system}, alpha {alpha:g}", loss={"intr_loss_coef": alpha},
+                    place={"varied": "alpha", "value": f"{alpha:g}"},
                 )  # fmt: skip
+        for size in sorted({*scale.capacities, scale.transitions}) if "crptpro" in methods else ():
+            yield from _scores(
+                request, group, task, "crptpro", label=f"crptpro, b {size:,}", transitions=size,
+                place={"varied": "b", "value": str(size)},
+            )  # fmt: skip
 
 
 @_experiment("Cost of pre-training")
