@@ -181,11 +181,7 @@ def _check_rendering(names: Sequence[str], *, has_gpu: bool) -> tuple[list[str],
 
 
 def render_domains(names: Sequence[str], backend: str, timeout_s: float) -> list[dict[str, Any]]:
-    """Check domains one after the other, each in its own process with a time limit.
-
-    Returns:
-        The result of :func:`check_domain` for each name.
-    """
+    """Return :func:`check_domain` of each name, one after the other, each in its own process with a time limit."""
     from crptpro.envs.rendering import run_isolated
 
     plugins = [part for name in loaded_plugins() for part in (FLAG, name)]

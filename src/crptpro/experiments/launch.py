@@ -366,18 +366,14 @@ def run_jobs(
     plugins: Sequence[str] = (),
     attempts: int = 3,
 ) -> list[Failure]:
-    """Run every missing job of a plan as soon as all jobs that it needs are finished.
+    """Run every missing job of a plan as soon as all jobs that it needs are finished; returns what is not finished.
 
     At most ``jobs`` run at a time, with ``cores`` each; an exclusive job starts when no other can. Each of the
     ``attempts`` at a job continues the one before. Ctrl-C, SIGTERM and SIGHUP stop all jobs at their next checkpoint, a
-    second one at once.
-
-    Returns:
-        Unfinished jobs: failures, then the jobs that depend on them.
+    second one at once; KeyboardInterrupt or SystemExit is raised when all jobs have ended.
 
     Raises:
         SubmissionError: a queue refuses the first job.
-        KeyboardInterrupt: after Ctrl-C, when all jobs have ended; likewise SystemExit.
     """
     describe(root, plan)
     usual = Work(str(root.resolve()), "", device, threads=cores, workers=cores, plugins=plugins)
@@ -522,16 +518,10 @@ def duration(seconds: float) -> str:
 def divide(
     launcher: str, *, device: str, jobs: int | None, cores: int | None, jobs_per_gpu: int = 1
 ) -> tuple[int, int, tuple[str, ...]]:
-    """Choose the numbers that the user left open.
+    """Return the number of jobs at a time, the cores of each, and the GPUs of this machine that they share.
 
     On one machine the default is a job per core, or, with ``device="cuda"``, ``jobs_per_gpu`` jobs per GPU, which is
     also the most. The jobs share the cores. On a cluster the default is 16 jobs, with a core each, or four with a GPU.
-
-    Returns:
-        Jobs at a time, the cores of each, and the GPUs of this machine that they share.
-
-    Raises:
-        CRPTproError: a number below 1, or a GPU is requested where there is none.
     """
     for name, value in (("jobs", jobs), ("cores-per-job", cores), ("jobs-per-gpu", jobs_per_gpu)):
         if value is not None and value < 1:
@@ -556,9 +546,6 @@ def slurm_parameters(
     *, partition: str | None, hours: float, memory_gb: float, sbatch: Sequence[str], has_gpu: bool
 ) -> dict[str, Any]:
     """Return the parameters of submitit's Slurm executor that all jobs share.
-
-    Raises:
-        CRPTproError: no time, no memory, or an option that is not ``key=value``.
 
     Examples:
         >>> slurm_parameters(partition="short", hours=2, memory_gb=8, sbatch=("qos=high",), has_gpu=False)

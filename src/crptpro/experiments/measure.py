@@ -46,11 +46,7 @@ COVERAGE_WINDOWS = 10
 
 
 def write_rows(path: Path, rows: pd.DataFrame | Sequence[Mapping[str, Any]], columns: Any = None) -> None:
-    """Write rows as a CSV file, whole or not at all; what was there before is replaced.
-
-    Raises:
-        DiskSpaceError: the disk is full.
-    """
+    """Write rows as a CSV file, whole or not at all, in place of an earlier one."""
     table = pd.DataFrame(rows, columns=columns, dtype=object)
     write_whole(path, table.to_csv(index=False, lineterminator="\n"))
 
@@ -67,18 +63,10 @@ PROBE_COLUMNS = (
 def probe_rows(
     pretrained: Any, dataset: FrameDataset, *, encoder: str, samples: int = 2_000, seed: int = 0
 ) -> tuple[list[dict[str, str]], list[dict[str, Any]]]:
-    """Probe an encoder on a dataset with physical state.
+    """Probe an encoder, called ``encoder`` in the rows, on a draw from a dataset with physical state.
 
-    Args:
-        pretrained: a :class:`~crptpro.pretrained.Pretrained`; its features are probed, and its projections if it has a
-            projector. The untrained control gets an untrained projector, so that it has z, too.
-        dataset: with physical state.
-        encoder: name of the encoder in the rows.
-        samples: drawn from the dataset.
-        seed: of the draw.
-
-    Returns:
-        A formatted row per embedding, and every number by :data:`PROBE_COLUMNS`.
+    Its features are probed, and its projections if it has a projector. The untrained control gets an untrained
+    projector, so that it has z, too. Returns a formatted row per embedding, and every number by :data:`PROBE_COLUMNS`.
 
     Raises:
         DatasetError: there is no physical state, or too little data to split.
@@ -135,12 +123,7 @@ def domains_seen(card: Mapping[str, Any]) -> set[str]:
 
 
 def prototypes(encoder: Positional[Path], *, out: Path) -> None:
-    """Write how far prototypes have spread, along their training and at its end: OUT/prototypes.csv.
-
-    Args:
-        encoder: in its run directory, with the record of its training.
-        out: directory to write to.
-    """
+    """Write how far prototypes have spread, along their training and at its end: OUT/prototypes.csv."""
     pretrained: Any = load_pretrained(encoder)
     if pretrained.prototypes is None:
         raise RecordError(f"{encoder} has no prototypes; its method is {pretrained.method}.")
@@ -161,22 +144,14 @@ def prototypes(encoder: Positional[Path], *, out: Path) -> None:
 class Comparison:
     """Random data beside an explorer's, as an encoder sees both."""
 
-    encoder: Path
-    """embeds all observations"""
-    explorer: Path
-    """the explorer's own encoder, in its run directory"""
-    replays: tuple[Path, ...]
-    """the explorer's observations, a directory for each domain"""
-    datasets: tuple[Path, ...]
-    """random transitions of each domain"""
+    encoder: Path  # embeds all observations
+    explorer: Path  # the explorer's own encoder, in its run directory
+    replays: tuple[Path, ...]  # the explorer's observations, a directory for each domain
+    datasets: tuple[Path, ...]  # random transitions of each domain
     out: Path
-    """directory to write to"""
-    samples: int = 1_024
-    """observations of each source"""
-    seed: int = 0
-    """of the draw"""
+    samples: int = 1_024  # observations of each source
+    seed: int = 0  # of the draw
     device: str = "cpu"
-    """where the encoder runs"""
 
     def load(self) -> Pretrained:
         """Return the artifact of the encoder, on its device."""
@@ -263,14 +238,9 @@ def timing(
 ) -> None:
     """Write the cost of training encoders, from a timed part of it: OUT/timing.csv.
 
-    Args:
-        out: directory to write to.
-        training: a `pretrain ...` command without --out and --device; the costs of several add up.
-        paper_training: the same with the paper's settings.
-        updates: encoder updates that are timed, after as many to warm up.
-        paper_updates: the same for the paper's trainings; 0 leaves their hours open unless both are the same.
-        device: of networks.
-        threads: of torch.
+    A training is a `pretrain ...` command without --out and --device, once with the settings of this scale and once
+    with the paper's; the costs of several add up. As many updates are timed as warm up before. Without `paper_updates`
+    the paper's hours stay open, unless both commands are the same.
     """
     torch.set_num_threads(threads)
     rows = []

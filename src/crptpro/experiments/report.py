@@ -735,12 +735,8 @@ PLATEAU = 0.99
 def left_plateau(record: pd.DataFrame) -> float:
     """Return after how many encoder updates a comparative loss has left its plateau for good.
 
-    Args:
-        record: rows of ``pretrain.csv``, in order.
-
-    Returns:
-        Updates at the first row from which the loss stays below :data:`PLATEAU` of ln M; infinity if the record ends on
-        the plateau, and NaN if there is no such loss.
+    This is the first row of ``pretrain.csv`` from which the loss stays below :data:`PLATEAU` of ln M; infinity if the
+    record ends on the plateau, and NaN if there is no such loss.
     """
     known = record.reindex(columns=["updates", "comp", "ln_num_prototypes"]).dropna()
     if known.empty:
