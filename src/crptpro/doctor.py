@@ -75,7 +75,7 @@ def run_doctor(domains: Iterable[str] | None = None) -> DoctorReport:
         domains: as for :func:`crptpro.domains.expand_groups`; by default the paper's eight.
 
     Raises:
-        UnknownNameError: for a domain that nobody knows.
+        UnknownNameError: for an unknown domain.
     """
     names = expand_groups(PAPER_DOMAINS if domains is None else domains)
     machine = provenance.hardware()

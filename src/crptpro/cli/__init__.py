@@ -120,7 +120,7 @@ class Collect:
     quality: Quality = "exact"
     """render quality; fast uses smaller shadow maps on software GL"""
     colors: Colors = "normal"
-    """colours of the worlds; reversed_background are the paper's unseen ones"""
+    """colours of the environments; reversed_background are the unseen ones of the paper"""
     action_repeat: int | None = None
     """simulator steps per decision (default: the domain's, 2)"""
 
@@ -269,7 +269,7 @@ class Evaluate:
     quality: Quality | None = None
     """render quality (default: the one the agent was trained with; exact for the random policy)"""
     colors: Colors | None = None
-    """colours of the world (default: those the agent was trained in; normal for the random policy)"""
+    """colours of the environment (default: those of the agent's training; normal for the random policy)"""
     action_repeat: int | None = None
     """simulator steps per decision (default: what the agent was trained with; the domain's for the random policy)"""
     csv: Path | None = None
