@@ -200,7 +200,7 @@ class Request:
         return [task for task in tasks if get_domain(task).name in domains]
 
     def seen_tasks(self, groups: Iterable[str]) -> list[tuple[str, str]]:
-        """Return requested groups, or these, with their tasks."""
+        """Return group and task for each requested group, or each of these, and each of its tasks."""
         return [(group, task) for group in self.groups or groups for task in self.tasks_in(GROUPS[group])]
 
     def encoders(

@@ -518,7 +518,12 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
         )
     if missing := sorted(kept.loc[kept["expert"].isna(), "task_name"].unique()):
         page.text(f"The paper has no DrQ score for {', '.join(missing)}: in the mean score only.", "note")
-    by_label = {label: normal[normal["label"] == label] for label in in_order(normal["label"])}
+    _improvement(page, normal)
+
+
+def _improvement(page: Page, runs: pd.DataFrame) -> None:
+    """Compare runs of crptpro with those of each other method."""
+    by_label = {label: runs[runs["label"] == label] for label in in_order(runs["label"])}
     ours = by_label.pop("crptpro", None)
     rows = []
     for label, own in by_label.items() if ours is not None else ():
