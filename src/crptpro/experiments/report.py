@@ -189,9 +189,8 @@ def _needed(keys: Iterable[str], jobs: pd.DataFrame, *kinds: str) -> list[str]:
 
 
 NOT_IN_LABELS = [
-    "seed", "task", "colors", "device", "precision", "compile", "cuda_graph", "eval_workers", "render_ahead",
-    "features", "video_episodes", "checkpoint_interval_env_steps", "log_interval_env_steps",
-    "eval_interval_env_steps", "eval_episodes",
+    "seed", "task", "colors", "device", "precision", "compile", "eval_workers", "features", "eval_episodes",
+    "checkpoint_interval_env_steps", "log_interval_env_steps", "eval_interval_env_steps",
 ]  # fmt: skip
 """Settings that do not distinguish methods: the seed, the task, how a run computes, and when it writes."""
 
