@@ -107,7 +107,7 @@ def python(code: str, **environment: str) -> subprocess.Popen[bytes]:
     "from crptpro.cli import main; import sys; sys.argv = ['crptpro', 'pretrain', '--help']; main()",
     "from crptpro.console import run_main; run_main(lambda: [print('x' * 100, flush=True) for _ in range(10**5)])",
 ])  # fmt: skip
-def test_a_reader_that_has_seen_enough_ends_a_program_quietly(program: str) -> None:
+def test_a_closed_pipe_ends_a_program_quietly(program: str) -> None:
     with python(program) as process:
         assert process.stdout is not None
         assert process.stderr is not None
@@ -121,7 +121,7 @@ def test_a_pipe_that_broke_elsewhere_keeps_its_traceback() -> None:
         run_main(fails(BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))))
 
 
-def test_what_a_terminal_cannot_show_is_printed_as_escapes() -> None:
+def test_characters_that_a_terminal_cannot_show_are_printed_as_escapes() -> None:
     program = (
         "import logging; from crptpro.console import run_main\n"
         "def main():\n print('3 \\xb1 1'); logging.getLogger('crptpro').info('4 \\xb1 1')\n"

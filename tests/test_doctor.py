@@ -97,7 +97,7 @@ def test_a_domain_that_fails_is_an_error_with_its_remedy(monkeypatch: pytest.Mon
     assert "cartpole with egl: boom\n  what to do: Try another backend" in report.text()
 
 
-def test_letters_are_domains_and_unknown_names_are_refused_before_anything_is_drawn(
+def test_group_letters_are_domains_and_unknown_names_are_refused_before_rendering(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked = answers(monkeypatch)
@@ -155,7 +155,7 @@ def test_versions_out_of_range_are_reported_with_their_remedy(
     (CRPTproError("no camera 7"), "no camera 7", False),
     (RenderingError("black"), "black", True),
 ])  # fmt: skip
-def test_a_domain_that_raises_is_reported_and_what_it_lacks_is_not_blamed_on_the_backend(
+def test_a_failing_domain_is_reported_and_a_missing_package_is_not_blamed_on_the_backend(
     monkeypatch: pytest.MonkeyPatch, reason: Exception, error: str, is_drawing: bool
 ) -> None:
     def make_env(*_: Any, **__: Any) -> None:

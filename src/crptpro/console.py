@@ -1,4 +1,4 @@
-"""What the command line and the recipes share: readable log lines, and one clear line per error."""
+"""For the command line and the recipes: readable log lines, and one line per error."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import logging
 import os
 import select
 import sys
+import traceback
 from collections.abc import Callable
 from typing import TextIO
 
@@ -35,9 +36,9 @@ def configure_logging(level: int = logging.INFO) -> None:
 def run_main(main: Callable[[], object]) -> None:
     """Run a program: expected errors become one line and exit status 1, Ctrl-C exits with 130.
 
-    Expected are this library's own errors, a setting it refuses, and a file that cannot be read or written. Anything
-    else is a defect and keeps its traceback. Characters that the terminal cannot show are printed as escapes, and a
-    closed pipe (``| head``) ends the program quietly, with the status of SIGPIPE.
+    Expected are this library's own errors, a setting it refuses, and a file that cannot be read or written. Any other
+    error is a defect and keeps its traceback. Characters that the terminal cannot show are printed as escapes. A closed
+    pipe (``| head``) ends the program silently, with the status of SIGPIPE.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -48,7 +49,7 @@ def run_main(main: Callable[[], object]) -> None:
             main()
         finally:
             if sys.stdout is not None:
-                sys.stdout.flush()  # at the interpreter's exit nobody could catch a broken pipe
+                sys.stdout.flush()  # a broken pipe cannot be caught at the interpreter's exit
     except BrokenPipeError:
         closed = [stream for stream in (sys.stdout, sys.stderr) if _is_closed_pipe(stream)]
         if not closed:
@@ -76,14 +77,11 @@ def _is_closed_pipe(stream: TextIO) -> bool:
 
 
 def _is_expected(error: BaseException) -> bool:
-    """Whether an error is one that a user can act on, not a defect."""
+    """Whether a user can act on an error: it is no defect."""
     if isinstance(error, CRPTproError):
         return True
     if isinstance(error, OSError):
         return error.filename is not None or is_disk_full(error)
-    # A ValueError that this library's own code raised names a setting; one from below is a defect.
-    origin = error.__traceback__
-    while origin is not None and origin.tb_next is not None:
-        origin = origin.tb_next
-    module = "" if origin is None else origin.tb_frame.f_globals.get("__name__", "")
-    return module.split(".")[0] == "crptpro"
+    # A ValueError that this library's own code raised names a setting; one from a dependency is a defect.
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return bool(frames) and frames[-1].f_globals.get("__name__", "").split(".")[0] == "crptpro"

@@ -25,22 +25,21 @@ from crptpro.domains import PAPER_DOMAINS, expand_groups
 from crptpro.errors import CRPTproError, RenderingError, WorldFailedError
 from crptpro.plugins import FLAG, load_plugins, loaded_plugins
 
-#: Outside their declared range these are known to break; others are merely untested.
 _BREAKING = ("mujoco", "dm-control", "torchrl", "tensordict")
+"""Packages that are known to break outside their declared range; others are merely untested."""
 _LEFTOVERS = ("mujoco-core", "mujoco-studio")
 _GB = 1e9
 _WARM_UP_AGENT_STEPS, _TIMED_AGENT_STEPS = 2, 6
 _OTHER_BACKEND = "Try another backend: MUJOCO_GL=osmesa or MUJOCO_GL=egl."
 _DOMAIN_S = 60.0
-"""Seconds that a domain has beside those for its first frame: imports, building, stepping."""
-
+"""Seconds for a domain besides its first frame: imports, building, stepping."""
 
 Severity = Literal["error", "warning", "note"]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Something to know: an error stops a run, a warning may spoil one, a note does neither."""
+    """An error stops a run, a warning may spoil one, a note does neither."""
 
     severity: Severity
     what: str
@@ -49,7 +48,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class DoctorReport:
-    """What :func:`run_doctor` found: lines of facts, then problems, the gravest first."""
+    """What :func:`run_doctor` found: lines of facts, and problems, the gravest first."""
 
     facts: tuple[str, ...]
     findings: tuple[Finding, ...]
@@ -60,11 +59,12 @@ class DoctorReport:
         return not any(finding.severity == "error" for finding in self.findings)
 
     def text(self) -> str:
-        """Return the report as plain text, a line per fact, problems and their remedies last."""
+        """Return the report as plain text: facts, then problems with their remedies."""
         lines = [*self.facts, ""]
         for finding in self.findings:
             lines.append(f"{finding.severity}: {finding.what}")
-            lines += [f"  what to do: {finding.remedy}"] if finding.remedy else []
+            if finding.remedy:
+                lines.append(f"  what to do: {finding.remedy}")
         return "\n".join([*lines, "A run would work." if self.ok else "A run would not work."])
 
 
@@ -75,12 +75,14 @@ def run_doctor(domains: Iterable[str] | None = None) -> DoctorReport:
         domains: as for :func:`crptpro.domains.expand_groups`; by default the paper's eight.
 
     Raises:
-        UnknownNameError: for a domain that nobody knows.
+        UnknownNameError: for an unknown domain.
     """
     names = expand_groups(PAPER_DOMAINS if domains is None else domains)
-    machine, here = provenance.hardware(), Path.cwd()
-    free_disk, free_ram = shutil.disk_usage(here).free, psutil.virtual_memory().available
+    machine = provenance.hardware()
     gpus = machine["gpus"]
+    here = Path.cwd()
+    free_disk = shutil.disk_usage(here).free
+    free_ram = psutil.virtual_memory().available
     facts = [
         "versions",
         *(f"  {name:<12}{version}" for name, version in provenance.versions().items()),
@@ -92,18 +94,16 @@ def run_doctor(domains: Iterable[str] | None = None) -> DoctorReport:
         f"  disk  {free_disk / _GB:.1f} GB free at {here}",
         "",
     ]
-    installed: dict[str, str] = {
-        canonicalize_name(each.name): each.version for each in importlib.metadata.distributions()
-    }
+    installed = {canonicalize_name(each.name): each.version for each in importlib.metadata.distributions()}
     declared = importlib.metadata.requires("crptpro") if "crptpro" in installed else None
     requirements = [text for text in declared or () if "extra ==" not in text]
-    drawn, problems = _check_rendering(names, has_gpu=bool(gpus))
+    rendering_facts, problems = _check_rendering(names, has_gpu=bool(gpus))
     findings = [*check_versions(installed, requirements), *_check_machine(free_ram, free_disk, gpus), *problems]
     findings.sort(key=lambda finding: ("error", "warning", "note").index(finding.severity))
-    return DoctorReport((*facts, *drawn), tuple(findings))
+    return DoctorReport((*facts, *rendering_facts), tuple(findings))
 
 
-def check_versions(installed: Mapping[str, str], requirements: Iterable[str]) -> list[Finding]:
+def check_versions(installed: Mapping[Any, str], requirements: Iterable[str]) -> list[Finding]:
     """Compare installed versions, by package name, with requirements such as ``"mujoco>=3.17,<4"``.
 
     Examples:
@@ -112,17 +112,19 @@ def check_versions(installed: Mapping[str, str], requirements: Iterable[str]) ->
         >>> check_versions({"torch": "2.13.0+cpu"}, ["torch>=2.11,<2.14"])
         []
     """
-    findings: list[Finding] = []
+    findings = []
     for requirement in map(Requirement, requirements):
-        name, wanted = canonicalize_name(requirement.name), f'pip install "{requirement}"'
+        name = canonicalize_name(requirement.name)
         version = installed.get(name)
+        remedy = f'pip install "{requirement}"'
         if version is None:
-            findings.append(Finding("error", f"{name} is not installed.", wanted))
+            findings.append(Finding("error", f"{name} is not installed.", remedy))
         elif not requirement.specifier.contains(version, prereleases=True):
-            severity: Severity = "error" if name in _BREAKING else "warning"
-            why = "is known to break" if severity == "error" else "is untested"
-            what = f"{name} {version} is outside {requirement.specifier}, which {why}."
-            findings.append(Finding(severity, what, wanted))
+            what = f"{name} {version} is outside {requirement.specifier}, which is "
+            if name in _BREAKING:
+                findings.append(Finding("error", f"{what}known to break.", remedy))
+            else:
+                findings.append(Finding("warning", f"{what}untested.", remedy))
     if leftovers := [name for name in _LEFTOVERS if name in installed]:
         what = f"{' and '.join(leftovers)} belong to MuJoCo 4 and break the import of MuJoCo 3."
         remedy = f'pip uninstall -y {" ".join(leftovers)}; pip install --force-reinstall "mujoco>=3.17,<4"'
@@ -144,8 +146,9 @@ def _check_machine(free_ram: int, free_disk: int, gpus: Sequence[str]) -> list[F
         remedy = "Free space, write to another disk, or collect fewer transitions."
         findings.append(Finding("error" if free_disk < 0.5 * _GB else "warning", what, remedy))
     remedy = "Repair its driver (nvidia-smi), or hide it with CUDA_VISIBLE_DEVICES; --device cpu always works."
-    unusable = [gpu for gpu in gpus if gpu.startswith(provenance.UNUSABLE)]
-    findings += [Finding("warning", f"torch cannot use a GPU: {gpu}.", remedy) for gpu in unusable]
+    for gpu in gpus:
+        if gpu.startswith(provenance.UNUSABLE):
+            findings.append(Finding("warning", f"torch cannot use a GPU: {gpu}.", remedy))
     if not gpus:
         findings.append(Finding("note", "torch sees no GPU; training runs on the CPU."))
     return findings
@@ -159,11 +162,9 @@ def _check_rendering(names: Sequence[str], *, has_gpu: bool) -> tuple[list[str],
     except RenderingError as reason:
         remedy = "Unset MUJOCO_GL, or repair that backend." if "MUJOCO_GL" in os.environ else ""
         return ["rendering: nothing renders"], [Finding("error", str(reason), remedy)]
-    gl, findings = rendering.backend_card(), []
-    facts = [
-        f"rendering with {backend} ({gl['gl_renderer']}, {gl['gl_kind']}), milliseconds per agent step "
-        "(physics and one image)"
-    ]
+    gl = rendering.backend_card()
+    title = f"rendering with {backend} ({gl['gl_renderer']}, {gl['gl_kind']})"
+    facts, findings = [f"{title}, milliseconds per agent step (physics and one image)"], []
     if has_gpu and gl["gl_kind"] == "software":
         what = f"There is a GPU, but {backend} renders in software, about twenty times slower."
         remedy = (
@@ -180,11 +181,7 @@ def _check_rendering(names: Sequence[str], *, has_gpu: bool) -> tuple[list[str],
 
 
 def render_domains(names: Sequence[str], backend: str, timeout_s: float) -> list[dict[str, Any]]:
-    """Check domains one after the other, each in a process of its own that has ``timeout_s``.
-
-    Returns:
-        What :func:`check_domain` returns, for each name.
-    """
+    """Return :func:`check_domain` of each name, one after the other, each in its own process with a time limit."""
     from crptpro.envs.rendering import run_isolated
 
     plugins = [part for name in loaded_plugins() for part in (FLAG, name)]
@@ -207,9 +204,9 @@ def check_domain(name: str) -> dict[str, Any]:
     """Step a domain at random and look at its pixels.
 
     Returns:
-        ``domain``; ``error``: why it failed, or what is wrong with its images, otherwise empty. With an error
-        ``remedy``; without one ``reset_ms`` (the first reset, which makes the render context) and ``agent_step_ms``
-        (physics and one image), wall-clock milliseconds.
+        ``domain`` and ``error``: why it failed, or what is wrong with its images, otherwise empty. With an error,
+        ``remedy``. Without one, wall-clock milliseconds: ``reset_ms`` of the first reset, which makes the render
+        context, and ``agent_step_ms`` of physics and one image.
     """
     import gymnasium
 
@@ -229,19 +226,17 @@ def check_domain(name: str) -> dict[str, Any]:
         finally:
             env.close()
     except Exception as reason:
-        cause = reason.__cause__ or reason
-        lacks = isinstance(cause, (ModuleNotFoundError, gymnasium.error.DependencyNotInstalled))
-        is_ours = isinstance(reason, CRPTproError)
-        has_name = is_ours or isinstance(reason, WorldFailedError)
-        error = str(reason) if has_name else f"{type(reason).__name__}: {reason}"
-        is_told = lacks or (is_ours and not isinstance(reason, RenderingError))
-        return _failed(name, error, remedy="" if is_told else _OTHER_BACKEND)
+        lacks_package = (ModuleNotFoundError, gymnasium.error.DependencyNotInstalled)
+        has_remedy = isinstance(reason, CRPTproError) and not isinstance(reason, RenderingError)
+        remedy = "" if has_remedy or isinstance(reason.__cause__ or reason, lacks_package) else _OTHER_BACKEND
+        has_name = isinstance(reason, (CRPTproError, WorldFailedError))
+        return _failed(name, str(reason) if has_name else f"{type(reason).__name__}: {reason}", remedy)
     if first["pixels"].unique().numel() == 1 or first["pixels"].equal(last["pixels"]):
         return _failed(name, "its pixels are constant or do not change")
     return {"domain": name, "error": "", "reset_ms": reset_s * 1e3, "agent_step_ms": agent_step_s * 1e3}
 
 
-def _failed(name: str, error: str, *, remedy: str = _OTHER_BACKEND) -> dict[str, Any]:
+def _failed(name: str, error: str, remedy: str = _OTHER_BACKEND) -> dict[str, Any]:
     return {"domain": name, "error": error, "remedy": remedy}
 
 

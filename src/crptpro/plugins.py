@@ -1,4 +1,4 @@
-"""Modules of the user's own, imported first, so that the domains and methods they register are known."""
+"""Modules of the user, imported before a command runs, so that their domains and methods are known."""
 
 from __future__ import annotations
 
@@ -27,10 +27,9 @@ def load_plugin(name: str) -> None:
     is_file = path.suffix == ".py"
     if is_file and not path.is_file():
         raise CRPTproError(f"{FLAG} {name}: there is no such file.")
-    # Last on the path, so that it hides nothing that is installed.
     folder = str(path.resolve().parent if is_file else Path.cwd())
     if folder not in sys.path:
-        sys.path.append(folder)
+        sys.path.append(folder)  # last, so that it hides no installed module
     module_name = path.stem if is_file else name
     try:
         module = importlib.import_module(module_name)
@@ -40,19 +39,18 @@ def load_plugin(name: str) -> None:
         raise CRPTproError(
             f"{FLAG} {name}: there is no such module; name an installed one, one of this directory, or a .py file."
         ) from None
-    found = getattr(module, "__file__", None)
-    if is_file and (found is None or Path(found).resolve() != path.resolve()):
+    if is_file and Path(getattr(module, "__file__", None) or "").resolve() != path.resolve():
         raise CRPTproError(f"{FLAG} {name}: {module_name!r} is the name of another module; rename the file.")
-    kept = str(path.resolve()) if is_file else name
-    if kept not in _loaded:
-        _loaded.append(kept)
+    full_name = str(path.resolve()) if is_file else name
+    if full_name not in _loaded:
+        _loaded.append(full_name)
 
 
 def load_plugins(arguments: Sequence[str]) -> list[str]:
     """Import every module that ``--plugin`` names, anywhere on a command line, and return the other arguments.
 
     Raises:
-        CRPTproError: nothing is named, or as :func:`load_plugin`.
+        CRPTproError: no name follows, or as :func:`load_plugin`.
     """
     rest: list[str] = []
     words = iter(arguments)
@@ -69,7 +67,7 @@ def load_plugins(arguments: Sequence[str]) -> list[str]:
 
 
 def load_again(names: Iterable[str]) -> None:
-    """Load in a worker process the plugins (:func:`loaded_plugins`) of the process that started it."""
+    """Load the plugins (:func:`loaded_plugins`) of the parent process in its worker."""
     for name in names:
         load_plugin(name)
 

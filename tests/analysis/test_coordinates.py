@@ -33,12 +33,12 @@ def test_each_joint_has_its_coordinates() -> None:
 
 
 @pytest.mark.parametrize("same", [{"wheel": 0.5 + 2 * math.pi}, {"turn": 0.3 + 2 * math.pi}, {"sign": -1.0}])
-def test_what_looks_the_same_has_the_same_coordinates(same: dict[str, float]) -> None:
+def test_equal_poses_have_equal_coordinates(same: dict[str, float]) -> None:
     assert positions(**same) == pytest.approx(positions(), abs=1e-5)
 
 
 @pytest.mark.parametrize("joints", [None, JOINTS])
-def test_without_fitting_joints_numbers_are_numbered(joints: tuple[Joint, ...] | None) -> None:
+def test_without_fitting_joints_coordinates_are_numbered(joints: tuple[Joint, ...] | None) -> None:
     assert position_coordinates(torch.zeros(1, 2), joints)[0] == ["qpos[0]", "qpos[1]"]
     assert velocity_coordinates(torch.zeros(1, 2), joints)[0] == ["qvel[0]", "qvel[1]"]
 

@@ -30,7 +30,7 @@ class Brightness(nn.Module):
         return self.weight * pixels.flatten(1).double().mean(1, keepdim=True)
 
 
-def test_embeddings_are_features_or_projections_encoded_where_the_encoder_lives_some_at_a_time() -> None:
+def test_embeddings_are_features_or_projections_computed_in_batches_on_the_encoders_device() -> None:
     pixels = torch.arange(150, dtype=torch.uint8).view(150, 1, 1, 1).expand(150, 9, 8, 8)
     points = embed_pixels(Brightness(), pixels)
     assert torch.equal(points, torch.arange(150.0).unsqueeze(1))

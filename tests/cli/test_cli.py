@@ -62,7 +62,9 @@ def test_the_installed_command_is_this_one() -> None:
     (("collect", "walker", "--quality", "best"), "best"),
     (("dance",), "dance"),
 ])  # fmt: skip
-def test_what_the_parser_cannot_read_is_named_with_status_2(call: Call, arguments: tuple[str, ...], named: str) -> None:
+def test_arguments_that_the_parser_cannot_read_are_named_with_status_2(
+    call: Call, arguments: tuple[str, ...], named: str
+) -> None:
     status, out, err = call(*arguments)
     assert status == 2
     assert out == ""
@@ -73,7 +75,7 @@ def test_what_the_parser_cannot_read_is_named_with_status_2(call: Call, argument
 # --- the whole way ---------------------------------------------------------------------------------------------------
 
 
-def test_every_command_does_its_part_on_a_world_without_a_simulator(
+def test_every_command_works_on_an_environment_without_a_simulator(
     call: Call, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs = tmp_path / "runs"
@@ -145,7 +147,7 @@ def test_the_controls_leave_agents_that_evaluate(call: Call, tmp_path: Path, pre
     assert out.startswith(f"{TASK}: ")
 
 
-def test_an_untrained_encoder_is_written_as_any_other(call: Call, dataset: Path, tmp_path: Path) -> None:
+def test_an_untrained_encoder_is_written_like_any_other(call: Call, dataset: Path, tmp_path: Path) -> None:
     for method in ("random-encoder", "random-encoder-standardised"):
         assert call("pretrain", dataset, "--method", method, "--out", tmp_path / method)[0] == 0
         loaded = load_pretrained(tmp_path / method / "encoder")
@@ -201,7 +203,7 @@ def test_collect_pretrain_downstream_and_evaluate_on_a_real_domain(call: Call, t
     (("downstream", TASK, "--pretrained", "random-encoder", "--discount", "2"), r"discount.*got 2"),
     (("--plugin", "absent.py", "pretrain", TASK), r"--plugin absent\.py: there is no such file"),
 ])  # fmt: skip
-def test_a_request_that_cannot_be_met_leaves_nothing_behind(
+def test_an_impossible_request_leaves_nothing_behind(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

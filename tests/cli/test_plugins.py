@@ -29,9 +29,7 @@ def plugin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     sys.modules.pop("own_method", None)
 
 
-def test_a_registration_in_a_file_of_the_users_makes_a_method(
-    call: Call, dataset: Path, tmp_path: Path, plugin: Path
-) -> None:
+def test_a_plugin_registers_a_method(call: Call, dataset: Path, tmp_path: Path, plugin: Path) -> None:
     assert "slowness" not in method_names()
     out = tmp_path / "out"
     own = ("pretrain", dataset, "--out", out, "--method", "slowness", "--log-interval", 1, "--plugin", plugin)
@@ -50,7 +48,7 @@ def test_a_registration_in_a_file_of_the_users_makes_a_method(
     assert pretrain(loss, dataset, progress=False).updates == 2
 
 
-def test_a_method_of_the_users_explores_for_a_reward_of_its_own(call: Call, tmp_path: Path, plugin: Path) -> None:
+def test_a_users_method_explores_with_its_own_reward(call: Call, tmp_path: Path, plugin: Path) -> None:
     out = tmp_path / "out"
     own = ("--plugin", plugin, "pretrain", TASK, "--out", out, "--method", "slowness-active")
     few = ("--log-interval", 1, "--hidden-dim", 8, "--replay-capacity", 40)
@@ -101,7 +99,7 @@ def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     gymnasium.registry.pop(WORLD, None)
 
 
-def test_a_plugins_world_is_collected_and_learned_with_evaluating_processes(
+def test_a_plugins_environment_is_collected_and_learned_with_evaluation_workers(
     call: Call, tmp_path: Path, world: Path
 ) -> None:
     task = f"gymnasium:{WORLD}"
@@ -118,7 +116,7 @@ def test_a_plugins_world_is_collected_and_learned_with_evaluating_processes(
     assert "MUJOCO" not in err
 
 
-def test_the_doctor_looks_at_a_plugins_world(call: Call, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_doctor_checks_a_plugins_environment(call: Call, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plugins.load_plugin(str(world))
     (entry,) = doctor.render_domains((f"gymnasium:{WORLD}",), "egl", 100.0)
     assert entry["error"] == ""

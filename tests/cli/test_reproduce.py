@@ -50,7 +50,7 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(call: Call, tmp_path: Path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_all_means_the_experiments_that_have_something_of_what_is_asked_for(call: Call, tmp_path: Path) -> None:
+def test_all_means_the_experiments_with_requested_cells(call: Call, tmp_path: Path) -> None:
     options = ("--scale", "tiny", "--dry-run", "--out", tmp_path)
     status, out, err = call("reproduce", "all", "--groups", "B", *options)
     assert status == 0, err
@@ -76,14 +76,14 @@ def test_all_means_the_experiments_that_have_something_of_what_is_asked_for(call
     (("seen", "--launcher", "slurm", "--sbatch", "qos"), "--sbatch qos: write key=value"),
     (("seen", "--out", ""), "`out` is empty"),
 ])  # fmt: skip
-def test_a_request_that_cannot_be_met_leaves_nothing_behind(
+def test_an_impossible_request_leaves_nothing_behind(
     call: Call, tmp_path: Path, arguments: tuple[str, ...], message: str
 ) -> None:
     assert message in refused(call("reproduce", "--scale", "tiny", "--out", tmp_path / "root", *arguments))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_the_machine_lacks_is_said_after_the_plan_and_nothing_is_written(
+def test_a_missing_package_or_disk_space_is_reported_after_the_plan_and_nothing_is_written(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)

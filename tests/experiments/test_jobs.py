@@ -13,7 +13,7 @@ from crptpro.errors import RecordError
 from crptpro.experiments.jobs import Job, bytes_of, describe, is_finished, load_results, make_plan, write_cells
 from crptpro.experiments.matrix import SMALL, dataset, encoder, probe, run
 
-SCALE = replace(SMALL, transitions=50, updates=100, batch_size=64)
+SCALE = replace(SMALL, transitions=50, updates=100, training={"batch_size": 64})
 
 
 def trained(scale=SCALE, **changed) -> Job:
@@ -49,10 +49,11 @@ def test_a_job_is_a_command_whose_key_names_its_directory() -> None:
     assert learned().command[:4] == ("downstream", "walker_run", "--pretrained", f"{{{job.key}}}/encoder")
 
 
-def test_another_command_is_another_job_and_so_is_what_needs_it() -> None:
+def test_a_changed_command_makes_another_job_and_so_do_its_dependents() -> None:
     others = [
-        trained(replace(SCALE, updates=101)), trained(replace(SCALE, batch_size=65)), trained(transitions=51),
-        trained(loss={"num_prototypes": 17}), encoder(SCALE, "crptpro", ("walker", "cheetah"), 1), trained(),
+        trained(replace(SCALE, updates=101)), trained(replace(SCALE, training={"batch_size": 65})),
+        trained(transitions=51), trained(loss={"num_prototypes": 17}),
+        encoder(SCALE, "crptpro", ("walker", "cheetah"), 1), trained(),
     ]  # fmt: skip
     assert len({job.key for job in others}) == 6
     assert len({probe(SCALE, job, dataset(SCALE, "walker", 0)).key for job in others}) == 6
@@ -64,7 +65,7 @@ def test_a_plan_has_what_is_needed_first_and_nothing_twice(tmp_path: Path) -> No
     assert plan.missing == plan.jobs
 
 
-def test_records_suffice_until_somebody_needs_the_weights_again(tmp_path: Path) -> None:
+def test_a_job_whose_weights_were_removed_runs_again_only_if_another_job_needs_them(tmp_path: Path) -> None:
     finish(tmp_path, trained())
     plan = make_plan([learned()], tmp_path)  # what only the encoder needed is not asked for
     assert [job.kind for job in plan.jobs] == ["encoder", "run"]
@@ -82,7 +83,7 @@ def test_records_suffice_until_somebody_needs_the_weights_again(tmp_path: Path) 
     assert json.loads((directory / "job.json").read_text())["kind"] == "encoder"
 
 
-def test_what_a_job_takes_on_the_disk_follows_its_frames() -> None:
+def test_the_disk_space_of_a_job_follows_its_frames() -> None:
     assert bytes_of(dataset(SCALE, "walker", 0, 2_000))[0] == 2_000 * 3 * 84 * 84
     after, during = bytes_of(learned())
     assert during > 12_000 * 3 * 84 * 84 > after

@@ -75,7 +75,7 @@ class FakeLauncher:
             write_json(work.directory / "done.json", {})
             return ""
 
-        return SimpleNamespace(poll=poll, stop=lambda: None)
+        return SimpleNamespace(poll=poll, stop=lambda at_once: None)
 
 
 @pytest.fixture(autouse=True)
@@ -92,7 +92,7 @@ def launched(
     return [work.key.split("-")[1] for work in launcher.started], failures
 
 
-def test_a_job_starts_when_all_that_it_needs_is_finished(tmp_path: Path) -> None:
+def test_a_job_starts_when_its_needs_are_finished(tmp_path: Path) -> None:
     a, b = job("a"), job("b")
     launcher = FakeLauncher()
     order, failures = launched(tmp_path, job("c", a, b), job("d", a), job("e"), launcher=launcher, jobs=2)
@@ -104,7 +104,7 @@ def test_a_job_starts_when_all_that_it_needs_is_finished(tmp_path: Path) -> None
     assert again == []
 
 
-def test_what_measures_time_is_alone_and_has_all_cores(tmp_path: Path) -> None:
+def test_a_timing_runs_alone_and_has_all_cores(tmp_path: Path) -> None:
     launcher = FakeLauncher()
     wanted = [job("t", kind="timing"), job("a"), job("b"), job("u", kind="timing")]
     launched(tmp_path, *wanted, launcher=launcher, jobs=2, cores=3)
@@ -113,7 +113,7 @@ def test_what_measures_time_is_alone_and_has_all_cores(tmp_path: Path) -> None:
     assert sorted(map(len, launcher.at_once)) == [1, 1, 1, 2]
 
 
-def test_a_lost_job_is_tried_again_and_what_needs_a_failed_one_is_not_started(tmp_path: Path) -> None:
+def test_a_lost_job_is_retried_and_dependents_of_a_failed_job_do_not_start(tmp_path: Path) -> None:
     bad, lucky = job("bad"), job("lucky")
     launcher = FakeLauncher(lost={"bad": 9, "lucky": 1})
     wanted = (job("child", bad), job("grandchild", job("child", bad)), lucky, job("other"))
@@ -125,7 +125,7 @@ def test_a_lost_job_is_tried_again_and_what_needs_a_failed_one_is_not_started(tm
     assert failures[0].reason == "it was lost"
 
 
-def test_a_queue_that_is_full_for_a_while_loses_nothing_but_one_that_takes_no_job_ends_the_command(
+def test_a_full_queue_is_retried_but_a_refusal_of_the_first_job_ends_the_command(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     order, failures = launched(tmp_path / "a", job("a"), job("b"), launcher=FakeLauncher(refuses=2), jobs=2)
@@ -156,7 +156,7 @@ def usual_signals() -> Iterator[None]:
 def test_a_signal_stops_all_jobs_at_a_checkpoint_and_a_second_one_at_once(
     tmp_path: Path, number: signal.Signals, error: type[BaseException]
 ) -> None:
-    stopped: list[str] = []
+    stopped: list[tuple[str, bool]] = []
 
     class Interrupted(FakeLauncher):
         def start(self, work: Work, *, is_exclusive: bool) -> Any:
@@ -165,11 +165,11 @@ def test_a_signal_stops_all_jobs_at_a_checkpoint_and_a_second_one_at_once(
                     signal.raise_signal(number)
                 return ""
 
-            return SimpleNamespace(poll=poll, stop=lambda: stopped.append(work.key))
+            return SimpleNamespace(poll=poll, stop=lambda at_once: stopped.append((work.key, at_once)))
 
     with pytest.raises(error):
         launched(tmp_path, job("a"), job("b"), job("c", job("a")), launcher=Interrupted(), jobs=2)
-    assert stopped == [job("a").key, job("b").key] * 2
+    assert stopped == [(job(name).key, at_once) for at_once in (False, True) for name in "ab"]
 
 
 def test_a_job_has_its_whole_command(tmp_path: Path) -> None:
@@ -280,7 +280,9 @@ def test_slurm_needs_its_commands(monkeypatch: pytest.MonkeyPatch) -> None:
         SlurmLauncher({})
 
 
-def test_a_slurm_job_asks_for_its_cores_and_a_refusal_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slurm_job_requests_its_cores_and_a_refusal_is_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = tmp_path / "bin"
     folder.mkdir()
     for name in ("sbatch", "srun", "scancel"):
@@ -395,7 +397,7 @@ def test_ray_runs_jobs_and_one_whose_worker_died_is_tried_again(
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1"])
-def test_a_ray_cluster_that_is_not_there_is_said_in_a_line(address: str) -> None:
+def test_a_missing_ray_cluster_is_reported_in_one_line(address: str) -> None:
     pytest.importorskip("ray")
     with pytest.raises(CRPTproError, match=rf"{address} cannot be used: .*refused.*--ray-address"):
         RayLauncher(address)

@@ -70,7 +70,7 @@ def test_the_committed_records_are_those_of_the_same_commands() -> None:
         assert missing <= {"crptpro-no-bonus", "random-encoder-standardised"}
 
 
-def test_every_system_of_seen_has_the_encoder_and_the_settings_of_its_own() -> None:
+def test_every_system_of_seen_has_its_own_encoder_and_settings() -> None:
     found = cells("seen", SMALL, **PART)
     assert list(dict.fromkeys(cell.label for cell in found)) == list(METHODS)
     assert {tuple(sorted(cell.place)) for cell in found} == {("encoder_seed", "group", "seed", "task")}
@@ -163,7 +163,7 @@ def test_a_tiny_reproduction_needs_few_jobs_of_every_kind() -> None:
     assert all(place[needed.key] < place[job.key] for job in jobs for needed in job.needs)
 
 
-def test_a_method_of_the_users_takes_the_scale_of_its_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_users_method_takes_the_scale_of_its_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plugin = tmp_path / "mine.py"
     plugin.write_text("# first")
     monkeypatch.setattr(plugins, "_loaded", [str(plugin)])
@@ -187,12 +187,14 @@ def test_a_method_of_the_users_takes_the_scale_of_its_kind(tmp_path: Path, monke
     ({"encoder_seeds": ()}, CRPTproError, "`encoder_seeds` must be"),
     ({"seeds": (1_000,)}, CRPTproError, "from 0 to 999"),
 ])  # fmt: skip
-def test_a_request_refuses_what_nobody_knows(part: dict[str, Any], error: type[Exception], message: str) -> None:
+def test_a_request_refuses_unknown_names_and_bad_seeds(
+    part: dict[str, Any], error: type[Exception], message: str
+) -> None:
     with pytest.raises(error, match=message):
         Request(SMALL, **part)
 
 
-def test_seeds_are_the_plain_numbers_that_they_mean_and_a_domain_stands_for_its_task() -> None:
+def test_seeds_become_plain_numbers_and_a_domain_means_its_task() -> None:
     plain = cells("seen", SMALL, encoder_seeds=(1,), seeds=(2,), **PART)
     asked = {**PART, "tasks": ("walker", "walker_run")}
     given = cells("seen", SMALL, encoder_seeds=(np.int64(1),), seeds=(2.0,), **asked)

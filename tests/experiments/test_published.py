@@ -29,7 +29,7 @@ from crptpro.objectives import method_names
     (("crptpro", "A", "walker_run", "reversed_background"), "None"),
     (("proto-rl-s", "A", "walker_run"), "None"),
 ])  # fmt: skip
-def test_a_number_stands_beside_the_place_that_the_paper_prints_it_for(place: tuple, printed: str) -> None:
+def test_published_scores_are_found_by_their_place(place: tuple, printed: str) -> None:
     assert str(published_score(*place)) == printed
 
 

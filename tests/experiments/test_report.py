@@ -69,7 +69,7 @@ def test_every_experiment_is_counted_and_every_job(seen: Report) -> None:
     assert len(seen.table("probe: 90 jobs")) == 90
 
 
-def test_budgets_stand_beside_the_papers(seen: Report) -> None:
+def test_budgets_are_shown_beside_the_papers(seen: Report) -> None:
     budgets = seen.table("Budgets beside the paper's").set_index("budget")["small"].to_dict()
     assert budgets == {
         "random transitions per domain": "20,000", "encoder updates on datasets": "3,000", "pre-training batch": "128",
@@ -81,7 +81,7 @@ def test_budgets_stand_beside_the_papers(seen: Report) -> None:
     assert "What this cannot show" in seen.text
 
 
-def test_returns_stand_beside_the_papers_without_intervals_of_two_runs(seen: Report) -> None:
+def test_returns_are_shown_beside_the_papers_without_intervals_of_two_runs(seen: Report) -> None:
     returns = seen.table("Episode return at the final evaluation").set_index("method")["A walker_run"]
     assert returns.to_dict() == {
         "crptpro": "56 ± 2 (n = 2) · paper 513 ± 33", "crptpro-fast": "64 ± 8 (n = 2)",
@@ -103,7 +103,7 @@ def test_returns_stand_beside_the_papers_without_intervals_of_two_runs(seen: Rep
     assert "Brackets are" not in seen.text
 
 
-def test_what_jobs_took_is_told_with_the_machine(seen: Report) -> None:
+def test_the_cost_of_jobs_is_shown_with_the_machine(seen: Report) -> None:
     took = seen.table("What jobs took").set_index(["kind", "of", "machine"])
     assert took.loc[("explored", "becl", "2")].tolist() == ["1", "2,997", "40,002", "2.6 h"]
     assert took.loc[("encoder", "atc", "1"), ["updates", "wall clock"]].tolist() == ["3,000", "20 min"]
@@ -270,7 +270,7 @@ def test_methods_are_compared_on_the_tasks_that_all_have(made: Reproduction) -> 
     assert report.cell("Over the 1 task", "mean score", "crptpro").startswith("505")
 
 
-def test_what_cannot_be_read_is_left_out_by_name(made: Reproduction) -> None:
+def test_unreadable_records_are_left_out_by_name(made: Reproduction) -> None:
     cells = made.runs("crptpro", "walker_run", [500.0, 510.0, 520.0])
     paths = [made.root / "jobs" / job / "eval.csv" for _, job, _ in cells]
     paths[0].unlink()
@@ -282,7 +282,7 @@ def test_what_cannot_be_read_is_left_out_by_name(made: Reproduction) -> None:
     assert report.cell("Episode return at the final", "crptpro", "A walker_run").startswith("520 (n = 1)")
 
 
-def test_colours_and_what_is_varied_have_rows_of_their_own(made: Reproduction) -> None:
+def test_colours_and_varied_settings_have_their_own_rows(made: Reproduction) -> None:
     reversed_colors = made.runs("crptpro", "cheetah_run", [400.0], group="C", colors="reversed_background")
     made.ask("colors", reversed_colors)
     cells = []
@@ -302,7 +302,7 @@ def test_colours_and_what_is_varied_have_rows_of_their_own(made: Reproduction) -
 HOSTILE = "</td><script>alert(1)</script> | [x](javascript:y) $\\frac$ \n# `big` & ünïcode"
 
 
-def test_names_of_users_break_neither_page(made: Reproduction) -> None:
+def test_hostile_names_break_neither_page(made: Reproduction) -> None:
     job = made.job("run-one", "run", facts={"method": HOSTILE}, eval=evaluations(10.0, method=HOSTILE))
     place = {"group": HOSTILE, "task": HOSTILE, "encoder_seed": 0, "seed": 0}
     made.ask(HOSTILE, [(HOSTILE, job, place), ("other", "run-none", place)], scale="<b>huge</b>")
@@ -347,7 +347,7 @@ def test_a_directory_without_anything_is_refused_and_left_alone(tmp_path: Path, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_runs_that_nobody_planned_are_told_apart_by_what_differs(tmp_path: Path) -> None:
+def test_unplanned_runs_are_labelled_by_the_settings_that_differ(tmp_path: Path) -> None:
     for seed, rate in enumerate([1e-3, 1e-3, 1e-4]):
         folder = tmp_path / "mine" / str(seed)
         settings = {"seed": seed, "env_steps": 500_000, "learning_rate": rate, "device": f"cuda:{seed}"}
@@ -366,7 +366,7 @@ def test_runs_that_nobody_planned_are_told_apart_by_what_differs(tmp_path: Path)
     assert "Machines, as tables" not in report.text
 
 
-def test_a_disk_that_is_full_is_named_and_the_older_page_kept(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_the_older_page_kept(tmp_path: Path) -> None:
     page = Page(tmp_path)
     page.section("One", "one")
     page.text("before")

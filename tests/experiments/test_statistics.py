@@ -42,7 +42,7 @@ def runs(scores: dict[str, list[float]], encoders: dict[str, list[str]] | None =
     (iqm, (0.5 + 1.0 + 2.0 + 3.0) / 4),  # of 0, 0.5, 0.5, 1, 2, 3, 3, 10
     (optimality_gap, (0.0 + (1.0 + 0.5 + 0.5) / 4) / 2),
 ])  # fmt: skip
-def test_aggregates_are_what_a_hand_computes(aggregate: Callable, by_hand: float) -> None:
+def test_aggregates_match_a_computation_by_hand(aggregate: Callable, by_hand: float) -> None:
     assert aggregate(TWO_TASKS) == pytest.approx(by_hand)
     # Replicates and curves are further axes before the runs.
     stacked = [np.stack([task, task + 1]) for task in TWO_TASKS]
@@ -107,7 +107,7 @@ def test_the_same_runs_give_the_same_interval_in_any_order_and_another_seed_anot
     assert estimate(iqm, own, seed=1).low != first.low
 
 
-def test_intervals_of_a_mean_hold_the_truth_as_often_as_is_said() -> None:
+def test_intervals_of_a_mean_have_the_stated_coverage() -> None:
     for count, share in COVERAGE.items():
         draws = pd.DataFrame(np.random.default_rng(0).normal(size=(count, 1_000)))  # a column per repetition
         own = pd.concat([runs({"a": [0.0] * count}), draws], axis=1)
@@ -127,7 +127,7 @@ def test_runs_that_share_encoders_have_the_wider_interval_of_their_encoders() ->
     np.testing.assert_allclose([one.low, one.high], [alone.low, alone.high], atol=0.12)
 
 
-def test_a_run_that_stands_under_two_tasks_is_drawn_alike_and_counts_once() -> None:
+def test_a_run_under_two_tasks_is_redrawn_alike_and_counts_once() -> None:
     own = runs({"A walker_run": [1.0, 2.0, 3.0, 4.0, 5.0]})
     both = pd.concat([own, own.assign(task="D walker_run")])
     alone, twice = estimate(mean, own), estimate(mean, both)
@@ -135,7 +135,7 @@ def test_a_run_that_stands_under_two_tasks_is_drawn_alike_and_counts_once() -> N
     np.testing.assert_allclose([twice.low, twice.high], [alone.low, alone.high])
 
 
-def test_what_cannot_be_estimated_is_refused_by_name() -> None:
+def test_runs_that_cannot_be_estimated_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"Run a 1 on a has a score that is not finite"):
         estimate(mean, runs({"a": [1.0, float("nan")]}))
     with pytest.raises(ValueError, match="no runs"):

@@ -25,14 +25,14 @@ class Joint(NamedTuple):
 def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
     """Return the joints behind a domain's ``qpos`` and ``qvel``, in order.
 
-    ``None`` where they are not known: worlds of your own, and those without a MuJoCo model.
+    ``None`` where they are not known: a custom environment, or one without a MuJoCo model.
 
     Raises:
-        RenderingError: dm_control's worlds cannot be loaded where nothing renders.
+        RenderingError: dm_control cannot be loaded because no backend renders.
     """
     try:
         domain = get_domain(domain)
-    except UnknownNameError:  # a world of one's own that is not registered in this process
+    except UnknownNameError:  # a custom domain that is not registered in this process
         return None
     env: Any
     if domain.source in ("suite", "manipulation"):
@@ -49,31 +49,25 @@ def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
         model = getattr(env.unwrapped, "model", None)
     else:
         return None
-    try:
-        return None if model is None else _joints(model)
-    finally:
-        env.close()
-
-
-def _joints(model: Any) -> tuple[Joint, ...]:
-    import mujoco
+    import mujoco  # after the backend is selected: the import fixes it
 
     joints = []
-    for index in range(model.njnt):
+    for index in range(model.njnt if model is not None else 0):
         kind = list(_SIZES)[model.jnt_type[index]]
         if kind == "hinge" and not model.jnt_limited[index]:
             kind = "turning"
         name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, index)
         joints.append(Joint(name or f"joint{index}", kind))
-    return tuple(joints)
+    env.close()
+    return None if model is None else tuple(joints)
 
 
 def position_coordinates(qpos: Tensor, joints: Sequence[Joint] | None) -> tuple[list[str], Tensor]:
     """Return names, and positions as float64 ``[N, len(names)]`` that are continuous where the picture is.
 
     Slides and limited hinges are kept. A hinge without limits becomes its sine and cosine. The orientation of a ball or
-    free joint becomes the first two columns of its rotation matrix, which determine it. With ``None`` for the joints,
-    or those of another model, ``qpos`` (``[N, nq]``: metres, radians, quaternions w, x, y, z) is returned as it is.
+    free joint becomes the first two columns of its rotation matrix, which determine it. Without joints that fit,
+    ``qpos`` (``[N, nq]``: metres, radians, quaternions w, x, y, z) is returned unchanged.
     """
     qpos = qpos.double()
     if joints is None or sum(_SIZES[joint.kind][0] for joint in joints) != qpos.shape[1]:

@@ -1,4 +1,4 @@
-"""How widely observations are spread: a particle estimate of the entropy of their embeddings."""
+"""Coverage of observations: a particle estimate of the entropy of their embeddings."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ def coverage(embeddings: Tensor, *, k: int = 12) -> float:
 
     :math:`z_i^{(j)}` is the j-th nearest other embedding, as in the rewards of APT (arXiv 2103.04551) and Proto-RL
     (arXiv 2102.11271). The paper plots "a particle-based estimator" and states neither k, nor the number of
-    observations, nor the encoder: these are this project's choice. The value falls with the number of observations,
-    whose neighbours then come closer: compare equal numbers. It is 0 where all look alike, and at most log 3 between
-    unit vectors.
+    observations, nor the encoder: these are this project's choice. The value falls with the number of observations:
+    compare equal numbers. It is 0 if all embeddings are equal, and at most log 3 for unit vectors.
 
     Args:
         embeddings: ``[N, D]``, N above ``k``.

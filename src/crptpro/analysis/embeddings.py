@@ -1,4 +1,4 @@
-"""Embeddings of a frozen encoder on sampled observations, and how they are spread."""
+"""Embeddings of a frozen encoder on sampled observations, and measures of their spread."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _BATCH = 64
 
 
 def sample_pixels(dataset: ReplayBuffer, samples: int, *, seed: int) -> Tensor:
-    """Draw observations ``[samples, C, H, W]``, the same for the same seed, whatever was sampled before."""
+    """Draw observations ``[samples, C, H, W]``, which depend on the seed alone, not on earlier samples."""
     dataset.set_rng(torch.Generator().manual_seed(seed))
     return dataset.sample(samples)["pixels"]
 
@@ -68,7 +68,7 @@ def effective_rank(features: Tensor) -> float:
     mean = features.mean(0, dtype=torch.float64)
     gram = gram_matrix(features, mean, torch.ones_like(mean))
     singular = np.sqrt(np.linalg.eigvalsh(gram).clip(min=0))
-    # Squaring has cost half of the digits: what is below is rounding.
+    # The Gram matrix has half of the digits: smaller values are rounding errors.
     singular = singular[singular > 1e-7 * singular.max()]
     if not len(singular):
         return 0.0

@@ -1,4 +1,4 @@
-"""What a frozen encoder knows of the simulator's state: a measure of pre-training that needs no RL."""
+"""Linear probes of the simulator's state from a frozen encoder: a measure of pre-training that needs no RL."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from crptpro.errors import DatasetError
 from crptpro.seeding import derive_seed
 
 HELD_OUT = 0.25
-"""Fraction of the episodes that is held out, and of the others by which the penalty is chosen."""
+"""Fraction of the episodes that is held out, and of the other episodes that choose the penalty."""
 LEAST_SPREAD = 1e-3
 """Standard deviation (m, rad, m/s, rad/s; 1 for sines and rotations) below which a coordinate counts as constant."""
 PENALTIES = tuple(10.0**power for power in range(-6, 3))
-"""Ridge penalties that are tried, in units of the mean eigenvalue of the fitted samples' Gram matrix."""
+"""Candidate ridge penalties, in units of the mean eigenvalue of the fitted samples' Gram matrix."""
 
 
 @dataclass(frozen=True)
 class ProbeSamples:
-    """Observations of one domain with the state that they show, and how they are split.
+    """Observations of one domain with their states, and their split.
 
     Attributes:
         pixels: uint8 ``[N, C, H, W]``.
         targets: float64 ``[N, T]``, positions and velocities.
         names: of the targets: ``"position"`` or ``"velocity"``, and the coordinate.
-        train: rows to fit, ``validation`` to choose the penalty, ``test`` to judge; no episode is in two of them.
-        held_out_episodes: how many episodes ``test`` comes from.
+        train: rows to fit; ``validation`` chooses the penalty, ``test`` judges. No episode is in two of them.
+        held_out_episodes: number of episodes in ``test``.
     """
 
     pixels: Tensor
@@ -46,21 +46,22 @@ class ProbeSamples:
 
 @dataclass(frozen=True)
 class ProbeResult:
-    """How well the state is predicted from one kind of embedding of one domain.
+    """How well one kind of embedding of one domain predicts the state.
 
-    Positions and velocities are R2 on held-out episodes by coordinate, but for those ``left_out``, which hardly vary in
-    the training or in the held-out episodes. Rank and cosine are those of :mod:`crptpro.analysis.embeddings`.
+    Positions and velocities are R2 on held-out episodes by coordinate. ``left_out`` are kind and coordinate of those
+    that hardly vary in the training or in the held-out episodes. Rank and cosine are those of
+    :mod:`crptpro.analysis.embeddings`.
     """
 
     positions: dict[str, float]
     velocities: dict[str, float]
-    left_out: tuple[str, ...]
+    left_out: tuple[tuple[str, str], ...]
     effective_rank: float
     mean_cosine: float
 
     @property
     def position_r2(self) -> float:
-        """Mean R2 of the positions; one that is predicted worse than by its mean counts as 0."""
+        """Mean R2 of the positions; a negative one counts as 0."""
         return _mean(self.positions)
 
     @property
@@ -79,19 +80,18 @@ def probe_samples(
     Args:
         dataset: with physical state.
         samples: N, drawn without replacement; all transitions if there are fewer.
-        seed: which ones, and which episodes are held out.
+        seed: of the draw, and of the held-out episodes.
         frame_stack: frames per observation; the dataset's if ``None``.
 
     Raises:
         DatasetError: there is no physical state, or too few episodes or samples to split.
     """
+    if "qpos" not in dataset.frames or "qvel" not in dataset.frames:
+        raise DatasetError(f"The dataset of {dataset.domain!r} stores no physical state (qpos, qvel).")
     transitions = dataset.transitions
     generator = torch.Generator().manual_seed(derive_seed(seed, "probe", dataset.domain))
     chosen = torch.randperm(len(transitions), generator=generator)[:samples].sort().values
     row, step, episode = (transitions.get(name)[chosen] for name in ("row", "step", "episode"))
-    if "qpos" not in dataset.frames or "qvel" not in dataset.frames:
-        raise DatasetError(f"The dataset of {dataset.domain!r} stores no physical state (qpos, qvel).")
-    qpos, qvel = (dataset.frames[name][row] for name in ("qpos", "qvel"))
     episodes = episode.unique()
     episodes = episodes[torch.randperm(len(episodes), generator=generator)]
     held_out = max(1, round(HELD_OUT * len(episodes)))
@@ -104,10 +104,9 @@ def probe_samples(
             "needs two in each of three parts that share no episode. Collect more episodes, or draw more samples."
         )
     joints = joints_of(dataset.card.get("task", dataset.domain))
-    position_names, positions = position_coordinates(qpos, joints)
-    velocity_names, velocities = velocity_coordinates(qvel, joints)
-    kinds = {"position": position_names, "velocity": velocity_names}
-    names = [(kind, name) for kind, own in kinds.items() for name in own]
+    position_names, positions = position_coordinates(dataset.frames["qpos"][row], joints)
+    velocity_names, velocities = velocity_coordinates(dataset.frames["qvel"][row], joints)
+    names = [("position", name) for name in position_names] + [("velocity", name) for name in velocity_names]
     rows = stack_rows(row, step, frame_stack or dataset.frame_stack)
     pixels = gather_stacks(dataset.frames["pixels"], rows)
     targets = torch.cat([positions, velocities], 1)
@@ -118,17 +117,17 @@ def probe_samples(
 def probe(samples: ProbeSamples, encoder: nn.Module, projector: nn.Module | None = None) -> dict[str, ProbeResult]:
     """Predict the state from an encoder's frozen features, and from the projections z if there is a projector.
 
-    Ridge regression on standardised features, in float64; nothing of the held-out episodes takes part in fitting,
-    standardising, or choosing the penalty. Images are not augmented.
+    Ridge regression on standardised features, in float64. Held-out episodes take no part in fitting, standardising, or
+    choosing the penalty. Images are not augmented.
 
     Returns:
         By ``"features"`` and, with a projector, ``"z"``.
     """
-    results = {"features": probe_embeddings(samples, embed_pixels(encoder, samples.pixels).cpu())}
-    if projector is not None:
-        latents = embed_pixels(encoder, samples.pixels, projector=projector)
-        results["z"] = probe_embeddings(samples, latents.cpu())
-    return results
+    heads = {"features": None} if projector is None else {"features": None, "z": projector}
+    return {
+        name: probe_embeddings(samples, embed_pixels(encoder, samples.pixels, projector=head).cpu())
+        for name, head in heads.items()
+    }
 
 
 @torch.no_grad()
@@ -151,7 +150,7 @@ def probe_embeddings(samples: ProbeSamples, embeddings: Tensor) -> ProbeResult:
     return ProbeResult(
         positions={name: value for (kind, name), value in scores.items() if kind == "position"},
         velocities={name: value for (kind, name), value in scores.items() if kind == "velocity"},
-        left_out=tuple(f"{kind} {name}" for kind, name in names if (kind, name) not in scores),
+        left_out=tuple(name for name in names if name not in scores),
         effective_rank=effective_rank(embeddings),
         mean_cosine=mean_cosine(embeddings),
     )
@@ -160,20 +159,20 @@ def probe_embeddings(samples: ProbeSamples, embeddings: Tensor) -> ProbeResult:
 def _standardized_gram(features: Tensor, fitted: Tensor) -> np.ndarray:
     """Return the inner products ``[N, N]`` of all samples' standardised features.
 
-    A feature's scale is its deviation plus the root mean square of all features' deviations: otherwise a ReLU feature
-    that is active in a handful of samples identifies them, and the R2 of velocities fell from 0.6 to 0.
+    A feature's scale is its deviation plus the root mean square of all features' deviations. With its deviation alone,
+    a ReLU feature that is active in a few samples identifies them, and the R2 of velocities fell from 0.6 to 0.
     """
     deviation, mean = torch.std_mean(features[fitted].double(), 0, correction=0)
     usual = deviation.square().mean().sqrt()
     return gram_matrix(features, mean, deviation + usual if usual else torch.ones_like(mean))
 
 
-def _predictions(gram: np.ndarray, targets: np.ndarray, fitted: np.ndarray, asked: np.ndarray) -> np.ndarray:
+def _predictions(gram: np.ndarray, targets: np.ndarray, fitted: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Predict targets ``[P, A, T]`` for each penalty; features are centred at the fitted samples' mean."""
     from sklearn.kernel_ridge import KernelRidge
     from sklearn.preprocessing import KernelCenterer
 
-    inner, across = gram[np.ix_(fitted, fitted)], gram[np.ix_(asked, fitted)]
+    inner, across = gram[np.ix_(fitted, fitted)], gram[np.ix_(rows, fitted)]
     centre = KernelCenterer().fit(inner)
     inner, across = centre.transform(inner), centre.transform(across)
     scale = np.trace(inner) / len(fitted) or 1.0  # constant features predict the mean

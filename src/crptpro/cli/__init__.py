@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
+import torch
 import tyro
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
 
@@ -66,17 +67,19 @@ class Logging:
 
     @contextlib.contextmanager
     def records(self, run_dir: Path, config: Any) -> Iterator[RunLogger | None]:
-        """Hold the record of a run with its mirrors; without mirrors the run makes its own."""
+        """Open the record of a run with its mirrors; without mirrors the run makes its own."""
         if self.wandb == "off" and not self.tensorboard:
             yield None
             return
-        options: Any = (self.wandb_project, self.wandb_group, None, self.wandb_tags, self.wandb)
-        wandb, is_new = None if self.wandb == "off" else WandbOptions(*options), not run_dir.exists()
+        wandb = None
+        if self.wandb != "off":
+            wandb = WandbOptions(self.wandb_project, self.wandb_group, tags=self.wandb_tags, mode=self.wandb)
+        is_new = not run_dir.exists()
         with RunLogger(run_dir, config=config, wandb=wandb, tensorboard=self.tensorboard) as logger:
             try:
                 yield logger
             except Exception:
-                if is_new and [path.name for path in run_dir.iterdir()] == [".lock"]:  # the request was refused
+                if is_new and [path.name for path in run_dir.iterdir()] == [".lock"]:  # refused before its first row
                     shutil.rmtree(run_dir)
                 raise
 
@@ -117,7 +120,7 @@ class Collect:
     quality: Quality = "exact"
     """render quality; fast uses smaller shadow maps on software GL"""
     colors: Colors = "normal"
-    """colours of the worlds; reversed_background are the paper's unseen ones"""
+    """colours of the environments; reversed_background are the unseen ones of the paper"""
     action_repeat: int | None = None
     """simulator steps per decision (default: the domain's, 2)"""
 
@@ -129,29 +132,13 @@ class Collect:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pretraining:
-    """What `pretrain` asks of every method."""
+class EncoderRun:
+    """A stage that trains an encoder."""
 
-    sources: Annotated[Positional[tuple[str, ...]], arg(help_behavior_hint="")] = ()
-    """dataset directories, e.g. data/walker data/cartpole; for methods that explore domains, tasks or group letters"""
     out: Path
     """run directory: records and checkpoints, and the encoder in OUT/encoder"""
-    method: str = "crptpro"
-    """crptpro, atc or random-encoder (on datasets), proto-rl-c, proto-rl-s, apt-c, apt-s or becl (exploring), a preset
-    such as crptpro-fast, or one of your own with --plugin FILE.py; settings: see --method NAME --help"""
-    loss: NamedValues = ()
-    """options of the method's loss, e.g. num_prototypes=128 intr_loss_coef=0"""
-    encoder: NamedValues = ()
-    """options of the encoder, e.g. pixel_offset=0.5"""
     logging: Logging = field(default_factory=Logging)
     """mirrors"""
-
-    def build(self, seed: int, image_size: int = 84, frame_stack: int = 3) -> Any:
-        """Return the method's loss on a fresh encoder."""
-        method, options = get_method(self.method), named_values("--encoder", self.encoder)
-        seed_everything(seed)
-        encoder = method.build_encoder(in_channels=3 * frame_stack, image_size=image_size, **options)
-        return method.build(encoder, **named_values("--loss", self.loss))
 
     def keep(self, result: Any, records: RunLogger | None) -> None:
         """Write the encoder, and copy it to the mirrors."""
@@ -162,28 +149,53 @@ class Pretraining:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Pretraining(EncoderRun):
+    """Settings of `pretrain` for every method."""
+
+    sources: Annotated[Positional[tuple[str, ...]], arg(help_behavior_hint="")] = ()
+    """dataset directories, e.g. data/walker data/cartpole; for methods that explore domains, tasks or group letters"""
+    method: str = "crptpro"
+    """crptpro, atc or random-encoder (on datasets), proto-rl-c, proto-rl-s, apt-c, apt-s or becl (exploring), a preset
+    such as crptpro-fast, or one of your own with --plugin FILE.py; settings: see --method NAME --help"""
+    loss: NamedValues = ()
+    """options of the method's loss, e.g. num_prototypes=128 intr_loss_coef=0"""
+    encoder: NamedValues = ()
+    """options of the encoder, e.g. pixel_offset=0.5"""
+
+    config: Any = None
+
+    def run(self) -> None:
+        """Pre-train, or continue, and write the artifact."""
+        method = get_method(self.method)
+        train: Any = training.pretrain
+        if method.exploration is not None:
+            train = training.pretrain_active
+            sources: list[Any] = expand_groups(self.sources)
+            image_size, frame_stack = 84, 3
+        else:
+            sources = [as_path(source, "sources") for source in self.sources]
+            needs_data = sources or method.loss_class is not None
+            image_size, frame_stack = image_format(sources) if needs_data else (84, 3)
+        images = {"image_size": image_size, "in_channels": 3 * frame_stack}
+        if method.loss_class is None:
+            untrained = random_pretrained(self.config.seed, method=self.method, datasets=sources, **images)
+            logger.info("untrained encoder: %s", save_pretrained(untrained, self.out / "encoder"))
+            return
+        loss_options = named_values("--loss", self.loss)
+        encoder_options = named_values("--encoder", self.encoder)
+        seed_everything(self.config.seed)
+        loss = method.build(method.build_encoder(**images, **encoder_options), **loss_options)
+        with self.logging.records(self.out, self) as records:
+            result = train(loss, sources, method=self.method, run_dir=self.out, config=self.config, records=records)
+            self.keep(result, records)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Pretrain(Pretraining):
     """Pre-train one encoder for several domains on their datasets, one update per domain in turn."""
 
     config: Annotated[training.PretrainConfig, arg(name="")] = field(default_factory=training.PretrainConfig)
     """every number of the stage"""
-
-    def run(self) -> None:
-        """Pre-train, or continue, and write the artifact."""
-        datasets = [as_path(source, "sources") for source in self.sources]
-        is_control = get_method(self.method).loss_class is None
-        image_size, frame_stack = image_format(datasets) if datasets or not is_control else (84, 3)
-        if is_control:
-            images: dict[str, Any] = {"image_size": image_size, "in_channels": 3 * frame_stack}
-            encoder = random_pretrained(self.config.seed, method=self.method, datasets=datasets, **images)
-            logger.info("untrained encoder: %s", save_pretrained(encoder, self.out / "encoder"))
-            return
-        loss = self.build(self.config.seed, image_size, frame_stack)
-        with self.logging.records(self.out, self) as records:
-            result = training.pretrain(
-                loss, datasets, method=self.method, run_dir=self.out, config=self.config, records=records
-            )
-            self.keep(result, records)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,42 +205,27 @@ class Explore(Pretraining):
     config: Annotated[training.ExploreConfig, arg(name="")] = field(default_factory=training.ExploreConfig)
     """every number of the stage"""
 
-    def run(self) -> None:
-        """Pre-train, or continue, and write the artifact."""
-        domains = expand_groups(self.sources)
-        loss = self.build(self.config.seed)
-        with self.logging.records(self.out, self) as records:
-            result = training.pretrain_active(
-                loss, domains, method=self.method, run_dir=self.out, config=self.config, records=records
-            )
-            self.keep(result, records)
-
 
 @dataclass(frozen=True, kw_only=True)
-class Finetune:
+class Finetune(EncoderRun):
     """Continue pre-training on one domain from a pretrained encoder."""
 
     pretrained: Positional[str]
     """directory of the pretrained encoder, or the name of one that ships"""
     dataset: Positional[Path]
     """dataset directory of the one domain"""
-    out: Path
-    """run directory: records and checkpoints, and the encoder in OUT/encoder"""
     config: Annotated[training.PretrainConfig, arg(name="")] = field(default_factory=training.PretrainConfig)
     """every number of the stage; the paper's updates: pendulum and manipulation 2,000, cartpole 3,000, cheetah 1,000,
     walker 500"""
-    logging: Logging = field(default_factory=Logging)
-    """mirrors"""
 
     def run(self) -> None:
         """Fine-tune, or continue, and write the artifact."""
         image_size, frame_stack = image_format([self.dataset])
         pretrained = load_pretrained(self.pretrained).require(image_size=image_size, frame_stack=frame_stack)
+        config = replace(self.config, updates=self.config.updates or get_method("crptpro-finetune").updates)
         with self.logging.records(self.out, self) as records:
-            updates = self.config.updates or get_method("crptpro-finetune").updates
-            config = replace(self.config, updates=updates)
             result = training.finetune(pretrained, self.dataset, run_dir=self.out, config=config, records=records)
-            Pretraining.keep(self, result, records)  # type: ignore[arg-type]
+            self.keep(result, records)
 
 
 @dataclass(frozen=True)
@@ -272,7 +269,7 @@ class Evaluate:
     quality: Quality | None = None
     """render quality (default: the one the agent was trained with; exact for the random policy)"""
     colors: Colors | None = None
-    """colours of the world (default: those the agent was trained in; normal for the random policy)"""
+    """colours of the environment (default: those of the agent's training; normal for the random policy)"""
     action_repeat: int | None = None
     """simulator steps per decision (default: what the agent was trained with; the domain's for the random policy)"""
     csv: Path | None = None
@@ -281,19 +278,20 @@ class Evaluate:
     """write the first episode as MP4 here (needs the `video` extra)"""
 
     def run(self) -> None:
-        """Write what was asked for, and print mean and deviation."""
-        if self.agent == "random-policy" and self.task is None:
+        """Write the requested files, and print mean and deviation."""
+        is_random = self.agent == "random-policy"
+        if is_random and self.task is None:
             raise CRPTproError("The random policy has no task of its own; name one, e.g. --task walker_run.")
         require_writable(self.csv, "--csv")  # before an hour of episodes
         require_writable(self.video, "--video")
-        agent, card = (None, {}) if self.agent == "random-policy" else training.load_agent(self.agent)
-        task, trained_with = self.task or card["task"], card.get("config", {})
+        agent, card = (None, {}) if is_random else training.load_agent(self.agent)
+        task = self.task or card["task"]
+        trained_with = card.get("config", {})
         settings: dict[str, Any] = {
             "quality": self.quality or trained_with.get("quality", "exact"),
             "colors": self.colors or trained_with.get("colors", "normal"),
             "action_repeat": self.action_repeat or trained_with.get("action_repeat"),
-            # Chance does not look; without a video there is nothing to draw.
-            "render": agent is not None or self.video is not None,
+            "render": not is_random or self.video is not None,  # the random policy needs no pixels
         }
         if agent is not None:
             encoder: Any = agent.encoder
@@ -311,7 +309,8 @@ class Evaluate:
             if self.csv is not None:
                 from crptpro.experiments import measure
 
-                measure.write_rows(self.csv, [{"task": task, "agent": self.agent, **vars(each)} for each in episodes])
+                rows = [{"task": task, "agent": self.agent, **vars(episode)} for episode in episodes]
+                measure.write_rows(self.csv, rows)
             if self.video is not None:
                 frames: list[Any] = []
                 policy = agent or training.uniform_policy(env, seed=self.seed)
@@ -344,7 +343,7 @@ class Probe:
     """where the encoder runs"""
 
     def run(self) -> None:
-        """Print a table, and write what was asked for."""
+        """Print a table, and write the requested file."""
         from crptpro.experiments import measure
 
         if self.samples < 1:
@@ -358,15 +357,16 @@ class Probe:
             pretrained = load_pretrained(self.encoder).require(image_size=image_size)
         for network in filter(None, (pretrained.encoder, pretrained.projector)):
             network.to(self.device)
-        table, measures, settings = [], [], {"samples": self.samples, "seed": self.seed}
+        table: list[dict[str, str]] = []
+        numbers: list[dict[str, Any]] = []
+        settings: dict[str, Any] = {"encoder": self.encoder, "samples": self.samples, "seed": self.seed}
         try:
             for path in self.datasets:
-                dataset = FrameDataset.open(path)
-                rows, numbers = measure.probe_rows(pretrained, dataset, encoder=self.encoder, **settings)
+                rows, measures = measure.probe_rows(pretrained, FrameDataset.open(path), **settings)
                 table += rows
-                measures += numbers
+                numbers += measures
                 if self.csv is not None:
-                    measure.write_rows(self.csv, measures, measure.PROBE_COLUMNS)
+                    measure.write_rows(self.csv, numbers, measure.PROBE_COLUMNS)
         finally:  # a later dataset may be refused, and writing may fail
             if table:
                 lines = [list(table[0]), ["---"] * len(table[0]), *(list(row.values()) for row in table)]
@@ -389,22 +389,21 @@ class Report:
         print(build_report(self.directory, out=self.out))
 
 
-def write_video(frames: Sequence[Any], path: Path) -> None:
+def write_video(frames: Sequence[torch.Tensor], path: Path) -> None:
     """Write RGB pictures, uint8 ``[3, H, W]``, as an MP4 at 25 pictures a second."""
     try:
         import imageio.v2 as imageio
         import imageio_ffmpeg  # noqa: F401 - the encoder behind the FFMPEG format
-        import torch
-
-        # Nearest-neighbour enlargement keeps 84 pixels visible on a screen; the codec wants even sizes.
-        large = torch.stack(list(frames)).repeat_interleave(4, -1).repeat_interleave(4, -2)
+    except ImportError:
+        raise CRPTproError("--video needs the `video` extra: pip install 'crptpro[video]'.") from None
+    # Nearest-neighbour enlargement keeps 84 pixels visible on a screen; the codec wants even sizes.
+    large = torch.stack(list(frames)).repeat_interleave(4, -1).repeat_interleave(4, -2)
+    aside = path.with_name(f".{path.name}")
+    try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        aside = path.with_name(f".{path.name}")
         pictures = list(large.permute(0, 2, 3, 1).numpy())
         imageio.mimwrite(aside, pictures, format="FFMPEG", fps=25, macro_block_size=4)
         aside.replace(path)
-    except ImportError:
-        raise CRPTproError("--video needs the `video` extra: pip install 'crptpro[video]'.") from None
     except (OSError, RuntimeError, ValueError) as reason:
         raise CRPTproError(f"--video {path} was not written: {reason}") from reason
 
@@ -447,18 +446,18 @@ def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
 
 
 def require_writable(path: Path | None, option: str) -> None:
-    """Refuse what no file can become, and make nothing yet."""
+    """Refuse a path that no file can have, before any work; makes nothing."""
     if path is None:
         return
-    if path.exists() and not path.is_file():  # a finished file takes its place: /dev/stdout would be gone
+    if path.exists() and not path.is_file():  # the finished file would replace it, /dev/stdout for example
         raise CRPTproError(f"{option} {path} is no ordinary file; name one.")
-    there = next(parent for parent in path.absolute().parents if parent.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
-        raise CRPTproError(f"{option} {path} cannot be written: {there} is a file, or not yours to write to.")
+    parent = next(parent for parent in path.absolute().parents if parent.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+        raise CRPTproError(f"{option} {path} cannot be written: {parent} is a file, or not yours to write to.")
 
 
 def pretrain_command(arguments: Sequence[str]) -> type[Pretrain] | type[Explore]:
-    """Return which settings ``pretrain`` has: those of the method that the command line names."""
+    """Return the settings of ``pretrain`` for the method that the command line names."""
     words = " ".join(arguments).replace("=", " ").split()
     names = [after for word, after in itertools.pairwise(words) if word == "--method"]
     explores = names and "pretrain" in arguments and get_method(names[-1]).exploration is not None
@@ -470,7 +469,7 @@ def main() -> None:
 
     def run() -> None:
         arguments = load_plugins(sys.argv[1:])
-        if arguments[:1] == ["measure"]:  # what jobs of `reproduce` call
+        if arguments[:1] == ["measure"]:  # for jobs of `reproduce`
             from crptpro.experiments import measure
 
             measure.main(arguments[1:])

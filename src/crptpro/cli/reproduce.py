@@ -1,4 +1,4 @@
-"""``crptpro reproduce``: an experiment of the paper, at a scale that can be afforded."""
+"""``crptpro reproduce``: experiments of the paper, also at scales of small machines."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ from crptpro.values import as_path
 
 ALL = "all"
 _ITS_OWN = arg(help_behavior_hint="(default: the experiment's)")
-_READ_BY = {
+_LAUNCHERS = {
     "partition": ("slurm",), "hours": ("slurm",), "memory_gb": ("slurm",), "sbatch": ("slurm",),
     "ray_address": ("ray",), "jobs_per_gpu": ("local", "ray"),
 }  # fmt: skip
+"""Options that only some launchers read."""
 PAPER_RUNS = 6
 """Evaluations behind each of the paper's numbers: three runs on each of two encoders."""
 
@@ -93,13 +94,11 @@ class Reproduce:
         jobs, cores, gpus = launch.divide(
             self.launcher, device=self.device, jobs=self.jobs, cores=self.cores_per_job, jobs_per_gpu=self.jobs_per_gpu
         )
-        names = ("methods", "groups", "tasks", "encoder_seeds", "seeds", "device")
         request = Request(
-            SCALES[self.scale],
-            **{name: getattr(self, name) for name in names},
-            colors=f"reversed_{self.colors_by}",
+            SCALES[self.scale], methods=self.methods, groups=self.groups, tasks=self.tasks, seeds=self.seeds,
+            encoder_seeds=self.encoder_seeds, colors=f"reversed_{self.colors_by}", device=self.device,
             threads=cores * (jobs if self.launcher == "local" else 1),
-        )
+        )  # fmt: skip
         wanted = self._wanted(request)
         plan = make_plan([cell.job for cells in wanted.values() for cell in cells], root)
         sizes = [bytes_of(job) for job in plan.missing]
@@ -113,26 +112,27 @@ class Reproduce:
         if self.dry_run:
             return
         require_disk(root, disk, "What this plan has yet to make")
-        # What a launcher lacks is said before anything is written.
-        launcher = self._launcher(slurm, gpus) if plan.missing else None
-        asked = {**dataclasses.asdict(request), "scale": self.scale}
+        launcher = self._launcher(slurm, gpus) if plan.missing else None  # it may fail, and nothing is written yet
+        request_record = {**dataclasses.asdict(request), "scale": self.scale}
         for name, cells in wanted.items():
             rows = [(cell.label, cell.job.key, cell.place) for cell in cells]
-            write_cells(root, name, self.scale, asked, rows)
+            write_cells(root, name, self.scale, request_record, rows)
         if launcher is not None:
-            how: dict[str, Any] = {"jobs": jobs, "cores": cores, "device": self.device, "attempts": self.attempts}
-            failures = launch.run_jobs(plan, root, launcher, plugins=loaded_plugins(), **how)
+            failures = launch.run_jobs(
+                plan, root, launcher, jobs=jobs, cores=cores, device=self.device, plugins=loaded_plugins(),
+                attempts=self.attempts,
+            )  # fmt: skip
             if failures:
                 print(failures_text(failures), flush=True)
                 raise SystemExit(1)
         print(f"\nAll of it is there. Tables and figures: crptpro report {root}", flush=True)
 
     def _checked_options(self) -> dict[str, Any]:
-        """Refuse what cannot be met, and an option that the launcher does not read: it was meant for another one."""
+        """Refuse impossible options, and those of another launcher; returns the parameters of Slurm."""
         if self.attempts < 1:
             raise CRPTproError(f"--attempts must be at least 1, got {self.attempts}.")
         for each in dataclasses.fields(self):
-            launchers = _READ_BY.get(each.name, (self.launcher,))
+            launchers = _LAUNCHERS.get(each.name, (self.launcher,))
             if getattr(self, each.name) != each.default and self.launcher not in launchers:
                 raise CRPTproError(
                     f"--{each.name.replace('_', '-')} is for --launcher {' or '.join(launchers)}; "
@@ -152,7 +152,7 @@ class Reproduce:
         )  # fmt: skip
 
     def _wanted(self, request: Request) -> dict[str, list[Cell]]:
-        """Cells by experiment. One that was named must have some; of all, those that have are meant."""
+        """Return cells by experiment. A named experiment must have some; ``all`` means those that have some."""
         for name in self.experiments or ("",):
             if name not in (*EXPERIMENTS, ALL):
                 raise UnknownNameError(
@@ -161,7 +161,7 @@ class Reproduce:
         names = EXPERIMENTS if ALL in self.experiments else dict.fromkeys(self.experiments)
         wanted = {name: EXPERIMENTS[name].cells(request) for name in names}
         empty = [name for name, cells in wanted.items() if not cells]
-        if {*empty} & {*self.experiments} or len(empty) == len(wanted):
+        if set(empty) & set(self.experiments) or len(empty) == len(wanted):
             raise CRPTproError(
                 f"Nothing of {', '.join(empty)} is among these groups, tasks and methods; leave out --groups, --tasks "
                 "or --methods."
@@ -178,7 +178,7 @@ class Reproduce:
 
 
 def plan_text(plan: Plan, root: Path, disk: int, jobs: int) -> str:
-    """Return how many jobs of each kind are needed, done and to do, with their env steps, and what they take."""
+    """Return a table of needed, finished and missing jobs by kind, with their env steps and times."""
     import pandas as pd
 
     spent: dict[str, list[float]] = {}
@@ -186,21 +186,25 @@ def plan_text(plan: Plan, root: Path, disk: int, jobs: int) -> str:
         spent.setdefault(path.parent.name.split("-")[0], []).append(float(read_json(path)["seconds"]))
     rows = []
     for kind, name in KINDS.items():
-        needed, left = ([job for job in each if job.kind == kind] for each in (plan.jobs, plan.missing))
+        needed = sum(job.kind == kind for job in plan.jobs)
+        missing = [job for job in plan.missing if job.kind == kind]
         if needed:
-            counts = {"needed": len(needed), "done": len(needed) - len(left), "to do": len(left)}
-            counts["env steps"] = sum(job.facts.get("env_steps", 0) for job in left)
-            took = launch.duration(statistics.median(spent[kind])) if kind in spent else ""
-            rows.append({"jobs": name, **{key: f"{n:,}" for key, n in counts.items()}, "took each": took})
+            env_steps = sum(job.facts.get("env_steps", 0) for job in missing)
+            rows.append({
+                "jobs": name, "needed": f"{needed:,}", "done": f"{needed - len(missing):,}",
+                "to do": f"{len(missing):,}", "env steps": f"{env_steps:,}",
+                "took each": launch.duration(statistics.median(spent[kind])) if kind in spent else "",
+            })  # fmt: skip
     text = pd.DataFrame(rows).to_string(index=False)
     if plan.missing:
         text += f"\n\n{jobs} at a time; the disk needs {max(disk, 10**6) / 1e9:,.2f} GB."
-        text += "\nThe last column is the median of what finished jobs in this directory took." * bool(spent)
+        if spent:
+            text += "\nThe last column is the median of what finished jobs in this directory took."
     return text
 
 
 def failures_text(failures: Sequence[launch.Failure]) -> str:
-    """List what is not finished, and where to look."""
+    """Return the list of unfinished jobs with their logs."""
     failed = [failure for failure in failures if failure.log is not None]
     skipped = [failure for failure in failures if failure.log is None]
     lines = [f"{len(failed)} failed:"]

@@ -1,4 +1,4 @@
-"""Small multiples with one legend, drawn from data frames without a window; every axis names its unit."""
+"""Small multiples with one legend, drawn from data frames without a display; every axis names its unit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ COLORS = {
     "proto-rl-s": "#e6a800", "atc": "#109e77", "apt-c": "#c76aa2", "apt-s": "#8a3f70", "becl": "#8f8a2a",
     "drq": "#8a7bd8", "random-encoder": "#858a91", "random policy": "#858a91",
 }  # fmt: skip
-"""Methods in the order of tables and legends; of Okabe and Ito's and of Tol's colour-blind-safe sets."""
+"""Methods in the order of tables and legends; colours from Okabe and Ito's and from Tol's colour-blind-safe sets."""
 OTHERS = ("#0b80c3", "#d9640a", "#109e77", "#c76aa2", "#8f8a2a", "#8a7bd8", "#e6a800", "#858a91", "#bb5566")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h", "*", "d")
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1)), (0, (3, 1, 1, 1, 1, 1)))
@@ -32,28 +32,22 @@ def base_method(label: str) -> str:
 
 
 def in_order(labels: Iterable[str]) -> list[str]:
-    """Sort labels as tables show them: methods as the paper's, variants after their method, others last."""
-    unique, order = list(dict.fromkeys(labels)), list(COLORS)
-
-    def place(label: str) -> tuple[int, bool, int]:
-        base = base_method(label)
-        return (order.index(base) if base else len(order), label != base, unique.index(label))
-
-    return sorted(unique, key=place)
+    """Sort labels as tables show them: methods in the paper's order, variants after their method, others last."""
+    order = [*COLORS, ""]
+    return sorted(dict.fromkeys(labels), key=lambda label: (order.index(base_method(label)), label not in COLORS))
 
 
 def styles(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Return colour, marker and dash of labels; a variant has its method's colour and another marker and dash."""
+    bases = {label: base_method(label) for label in in_order(labels)}
+    free = [color for color in OTHERS if color not in {COLORS.get(base) for base in bases.values()}]
+    order = list(COLORS)
     found: dict[str, dict[str, Any]] = {}
-    unique = in_order(labels)
-    free = [color for color in OTHERS if color not in {COLORS.get(base_method(label)) for label in unique}]
-    for label in unique:
-        base = base_method(label)
-        alike = sum(base_method(other) == base for other in found)
-        place = (list(COLORS).index(base) if base else 0) + alike
+    for label, base in bases.items():
+        alike = [bases[other] for other in found].count(base)
         color = COLORS[base] if base else free[alike % len(free)]
-        dashes, marker = DASHES[alike % len(DASHES)], MARKERS[place % len(MARKERS)]
-        found[label] = {"color": color, "marker": marker, "linestyle": dashes}
+        marker = MARKERS[((order.index(base) if base else 0) + alike) % len(MARKERS)]
+        found[label] = {"color": color, "marker": marker, "linestyle": DASHES[alike % len(DASHES)]}
     return found
 
 
@@ -69,14 +63,14 @@ def draw(
     """Draw panels with one legend below.
 
     Args:
-        points: columns ``label``, ``x`` (numbers, or names of places in order) and ``y``; and, if there are such,
-            ``panel`` (its title), ``line`` (which of a label's curves), ``n`` (runs, for the legend), ``low`` and
-            ``high`` (an interval), ``thin``.
-        x: name and unit of the horizontal axis; empty where the titles say it.
-        y: of the vertical one.
+        points: columns ``label``, ``x`` (numbers, or names of places in order) and ``y``; optionally ``panel`` (its
+            title), ``line`` (one of a label's curves), ``n`` (runs, for the legend), ``low`` and ``high`` (an
+            interval), ``thin``.
+        x: name and unit of the horizontal axis; empty if the titles say it.
+        y: of the vertical axis.
         kind: ``"line"``, or ``"cloud"`` of points.
         columns: panels side by side.
-        marks: heights of dashed lines of the first panel, by what they say.
+        marks: heights of dashed lines in the first panel, by their names.
     """
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -86,9 +80,11 @@ def draw(
     points = points.assign(**{name: value for name, value in optional.items() if name not in points})
     panels = list(dict.fromkeys(points["panel"]))
     columns = min(len(panels), columns)
-    rows, height = math.ceil(len(panels) / columns), 2.9
+    rows = math.ceil(len(panels) / columns)
+    height = 2.9
     width = {1: 7.4, 2: 5.2}.get(columns, 3.9)
-    look, handles = styles(points["label"]), dict[str, Any]()
+    look = styles(points["label"])
+    handles: dict[str, Any] = {}
     counts = {label: " or ".join(map(str, sorted(set(own)))) for label, own in points.groupby("label")["n"]}
     with mpl.rc_context({"text.parse_math": False}):  # a user's name in dollars is a name
         figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
@@ -97,7 +93,7 @@ def draw(
         for axis, panel in zip(axes, panels):
             here = points[points["panel"] == panel]
             for (label, _), own in here.groupby(["label", "line"], sort=False):
-                style, name = look[label], f"{label} (n = {counts[label]})" if counts[label] else label
+                style = look[label]
                 if own["thin"].all():
                     axis.plot(own["x"], own["y"], color=style["color"], linewidth=0.5, alpha=0.7)
                     continue
@@ -105,7 +101,7 @@ def draw(
                     style = {**style, "linestyle": "none", "alpha": 0.6}
                 spaced = max(1, len(own) // 12) if kind == "line" else 1
                 (handle,) = axis.plot(own["x"], own["y"], **style, linewidth=1.5, markersize=4, markevery=spaced)
-                handles.setdefault(name, handle)
+                handles.setdefault(f"{label} (n = {counts[label]})" if counts[label] else label, handle)
                 if own["low"].notna().any():
                     axis.fill_between(own["x"], own["low"], own["high"], color=style["color"], alpha=0.15)
             axis.set_title(panel, fontsize=9.5, loc="left")

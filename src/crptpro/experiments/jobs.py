@@ -1,8 +1,8 @@
 """A job is a ``crptpro`` command with a directory, ``ROOT/jobs/KEY``.
 
-``job.json`` describes it, ``log.txt`` has what its command printed, ``done.json`` says that it is finished and what it
-took. The key ends in a hash of the command, which names needed jobs by their keys: experiments share what they have in
-common, and a changed number makes another job. ``ROOT/experiments`` says which jobs an experiment asked for.
+``job.json`` describes it, ``log.txt`` has the output of its command, and ``done.json`` of a finished job its cost. The
+key ends in a hash of the command, which names needed jobs by their keys: experiments share equal jobs, and a changed
+number makes another job. ``ROOT/experiments`` lists the jobs of each experiment.
 """
 
 from __future__ import annotations
@@ -44,30 +44,21 @@ KINDS = {
     "coverage": "coverage measurements",
     "embeddings": "embeddings",
 }
-"""Kinds of jobs in the order of tables, and what they are called there."""
+"""Kinds of jobs in the order of tables, and their names there."""
 OWN = "{out}"
 """Stands for the job's own directory in a command; ``{KEY}`` for that of a job it needs."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One command, and what tables have to know of it.
+    """One command, and its facts for tables."""
 
-    Args:
-        kind: of :data:`KINDS`.
-        title: a few readable words for the key.
-        command: arguments of ``crptpro``, without those that say where and how it runs.
-        facts: plain values that tables need: method, domains, task, seed, updates.
-        needs: jobs that must be finished before.
-        definition: digest of the plugins that its command's names come from; empty for those of the library.
-    """
-
-    kind: str
-    title: str
-    command: tuple[str, ...]
-    facts: Mapping[str, Any] = field(compare=False)
-    needs: tuple[Job, ...] = field(default=(), compare=False)
-    definition: str = ""
+    kind: str  # of KINDS
+    title: str  # a few readable words for the key
+    command: tuple[str, ...]  # arguments of ``crptpro``, except for device, workers and plugins
+    facts: Mapping[str, Any] = field(compare=False)  # plain values: method, domains, task, seed, updates
+    needs: tuple[Job, ...] = field(default=(), compare=False)  # jobs that must be finished before
+    definition: str = ""  # digest of the plugins that define names in the command, if any
 
     @cached_property
     def key(self) -> str:
@@ -78,12 +69,12 @@ class Job:
 
     @property
     def is_exclusive(self) -> bool:
-        """Whether nothing else may run on its machine: it measures time."""
+        """Whether the job needs its machine to itself: it measures time."""
         return self.kind == "timing"
 
 
 def plugins_digest() -> str:
-    """Return a digest of the code of all plugins: an edited one makes new jobs instead of reusing old results."""
+    """Return a digest of the code of all plugins: an edited plugin makes new jobs."""
     paths = [name if name.endswith(".py") else sys.modules[name].__file__ for name in loaded_plugins()]
     return hashlib.sha256(b"".join(Path(path or "").read_bytes() for path in paths)).hexdigest()
 
@@ -109,7 +100,7 @@ def options(**values: Any) -> list[str]:
     return words
 
 
-# --- what there is to do --------------------------------------------------------------------------------------------
+# --- plans ----------------------------------------------------------------------------------------------------------
 
 
 def directory_of(root: Path, key: str) -> Path:
@@ -118,41 +109,41 @@ def directory_of(root: Path, key: str) -> Path:
 
 
 def is_finished(root: Path, job: Job) -> bool:
-    """Whether a job has been finished; its dataset or weights may have been removed since, its records stay."""
+    """Whether a job has been finished; its records stay even if its dataset or weights were removed."""
     return (directory_of(root, job.key) / DONE).is_file()
 
 
-def _has_what(root: Path, job: Job, reader: Job) -> bool:
-    """Whether the directories of a job that another one's command names are there, with weights or pixels."""
-    named = re.findall(rf"\{{{re.escape(job.key)}\}}/([^\s'\"]*)", " ".join(reader.command))
-    paths = [directory_of(root, job.key) / name for name in named]
-    content = (WEIGHTS_FILE, PIXELS_FILE)
-    return all(
-        path.exists() and (not (path / "card.json").exists() or any((path / file).exists() for file in content))
-        for path in paths
-    )
+def _has_inputs(root: Path, job: Job, reader: Job) -> bool:
+    """Whether the directories of a job that another job reads exist, with weights or pixels if they have a card."""
+    names = re.findall(rf"\{{{re.escape(job.key)}\}}/([^\s'\"]*)", " ".join(reader.command))
+    for path in (directory_of(root, job.key) / name for name in names):
+        is_artifact = (path / "card.json").exists()
+        has_content = (path / WEIGHTS_FILE).exists() or (path / PIXELS_FILE).exists()
+        if not path.exists() or (is_artifact and not has_content):
+            return False
+    return True
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What experiments need: ``jobs`` without repeats, and those ``missing`` that have to run, in order."""
+    """All jobs of experiments without repeats, and those that have to run, in order."""
 
     jobs: tuple[Job, ...]
     missing: tuple[Job, ...]
 
 
 def make_plan(wanted: Iterable[Job], root: Path) -> Plan:
-    """Collect jobs and, recursively, what those need that are not finished.
+    """Collect jobs and, recursively, the needs of unfinished ones.
 
-    A finished job is left alone, whatever has become of what it needed. What an unfinished one reads must be there: a
-    job whose encoder was removed since runs again.
+    A finished job does not run again, even if its inputs were removed. An unfinished job needs its inputs: a job whose
+    encoder was removed runs again.
     """
-    there: dict[str, Job] = {}
+    finished: dict[str, Job] = {}
     missing: dict[str, Job] = {}
 
     def require(job: Job, reader: Job | None = None) -> None:
-        if is_finished(root, job) and (reader is None or _has_what(root, job, reader)):
-            there[job.key] = job
+        if is_finished(root, job) and (reader is None or _has_inputs(root, job, reader)):
+            finished[job.key] = job
         elif job.key not in missing:
             for needed in job.needs:
                 require(needed, job)
@@ -160,12 +151,12 @@ def make_plan(wanted: Iterable[Job], root: Path) -> Plan:
 
     for job in wanted:
         require(job)
-    kept = [job for key, job in there.items() if key not in missing]
+    kept = [job for key, job in finished.items() if key not in missing]
     return Plan((*kept, *missing.values()), tuple(missing.values()))
 
 
 def describe(root: Path, plan: Plan) -> None:
-    """Write ``job.json`` of every job; one that was finished and has to run again loses what it had."""
+    """Write ``job.json`` of every job, and empty the directory of a finished job that has to run again."""
     for job in plan.missing:
         directory = directory_of(root, job.key)
         if is_finished(root, job):
@@ -185,11 +176,11 @@ def describe(root: Path, plan: Plan) -> None:
 
 FRAME_BYTES = 3 * 84 * 84
 ENCODER_BYTES, CHECKPOINT_BYTES, AGENT_BYTES = 45_000_000, 200_000_000, 12_000_000
-"""Of an artifact with its heads; of the two checkpoints that a training keeps; of an agent."""
+"""Sizes of an artifact with its heads, of the two checkpoints of a training, and of an agent."""
 
 
 def bytes_of(job: Job) -> tuple[int, int]:
-    """Return what a job leaves on the disk, about, and what it takes besides while it runs."""
+    """Estimate the disk space that a job leaves occupied, and the space that it needs in addition while it runs."""
     facts = job.facts
     if job.kind == "dataset":
         return facts["transitions"] * FRAME_BYTES, 0
@@ -204,7 +195,7 @@ def bytes_of(job: Job) -> tuple[int, int]:
     return 1_000_000, 0
 
 
-# --- what there is --------------------------------------------------------------------------------------------------
+# --- records --------------------------------------------------------------------------------------------------------
 
 
 def write_cells(
@@ -214,9 +205,9 @@ def write_cells(
     request: Mapping[str, Any],
     cells: Iterable[tuple[str, str, Mapping[str, Any]]],
 ) -> None:
-    """Write down what an experiment asks for: label, key of the job and place of each number.
+    """Record the cells of an experiment: label, key of the job and place of each number.
 
-    It is added to what was asked for before, or takes its place.
+    They are added to earlier cells, and replace those with the same label and place.
 
     Raises:
         RecordError: the file is there and cannot be read.
@@ -234,10 +225,10 @@ def write_cells(
 
 @dataclass(frozen=True)
 class Results:
-    """What a reproduction has so far.
+    """The state of a reproduction.
 
     Args:
-        cells: a row per number that an experiment asks for: ``experiment``, ``scale``, ``label``, ``job`` (a key),
+        cells: a row per number of an experiment: ``experiment``, ``scale``, ``label``, ``job`` (a key),
             ``done``, and a column per name of a place, such as ``group``, ``task``, ``encoder_seed``, ``seed``.
         jobs: by key: ``kind``, ``path``, ``done``, ``seconds``, ``attempts``, ``threads``, ``device``, ``machine``,
             ``git_revision``, ``versions``, ``facts``, ``needs``.
@@ -248,13 +239,13 @@ class Results:
 
 
 DESCRIBED = ("kind", "command", "facts", "needs")
-"""What tables read of ``job.json``."""
+"""Keys of ``job.json`` that tables read."""
 MADE = ("seconds", "attempts", "threads", "device", "git_revision", "versions")
-"""What they read of ``done.json``, besides the hardware."""
+"""Keys of ``done.json`` that tables read, besides the hardware."""
 
 
 def load_results(root: str | Path) -> Results:
-    """Read what experiments asked for and what was made of it.
+    """Read the cells of experiments, and their jobs.
 
     Args:
         root: directory of a reproduction.
@@ -293,10 +284,10 @@ def _job_row(path: Path) -> dict[str, Any]:
 
 
 def machine(hardware: Mapping[str, Any]) -> str:
-    """Return the hardware of a record in words; empty where none is recorded."""
+    """Describe the hardware of a record; empty if none is recorded."""
     if not hardware:
         return ""
-    instructions = f" ({there})" if (there := hardware.get("cpu_instructions")) else ""
+    instructions = f" ({hardware['cpu_instructions']})" if hardware.get("cpu_instructions") else ""
     cores = f"{hardware.get('cpu')}{instructions}, {hardware.get('cpu_cores')} cores"
     ram = float(hardware.get("ram_bytes") or 0) / 2**30
     return f"{cores}, {ram:.0f} GiB, {', '.join(hardware.get('gpus') or ()) or 'no GPU'}"

@@ -1,6 +1,6 @@
 """Run the missing jobs of a plan: in processes of this machine, on a Slurm cluster, or on Ray.
 
-Everywhere a job is a process of its own (:meth:`Work.process`), which ends with the process that started it.
+A job always has its own process (:meth:`Work.process`), which ends with the process that started it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from filelock import FileLock, Timeout
+from filelock import FileLock
 
 from crptpro.artifact import read_json, write_json
 from crptpro.errors import CRPTproError, RecordError, SubmissionError
@@ -39,14 +39,17 @@ from crptpro.provenance import cpu_cores, provenance
 logger = logging.getLogger(__name__)
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-"""What numpy and torch read when they are loaded."""
+"""Variables that numpy and torch read at import."""
 LEFTOVERS = {"run": ("checkpoints", "replay")}
-"""Directories that only an unfinished job needs, other than ``checkpoints`` alone: an explorer's replay is kept."""
+"""Directories to remove from a finished job, other than ``checkpoints`` alone: an explorer's replay is kept."""
 WITH_DEVICE = ("encoder", "explored", "finetuned", "run", "probe", "coverage", "embeddings")
+"""Kinds of jobs whose command has a ``--device``."""
 CLUSTER_JOBS, CLUSTER_GPU_CORES = 16, 4
-MAX_REQUEUES = 1_000
-"""How often a Slurm job is queued again when its time was up. Each time it has got further."""
-POLL_S, REFUSED_S, LAST_WAIT_S, SLURM_LOOK_S = 0.2, 60.0, 10.0, 10.0
+MAX_REQUEUES = 1_000  # of a Slurm job at its time limit; it makes progress each time
+POLL_S = 0.2
+REFUSED_S = 60.0  # pause after a queue refused a job
+LAST_WAIT_S = 10.0  # for jobs that were told to stop at once
+SLURM_LOOK_S = 10.0  # between questions about jobs that stop; submitit alone asks every ten minutes
 
 
 # --- one job --------------------------------------------------------------------------------------------------------
@@ -54,7 +57,7 @@ POLL_S, REFUSED_S, LAST_WAIT_S, SLURM_LOOK_S = 0.2, 60.0, 10.0, 10.0
 
 @dataclass(frozen=True)
 class Work:
-    """One job to run, and how; all that travels to where it runs. Only ``root`` and ``key`` say what it is."""
+    """A job to run, and its resources: everything that travels to its machine."""
 
     root: str
     key: str
@@ -65,24 +68,27 @@ class Work:
 
     @property
     def directory(self) -> Path:
-        """Where the job lies."""
+        """Directory of the job."""
         return directory_of(Path(self.root), self.key)
 
     def arguments(self) -> list[str]:
         """Return the whole command line of the job after ``crptpro``."""
         content = read_json(self.directory / DESCRIPTION, error=RecordError)
-        places = {f"{{{key}}}": str(directory_of(Path(self.root), key)) for key in content["needs"]}
-        places[OWN] = str(self.directory)
+        directories = {f"{{{key}}}": str(directory_of(Path(self.root), key)) for key in content["needs"]}
+        directories[OWN] = str(self.directory)
         words = content["command"]
-        for mark, path in places.items():
+        for mark, path in directories.items():
             words = [word.replace(mark, path) for word in words]
-        words += [part for plugin in self.plugins for part in ("--plugin", plugin)]
+        for plugin in self.plugins:
+            words += ["--plugin", plugin]
         if content["kind"] == "dataset":
             words += ["--workers", str(self.workers)]
-        return words + (["--device", self.device] if content["kind"] in WITH_DEVICE else [])
+        if content["kind"] in WITH_DEVICE:
+            words += ["--device", self.device]
+        return words
 
     def process(self, **environment: str) -> subprocess.Popen:
-        """Start a process that runs the job; what it prints goes to the job's log, and Ctrl-C does not reach it."""
+        """Start a process that runs the job and prints to its log; Ctrl-C does not reach it."""
         variables = os.environ | dict.fromkeys(THREAD_VARIABLES, str(self.threads)) | environment
         command = [sys.executable, "-m", "crptpro.experiments.launch"]
         command += [json.dumps(dataclasses.asdict(self)), str(os.getpid())]
@@ -90,11 +96,12 @@ class Work:
             return subprocess.Popen(command, env=variables, start_new_session=True, stdout=log, stderr=log)
 
     def run(self) -> str:
-        """Run the job in this process, or continue it; returns why it is not finished, or an empty text."""
+        """Run or continue the job in this process; returns why it is not finished, or an empty string."""
         now = datetime.datetime.now(datetime.UTC).isoformat(sep=" ", timespec="seconds")
         where = f"{socket.gethostname()}, process {os.getpid()}, {self.device}, {self.threads} threads"
         print(f"--- {now}: {where}", flush=True)
-        with _lock(self.directory):
+        # Another command, or a killed job on its way to a checkpoint, may still hold it.
+        with FileLock(self.directory / LOCK, timeout=1e9, poll_interval=1):
             if (self.directory / DONE).exists():
                 return ""
             torch.set_num_threads(self.threads)
@@ -111,39 +118,31 @@ class Work:
         return reason
 
 
-def _lock(directory: Path) -> Any:
-    """Hold a job; another command, or the job of a killed one that runs to its next checkpoint, may hold it first."""
-    lock = FileLock(directory / LOCK)
-    try:
-        return lock.acquire(timeout=0)
-    except Timeout:
-        logger.warning("Another process runs %s; waiting until it ends.", directory.name)
-        return lock.acquire(timeout=1e9, poll_interval=1)
-
-
 def _clock(directory: Path) -> dict[str, float]:
-    """Begin an attempt; one that was killed lasted until the last change of a file of the job."""
-    before: dict[str, Any] = {"seconds": 0.0, "attempts": 0}
+    """Begin an attempt. A killed one is taken to have lasted until the last change of a file of the job."""
+    clock = {"seconds": 0.0, "attempts": 0}
     with contextlib.suppress(RecordError):
-        before = read_json(directory / CLOCK, error=RecordError)
+        clock = read_json(directory / CLOCK, error=RecordError)
         last = max(path.stat().st_mtime for path in directory.iterdir() if path.name not in (LOCK, LOG))
-        before["seconds"] += max(0.0, last - before["began"])
-    clock = {"seconds": before["seconds"], "attempts": before["attempts"] + 1, "began": time.time()}
+        clock["seconds"] += max(0.0, last - clock["began"])
+    clock["attempts"] += 1
+    clock["began"] = time.time()
     write_json(directory / CLOCK, clock)
     return clock
 
 
 def _command(arguments: Sequence[str], log: Path) -> str:
+    """Run a ``crptpro`` command in this process; returns why it failed, or an empty string."""
     from crptpro.cli import main
 
     sys.argv = ["crptpro", *arguments]
     try:
         main()
     except SystemExit as end:
-        if end.code in (130, 143):  # it was stopped
+        if end.code in (130, 143):  # stopped by a signal
             raise
         return _last_line(log) if end.code else ""
-    except Exception as error:  # a defect keeps its traceback
+    except Exception as error:  # a defect: the log needs its traceback
         traceback.print_exc()
         return f"{type(error).__name__}: {error}"
     return ""
@@ -155,7 +154,7 @@ def _last_line(path: Path) -> str:
 
 
 def _run_here(work: Work) -> None:
-    """Run a job as the function that a cluster calls; one that is cancelled stops at its next checkpoint."""
+    """Run a job on a node of a cluster; a cancelled job stops at its next checkpoint."""
     process = work.process()
     try:
         process.wait()
@@ -164,11 +163,11 @@ def _run_here(work: Work) -> None:
         process.wait()
 
 
-# --- where jobs run -------------------------------------------------------------------------------------------------
+# --- launchers ------------------------------------------------------------------------------------------------------
 #
-# A launcher's `start(work, is_exclusive=)` raises SubmissionError if a queue does not take the job now. What it returns
-# has `poll()`: None while the job runs or is queued, then why it was lost, or an empty text; and `stop()`: to end at
-# the next checkpoint, and asked again at once. `is_one_machine` says whether all jobs share this machine's cores.
+# A launcher's `start(work, is_exclusive=)` raises SubmissionError if a queue does not take the job now. It returns a
+# handle with `poll()`: None while the job runs or is queued, then why it was lost, or an empty string; and
+# `stop(at_once)`: end at the next checkpoint, or at once. `is_one_machine`: all jobs share this machine's cores.
 
 
 class LocalLauncher:
@@ -177,7 +176,8 @@ class LocalLauncher:
     is_one_machine = True
 
     def __init__(self, gpus: Sequence[str] = ()) -> None:
-        self.gpus, self._running = tuple(gpus), list[_Process]()
+        self.gpus = tuple(gpus)
+        self._running: list[_Process] = []
 
     def start(self, work: Work, *, is_exclusive: bool) -> _Process:
         """Start a job on the GPU that has the fewest."""
@@ -193,7 +193,6 @@ class LocalLauncher:
 class _Process:
     process: subprocess.Popen
     gpu: str
-    is_stopping: bool = False
 
     def poll(self) -> str | None:
         status = self.process.poll()
@@ -201,15 +200,14 @@ class _Process:
             return None
         return f"its process was ended by {signal.Signals(-status).name}" if status < 0 else ""
 
-    def stop(self) -> None:
-        self.process.send_signal(signal.SIGINT if self.is_stopping else signal.SIGTERM)
-        self.is_stopping = True
+    def stop(self, at_once: bool) -> None:
+        self.process.send_signal(signal.SIGINT if at_once else signal.SIGTERM)
 
 
 class SlurmLauncher:
     """A Slurm cluster, whose nodes share ROOT and the environment of this process.
 
-    The parameters are those of submitit's executor; ``cluster`` is its name of it, ``"local"`` in tests.
+    The parameters are those of submitit's executor; its ``cluster`` is ``"local"`` in tests.
     """
 
     is_one_machine = False
@@ -222,28 +220,31 @@ class SlurmLauncher:
                 "--launcher slurm needs sbatch and srun, which are not here: call it on a login node of the cluster, "
                 "or choose --launcher local."
             )
-        self.parameters, self.cluster = dict(parameters), cluster
+        self.parameters = dict(parameters)
+        self.cluster = cluster
 
     def start(self, work: Work, *, is_exclusive: bool) -> _SlurmJob:
-        """Queue a job; an exclusive one asks for a node of its own."""
+        """Queue a job; an exclusive job requests a whole node."""
         from submitit import AutoExecutor
         from submitit.core.utils import FailedJobError
 
         parent = Path(work.root) / "submitted"
         parent.mkdir(exist_ok=True)
         folder = Path(tempfile.mkdtemp(prefix=f"{work.key}-", dir=parent))
-        # Since Slurm 22.05 srun does not ask for the cores that sbatch was given, and would run the job on one.
+        # Since Slurm 22.05 srun does not inherit the cores of sbatch, and would run the job on one.
         setup = [f"export {name}={work.threads}" for name in (*THREAD_VARIABLES, "SRUN_CPUS_PER_TASK")]
-        own = {"job_name": work.key, "cpus_per_task": work.threads, "setup": setup, "exclusive": is_exclusive}
-        asked = {f"slurm_{name}": value for name, value in {**own, **self.parameters}.items() if value}
+        parameters = {"job_name": work.key, "cpus_per_task": work.threads, "setup": setup, "exclusive": is_exclusive}
+        parameters |= self.parameters
         executor = AutoExecutor(folder, cluster=self.cluster, slurm_max_num_timeout=MAX_REQUEUES)
-        executor.update_parameters(**asked)
+        executor.update_parameters(**{f"slurm_{name}": value for name, value in parameters.items() if value})
         try:
             return _SlurmJob(executor.submit(_Submitted(work)), folder, work.directory / LOG)
         except FailedJobError as reason:
             shutil.rmtree(folder, ignore_errors=True)
-            said = (str(reason).strip().splitlines() or ["it gave no reason"])[-1]
-            raise SubmissionError(f"sbatch refused a job: {said} Change --partition, --hours or --sbatch.") from reason
+            last_line = (str(reason).strip().splitlines() or ["it gave no reason"])[-1]
+            raise SubmissionError(
+                f"sbatch refused a job: {last_line} Change --partition, --hours or --sbatch."
+            ) from reason
 
 
 @dataclass(frozen=True)
@@ -254,7 +255,7 @@ class _Submitted:
         _run_here(self.work)
 
     def checkpoint(self) -> Any:
-        """Have Slurm queue the job again when its time is up; it continues from its own checkpoint."""
+        """Let Slurm queue the job again at its time limit; it continues from its own checkpoint."""
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(self)
@@ -269,30 +270,30 @@ class _SlurmJob:
     looked: float = -math.inf
 
     def poll(self) -> str | None:
-        # Left alone, submitit asks Slurm every ten minutes.
         is_due = self.is_stopping and time.monotonic() - self.looked > SLURM_LOOK_S
-        self.looked = time.monotonic() if is_due else self.looked
+        if is_due:
+            self.looked = time.monotonic()
         if not self.job.done(force_check=is_due):
             return None
         reason = ""
         if type(self.job.exception()).__name__ == "UncompletedJobError":
             reason = f"the job was lost ({str(self.job.state).lower()})"
-            with open(self.log, "a", encoding="utf-8") as log:  # it may not have got as far as its log
+            with open(self.log, "a", encoding="utf-8") as log:  # the job may have died before it opened its log
                 log.write((self.job.stderr() or "").strip() + "\n")
         shutil.rmtree(self.folder, ignore_errors=True)
         return reason
 
-    def stop(self) -> None:
-        for options in [[]] if self.is_stopping else [["--state=PENDING"], ["--signal=TERM"]]:
+    def stop(self, at_once: bool) -> None:
+        self.is_stopping = True
+        for options in [[]] if at_once else [["--state=PENDING"], ["--signal=TERM"]]:
             with contextlib.suppress(OSError):
                 subprocess.call(["scancel", *options, self.job.job_id])
-        self.is_stopping = True
 
 
 class RayLauncher:
     """A Ray cluster whose nodes share ROOT; each job has a number, or a fraction, of its GPUs.
 
-    Without an address it is that of ``RAY_ADDRESS``, one that runs here, or a new one on this machine.
+    Without an address: the cluster of ``RAY_ADDRESS``, one that runs here, or a new one on this machine.
     """
 
     is_one_machine = False
@@ -305,17 +306,18 @@ class RayLauncher:
         address = address or os.environ.get("RAY_ADDRESS") or None
         try:
             host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
-            if colon and port.isdigit():  # Ray itself would ask for minutes where nobody listens
+            if colon and port.isdigit():  # Ray itself would retry for minutes
                 socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
         except (OSError, RuntimeError, ValueError) as reason:
-            said = (str(reason).strip().splitlines() or [type(reason).__name__])[0]
+            first_line = (str(reason).strip().splitlines() or [type(reason).__name__])[0]
             raise CRPTproError(
-                f"The Ray cluster {address or 'of this machine'} cannot be used: {said}. Give the address that "
+                f"The Ray cluster {address or 'of this machine'} cannot be used: {first_line}. Give the address that "
                 "`ray start --head` printed, as --ray-address HOST:6379, or ray://HOST:10001."
             ) from reason
-        # A worker ends with its job: nothing of it is left for the next.
-        self._ray, self._run = ray, ray.remote(max_retries=0, max_calls=1, num_gpus=gpus)(_run_here)
+        self._ray = ray
+        # A worker process ends with its job, so that the next job starts afresh.
+        self._run = ray.remote(max_retries=0, max_calls=1, num_gpus=gpus)(_run_here)
 
     def start(self, work: Work, *, is_exclusive: bool) -> _RayJob:
         """Queue a job; Ray starts it where cores and GPUs are free."""
@@ -326,7 +328,6 @@ class RayLauncher:
 class _RayJob:
     ray: Any
     task: Any
-    is_stopping: bool = False
 
     def poll(self) -> str | None:
         if not self.ray.wait([self.task], timeout=0)[0]:
@@ -337,9 +338,8 @@ class _RayJob:
             return f"the job was lost ({type(reason).__name__})"
         return ""
 
-    def stop(self) -> None:
-        self.ray.cancel(self.task, force=self.is_stopping)
-        self.is_stopping = True
+    def stop(self, at_once: bool) -> None:
+        self.ray.cancel(self.task, force=at_once)
 
 
 # --- which jobs, when -----------------------------------------------------------------------------------------------
@@ -347,7 +347,7 @@ class _RayJob:
 
 @dataclass(frozen=True)
 class Failure:
-    """A job that is not finished; without a ``log`` it was not started, since something that it needs failed."""
+    """A job that is not finished; without a ``log`` it was not started, because a job that it needs failed."""
 
     key: str
     reason: str
@@ -366,30 +366,30 @@ def run_jobs(
     plugins: Sequence[str] = (),
     attempts: int = 3,
 ) -> list[Failure]:
-    """Run every missing job of a plan as soon as all that it needs is finished.
+    """Run every missing job of a plan as soon as all jobs that it needs are finished; returns what is not finished.
 
-    At most ``jobs`` run at a time, with ``cores`` each; one that must be alone on its machine starts when nothing else
-    can. Each of the ``attempts`` at a job continues the one before. Ctrl-C, SIGTERM and SIGHUP stop all jobs at their
-    next checkpoint, a second one at once.
-
-    Returns:
-        What was not finished: failures first, then what depends on them.
+    At most ``jobs`` run at a time, with ``cores`` each; an exclusive job starts when no other can. Each of the
+    ``attempts`` at a job continues the one before. Ctrl-C, SIGTERM and SIGHUP stop all jobs at their next checkpoint, a
+    second one at once; KeyboardInterrupt or SystemExit is raised when all jobs have ended.
 
     Raises:
         SubmissionError: a queue refuses the first job.
-        KeyboardInterrupt: after Ctrl-C, when all jobs have ended; likewise SystemExit.
     """
     describe(root, plan)
-    queue = _Queue(plan, Work(str(root.resolve()), "", device, cores, cores, plugins), launcher, jobs, attempts)
+    usual = Work(str(root.resolve()), "", device, threads=cores, workers=cores, plugins=plugins)
+    queue = _Queue(plan, usual, launcher, jobs, attempts)
     with _signals_end_it():
         try:
-            while queue.waiting or queue.running:
+            while queue.running or queue.ready():
                 queue.look()
                 if not queue.start():
                     time.sleep(POLL_S)
         except BaseException:
             queue.stop()
             raise
+    for job in queue.waiting:
+        missing = next(needed.key for needed in job.needs if needed.key not in queue.finished)
+        queue.failures.append(Failure(job.key, f"needs {missing}"))
     return queue.failures
 
 
@@ -399,7 +399,7 @@ def _leave(number: int, frame: object) -> None:
 
 @contextlib.contextmanager
 def _signals_end_it() -> Iterator[None]:
-    """Have SIGTERM and SIGHUP interrupt as Ctrl-C does; what the caller ignores (nohup) stays ignored."""
+    """Let SIGTERM and SIGHUP interrupt like Ctrl-C; a signal that the caller ignores (nohup) stays ignored."""
     numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN]
     is_main = threading.current_thread() is threading.main_thread()
     before = {number: signal.signal(number, _leave) for number in numbers if is_main}
@@ -412,21 +412,32 @@ def _signals_end_it() -> Iterator[None]:
 
 class _Queue:
     def __init__(self, plan: Plan, usual: Work, launcher: Any, jobs: int, attempts: int) -> None:
-        self.usual, self.launcher, self.jobs, self.attempts = usual, launcher, jobs, attempts
-        self.waiting, self.count = list(plan.missing), len(plan.jobs)
+        self.usual = usual
+        self.launcher = launcher
+        self.jobs = jobs
+        self.attempts = attempts
+        self.waiting = list(plan.missing)
         self.finished = {job.key for job in plan.jobs} - {job.key for job in plan.missing}
+        self.count = len(plan.jobs)
         self.running: dict[Job, tuple[Any, float]] = {}
         self.failures: list[Failure] = []
         self.tried: Counter[str] = Counter()
-        self.is_stopping, self.resumes = False, -math.inf
+        self.is_stopping = False
+        self.resumes = -math.inf
+
+    def ready(self) -> list[Job]:
+        """Return the waiting jobs whose needs are finished."""
+        return [job for job in self.waiting if all(needed.key in self.finished for needed in job.needs)]
 
     def start(self) -> bool:
-        """Start what can be started, and return whether anything was."""
+        """Start the jobs that can start, and return whether there were any."""
         if time.monotonic() < self.resumes or any(job.is_exclusive for job in self.running):
             return False
-        ready = [job for job in self.waiting if all(needed.key in self.finished for needed in job.needs)]
-        shared = [job for job in ready if not job.is_exclusive]
-        chosen = shared[: self.jobs - len(self.running)] or ([] if shared or self.running else ready[:1])
+        ready = self.ready()
+        chosen = [job for job in ready if not job.is_exclusive]
+        if not chosen and not self.running:
+            chosen = ready[:1]
+        chosen = chosen[: self.jobs - len(self.running)]
         share = max(1, self.jobs // max(1, len(self.running) + len(chosen)))
         for job in chosen:
             work = replace(self.usual, key=job.key)
@@ -438,7 +449,7 @@ class _Queue:
                 handle = self.launcher.start(work, is_exclusive=job.is_exclusive)
             except SubmissionError as refusal:
                 if not self.tried:
-                    raise  # what is wrong with the first is wrong with all
+                    raise  # every other job would be refused, too
                 self.resumes = time.monotonic() + REFUSED_S
                 logger.warning("%s: %s It is tried again in %g s.", job.key, refusal, REFUSED_S)
                 return False
@@ -449,18 +460,20 @@ class _Queue:
         return bool(chosen)
 
     def look(self) -> None:
+        """Take in the jobs that have ended."""
         for job, (handle, began) in list(self.running.items()):
             lost = handle.poll()
             if lost is None:
                 continue
             del self.running[job]
             directory = directory_of(Path(self.usual.root), job.key)
-            took, log, tried = duration(time.monotonic() - began), directory / LOG, self.tried[job.key]
-            # The job's own record decides: it may have been lost after its work was done.
+            took = duration(time.monotonic() - began)
+            # The job's own record decides: the job may have been lost after its work was done.
             if (directory / DONE).exists():
                 self.finished.add(job.key)
                 logger.info("%s: finished in %s (%d of %d)", job.key, took, len(self.finished), self.count)
                 continue
+            log, tried = directory / LOG, self.tried[job.key]
             reason = lost or _last_line(log) or "it ended unfinished"
             if self.is_stopping:
                 logger.info("%s: stopped after %s", job.key, took)
@@ -471,14 +484,6 @@ class _Queue:
             else:
                 logger.error("%s: failed after %s: %s (log: %s)", job.key, took, reason, log)
                 self.failures.append(Failure(job.key, reason, log, tried))
-                self._skip({job.key})
-
-    def _skip(self, lost: set[str]) -> None:
-        for job in list(self.waiting):
-            if failed := [needed.key for needed in job.needs if needed.key in lost]:
-                self.waiting.remove(job)
-                lost.add(job.key)
-                self.failures.append(Failure(job.key, f"needs {failed[0]}"))
 
     def stop(self) -> None:
         """Stop all jobs at their next checkpoint and wait for them; interrupted once more, stop them at once."""
@@ -487,7 +492,7 @@ class _Queue:
             logger.warning("Stopping at the next checkpoints; press Ctrl-C again to stop at once.")
         for seconds in (math.inf, LAST_WAIT_S):
             for handle, _ in self.running.values():
-                handle.stop()
+                handle.stop(at_once=seconds < math.inf)
             deadline = time.monotonic() + seconds
             with contextlib.suppress(KeyboardInterrupt, SystemExit):
                 while self.running and time.monotonic() < deadline:
@@ -496,7 +501,7 @@ class _Queue:
 
 
 def duration(seconds: float) -> str:
-    """Return a duration in a form that one reads.
+    """Return a readable duration.
 
     Examples:
         >>> duration(42.4), duration(4000), duration(100_000)
@@ -507,22 +512,16 @@ def duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 7_200 else f"{seconds / 3_600:.1f} h"
 
 
-# --- what jobs have -------------------------------------------------------------------------------------------------
+# --- resources ------------------------------------------------------------------------------------------------------
 
 
 def divide(
     launcher: str, *, device: str, jobs: int | None, cores: int | None, jobs_per_gpu: int = 1
 ) -> tuple[int, int, tuple[str, ...]]:
-    """Fill in what the user left open.
+    """Return the number of jobs at a time, the cores of each, and the GPUs of this machine that they share.
 
-    On one machine there is a job per core, or, with ``device="cuda"``, per GPU times ``jobs_per_gpu``, which is also
-    the most. The cores are divided among them. On a cluster there are 16 jobs, with a core each, or four beside a GPU.
-
-    Returns:
-        How many jobs at a time, the cores of each, and the GPUs of this machine that they share.
-
-    Raises:
-        CRPTproError: a number below 1, or no GPU where one is asked for.
+    On one machine the default is a job per core, or, with ``device="cuda"``, ``jobs_per_gpu`` jobs per GPU, which is
+    also the most. The jobs share the cores. On a cluster the default is 16 jobs, with a core each, or four with a GPU.
     """
     for name, value in (("jobs", jobs), ("cores-per-job", cores), ("jobs-per-gpu", jobs_per_gpu)):
         if value is not None and value < 1:
@@ -546,10 +545,7 @@ def divide(
 def slurm_parameters(
     *, partition: str | None, hours: float, memory_gb: float, sbatch: Sequence[str], has_gpu: bool
 ) -> dict[str, Any]:
-    """Return the parameters of submitit's Slurm executor that hold for every job.
-
-    Raises:
-        CRPTproError: no time, no memory, or an option that is not ``key=value``.
+    """Return the parameters of submitit's Slurm executor that all jobs share.
 
     Examples:
         >>> slurm_parameters(partition="short", hours=2, memory_gb=8, sbatch=("qos=high",), has_gpu=False)
@@ -557,19 +553,21 @@ def slurm_parameters(
     """
     if not (hours * 60 >= 1 and memory_gb >= 1):
         raise CRPTproError(f"--hours {hours:g} --memory-gb {memory_gb:g}: a job needs a minute and 1 GB at least.")
-    found: dict[str, Any] = {"time": round(hours * 60), "mem": f"{round(memory_gb * 1024)}M"}
-    found |= {} if partition is None else {"partition": partition}
-    found |= {"gpus_per_node": 1} if has_gpu else {}
+    parameters: dict[str, Any] = {"time": round(hours * 60), "mem": f"{round(memory_gb * 1024)}M"}
+    if partition is not None:
+        parameters["partition"] = partition
+    if has_gpu:
+        parameters["gpus_per_node"] = 1
     for option in sbatch:
         key, equals, value = option.partition("=")
         if not key or not equals:
             raise CRPTproError(f"--sbatch {option}: write key=value, e.g. qos=high or account=robots.")
-        found.setdefault("additional_parameters", {})[key.lstrip("-")] = value
-    return found
+        parameters.setdefault("additional_parameters", {})[key.lstrip("-")] = value
+    return parameters
 
 
 def _end_with(parent: int) -> None:
-    """Stop at the next checkpoint when the command that started this job is gone: nobody would take in its result."""
+    """Stop at the next checkpoint when the command that started this job is gone."""
     while os.getppid() == parent:
         time.sleep(1)
     print("the command that started this job is gone: leaving at the next checkpoint", flush=True)
@@ -579,6 +577,6 @@ def _end_with(parent: int) -> None:
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     signal.signal(signal.SIGTERM, _leave)
-    signal.signal(signal.SIGUSR2, signal.SIG_IGN)  # it tells submitit that the time is up
+    signal.signal(signal.SIGUSR2, signal.SIG_IGN)  # Slurm's notice of the time limit, which submitit handles
     threading.Thread(target=_end_with, args=(int(sys.argv[2]),), daemon=True).start()
     raise SystemExit(bool(Work(**json.loads(sys.argv[1])).run()))

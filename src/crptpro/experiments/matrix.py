@@ -1,23 +1,23 @@
-"""What each experiment of the paper asks for, at which scale: cells of its tables, and the job behind each.
+"""The experiments of the paper at each scale: the cells of its tables, and the job behind each cell.
 
-From top to bottom: systems and scales, what a user may ask for, the job of each kind, and then the experiments.
+From top to bottom: systems and scales, a user's request, the jobs of each kind, and the experiments.
 """
 
 from __future__ import annotations
 
 import inspect
-import re
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any, NamedTuple
 
+from crptpro.data.collect import dataset_path
 from crptpro.domains import GROUPS, get_domain
 from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.experiments.jobs import OWN, Job, options, plugins_digest
-from crptpro.experiments.published import FINETUNE_UPDATES
+from crptpro.experiments.published import COLORS, FINETUNE_UPDATES, UNSEEN, ScoreRow
 from crptpro.objectives import Method, get_method
 from crptpro.seeding import derive_seed
 from crptpro.training.explore import ExploreConfig, plan_exploration
@@ -34,17 +34,9 @@ METHODS = (
 )  # fmt: skip
 """Every system of the comparison, in the order of tables."""
 PRETRAINED = ("crptpro", FAST, "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-s", "becl")
-"""Those with a pre-training of their own."""
+"""Systems with a pre-training of their own."""
 CROSS_DOMAIN = ("crptpro", FAST, "proto-rl-c", "atc", "apt-c", "becl", RANDOM)
-"""Those whose one encoder serves several domains, with the control."""
-
-UNSEEN_TASKS = {
-    "A": ("pendulum_swingup", "finger_spin", "hopper_hop", "reach_duplo", "cartpole_swingup_sparse"),
-    "C": ("cheetah_run", "walker_run", "quadruped_run", "pendulum_swingup", "cartpole_swingup_sparse"),
-}
-"""Tasks of domains that a group's encoder never saw, in the paper's table."""
-COLORS_TASKS = {"C": ("reach_duplo", "pendulum_swingup", "cheetah_run")}
-"""Tasks with a reversed background, likewise."""
+"""Systems with one encoder for several domains, and the untrained control."""
 
 DISPERSION, NO_DISPERSION = {"intr_loss_coef": 5e-3}, {"intr_loss_coef": 0.0}
 VARIANTS: dict[str, tuple[tuple[str, Settings], ...]] = {
@@ -53,38 +45,38 @@ VARIANTS: dict[str, tuple[tuple[str, Settings], ...]] = {
     "proto-rl-c": (("proto-rl-c with dispersion", DISPERSION), ("proto-rl-c", NONE)),
     "proto-rl-s": (("proto-rl-s with dispersion", DISPERSION), ("proto-rl-s", NONE)),
 }
-"""Methods with prototypes, the paper's with and without the dispersion loss: label and options of the loss."""
+"""Methods with prototypes, those of the paper with and without the dispersion loss: label and options of the loss."""
 SINGLE_DISPERSION = {"cheetah": 1e-3, "hopper": 5e-4}
 """Proto-RL(S)'s weight of the dispersion loss in the paper's ablation, which has these two domains."""
 SINGLE_DOMAIN = {"A": "walker", "B": "pendulum", "C": "finger", "D": "walker"}
-"""The domain of a group whose encoder stands for an (S) method where one is enough; B's and C's are the paper's."""
+"""The domain of a group that represents an (S) method where one encoder is enough; B's and C's are the paper's."""
 PROBED_UNSEEN = {
     "A": ("finger", "pendulum"), "B": ("finger", "walker"), "C": ("walker", "pendulum"), "D": ("cheetah", "finger"),
 }  # fmt: skip
 """Domains outside a group on which its encoders are probed."""
 
 SEEDS = 1_000
-"""Seeds of a level lie below this number, so that DrQ's runs, which have both levels in one, are all different."""
+"""Seeds of each level are below this number: DrQ combines both levels in one seed, and all of them differ."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Every budget of every experiment; the values here are the paper's."""
+    """Every budget of every experiment; the defaults are the paper's."""
 
     name: str
     transitions: int = 100_000  # random transitions per domain
-    quality: str | None = None  # render quality of everything; ``None`` for the exact one
+    quality: str | None = None  # render quality of datasets; ``None`` for the exact one
     updates: int = 50_000  # encoder updates on datasets, over all domains
-    batch_size: int | None = None  # transitions per pre-training update; ``None`` for the method's own
+    training: Settings = field(default_factory=dict)  # settings of every encoder's training
     loss: Mapping[str, Settings] = field(default_factory=dict)  # options of losses, by name of their class
     # settings of exploring, with the encoder update interval of a method that makes one update each time
     explore: Settings = field(default_factory=dict)
-    explore_single: Settings = field(default_factory=dict)  # the same of the (S) methods
-    single_ablation: Settings = field(default_factory=dict)  # what these have in ``ablation`` besides
+    explore_single: Settings = field(default_factory=dict)  # the same for the (S) methods
+    single_ablation: Settings = field(default_factory=dict)  # further settings of the (S) methods in ``ablation``
     run: Settings = field(default_factory=dict)  # settings of every downstream run
-    seeds: int = 3  # downstream runs on each encoder unless the caller says otherwise
+    seeds: int = 3  # downstream runs on each encoder by default
     alphas: tuple[float, ...] = (5e-4, 5e-2, 5e-1)  # of ``sensitivity``, besides none and the method's own
-    capacities: tuple[int, ...] = (10_000, 50_000, 100_000)  # likewise, random transitions per domain
+    capacities: tuple[int, ...] = (10_000, 50_000, 100_000)  # of ``sensitivity``, random transitions per domain
     probe_samples: int = 4_000  # observations of a state probe
     probe_transitions: int | None = None  # of a dataset that is probed, if not ``transitions``
     timing_updates: int = 100  # encoder updates that ``efficiency`` times, after as many to warm up
@@ -92,21 +84,12 @@ class Scale:
     coverage_samples: int = 1_024  # observations of a coverage estimate
     embedded_samples: int = 125  # observations of each source in ``visualize``
 
-    @property
-    def training(self) -> dict[str, Any]:
-        """Settings of every encoder's training."""
-        return {} if self.batch_size is None else {"batch_size": self.batch_size}
-
-    def finetune_updates(self, domain: str) -> int:
-        """Return the encoder updates of fine-tuning on a domain: in proportion to the paper's."""
-        return max(2, FINETUNE_UPDATES.get(domain, 3_000) * self.updates // 50_000)
-
 
 # 20,000 decisions and, after the random ones, as many encoder updates as the methods on random data have.
 _SMALL_EXPLORER = {"env_steps": 40_000, "checkpoint_interval_env_steps": 2_000, "encoder_update_interval": 6}
 _TINY_EXPLORER = {
     "env_steps": 120, "random_agent_steps": 8, "hidden_dim": 16, "queue_size": 32,
-    "checkpoint_interval_env_steps": 60, "encoder_update_interval": 2,
+    "checkpoint_interval_env_steps": 60, "encoder_update_interval": 2, "quality": "fast",
 }  # fmt: skip
 
 PAPER = Scale("paper", single_ablation={"env_steps": 200_000})
@@ -114,7 +97,7 @@ SMALL = Scale(
     "small",
     transitions=20_000,
     updates=3_000,
-    batch_size=128,
+    training={"batch_size": 128},
     # As many prototypes as rows, as in the paper (512 of both): with more, most rows are their own nearest candidates
     # and the prototype reward is 0.
     loss={"ProtoLoss": {"num_prototypes": 128}},
@@ -137,7 +120,7 @@ TINY = Scale(
     transitions=130,  # an episode of manipulation has 125
     quality="fast",
     updates=6,
-    batch_size=4,
+    training={"batch_size": 4},
     loss={
         "ProtoLoss": {"num_prototypes": 16, "latent_dim": 8, "hidden_dim": 16}, "ATCLoss": {"latent_dim": 8},
         "SimCLRLoss": {"latent_dim": 8}, "BeCLLoss": {"hidden_dim": 16},
@@ -147,7 +130,7 @@ TINY = Scale(
     run={
         "env_steps": 60, "random_agent_steps": 12, "batch_size": 4, "replay_capacity": 40, "hidden_dim": 16,
         "queue_size": 32, "eval_interval_env_steps": 60, "eval_episodes": 1, "checkpoint_interval_env_steps": 30,
-        "log_interval_env_steps": 10,
+        "log_interval_env_steps": 10, "quality": "fast",
     },
     seeds=1,
     alphas=(5e-2,),
@@ -158,12 +141,12 @@ TINY = Scale(
     coverage_samples=32,
     embedded_samples=8,
 )  # fmt: skip
-"""Minutes; shows that everything runs, and nothing else."""
+"""Minutes; it only shows that everything runs."""
 SCALES: dict[str, Scale] = {scale.name: scale for scale in (TINY, SMALL, PAPER)}
 
 
 class Cell(NamedTuple):
-    """One number that an experiment asks for, what gives it, and where it stands: ``{"group": "A", ...}``.
+    """One number of an experiment: the job that gives it, and its place, such as ``{"group": "A", ...}``.
 
     The label is the system or variant, a row of the tables: ``"crptpro"``, ``"proto-rl-c with dispersion"``.
     """
@@ -175,10 +158,10 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class Request:
-    """What part of an experiment is wanted, at which scale; what is empty is the experiment's own choice.
+    """The requested part of an experiment, and its scale; an empty field is the experiment's own choice.
 
     Encoder seeds are the first level (collection, exploration, pre-training), seeds the second: downstream runs on each
-    encoder. Device and threads, of a job that is alone on its machine, matter to timings only.
+    encoder. Device and threads matter only to timings, whose jobs are alone on their machine.
 
     Raises:
         UnknownNameError: for a method, a group or a task.
@@ -196,34 +179,46 @@ class Request:
     threads: int = 1
 
     def __post_init__(self) -> None:
-        """Refuse names that nobody knows; a domain's name becomes that of its task."""
+        """Refuse unknown names; a domain's name becomes that of its task."""
         for method in self.methods:
             get_method(method)
         for group in self.groups:
             if group not in GROUPS:
                 raise UnknownNameError(f"There is no group {group!r}; choose from {', '.join(GROUPS)}.")
-        # dm_control's manipulation tasks may be spelled in several ways; a run is named by one of them.
-        named = [(task, get_domain(task)) for task in self.tasks]
-        tasks = (d.task if task == d.name or d.source == "manipulation" else task for task, d in named)
-        object.__setattr__(self, "tasks", tuple(dict.fromkeys(tasks)))
+        object.__setattr__(self, "tasks", tuple(dict.fromkeys(get_domain(task).task for task in self.tasks)))
         object.__setattr__(self, "seeds", tuple(self.seeds) or tuple(range(self.scale.seeds)))
         for name in ("encoder_seeds", "seeds"):
-            given = tuple(as_int(seed, name) for seed in getattr(self, name))
-            if not given or len(set(given)) != len(given) or not all(0 <= seed < SEEDS for seed in given):
-                raise CRPTproError(f"`{name}` must be different numbers from 0 to {SEEDS - 1}, got {given}.")
-            object.__setattr__(self, name, given)
-
-    @property
-    def domains(self) -> tuple[str, ...]:
-        """Domains of the tasks asked for."""
-        return tuple(dict.fromkeys(get_domain(task).name for task in self.tasks))
+            seeds = tuple(as_int(seed, name) for seed in getattr(self, name))
+            if not seeds or len(set(seeds)) != len(seeds) or not all(0 <= seed < SEEDS for seed in seeds):
+                raise CRPTproError(f"`{name}` must be different numbers from 0 to {SEEDS - 1}, got {seeds}.")
+            object.__setattr__(self, name, seeds)
 
     def tasks_in(self, domains: Iterable[str]) -> list[str]:
-        """Return the tasks asked for that are in these domains, or one of each domain."""
+        """Return the requested tasks of these domains; without requested tasks, one task of each domain."""
         domains = list(domains)
-        if self.tasks:
-            return [task for task in self.tasks if get_domain(task).name in domains]
-        return [get_domain(domain).task for domain in domains]
+        tasks = self.tasks or [get_domain(domain).task for domain in domains]
+        return [task for task in tasks if get_domain(task).name in domains]
+
+    def seen_tasks(self, groups: Iterable[str]) -> list[tuple[str, str]]:
+        """Return group and task for each requested group, or each of these, and each of its tasks."""
+        return [(group, task) for group in self.groups or groups for task in self.tasks_in(GROUPS[group])]
+
+    def encoders(
+        self, systems: Iterable[str], groups: Iterable[str] = "A"
+    ) -> Iterator[tuple[str, int, str, tuple[str, ...]]]:
+        """Yield group, encoder seed, system and domains of each encoder.
+
+        An (S) method has one encoder per requested domain of the group, or that of :data:`SINGLE_DOMAIN`.
+        """
+        requested = [get_domain(task).name for task in self.tasks]
+        for group, seed in product(self.groups or groups, self.encoder_seeds):
+            for system in self.methods or systems:
+                if is_single_domain(system):
+                    single = [domain for domain in dict.fromkeys(requested) if domain in GROUPS[group]]
+                    for domain in single or [SINGLE_DOMAIN[group]]:
+                        yield group, seed, system, (domain,)
+                else:
+                    yield group, seed, system, GROUPS[group]
 
 
 # --- jobs at a scale ------------------------------------------------------------------------------------------------
@@ -236,7 +231,7 @@ def pretraining_of(system: str) -> Method:
 
 
 def is_single_domain(system: str) -> bool:
-    """Whether a system has an encoder per domain because it cannot be trained on several: the (S) methods."""
+    """Whether a system needs an encoder per domain: the (S) methods."""
     exploration = pretraining_of(system).exploration
     return exploration is not None and exploration.is_single_domain
 
@@ -257,8 +252,7 @@ def _encoder_of(job: Job) -> str:
 
 
 def _dataset_of(job: Job) -> str:
-    directory = re.sub(r"[^\w.+-]+", "-", job.facts["domain"])
-    return f"{{{job.key}}}/{directory}"
+    return str(dataset_path(f"{{{job.key}}}", job.facts["domain"]))
 
 
 def dataset(scale: Scale, domain: str, seed: int, transitions: int | None = None) -> Job:
@@ -280,45 +274,46 @@ def encoder(
     transitions: int | None = None,
     loss: Settings = NONE,
     explore: Settings = NONE,
+    data: Sequence[Job] = (),
 ) -> Job:
-    """Return the encoder that a system has for domains, in ``<job>/encoder``.
+    """Return a system's encoder for domains, in ``<job>/encoder``.
 
-    `loss` and `explore` are settings instead of, or besides, the scale's.
+    `transitions`, `loss` and `explore` replace settings of the scale, and `data` its datasets.
     """
     method = pretraining_of(system)
     names = [get_domain(domain).name for domain in domains]
     title = f"{method.name} {'+'.join(names)} seed {seed}"
-    command, facts = ["--method", method.name, "--out", OWN], {"method": method.name, "seed": seed}
+    where = ["--method", method.name, "--out", OWN]
+    facts: dict[str, Any] = {"method": method.name, "seed": seed}
     if method.loss_class is None:
         data = [dataset(scale, name, seed, transitions) for name in names] if system == STANDARDISED else []
-        command = ["pretrain", *map(_dataset_of, data), *command, *options(seed=seed)]
+        command = ["pretrain", *map(_dataset_of, data), *where, *options(seed=seed)]
         return Job("untrained", title if data else f"seed {seed}", tuple(command), facts, tuple(data))
-    # What the method's loss has anyway is no option: it would make the same encoder another job.
-    usual = {**_loss_defaults(method), **method.loss_options}
-    asked = {**scale.loss.get(method.loss_class.__name__, {}), **loss}
-    settings = {"loss": {k: v for k, v in asked.items() if k not in usual or usual[k] != v}, **scale.training}
+    # A default of the method's loss is no option: it would make the same encoder another job.
+    defaults = {**_loss_defaults(method), **method.loss_options}
+    chosen = {**scale.loss.get(method.loss_class.__name__, {}), **loss}
+    settings = {"loss": {k: v for k, v in chosen.items() if k not in defaults or defaults[k] != v}, **scale.training}
     facts |= {"domains": names, **settings}
-    if method.exploration is not None:
-        exploring = dict(scale.explore_single if method.exploration.is_single_domain else scale.explore)
-        if "encoder_update_interval" in exploring:
-            exploring["encoder_update_interval"] *= method.exploration.encoder_updates_each
-        exploring |= {**({"quality": scale.quality} if scale.quality else {}), **explore}
-        plan = plan_exploration(method, names, ExploreConfig(**exploring))
-        facts |= {"explore": exploring, "env_steps": plan.env_steps, "decisions": plan.decisions}
-        facts |= {"updates": plan.encoder_updates}
-        command = ["pretrain", *names, *command, *options(seed=seed, **settings, **exploring)]
-        return Job("explored", title, tuple(command), facts, (), _definition(*names, method=method))
-    data = [dataset(scale, name, seed, transitions) for name in names]
-    facts |= {"updates": scale.updates, "transitions": data[0].facts["transitions"]}
-    command = ["pretrain", *map(_dataset_of, data), *command]
-    command += options(seed=seed, updates=scale.updates, **settings)
-    return Job("encoder", title, tuple(command), facts, tuple(data), _definition(method=method))
+    if method.exploration is None:
+        data = data or [dataset(scale, name, seed, transitions) for name in names]
+        facts |= {"updates": scale.updates, "transitions": data[0].facts["transitions"]}
+        command = ["pretrain", *map(_dataset_of, data), *where]
+        command += options(seed=seed, updates=scale.updates, **settings)
+        return Job("encoder", title, tuple(command), facts, tuple(data), _definition(method=method))
+    exploring = {**(scale.explore_single if method.exploration.is_single_domain else scale.explore), **explore}
+    if "encoder_update_interval" in exploring:
+        exploring["encoder_update_interval"] *= method.exploration.encoder_updates_each
+    plan = plan_exploration(method, names, ExploreConfig(**exploring))
+    facts |= {"explore": exploring, "env_steps": plan.env_steps, "decisions": plan.decisions}
+    facts["updates"] = plan.encoder_updates
+    command = ["pretrain", *names, *where, *options(seed=seed, **settings, **exploring)]
+    return Job("explored", title, tuple(command), facts, (), _definition(*names, method=method))
 
 
 def encoder_for_task(
     scale: Scale, system: str, domains: Iterable[str], task: str, seed: int, **settings: Any
 ) -> Job | None:
-    """Return the encoder that a task of a group is learned on; ``None`` for DrQ, which trains its own.
+    """Return a system's encoder for a task of a group; ``None`` for DrQ, which trains its own.
 
     The (S) methods have one per domain, and fine-tuning continues the group's on the task's domain.
     """
@@ -328,7 +323,8 @@ def encoder_for_task(
     base = encoder(scale, system, (domain,) if is_single_domain(system) else domains, seed, **settings)
     if system != FINETUNE:
         return base
-    data, updates = dataset(scale, domain, seed), scale.finetune_updates(domain)
+    data = dataset(scale, domain, seed)
+    updates = max(2, FINETUNE_UPDATES.get(domain, 3_000) * scale.updates // 50_000)  # the paper's, in proportion
     command = ["finetune", _encoder_of(base), _dataset_of(data), "--out", OWN]
     command += options(seed=seed, updates=updates, **scale.training)
     facts = {"method": FINETUNE, "domains": [domain], "seed": seed, "updates": updates, **scale.training}
@@ -340,20 +336,22 @@ def run(scale: Scale, system: str, task: str, base: Job | None, seed: int, *, co
 
     ``base`` is the frozen encoder, or ``None`` for DrQ. Runs of several tasks with one seed share nothing else.
     """
-    config = {**scale.run, **({"quality": scale.quality} if scale.quality else {})}
-    config |= {"intrinsic_reward_coef": 0} if system == NO_BONUS else {}
-    config |= {} if colors == "normal" else {"colors": colors}
-    facts: dict[str, Any] = {"method": DRQ}
+    config = dict(scale.run)
+    if system == NO_BONUS:
+        config["intrinsic_reward_coef"] = 0
+    if colors != "normal":
+        config["colors"] = colors
+    facts: dict[str, Any] = {"method": DRQ, "env_steps": 1_000_000}
+    by = ""
     if base is None:
-        config.pop("queue_size", None)  # it has no bonus
+        config.pop("queue_size", None)  # DrQ has no bonus
     else:
-        facts = {"method": NO_BONUS if system == NO_BONUS else base.facts["method"]}
+        facts = {"method": NO_BONUS if system == NO_BONUS else base.facts["method"], "env_steps": 500_000}
         facts["encoder_seed"] = base.facts["seed"]
-    command = ["downstream", task, "--pretrained", DRQ if base is None else _encoder_of(base)]
-    command += ["--out", OWN, *options(seed=derive_seed(seed, "task", task), **config)]
-    facts |= {"task": task, "domain": get_domain(task).name, "seed": seed, "colors": colors}
-    facts |= {"env_steps": 1_000_000 if base is None else 500_000, **config}
-    by = "" if base is None else f" encoder {base.facts['seed']}"
+        by = f" encoder {base.facts['seed']}"
+    facts |= {"task": task, "domain": get_domain(task).name, "seed": seed, "colors": colors, **config}
+    command = ["downstream", task, "--pretrained", DRQ if base is None else _encoder_of(base), "--out", OWN]
+    command += options(seed=derive_seed(seed, "task", task), **config)
     title = f"{task}{'' if colors == 'normal' else f' {colors}'} {facts['method']}{by} seed {seed}"
     needs = () if base is None else (base,)
     return Job("run", title, tuple(command), facts, needs, _definition(task))
@@ -368,59 +366,51 @@ def probe(scale: Scale, base: Job, data: Job) -> Job:
     return Job("probe", f"{method} seed {seed} on {domain}", tuple(command), facts, (base, data))
 
 
-def _about(job: Job) -> tuple[str, dict[str, Any]]:
-    facts = {name: job.facts[name] for name in ("method", "domains", "seed")}
-    return f"{facts['method']} {'+'.join(facts['domains'])} seed {facts['seed']}", facts
+def _measurement(kind: str, trained: Job, command: Sequence[str], needs: Iterable[Job], **more: Any) -> Job:
+    facts = {name: trained.facts[name] for name in ("method", "domains", "seed")}
+    title = f"{facts['method']} {'+'.join(facts['domains'])} seed {facts['seed']}"
+    return Job(kind, title, tuple(command), facts | more, tuple(dict.fromkeys(needs)))
 
 
 def spread(base: Job) -> Job:
     """Return how far an encoder's prototypes have spread, along its training and at its end."""
-    title, facts = _about(base)
-    command = ("measure", "prototypes", _encoder_of(base), "--out", OWN)
-    return Job("prototypes", title, command, facts, (base,))
+    return _measurement("prototypes", base, ["measure", "prototypes", _encoder_of(base), "--out", OWN], [base])
 
 
 def comparison(kind: str, base: Job, explorer: Job, datasets: Sequence[Job], *, samples: int, seed: int) -> Job:
-    """Return what compares an explorer's data with random data: ``coverage`` or ``embeddings``."""
+    """Return a comparison of an explorer's data with random data: ``coverage`` or ``embeddings``."""
     replays = [f"{{{explorer.key}}}/replay/{domain}" for domain in explorer.facts["domains"]]
     command = ["measure", kind, "--encoder", _encoder_of(base), "--explorer", _encoder_of(explorer)]
     command += ["--replays", *replays, "--datasets", *map(_dataset_of, datasets), "--out", OWN]
     command += options(samples=samples, seed=seed)
-    title, facts = _about(explorer)
-    needs = tuple(dict.fromkeys((base, explorer, *datasets)))
-    return Job(kind, title, tuple(command), facts | {"samples": samples}, needs)
+    return _measurement(kind, explorer, command, [base, explorer, *datasets], samples=samples)
 
 
 def timing(request: Request, system: str, domain_sets: Sequence[Sequence[str]], seed: int) -> Job:
     """Return the timing of encoders' training, ``<job>/timing.csv``: of one, or of several whose costs add up."""
-    scale, where = request.scale, {"device": request.device, "threads": request.threads}
-    here, paper = ([encoder(at, system, domains, seed) for domains in domain_sets] for at in (scale, PAPER))
+    scale = request.scale
+    where = {"device": request.device, "threads": request.threads}
     command = ["measure", "timing", "--out", OWN]
     command += options(updates=scale.timing_updates, paper_updates=scale.paper_timing_updates, **where)
-    for trained, whole in zip(here, paper):
-        # What is in the data does not change the time: both are timed on this scale's.
-        command += ["--training", _as_word(trained, trained), "--paper-training", _as_word(whole, trained)]
-    domains = [domain for job in here for domain in job.facts["domains"]]
-    facts = {"method": here[0].facts["method"], "domains": domains, "seed": seed, **where}
-    needs = tuple(dict.fromkeys(needed for job in here for needed in job.needs))
-    title = f"{facts['method']} {'+'.join(domains)} {request.device} {request.threads}"
+    trainings = [encoder(scale, system, domains, seed) for domains in domain_sets]
+    for training, domains in zip(trainings, domain_sets):
+        # The content of the data does not change the time: the paper's training is timed on this scale's.
+        paper_training = encoder(PAPER, system, domains, seed, data=training.needs)
+        for option, job in {"--training": training, "--paper-training": paper_training}.items():
+            at = job.command.index("--out")
+            command += [option, shlex.join(job.command[:at] + job.command[at + 2 :])]
+    names = [domain for domains in domain_sets for domain in domains]
+    facts = {"method": trainings[0].facts["method"], "domains": names, "seed": seed, **where}
+    needs = tuple(dict.fromkeys(needed for training in trainings for needed in training.needs))
+    title = f"{facts['method']} {'+'.join(names)} {request.device} {request.threads}"
     return Job("timing", title, tuple(command), facts, needs)
-
-
-def _as_word(job: Job, like: Job) -> str:
-    """Return a training's command as one word, on the data of another."""
-    command = list(job.command)
-    if job.needs:
-        command[1 : 1 + len(job.needs)] = map(_dataset_of, like.needs)
-    at = command.index("--out")
-    return shlex.join(command[:at] + command[at + 2 :])
 
 
 # --- experiments ----------------------------------------------------------------------------------------------------
 
 
 class Experiment(NamedTuple):
-    """One of the commands ``crptpro reproduce NAME``: heading, what it asks, and the cells of a request."""
+    """One of the commands ``crptpro reproduce NAME``: heading, question, and the cells of a request."""
 
     title: str
     summary: str
@@ -428,7 +418,7 @@ class Experiment(NamedTuple):
 
 
 EXPERIMENTS: dict[str, Experiment] = {}
-"""In the order of the paper; what it does not have comes last."""
+"""In the order of the paper; further ones come last."""
 
 
 def _experiment(title: str) -> Callable[[Callable[[Request], Iterator[Cell]]], None]:
@@ -467,35 +457,36 @@ def _scores(
 
 
 def _table(
-    request: Request, rows: Mapping[str, Sequence[str]], systems: Iterable[str], colors: str = "normal"
+    request: Request, tasks: Iterable[tuple[str, str]], systems: Iterable[str], colors: str = "normal"
 ) -> Iterator[Cell]:
-    for group, tasks in rows.items():
-        for task, system in product(tasks, list(systems)):
-            yield from _scores(request, group, task, system, colors=colors)
+    """Yield the runs of all systems on tasks, each with its group."""
+    for (group, task), system in product(tasks, systems):
+        yield from _scores(request, group, task, system, colors=colors)
+
+
+def _elsewhere(
+    request: Request, rows: Iterable[ScoreRow], systems: Iterable[str], colors: str = "normal"
+) -> Iterator[Cell]:
+    """Yield the runs on the requested rows of a table of the paper; no encoder is fine-tuned on them."""
+    tasks = [
+        (row.group, row.task)
+        for row in rows
+        if (not request.groups or row.group in request.groups) and (not request.tasks or row.task in request.tasks)
+    ]
+    return _table(request, tasks, [system for system in systems if system != FINETUNE], colors)
 
 
 @_experiment("Tasks of seen domains")
 def _seen(request: Request) -> Iterator[Cell]:
     """Tasks of the domains that the encoder was pre-trained on, for every method (section IV.B)."""
-    rows = {group: request.tasks_in(GROUPS[group]) for group in request.groups or GROUPS}
-    return _table(request, rows, request.methods or METHODS)
-
-
-def _elsewhere(request: Request, rows: Mapping[str, Sequence[str]]) -> dict[str, list[str]]:
-    """Return the tasks asked for, by group. Nothing is fine-tuned, and no encoder has seen a task's own domain."""
-    return {
-        group: [task for task in tasks if task in (request.tasks or tasks)]
-        for group, tasks in rows.items()
-        if group in (request.groups or rows)
-    }
+    return _table(request, request.seen_tasks(GROUPS), request.methods or METHODS)
 
 
 @_experiment("Tasks of unseen domains")
 def _unseen(request: Request) -> Iterator[Cell]:
     """Tasks of domains that the encoder never saw, without fine-tuning (section IV.C)."""
-    systems = [each for each in request.methods or CROSS_DOMAIN if each != FINETUNE]
-    several = [system for system in systems if not is_single_domain(system)]
-    return _table(request, _elsewhere(request, UNSEEN_TASKS), several)
+    systems = [system for system in request.methods or CROSS_DOMAIN if not is_single_domain(system)]
+    return _elsewhere(request, UNSEEN, systems)
 
 
 @_experiment("Reversed background colours")
@@ -504,56 +495,52 @@ def _colors(request: Request) -> Iterator[Cell]:
 
     The paper does not say how it reverses them; whole images are the option.
     """
-    systems = [each for each in request.methods or CROSS_DOMAIN if each != FINETUNE]
-    return _table(request, _elsewhere(request, COLORS_TASKS), systems, request.colors)
+    return _elsewhere(request, COLORS, request.methods or CROSS_DOMAIN, request.colors)
 
 
 @_experiment("Fine-tuning on one domain")
 def _finetune(request: Request) -> Iterator[Cell]:
     """The encoder of group A trained further on one domain, beside single-domain methods and DrQ (section IV.D)."""
-    rows = {group: request.tasks_in(FINETUNE_UPDATES) for group in request.groups or "A"}
-    return _table(request, rows, request.methods or ("crptpro", FAST, FINETUNE, "proto-rl-s", "apt-s", DRQ))
+    tasks = product(request.groups or "A", request.tasks_in(FINETUNE_UPDATES))
+    return _table(request, tasks, request.methods or ("crptpro", FAST, FINETUNE, "proto-rl-s", "apt-s", DRQ))
 
 
 @_experiment("Ablation: dispersion loss, decoupled collection")
 def _ablation(request: Request) -> Iterator[Cell]:
     """With and without the dispersion loss, with and without decoupled collection (section IV.F)."""
     # Proto-RL(C) with the dispersion loss is CRPTpro without its decoupled collection.
-    for group in request.groups or ("A", "C"):
-        for task in request.tasks_in(GROUPS[group]):
-            for system in request.methods or VARIANTS:
-                explore, weight = NONE, DISPERSION["intr_loss_coef"]
-                if is_single_domain(system):
-                    domain = get_domain(task).name
-                    if domain not in SINGLE_DISPERSION and not request.tasks:
-                        continue  # the paper has two domains
-                    explore, weight = request.scale.single_ablation, SINGLE_DISPERSION.get(domain, weight)
-                for label, loss in VARIANTS.get(system, ((system, NONE),)):
-                    own = {"intr_loss_coef": weight} if loss == DISPERSION else loss
-                    how: dict[str, Any] = {"label": label, "loss": own, "explore": explore}
-                    yield from _scores(request, group, task, system, **how)
+    for (group, task), system in product(request.seen_tasks("AC"), request.methods or VARIANTS):
+        explore, weight = NONE, DISPERSION["intr_loss_coef"]
+        if is_single_domain(system):
+            domain = get_domain(task).name
+            if domain not in SINGLE_DISPERSION and not request.tasks:
+                continue  # the paper has two domains
+            explore = request.scale.single_ablation
+            weight = SINGLE_DISPERSION.get(domain, weight)
+        for label, loss in VARIANTS.get(system, ((system, NONE),)):
+            own = {"intr_loss_coef": weight} if loss == DISPERSION else loss
+            yield from _scores(request, group, task, system, label=label, loss=own, explore=explore)
 
 
 @_experiment("Sensitivity: weight of the dispersion loss, amount of data")
 def _sensitivity(request: Request) -> Iterator[Cell]:
     """The weight alpha of the dispersion loss, and the capacity b of the random datasets (section IV.F)."""
-    # The weight of the dispersion loss; methods without one have nothing to vary. Then the size of the datasets.
     scale = request.scale
-    for group in request.groups or "A":
-        for task in request.tasks_in(GROUPS[group]):
-            for system in request.methods or ("crptpro", "proto-rl-c"):
-                has_weight = "intr_loss_coef" in _loss_defaults(pretraining_of(system))
-                for weight in sorted({0.0, 5e-3, *scale.alphas}) if has_weight else ():
-                    yield from _scores(
-                        request, group, task, system, label=f"{system}, alpha {weight:g}",
-                        loss={"intr_loss_coef": weight}, place={"varied": "alpha", "value": f"{weight:g}"},
-                    )  # fmt: skip
-            sizes = sorted({*scale.capacities, scale.transitions})
-            for size in sizes if "crptpro" in (request.methods or ("crptpro",)) else ():
+    methods = request.methods or ("crptpro", "proto-rl-c")
+    for group, task in request.seen_tasks("A"):
+        for system in methods:
+            if "intr_loss_coef" not in _loss_defaults(pretraining_of(system)):
+                continue
+            for alpha in sorted({0.0, 5e-3, *scale.alphas}):
                 yield from _scores(
-                    request, group, task, "crptpro", label=f"crptpro, b {size:,}", transitions=size,
-                    place={"varied": "b", "value": str(size)},
+                    request, group, task, system, label=f"{system}, alpha {alpha:g}", loss={"intr_loss_coef": alpha},
+                    place={"varied": "alpha", "value": f"{alpha:g}"},
                 )  # fmt: skip
+        for size in sorted({*scale.capacities, scale.transitions}) if "crptpro" in methods else ():
+            yield from _scores(
+                request, group, task, "crptpro", label=f"crptpro, b {size:,}", transitions=size,
+                place={"varied": "b", "value": str(size)},
+            )  # fmt: skip
 
 
 @_experiment("Cost of pre-training")
@@ -569,14 +556,6 @@ def _efficiency(request: Request) -> Iterator[Cell]:
                 yield Cell(system, timing(request, system, sets, seed), place)
 
 
-def _domain_sets(request: Request, group: str, system: str) -> list[tuple[str, ...]]:
-    """The domains of each encoder of a system: the group's, or, of an (S) method, one for each of those asked for."""
-    if not is_single_domain(system):
-        return [GROUPS[group]]
-    asked = [domain for domain in request.domains if domain in GROUPS[group]]
-    return [(domain,) for domain in asked or (SINGLE_DOMAIN[group],)]
-
-
 def _measured(label: str, job: Job, group: str, seed: int, domains: Sequence[str]) -> Cell:
     return Cell(label, job, {"group": group, "domains": "+".join(domains), "encoder_seed": seed})
 
@@ -584,12 +563,11 @@ def _measured(label: str, job: Job, group: str, seed: int, domains: Sequence[str
 def _trained(
     request: Request, variants: Mapping[str, Sequence[tuple[str, Settings]]], measure: Callable[[Job], Job]
 ) -> Iterator[Cell]:
-    """Encoders of methods with prototypes, or what is measured of them."""
-    for group, seed in product(request.groups or "A", request.encoder_seeds):
-        for system in request.methods or variants:
-            for domains, (label, loss) in product(_domain_sets(request, group, system), variants.get(system, ())):
-                trained = encoder(request.scale, system, domains, seed, loss=loss)
-                yield _measured(label, measure(trained), group, seed, domains)
+    """Yield a measurement of each encoder of methods with prototypes."""
+    for group, seed, system, domains in request.encoders(variants):
+        for label, loss in variants.get(system, ()):
+            trained = encoder(request.scale, system, domains, seed, loss=loss)
+            yield _measured(label, measure(trained), group, seed, domains)
 
 
 @_experiment("Spread of the prototypes")
@@ -599,18 +577,16 @@ def _prototypes(request: Request) -> Iterator[Cell]:
 
 
 def _compared(request: Request, kind: str, groups: str, system: str, samples: int) -> Iterator[Cell]:
-    """Random data beside an explorer's, as CRPTpro's encoder sees both: it was trained on all domains."""
+    """Yield comparisons of random data with an explorer's, as CRPTpro's encoder of all domains sees both."""
     scale = request.scale
-    for group, seed in product(request.groups or groups, request.encoder_seeds):
+    for group, seed, explorer, domains in request.encoders([system], groups):
+        if pretraining_of(explorer).exploration is None:
+            continue
         base = encoder(scale, "crptpro", GROUPS[group], seed)
-        for explorer in request.methods or (system,):
-            if pretraining_of(explorer).exploration is None:
-                continue
-            for domains in _domain_sets(request, group, explorer):
-                data = [dataset(scale, d, seed) for d in (domains if kind == "coverage" else GROUPS[group])]
-                exploring = encoder(scale, explorer, domains, seed)
-                job = comparison(kind, base, exploring, data, samples=samples, seed=seed)
-                yield _measured(explorer, job, group, seed, domains)
+        data = [dataset(scale, domain, seed) for domain in (domains if kind == "coverage" else GROUPS[group])]
+        exploring = encoder(scale, explorer, domains, seed)
+        job = comparison(kind, base, exploring, data, samples=samples, seed=seed)
+        yield _measured(explorer, job, group, seed, domains)
 
 
 @_experiment("Coverage of the data")
@@ -636,11 +612,12 @@ def _visualize(request: Request) -> Iterator[Cell]:
 @_experiment("State probe")
 def _probe(request: Request) -> Iterator[Cell]:
     """What a linear model reads of the simulator's state from frozen features. Not in the paper."""
-    # Tasks of the request choose the domains; an (S) method's one encoder is probed on all of them, too.
+    # Requested tasks choose the domains; an (S) method's one encoder is probed on all of them, too.
     scale = request.scale
+    requested = dict.fromkeys(get_domain(task).name for task in request.tasks)
     for group, seed in product(request.groups or "A", request.encoder_seeds):
         for system in request.methods or (*PRETRAINED, RANDOM):
-            for domain in request.domains or (*GROUPS[group], *PROBED_UNSEEN[group]):
+            for domain in requested or (*GROUPS[group], *PROBED_UNSEEN[group]):
                 home = domain if system == FINETUNE else SINGLE_DOMAIN[group]
                 trained = encoder_for_task(scale, system, GROUPS[group], get_domain(home).task, seed)
                 if trained is None or system == NO_BONUS:

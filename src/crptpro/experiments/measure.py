@@ -1,4 +1,4 @@
-"""What experiments measure of encoders and their data; ``crptpro measure`` writes it as CSV files for jobs."""
+"""Measurements of encoders and their data; ``crptpro measure`` writes them as CSV files for jobs."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import shlex
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,19 +38,15 @@ PROTOTYPE_METRICS = {
 }  # fmt: skip
 """Names in the training's record to columns of ``prototypes.csv``."""
 WINDOWS = 5
-"""Parts of a timing whose median counts, so that one hiccup of the machine does not."""
+"""Parts of a timing; their median is robust against one hiccup of the machine."""
 RANDOM_AGENT_STEPS = 24
 """Random decisions per domain before a timed exploration, instead of the method's own."""
 COVERAGE_WINDOWS = 10
-"""Windows of the training, fewer where one would have less decisions of a domain than samples."""
+"""Windows of the training; fewer if a window would have fewer decisions of a domain than samples."""
 
 
 def write_rows(path: Path, rows: pd.DataFrame | Sequence[Mapping[str, Any]], columns: Any = None) -> None:
-    """Write rows as a CSV file, whole or not at all; what was there before is replaced.
-
-    Raises:
-        DiskSpaceError: the disk is full.
-    """
+    """Write rows as a CSV file, whole or not at all, in place of an earlier one."""
     table = pd.DataFrame(rows, columns=columns, dtype=object)
     write_whole(path, table.to_csv(index=False, lineterminator="\n"))
 
@@ -66,18 +63,10 @@ PROBE_COLUMNS = (
 def probe_rows(
     pretrained: Any, dataset: FrameDataset, *, encoder: str, samples: int = 2_000, seed: int = 0
 ) -> tuple[list[dict[str, str]], list[dict[str, Any]]]:
-    """Probe an encoder on a dataset with physical state.
+    """Probe an encoder, called ``encoder`` in the rows, on a draw from a dataset with physical state.
 
-    Args:
-        pretrained: a :class:`~crptpro.pretrained.Pretrained` whose features, and projections if it has a projector, are
-            read. The untrained control is given an untrained projector, so that z has one too.
-        dataset: what is probed.
-        encoder: what the encoder is called in the rows.
-        samples: drawn from the dataset.
-        seed: of the draw.
-
-    Returns:
-        A row per embedding for people, and every number by :data:`PROBE_COLUMNS`.
+    Its features are probed, and its projections if it has a projector. The untrained control gets an untrained
+    projector, so that it has z, too. Returns a formatted row per embedding, and every number by :data:`PROBE_COLUMNS`.
 
     Raises:
         DatasetError: there is no physical state, or too little data to split.
@@ -86,29 +75,34 @@ def probe_rows(
     observed = probe_samples(dataset, samples=samples, seed=seed, frame_stack=frame_stack)
     is_control = pretrained.method.startswith("random-encoder")
     projector = _untrained_projector(pretrained) if is_control else pretrained.projector
-    about = {"method": pretrained.label, "domain": dataset.domain}
-    about |= {"seen": "yes" if dataset.domain in domains_seen(pretrained.card) else "no"}
-    about |= {"colors": dataset.card.get("colors", "normal")}
+    about = {
+        "method": pretrained.label, "domain": dataset.domain,
+        "seen": "yes" if dataset.domain in domains_seen(pretrained.card) else "no",
+        "colors": dataset.card.get("colors", "normal"),
+    }  # fmt: skip
     counts = {"samples": len(observed.pixels), "held_out_episodes": observed.held_out_episodes, "seed": seed}
-    table, measures = [], []
+    table, numbers = [], []
     for embedding, result in probe(observed, pretrained.encoder, projector).items():
         table.append({
             **about, "embedding": embedding, "R2 positions": f"{result.position_r2:.3f}",
             "R2 velocities": f"{result.velocity_r2:.3f}", "effective rank": f"{result.effective_rank:.1f}",
             "mean cosine": f"{result.mean_cosine:.4f}",
         })  # fmt: skip
-        found: list[tuple[str, str, Any]] = [("r2_position", *each) for each in result.positions.items()]
-        found += [("r2_velocity", *each) for each in result.velocities.items()]
-        found += [(f"r2_{kind}", name, "") for kind, name in (each.split(" ", 1) for each in result.left_out)]
-        found += [("r2_position", "", result.position_r2), ("r2_velocity", "", result.velocity_r2)]
-        found += [(name, "", getattr(result, name)) for name in ("effective_rank", "mean_cosine")]
-        named = {"encoder": encoder, **about, "embedding": embedding}
-        measures += [{**named, "measure": m, "coordinate": c, "value": v, **counts} for m, c, v in found]
-    return table, measures
+        found: list[tuple[str, str, Any]] = [
+            *(("r2_position", *each) for each in result.positions.items()),
+            *(("r2_velocity", *each) for each in result.velocities.items()),
+            *((f"r2_{kind}", name, "") for kind, name in result.left_out),
+            ("r2_position", "", result.position_r2), ("r2_velocity", "", result.velocity_r2),
+            ("effective_rank", "", result.effective_rank), ("mean_cosine", "", result.mean_cosine),
+        ]  # fmt: skip
+        for measure, coordinate, value in found:
+            row = {"embedding": embedding, "measure": measure, "coordinate": coordinate, "value": value}
+            numbers.append({"encoder": encoder, **about, **row, **counts})
+    return table, numbers
 
 
 def _untrained_projector(pretrained: Pretrained) -> Projector:
-    """A projector at its initialisation, which the encoder's seed decides."""
+    """Return a projector at its initialisation, from the encoder's seed."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive_seed(int(pretrained.card.get("seed", 0)), "untrained_projector"))
         projector = Projector(pretrained.encoder.feature_dim)
@@ -116,7 +110,7 @@ def _untrained_projector(pretrained: Pretrained) -> Projector:
 
 
 def domains_seen(card: Mapping[str, Any]) -> set[str]:
-    """Return the domains that an encoder was trained on, those of the encoder it started from included."""
+    """Return the domains that an encoder, and the encoder it started from, were trained on."""
     training: Any = card.get("training")
     seen: set[str] = set()
     while isinstance(training, Mapping):
@@ -129,17 +123,12 @@ def domains_seen(card: Mapping[str, Any]) -> set[str]:
 
 
 def prototypes(encoder: Positional[Path], *, out: Path) -> None:
-    """Write how far prototypes have spread, along their training and at its end: OUT/prototypes.csv.
-
-    Args:
-        encoder: in its run directory, whose record says how it came there.
-        out: directory to write to.
-    """
+    """Write how far prototypes have spread, along their training and at its end: OUT/prototypes.csv."""
     pretrained: Any = load_pretrained(encoder)
     if pretrained.prototypes is None:
         raise RecordError(f"{encoder} has no prototypes; its method is {pretrained.method}.")
     config, updates = pretrained.card["loss"]["config"], pretrained.card["training"]["updates"]
-    # The record's own last row, if it is of the last update, is of weights that had not been normalised yet.
+    # The record's row of the last update is of weights before their normalisation: it is computed anew.
     record = pd.read_csv(encoder.parent / "pretrain.csv", dtype=str, keep_default_na=False)
     rows = record.loc[record["updates"].astype(int) < updates, ["updates", *PROTOTYPE_METRICS]]
     metrics = prototype_metrics(pretrained.prototypes.weight, offset=config["offset"])
@@ -155,22 +144,14 @@ def prototypes(encoder: Positional[Path], *, out: Path) -> None:
 class Comparison:
     """Random data beside an explorer's, as an encoder sees both."""
 
-    encoder: Path
-    """which embeds all observations"""
-    explorer: Path
-    """its encoder, in its run directory"""
-    replays: tuple[Path, ...]
-    """what the explorer saw, a directory for each domain"""
-    datasets: tuple[Path, ...]
-    """random transitions of each domain"""
+    encoder: Path  # embeds all observations
+    explorer: Path  # the explorer's own encoder, in its run directory
+    replays: tuple[Path, ...]  # the explorer's observations, a directory for each domain
+    datasets: tuple[Path, ...]  # random transitions of each domain
     out: Path
-    """directory to write to"""
-    samples: int = 1_024
-    """observations of each source"""
-    seed: int = 0
-    """of the draw"""
+    samples: int = 1_024  # observations of each source
+    seed: int = 0  # of the draw
     device: str = "cpu"
-    """where the encoder runs"""
 
     def load(self) -> Pretrained:
         """Return the artifact of the encoder, on its device."""
@@ -180,7 +161,7 @@ class Comparison:
         return pretrained
 
     def draw(self, start: int, end: int, count: int, *stream: str | int) -> torch.Tensor:
-        """Return the sorted numbers of ``count`` of the observations from ``start`` to before ``end``."""
+        """Draw ``count`` of the observations from ``start`` to before ``end``; returns their sorted numbers."""
         generator = torch.Generator().manual_seed(derive_seed(self.seed, *stream))
         return start + torch.randperm(end - start, generator=generator)[:count].sort().values
 
@@ -188,33 +169,36 @@ class Comparison:
 def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
     """Write how widely an explorer's observations are spread along its training, beside random data: OUT/coverage.csv.
 
-    A window has the same decisions of both sources. Where one does not have enough of them, it has no row.
+    A window has the same decisions of both sources; a source with too few of them has no row.
     """
     pretrained, explored = of.load(), load_pretrained(of.explorer)
-    frame_stack, training = pretrained.encoder.in_channels // 3, explored.card["training"]
+    frame_stack = pretrained.encoder.in_channels // 3
+    training = explored.card["training"]
     decisions = {entry["domain"]: int(entry["agent_steps"]) for entry in training["datasets"]}
-    least = min(decisions.values())
-    windows = max(1, min(COVERAGE_WINDOWS, least // of.samples))
-    samples = min(of.samples, least // windows)
+    fewest = min(decisions.values())
+    windows = max(1, min(COVERAGE_WINDOWS, fewest // of.samples))
+    samples = min(of.samples, fewest // windows)
     rows = []
     for path, replay_path in zip(of.datasets, of.replays, strict=True):
         random = FrameDataset.open(path, frame_stack=frame_stack)
         replay = StoredReplay(replay_path, frame_stack=frame_stack)
-        total, domain = decisions[random.domain], random.domain
-        lost = total - len(replay)  # the oldest decisions, of a ring that went round
-        for window in range(windows):
+        domain = random.domain
+        total = decisions[domain]
+        lost = total - len(replay)  # the oldest decisions, which the ring has overwritten
+        for window, source in product(range(windows), ("random", "explorer")):
             start, end = window * total // windows, (window + 1) * total // windows
-            spans = {"random": (start, min(end, len(random))), "explorer": (max(start, lost), end)}
-            for source, (first, last) in spans.items():
-                if last - first < samples:
-                    continue  # estimates of fewer observations cannot be compared
-                chosen = of.draw(first, last, samples, "coverage", source, domain, window)
-                is_random = source == "random"
-                pixels = random[chosen]["pixels"] if is_random else replay.observations(chosen - lost)
-                points = embed_pixels(pretrained.encoder, pixels, projector=pretrained.projector)
-                found = {"source": source, "method": "" if is_random else explored.method, "domain": domain}
-                found["env_steps"] = training["env_steps"] * end // total
-                rows.append({**found, "coverage": particle_estimate(F.normalize(points, dim=-1)), "samples": samples})
+            is_random = source == "random"
+            first, last = (start, min(end, len(random))) if is_random else (max(start, lost), end)
+            if last - first < samples:
+                continue  # estimates of fewer observations are not comparable
+            chosen = of.draw(first, last, samples, "coverage", source, domain, window)
+            pixels = random[chosen]["pixels"] if is_random else replay.observations(chosen - lost)
+            points = embed_pixels(pretrained.encoder, pixels, projector=pretrained.projector)
+            rows.append({
+                "source": source, "method": "" if is_random else explored.method, "domain": domain,
+                "env_steps": training["env_steps"] * end // total,
+                "coverage": particle_estimate(F.normalize(points, dim=-1)), "samples": samples,
+            })  # fmt: skip
     columns = ("source", "method", "domain", "env_steps", "coverage", "samples")
     write_rows(of.out / "coverage.csv", rows, columns)
 
@@ -222,7 +206,8 @@ def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
 def embeddings(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
     """Write principal components of random data and of an explorer's last quarter: OUT/embeddings.csv."""
     pretrained = of.load()
-    frame_stack, pixels = pretrained.encoder.in_channels // 3, {}
+    frame_stack = pretrained.encoder.in_channels // 3
+    pixels = {}
     for path in of.datasets:
         random = FrameDataset.open(path, frame_stack=frame_stack)
         pixels[f"{random.domain} random"] = sample_pixels(random, of.samples, seed=of.seed)
@@ -251,21 +236,17 @@ def timing(
     device: str = "cpu",
     threads: int = 1,
 ) -> None:
-    """Write what training encoders takes, from a timed part of it: OUT/timing.csv.
+    """Write the cost of training encoders, from a timed part of it: OUT/timing.csv.
 
-    Args:
-        out: directory to write to.
-        training: a `pretrain ...` command without --out and --device; of several the costs add up.
-        paper_training: the same as the paper trains.
-        updates: encoder updates that are timed, after as many to warm up.
-        paper_updates: likewise of the paper's trainings; 0 leaves their hours open unless both are the same.
-        device: of networks.
-        threads: of torch.
+    A training is a `pretrain ...` command without --out and --device, once with the settings of this scale and once
+    with the paper's; the costs of several add up. As many updates are timed as warm up before. Without `paper_updates`
+    the paper's hours stay open, unless both commands are the same.
     """
     torch.set_num_threads(threads)
     rows = []
     for command, paper_command in zip(training, paper_training, strict=True):
-        here, paper = (_Timed(each, out / "timed", device) for each in (command, paper_command))
+        here = _Timed(command, out / "timed", device)
+        paper = _Timed(paper_command, out / "timed", device)
         timed, seconds, each = here.time(updates)
         paper_each = each if command == paper_command else math.nan
         if command != paper_command and paper_updates:
@@ -297,16 +278,17 @@ class _Timed:
 
         words = shlex.split(text)
         arguments = [*words[1:], "--out", str(out), "--device", device]
-        stage: Any = tyro.cli(pretrain_command(words), args=arguments)
-        self.stage, method, config = stage, get_method(stage.method), stage.config
-        self.plan = plan_exploration(method, stage.sources, config) if method.exploration else None
+        self.stage: Any = tyro.cli(pretrain_command(words), args=arguments)
+        method = get_method(self.stage.method)
+        config: Any = self.stage.config
+        self.plan = plan_exploration(method, self.stage.sources, config) if method.exploration else None
         self.updates: int = self.plan.encoder_updates if self.plan else config.updates
         self.decisions = self.plan.decisions if self.plan else 0
 
     def time(self, updates: int) -> tuple[int, float, float]:
         """Return timed updates, their seconds, and seconds per update by the median over windows."""
         stage, plan = self.stage, self.plan
-        # Updates after which all domains have had their turn.
+        # Updates of one round over all domains.
         period = len(stage.sources) * (plan.encoder_updates_each if plan else 1)
         window = period * math.ceil(updates / (WINDOWS * period))
         needed = 2 * WINDOWS * window

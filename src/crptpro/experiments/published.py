@@ -1,7 +1,6 @@
-"""Every number that the paper prints, to stand next to one's own (arXiv 2302.05614, tables of section IV).
+"""Every number in the paper's tables (arXiv 2302.05614, section IV).
 
-Scores are returns of whole episodes; "±" is printed without saying over what. Figures of the paper carry no numbers and
-are missing here for that reason.
+Scores are returns of whole episodes; the paper does not say what its "±" is taken over. Its figures have no numbers.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ class Score(NamedTuple):
 
 
 class ScoreRow(NamedTuple):
-    """A task of a score table: whose domains encoders were pre-trained on, what was learned, scores by method."""
+    """A task of a score table: the pre-training group of its encoders, the task, and scores by method."""
 
     group: str
     task: str

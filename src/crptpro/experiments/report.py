@@ -1,13 +1,13 @@
 """One page on a reproduction, or on any downstream runs: tables beside the paper's, figures, and what is missing.
 
-:func:`build_report` reads two frames, the cells that experiments asked for and the jobs behind them. An experiment is
-reported by the kinds of its jobs, so that those of a plugin have their section, too. Nothing stands in for what is
-missing or not known.
+:func:`build_report` reads two frames: the cells of experiments, and the jobs behind them. The kinds of an experiment's
+jobs decide what its section contains, also for an experiment of a plugin. Missing or unknown values stay empty.
 """
 
 from __future__ import annotations
 
 import datetime
+import html
 import io
 import logging
 import math
@@ -38,7 +38,7 @@ ENCODERS = ("encoder", "explored", "finetuned", "untrained")
 PLACES = ("group", "task", "colors", "encoder_seed", "varied", "value")
 """Columns of cells that tables read."""
 EPISODES = ("env_steps", "episode_return")
-"""Columns of ``eval.csv`` that they read."""
+"""Columns of ``eval.csv`` that tables read."""
 
 
 def build_report(root: str | Path, *, out: str | Path | None = None) -> Path:
@@ -62,17 +62,16 @@ def build_report(root: str | Path, *, out: str | Path | None = None) -> Path:
     cells, jobs = (results.cells, results.jobs) if len(results.cells) else _unplanned_runs(root)
     cells = cells.assign(**{name: "" for name in PLACES if name not in cells})
     cells = cells.where(cells.notna(), "").astype({name: str for name in cells if name != "done"})
+    order = [*EXPERIMENTS, *cells["experiment"]]
+    cells = cells.sort_values("experiment", key=lambda names: names.map(order.index), kind="stable")
     jobs["where"] = [_where(job) for job in jobs.to_dict("records")]
-    numbers = {where: str(count) for count, where in enumerate(filter(None, jobs["where"].unique()), 1)}
-    jobs["machine"] = [numbers.get(where, "") for where in jobs["where"]]
-    order = {name: place for place, name in enumerate(dict.fromkeys([*EXPERIMENTS, *cells["experiment"]]))}
-    cells = cells.sort_values("experiment", key=lambda names: names.map(order), kind="stable")
+    jobs["machine"] = [str(code + 1) if code >= 0 else "" for code in pd.factorize(jobs["where"].replace("", None))[0]]
     page = Page(root / "report" if out is None else as_path(out, "out"))
     _contents(page, cells, jobs)
     _limits(page, cells, jobs)
     for (experiment, scale), own in cells.groupby(["experiment", "scale"], sort=False):
-        labels = {label: place for place, label in enumerate(in_order(own["label"]))}
-        own = own.sort_values("label", key=lambda names, labels=labels: names.map(labels), kind="stable")
+        labels = in_order(own["label"])
+        own = own.sort_values("label", key=lambda names, labels=labels: names.map(labels.index), kind="stable")
         _experiment(page, experiment, scale, own, jobs)
     _provenance(page, jobs)
     scales = " and ".join(filter(None, cells["scale"].unique()))
@@ -85,7 +84,7 @@ def build_report(root: str | Path, *, out: str | Path | None = None) -> Path:
 
 
 class Page:
-    """A page of sections, each with texts, tables and figures in the order in which they are added."""
+    """A page of sections, each with texts, tables and figures in the order of their calls."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -100,17 +99,18 @@ class Page:
         self._add(kind="text", text=text, style=style)
 
     def table(self, caption: str, rows: pd.DataFrame | Sequence[dict[str, Any]], fold: bool = False) -> None:
-        """Add a table, which a reader opens if it is to ``fold``. Empty cells become dashes, empty columns go."""
+        """Add a table, closed at first if ``fold``. Empty cells become dashes; empty columns are left out."""
         frame = pd.DataFrame(rows)
         is_known = frame.notna() & (frame != "")
         shown = frame.astype(object).where(is_known, "\N{EN DASH}").astype(str).loc[:, is_known.any()]
         if len(shown):
-            content = {"columns": list(map(str, shown)), "rows": shown.to_numpy().tolist()}
-            self._add(kind="table", caption=caption, fold=fold, **content)
+            columns, lines = list(map(str, shown)), shown.to_numpy().tolist()
+            self._add(kind="table", caption=caption, fold=fold, columns=columns, rows=lines)
 
     def figure(self, name: str, caption: str, figure: Any) -> None:
         """Write a figure and show it; the same numbers give the same file."""
-        file, pixels = f"figures/{_plain(name)}.png", io.BytesIO()
+        file = f"figures/{_plain(name)}.png"
+        pixels = io.BytesIO()
         figure.savefig(pixels, format="png", dpi=110, metadata={"Software": None})
         write_whole(self.folder / file, pixels.getvalue())
         self._add(kind="figure", file=file, caption=caption)
@@ -119,7 +119,8 @@ class Page:
         """Write both files; returns the HTML page."""
         from jinja2 import Environment, PackageLoader, select_autoescape
 
-        loader, escape = PackageLoader("crptpro.experiments"), select_autoescape(["html.j2"])
+        loader = PackageLoader("crptpro.experiments")
+        escape = select_autoescape(["html.j2"])
         environment = Environment(loader=loader, autoescape=escape, trim_blocks=True, lstrip_blocks=True)
         environment.filters["md"] = _markdown
         sections = [section for section in self.sections if section["parts"]]
@@ -133,9 +134,9 @@ class Page:
 
 
 def _markdown(text: Any) -> str:
-    """Keep a name or a sentence what it is: no HTML, no link, no new line or cell."""
-    shown = str(text).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-    return re.sub(r"\s*[\r\n]\s*", " · ", re.sub(r"([\\`*\[\]|])", r"\\\1", shown))
+    """Escape a text, so that it makes no HTML, link, line or table cell of its own."""
+    escaped = re.sub(r"([\\`*\[\]|])", r"\\\1", html.escape(str(text), quote=False))
+    return re.sub(r"\s*[\r\n]\s*", " · ", escaped)
 
 
 def _plain(name: str) -> str:
@@ -146,7 +147,7 @@ def _plain(name: str) -> str:
 
 
 def _read(path: Path, *columns: str) -> pd.DataFrame:
-    """Read a CSV record that has rows, and finite numbers in the columns named."""
+    """Read a CSV record; it must have rows, and finite numbers in these columns."""
     try:
         table = pd.read_csv(path)
     except FileNotFoundError:
@@ -164,7 +165,7 @@ def _read(path: Path, *columns: str) -> pd.DataFrame:
 def _records(
     page: Page, cells: pd.DataFrame, jobs: pd.DataFrame, kinds: Sequence[str], name: str, *columns: str
 ) -> pd.DataFrame:
-    """Read ``<name>.csv`` of every finished job of these kinds, with what its cell says besides."""
+    """Read ``<name>.csv`` of every finished job of these kinds, and add the columns of its cell."""
     found = []
     for cell in cells[cells["done"] & cells["job"].map(jobs["kind"]).isin(kinds)].to_dict("records"):
         try:
@@ -175,67 +176,63 @@ def _records(
     return pd.concat(found, ignore_index=True) if found else pd.DataFrame()
 
 
-def _json(path: Path) -> dict[str, Any]:
-    """Read a file that a page can do without; empty if it is not there, or damaged."""
-    try:
-        return dict(read_json(path, error=RecordError))
-    except (RecordError, OSError, TypeError, ValueError):
-        return {}
-
-
-def _needed(key: str, jobs: pd.DataFrame, *kinds: str) -> list[str]:
-    """Return a job and everything that it stands on, each once; those of some kinds if any are named."""
-    found: dict[str, None] = {}
-    waiting = [key]
+def _needed(keys: Iterable[str], jobs: pd.DataFrame, *kinds: str) -> list[str]:
+    """Return jobs and everything that they need, each once; of some kinds only, if any are named."""
+    found: list[str] = []
+    waiting = list(keys)
     while waiting:
-        if (one := waiting.pop(0)) not in found and one in jobs.index:
-            found[one] = None
-            waiting += jobs.loc[one, "needs"]
+        key = waiting.pop(0)
+        if key in jobs.index and key not in found:
+            found.append(key)
+            waiting += jobs.loc[key, "needs"]
     return [key for key in found if not kinds or jobs.loc[key, "kind"] in kinds]
 
 
-NOT_TOLD_APART = [
-    "seed", "task", "colors", "device", "precision", "compile", "cuda_graph", "eval_workers", "render_ahead",
-    "features", "video_episodes", "checkpoint_interval_env_steps", "log_interval_env_steps",
-    "eval_interval_env_steps", "eval_episodes",
+NOT_IN_LABELS = [
+    "seed", "task", "colors", "device", "precision", "compile", "eval_workers", "features", "eval_episodes",
+    "checkpoint_interval_env_steps", "log_interval_env_steps", "eval_interval_env_steps",
 ]  # fmt: skip
-"""Settings that do not make a run another method's: its seed, where it stands, how it computed, when it wrote."""
+"""Settings that do not distinguish methods: the seed, the task, how a run computes, and when it writes."""
 
 
 def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Find downstream runs that no experiment planned, and describe them as cells and jobs.
 
-    Runs of one method on one task are seeds of each other only if they agree in everything else: where they do not, the
-    label names what differs, as in ``"crptpro, env_steps 20000"``.
+    Runs of one method on one task are seeds of each other only if all other settings agree. Otherwise the label names
+    the settings that differ, as in ``"crptpro, env_steps 20000"``.
     """
-    cells, jobs = [], dict[str, dict[str, Any]]()
+    cells = []
+    jobs: dict[str, dict[str, Any]] = {}
     for path in sorted(path.parent for path in root.rglob("eval.csv")):
         try:
-            content, key = read_json(path / "config.json", error=RecordError), str(path.relative_to(root))
-            told = content["config"]
-            facts = {"task": told["task"], **told.get("config", told)}
+            content = read_json(path / "config.json", error=RecordError)
+            config = content["config"]
+            facts = {"task": config["task"], **config.get("config", config)}
             episodes = _read(path / "eval.csv", *EPISODES)
-            cell = {"experiment": "runs", "scale": "", "label": episodes["method"].iloc[0], "job": key}
-            cell |= {"done": bool(episodes["env_steps"].max() >= facts["env_steps"]), "task": facts["task"]}
+            label = episodes["method"].iloc[0]
+            is_done = bool(episodes["env_steps"].max() >= facts["env_steps"])
         except (RecordError, KeyError, TypeError, AttributeError) as reason:
             logger.warning("Left out: %s is no downstream run that can be read (%s).", path, reason)
             continue
-        cells.append(cell | {"colors": facts.get("colors", "")})
-        made = {name: content.get(name) for name in records.MADE} | {"device": facts.get("device")}
-        made |= {"machine": records.machine(content.get("hardware") or {}), "path": path}
-        made |= {"kind": "run", "facts": facts, "needs": [], "command": None, "done": cell["done"]}
-        jobs[key] = made
+        key = str(path.relative_to(root))
+        place = {"task": facts["task"], "colors": facts.get("colors", "")}
+        cells.append({"experiment": "runs", "scale": "", "label": label, "job": key, "done": is_done, **place})
+        jobs[key] = {
+            **{name: content.get(name) for name in records.MADE}, "device": facts.get("device"),
+            "machine": records.machine(content.get("hardware") or {}), "path": path, "kind": "run", "facts": facts,
+            "needs": [], "command": None, "done": is_done,
+        }  # fmt: skip
     table = pd.DataFrame(cells)
     if not len(table) or not table["done"].any():
         raise RecordError(
             f"{root} holds nothing to report on: no experiment of `crptpro reproduce` (experiments/*.json) and no "
             "finished downstream run."
         )
-    told = pd.DataFrame([job["facts"] for job in jobs.values()]).astype(str)
+    settings = pd.DataFrame([job["facts"] for job in jobs.values()]).astype(str)
     for _, own in table.groupby("label"):
-        counts = told.loc[own.index].groupby([own["task"], own["colors"]]).nunique().max()
-        for name in counts.index[counts > 1].difference(NOT_TOLD_APART):
-            table.loc[own.index, "label"] += f", {name} " + told[name]
+        counts = settings.loc[own.index].groupby([own["task"], own["colors"]]).nunique().max()
+        for name in counts.index[counts > 1].difference(NOT_IN_LABELS):
+            table.loc[own.index, "label"] += f", {name} " + settings[name]
     return table, pd.DataFrame.from_dict(jobs, orient="index")
 
 
@@ -243,13 +240,11 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def _where(job: dict[str, Any]) -> str:
+    """Describe the machine and the device of a finished job; empty if the machine is not known."""
+    if not job["done"] or not job["machine"]:
+        return ""
     has_threads = job["device"] == "cpu" and not pd.isna(job["threads"])
-    device = _count(int(job["threads"]), "thread") if has_threads else job["device"]
-    return f"{job['machine']}, {device}" if job["done"] and job["machine"] else ""
-
-
-def _machines(jobs: pd.DataFrame, keys: Iterable[str]) -> str:
-    return ", ".join(sorted(set(jobs.loc[list(keys), "machine"]) - {""}))
+    return f"{job['machine']}, {_count(int(job['threads']), 'thread') if has_threads else job['device']}"
 
 
 def _count(number: int, noun: str) -> str:
@@ -260,8 +255,8 @@ def _number(value: float, spec: str) -> str:
     return "" if math.isnan(value) else f"{value:{spec}}"
 
 
-def _or(values: Iterable[float]) -> str:
-    return " or ".join(f"{value:,.0f}" for value in sorted(set(values)))
+def _or(values: pd.Series) -> str:
+    return " or ".join(f"{value:,.0f}" for value in sorted(values.dropna().unique()))
 
 
 def _beside(text: str, paper: Any) -> str:
@@ -269,17 +264,12 @@ def _beside(text: str, paper: Any) -> str:
 
 
 def _spread(values: pd.Series, digits: int, n: bool = True) -> str:
-    """Print mean ± standard deviation (n); one number has no deviation."""
+    """Return mean ± standard deviation (n); a single number has no deviation."""
     deviation = f" ± {values.std():.{digits}f}" if len(values) > 1 else ""
     return f"{values.mean():.{digits}f}{deviation}" + (f" (n = {len(values)})" if n else "")
 
 
 # --- the head and the end of the page -------------------------------------------------------------------------------
-
-
-def _missing(cells: pd.DataFrame) -> str:
-    counts = cells.loc[~cells["done"], "label"].value_counts(sort=False)
-    return ", ".join(f"{label} {count}" for label, count in counts.items())
 
 
 def _contents(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
@@ -290,48 +280,43 @@ def _contents(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
         numbers.set_axis(["asked for", "finished"], axis=1).reset_index(),
     )
     counts = jobs.groupby("kind")["done"].agg(["sum", "size"])
-    told = ", ".join(f"{done} of {count} {kind}" for kind, done, count in counts.itertuples())
+    finished = ", ".join(f"{done} of {count} {kind}" for kind, done, count in counts.itertuples())
     seconds = jobs.loc[jobs["done"], "seconds"].dropna()
     work = f"; {seconds.sum() / 3600:.1f} h of work in all" if len(seconds) else ""
-    page.text(f"Jobs finished: {told}{work}. Machines, revisions and versions are at the end.")
+    page.text(f"Jobs finished: {finished}{work}. Machines, revisions and versions are at the end.")
 
 
 BUDGETS = {
-    "random transitions per domain": ("transitions", ["dataset"], "", "100,000"),
-    "encoder updates on datasets": ("updates", ["encoder"], "", "50,000"),
-    "pre-training batch": ("batch_size", ["encoder", "explored"], "", "512, or the method's own"),
-    "prototypes": ("loss.num_prototypes", ["encoder", "explored"], "crptpro|proto-rl", "512"),
-    "env steps of exploration (C)": ("explore.env_steps", ["explored"], "proto-rl-c", "200,000"),
-    "decisions per encoder update (C)": ("explore.encoder_update_interval", ["explored"], "proto-rl-c", "2"),
-    "downstream env steps": ("env_steps", ["run"], "(?!drq)", "500,000"),
-    "DrQ's env steps": ("env_steps", ["run"], "drq", "1,000,000"),
-    "downstream batch": ("batch_size", ["run"], "", "512"),
-    "downstream learning rate": ("learning_rate", ["run"], "", "0.0001"),
-    "downstream replay": ("replay_capacity", ["run"], "", "40,000 (Proto-RL 100,000)"),
-    "render quality": ("quality", ["dataset"], "", "exact"),
+    "random transitions per domain": (("transitions", ["dataset"], ""), "100,000"),
+    "encoder updates on datasets": (("updates", ["encoder"], ""), "50,000"),
+    "pre-training batch": (("batch_size", ["encoder", "explored"], ""), "512, or the method's own"),
+    "prototypes": (("loss.num_prototypes", ["encoder", "explored"], "crptpro|proto-rl"), "512"),
+    "env steps of exploration (C)": (("explore.env_steps", ["explored"], "proto-rl-c"), "200,000"),
+    "decisions per encoder update (C)": (("explore.encoder_update_interval", ["explored"], "proto-rl-c"), "2"),
+    "downstream env steps": (("env_steps", ["run"], "(?!drq)"), "500,000"),
+    "DrQ's env steps": (("env_steps", ["run"], "drq"), "1,000,000"),
+    "downstream batch": (("batch_size", ["run"], ""), "512"),
+    "downstream learning rate": (("learning_rate", ["run"], ""), "0.0001"),
+    "downstream replay": (("replay_capacity", ["run"], ""), "40,000 (Proto-RL 100,000)"),
+    "render quality": (("quality", ["dataset"], ""), "exact"),
 }
-"""Budget to the fact of jobs that holds it, their kinds, which methods, and the paper's."""
+"""Budget to where it is found (fact, kinds of jobs, pattern of their methods), and the paper's."""
 
 
 def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
-    """Show the budgets of every scale beside the paper's, as its jobs have them, and what they cannot show."""
+    """Show the budgets of every scale beside the paper's, and what such budgets cannot show."""
     page.section("What this scale cannot show", "limits")
-    table = pd.DataFrame(index=[*BUDGETS, "downstream runs per encoder"])
+    scales = {}
     for scale, own in cells[cells["scale"] != "paper"].groupby("scale", sort=False):
-        here = jobs.loc[list({key: 0 for job in own["job"].unique() for key in _needed(job, jobs)})]
-        facts = pd.json_normalize(here["facts"].tolist()).set_index(here.index)
-        methods = here["facts"].map(lambda told: str(told.get("method", "")))
-        values = []
-        for fact, kinds, method, _ in BUDGETS.values():
-            is_meant = here["kind"].isin(kinds) & methods.str.match(method)
-            found = facts.loc[is_meant, fact].dropna() if fact in facts else pd.Series()
-            words = [v if isinstance(v, str) else f"{v:,}".removesuffix(".0") for v in sorted(found.unique())]
-            values.append(" or ".join(words + ["the paper's"] * bool(len(found) < is_meant.sum())))
+        here = jobs.loc[_needed(own["job"].unique(), jobs)]
+        budgets = {name: _budget(here, *where) for name, (where, _) in BUDGETS.items()}
         runs = own[own["job"].map(jobs["kind"]) == "run"].drop_duplicates("job")
-        table[scale or "here"] = [*values, _or(runs.groupby(["label", *PLACES]).size())]
+        budgets["downstream runs per encoder"] = _or(runs.groupby(["label", *PLACES]).size())
+        scales[scale or "here"] = budgets
+    table = pd.DataFrame(scales)
     table = table[(table != "").any(axis=1)]
     if len(table):
-        paper = {budget: told for budget, (*_, told) in BUDGETS.items()}
+        paper = {name: printed for name, (_, printed) in BUDGETS.items()}
         table["the paper's"] = [paper.get(name, "not printed, at least 6 evaluations") for name in table.index]
         page.table("Budgets beside the paper's.", table.reset_index(names="budget"))
         page.text(
@@ -341,6 +326,14 @@ def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
             f"With fewer than {stats.MIN_RUNS} runs on a task there are no intervals, and two or three rank nothing.",
             "warning",
         )
+
+
+def _budget(jobs: pd.DataFrame, fact: str, kinds: Sequence[str], methods: str) -> str:
+    """Return the values of a fact in jobs of these kinds and methods; a job without it has the paper's."""
+    facts = pd.json_normalize(jobs.loc[jobs["kind"].isin(kinds), "facts"].tolist()).reindex(columns=["method", fact])
+    values = facts.loc[facts["method"].astype(object).fillna("").str.match(methods), fact]
+    words = [v if isinstance(v, str) else f"{v:,}".removesuffix(".0") for v in sorted(values.dropna().unique())]
+    return " or ".join(words + ["the paper's"] * bool(values.isna().any()))
 
 
 def _provenance(page: Page, jobs: pd.DataFrame) -> None:
@@ -360,16 +353,16 @@ def _provenance(page: Page, jobs: pd.DataFrame) -> None:
         "What jobs took, means. Times compare only within one machine, and jobs that shared one slowed each other.",
         costs.reset_index(),
     )
-    sets = done["versions"].dropna().map(lambda told: tuple(sorted(told.items()))).value_counts()
-    versions = pd.DataFrame({f"version ({_count(n, 'job')})": dict(told) for told, n in sets.items()})
+    sets = done["versions"].dropna().map(lambda versions: tuple(sorted(versions.items()))).value_counts()
+    versions = pd.DataFrame({f"version ({_count(count, 'job')})": dict(each) for each, count in sets.items()})
     page.table("Versions", versions.rename_axis("package").reset_index())
     page.section("Jobs", "jobs")
-    has_begun = jobs["path"].map(lambda path: (path / records.LOG).exists())
+    has_begun = [(path / records.LOG).exists() for path in jobs["path"]]
     table = pd.DataFrame({
         "job": jobs.index, "state": np.select([jobs["done"], has_begun], ["finished", "begun"], "not begun"),
         "wall clock": jobs["seconds"].map(duration, na_action="ignore"), "attempts": jobs["attempts"],
         "machine": jobs["machine"], "revision": jobs["git_revision"],
-        "command": [shlex.join(["crptpro", *told]) if isinstance(told, list) else "" for told in jobs["command"]],
+        "command": jobs["command"].map(lambda words: shlex.join(["crptpro", *words]), na_action="ignore"),
     })  # fmt: skip
     for kind, own in table.groupby(jobs["kind"].to_numpy()):
         page.table(f"{kind}: {_count(len(own), 'job')}", own, fold=True)
@@ -390,7 +383,9 @@ def _experiment(page: Page, experiment: str, scale: str, cells: pd.DataFrame, jo
         return
     page.text(f"{len(cells) - len(missing)} of {len(cells)} numbers are there.")
     if len(missing):
-        page.text(f"Missing: {_missing(cells)}. Nothing stands in for what is missing.", "warning")
+        counts = missing["label"].value_counts(sort=False)
+        names = ", ".join(f"{label} {count}" for label, count in counts.items())
+        page.text(f"Missing: {names}. Nothing stands in for what is missing.", "warning")
         places = missing.drop(columns=["experiment", "scale", "done"])
         page.table(f"The {len(missing)} that are missing", places, fold=True)
     _measurements(page, name, cells, jobs)
@@ -402,11 +397,13 @@ def _experiment(page: Page, experiment: str, scale: str, cells: pd.DataFrame, jo
 
 
 def _scores(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
-    runs, points = _runs(page, cells, jobs)
-    if runs.empty:
+    evaluations = _evaluations(page, cells, jobs)
+    if evaluations.empty:
         return
+    last = evaluations.groupby(["group", "label", "run"], sort=False)["env_steps"].idxmax()
+    runs = evaluations.loc[last].assign(expert=lambda own: own["task_name"].map(published.EXPERT_SCORES))
     page.text(
-        f"Runs of {_or(runs['budget'])} env steps here. n is the number of runs that a number stands on; “paper” is "
+        f"Runs of {_or(runs['env_steps'])} env steps here. n is the number of runs that a number stands on; “paper” is "
         f"what it printed, after {published.ENV_STEPS:,} env steps (DrQ: {published.DRQ_ENV_STEPS:,}): scores of a "
         "smaller budget do not compare with it.",
         "note",
@@ -417,28 +414,36 @@ def _scores(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> N
         if varied:
             _sensitivity(page, f"{name}-{varied}", part, str(varied))
     _aggregates(page, runs)
-    _learning_curves(page, name, points)
+    _learning_curves(page, name, evaluations)
 
 
-def _runs(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return a row per run with its place and scores, and one per evaluation with env steps and mean return."""
+def _evaluations(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> pd.DataFrame:
+    """Return a row per evaluation of a run: its mean return as ``score``, and the place and the encoder of the run.
+
+    ``task`` is the row of the tables, with group and colours; ``task_name`` the task alone.
+    """
     rows = _records(page, cells.sort_values("group", kind="stable"), jobs, ["run"], "eval", *EPISODES)
-    runs, points = [], []
-    for _, own in rows.groupby(["group", "label", "job"], sort=False) if len(rows) else ():
-        place = own[[*PLACES, "label"]].iloc[0].to_dict()
-        job, task, colors = own["job"].iloc[0], place["task"], place["colors"] or "normal"
-        where = f"{place['group']} {task}".strip() + (f", {colors}" if colors != "normal" else "")
-        place |= {"task": where, "task_name": task, "colors": colors, "run": job}
-        # Runs on encoders that were fine-tuned from one base share it: it is their one draw of a pre-training.
-        encoders = _needed(job, jobs, *ENCODERS)
-        card = jobs.loc[job, "path"] / "agent" / "card.json"
-        place["encoder"] = encoders[-1] if encoders else _json(card).get("pretrained") or job
-        curve = own.groupby("env_steps")["episode_return"].mean()
-        place |= {"score": curve.iloc[-1], "budget": curve.index[-1]}
-        runs.append({**place, "expert": published.EXPERT_SCORES.get(task, math.nan)})
-        about = {key: place[key] for key in ("label", "task", "run", "encoder")}
-        points.append(curve.reset_index(name="score").assign(**about))
-    return pd.DataFrame(runs), pd.concat(points, ignore_index=True) if points else pd.DataFrame()
+    if rows.empty:
+        return rows
+    rows = rows.rename(columns={"task": "task_name", "job": "run"})
+    rows["colors"] = rows["colors"].replace("", "normal")
+    colors = (", " + rows["colors"]).mask(rows["colors"] == "normal", "")
+    rows["task"] = (rows["group"] + " " + rows["task_name"]).str.strip() + colors
+    rows["encoder"] = rows["run"].map({run: _encoder(run, jobs) for run in rows["run"].unique()})
+    columns = ["task", "task_name", "colors", "varied", "value", "encoder", "env_steps"]
+    scores = rows.groupby(["group", "label", "run", *columns], sort=False)["episode_return"].mean()
+    return scores.reset_index(name="score")
+
+
+def _encoder(run: str, jobs: pd.DataFrame) -> str:
+    """Return the job or the artifact that a run's encoder comes from; the run itself if it has none.
+
+    Encoders that were fine-tuned from one base share it: it is their one draw of a pre-training.
+    """
+    if encoders := _needed([run], jobs, *ENCODERS):
+        return encoders[-1]
+    card = jobs.loc[run, "path"] / "agent" / "card.json"
+    return read_json(card, error=RecordError).get("pretrained") or run if card.exists() else run
 
 
 def _score_table(page: Page, runs: pd.DataFrame, caption: str) -> None:
@@ -448,7 +453,7 @@ def _score_table(page: Page, runs: pd.DataFrame, caption: str) -> None:
     for (label, task, *place), own in groups:
         text = _spread(own, 0 if abs(own.mean()) >= 10 else 1)
         cells[label, task] = _beside(text, published.published_score(label, *place))
-    labels, tasks = in_order(runs["label"]), list(runs["task"].unique())
+    labels, tasks = in_order(runs["label"]), runs["task"].unique()
     table = pd.Series(cells).unstack().loc[labels, tasks]
     if len(tasks) <= 3 < len(labels):
         page.table(caption, table.reset_index(names="method"))
@@ -463,12 +468,12 @@ NORMALIZED = {
 
 
 def _aggregates(page: Page, runs: pd.DataFrame) -> None:
+    """Compare methods on the tasks that all of them have."""
     labels = in_order(runs["label"])
     has_run = runs.groupby(["task", "label"], sort=False).size().unstack().notna()[labels]
-    shared = has_run.index[has_run.all(axis=1)]
     for task, row in has_run[~has_run.all(axis=1)].iterrows():
-        lacking = ", ".join(row.index[~row])
-        page.text(f"Left out of what compares methods: {task} (no run of {lacking}).", "note")
+        page.text(f"Left out of what compares methods: {task} (no run of {', '.join(row.index[~row])}).", "note")
+    shared = has_run.index[has_run.all(axis=1)]
     if shared.empty:
         page.text("There is no task on which every method has a run: nothing to aggregate.", "note")
         return
@@ -476,17 +481,17 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
     normal = kept.assign(score=kept["score"] / kept["expert"]).dropna(subset="expert")
     drq = kept[kept["label"] == "drq"]
     places = kept[["group", "task_name", "colors"]].drop_duplicates().to_numpy().tolist()
-    rows = list[dict[str, Any]]()
+    rows = []
     for label in labels:
         own, own_normal = (frame[frame["label"] == label] for frame in (kept, normal))
-        found, encoders = (stats.estimate(stats.mean, own), own.loc[own["encoder"] != own["run"], "encoder"].nunique())
+        found = stats.estimate(stats.mean, own)
+        encoders = own.loc[own["encoder"] != own["run"], "encoder"].nunique()
         line: dict[str, Any] = {"method": label, "tasks": len(shared), "runs": found.runs, "encoders": encoders or ""}
         line["mean score"] = _beside(f"{found:.0f}", _paper_mean(label, places))
-        for title, statistic in NORMALIZED.items() if len(normal) else ():
-            line[title] = f"{stats.estimate(statistic, own_normal):.3f}"
         if len(normal):
+            line |= {title: f"{stats.estimate(each, own_normal):.3f}" for title, each in NORMALIZED.items()}
             line["mean / DrQ"] = _beside(line["mean / DrQ"], _paper_mean(label, places, normalized=True))
-        if (drq["score"] > 0).all() and len(drq):
+        if len(drq) and (drq["score"] > 0).all():
             line["mean / DrQ here"] = "1" if label == "drq" else f"{stats.estimate(stats.relative_mean, own, drq):.3f}"
         rows.append(line)
     page.table(
@@ -512,13 +517,17 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
         )
     if missing := sorted(kept.loc[kept["expert"].isna(), "task_name"].unique()):
         page.text(f"The paper has no DrQ score for {', '.join(missing)}: in the mean score only.", "note")
-    ours = normal[normal["label"] == "crptpro"]
+    _improvement(page, normal)
+
+
+def _improvement(page: Page, runs: pd.DataFrame) -> None:
+    """Compare runs of crptpro with those of each other method."""
+    by_label = {label: runs[runs["label"] == label] for label in in_order(runs["label"])}
+    ours = by_label.pop("crptpro", None)
     rows = []
-    for label in in_order(normal["label"]) if len(ours) else ():
-        if label != "crptpro":
-            found = stats.estimate(stats.probability_of_improvement, ours, normal[normal["label"] == label])
-            told = {"other method": label, "runs of both": found.runs}
-            rows.append({**told, "P(crptpro > other)": f"{found:.2f}"})
+    for label, own in by_label.items() if ours is not None else ():
+        better = stats.estimate(stats.probability_of_improvement, ours, own)
+        rows.append({"other method": label, "runs of both": better.runs, "P(crptpro > other)": f"{better:.2f}"})
     page.table(
         "Probability that a run of crptpro scores higher than one of the other method on the same task; 0.5 is no "
         "difference. Of two runs against two it can only be 0, 0.25, 0.5, 0.75 or 1.",
@@ -527,26 +536,30 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
 
 
 def _paper_mean(label: str, places: Sequence[Sequence[str]], normalized: bool = False) -> str:
-    """Return what the paper printed for all of its seen tasks; for a part of them, what its cells give."""
+    """Return what the paper printed for all of its seen tasks; for a part of them, the mean of its cells."""
     digits, means = (3, published.SEEN_NORMALIZED_MEAN) if normalized else (0, published.SEEN_MEAN)
-    if {(*place[:2],) for place in places} == {row[:2] for row in published.SEEN} and label in means:
+    if {(group, task) for group, task, _ in places} == {row[:2] for row in published.SEEN} and label in means:
         return f"{means[label]:.{digits}f}"
-    asked = [place for place in places if not normalized or place[1] in published.EXPERT_SCORES]
-    scores = [published.published_score(label, *place) for place in asked]
-    experts = [published.EXPERT_SCORES[place[1]] if normalized else 1.0 for place in asked]
-    values = [score.mean / expert for score, expert in zip(scores, experts) if score]
-    return f"{np.mean(values):.{digits}f}" if values and len(values) == len(asked) else ""
+    values = []
+    for group, task, colors in places:
+        expert = published.EXPERT_SCORES.get(task) if normalized else 1.0
+        score = published.published_score(label, group, task, colors)
+        if expert and not score:
+            return ""
+        if expert and score:
+            values.append(score.mean / expert)
+    return f"{np.mean(values):.{digits}f}" if values else ""
 
 
-def _estimated(found: Any, **about: Any) -> pd.DataFrame:
-    """Return an estimate and its interval, if there is one, as points of a figure."""
-    ends = {end: math.nan if at is None else at for end, at in (("low", found.low), ("high", found.high))}
-    return pd.DataFrame({"y": found.value, **ends}).assign(**about)
+def _estimated(found: stats.Estimate, **columns: Any) -> pd.DataFrame:
+    """Return an estimate and its interval as points of a figure."""
+    ends = {"low": found.low, "high": found.high}
+    return pd.DataFrame({"y": found.value, **ends}).assign(**columns).astype({"low": float, "high": float})
 
 
-def _learning_curves(page: Page, name: str, points: pd.DataFrame) -> None:
+def _learning_curves(page: Page, name: str, evaluations: pd.DataFrame) -> None:
     drawn = []
-    for (task, label), own in points.groupby(["task", "label"], sort=False):
+    for (task, label), own in evaluations.groupby(["task", "label"], sort=False):
         runs = own.pivot_table("score", ["task", "encoder", "run"], "env_steps").dropna(axis=1)
         if runs.empty:  # no evaluation that all runs have
             continue
@@ -554,8 +567,8 @@ def _learning_curves(page: Page, name: str, points: pd.DataFrame) -> None:
         about = {"panel": task, "label": label, "n": str(len(runs))}
         drawn.append(_estimated(found, x=runs.columns, **about, line="mean", thin=False))
         if found.low is None and len(runs) > 1:  # too few for an interval: the runs themselves
-            own = own.rename(columns={"env_steps": "x", "score": "y", "run": "line"})
-            drawn.append(own.assign(**about, low=math.nan, high=math.nan, thin=True))
+            curves = own[["env_steps", "score", "run"]].set_axis(["x", "y", "line"], axis=1)
+            drawn.append(curves.assign(**about, low=math.nan, high=math.nan, thin=True))
     page.figure(
         f"{name}-curves",
         f"Episode return along training: mean over runs, with {stats.CONFIDENCE:.0%} bootstrap intervals from "
@@ -581,34 +594,39 @@ def _sensitivity(page: Page, name: str, runs: pd.DataFrame, varied: str) -> None
 # --- cost of pre-training -------------------------------------------------------------------------------------------
 
 
+COSTS = {
+    "s per encoder update": ("seconds_per_update", ".3g"),
+    "s per decision": ("seconds_per_decision", ".3g"),
+    "encoder updates at this scale": ("budget_updates", ",.0f"),
+    "hours at this scale": ("projected_hours", ".3g"),
+    "hours of collecting": ("collecting", ".3g"),
+    "encoder updates, paper's budget": ("paper_updates", ",.0f"),
+    "hours, paper's budget": ("paper_projected_hours", ".3g"),
+    "the same and collecting": ("hours", ".3g"),
+}
+"""Heading to the column of ``timing.csv``, or of what follows from it, and its format."""
+
+
 def _efficiency(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     rows = _records(page, cells, jobs, ["timing"], "timing")
     if rows.empty:
         return
+    transitions = jobs["facts"].str.get("transitions")
+    data = rows["job"].map(lambda job: transitions[_needed([job], jobs, "dataset")].mean())
     rows["collecting"] = rows["collection_seconds"].astype(float) / 3600
-    rows["hours"] = rows["paper_projected_hours"] + (
-        rows["collecting"] * rows["job"].map(lambda job: _papers_data(job, jobs))
-    ).fillna(0)
+    rows["hours"] = rows["paper_projected_hours"] + (rows["collecting"] * (100_000 / data)).fillna(0)
     table = []
-    groups = rows.groupby(["device", "threads", "method", "domains"], sort=False)
-    for (device, threads, method, count), own in groups:
-        average, hours, updates = own.mean(numeric_only=True), math.nan, math.nan
+    for (device, threads, method, count), own in rows.groupby(["device", "threads", "method", "domains"], sort=False):
+        average = own.mean(numeric_only=True)
+        line: dict[str, Any] = {"method": method, "domains": count}
+        line["on"] = device if device != "cpu" else _count(int(threads), "thread")
+        line |= {title: _number(average[column], spec) for title, (column, spec) in COSTS.items()}
+        line["s per encoder update"] += f" (n = {len(own)})"
         if method in published.EFFICIENCY and count in (1, 2, 3):
-            hours, updates = (told[count - 1] for told in published.EFFICIENCY[method])
-        paper_updates = _number(average["paper_updates"], ",.0f")
-        paper_hours = _number(average["paper_projected_hours"], ".3g")
-        table.append({
-            "method": method, "domains": count, "on": device if device != "cpu" else _count(int(threads), "thread"),
-            "s per encoder update": f"{average['seconds_per_update']:.3g} (n = {len(own)})",
-            "s per decision": _number(average["seconds_per_decision"], ".3g"),
-            "encoder updates at this scale": f"{average['budget_updates']:,.0f}",
-            "hours at this scale": f"{average['projected_hours']:.3g}",
-            "hours of collecting": _number(average["collecting"], ".3g"),
-            "encoder updates, paper's budget": _beside(paper_updates, _number(updates, ",.0f")),
-            "hours, paper's budget": _beside(paper_hours, _number(hours, "g")),
-            "the same and collecting": _number(average["hours"], ".3g"),
-            "machine": _machines(jobs, own["job"]),
-        })  # fmt: skip
+            hours, updates = (values[count - 1] for values in published.EFFICIENCY[method])
+            line["encoder updates, paper's budget"] += f"\npaper {updates:,}"
+            line["hours, paper's budget"] += f"\npaper {hours:g}"
+        table.append({**line, "machine": ", ".join(sorted(set(jobs.loc[own["job"], "machine"]) - {""}))})
     page.table(
         "Pre-training by number of domains: some updates timed here (n timings), projected to whole budgets; the "
         "paper's hours are those of an NVIDIA Tesla P100. Times compare only within one machine. Hours include the "
@@ -618,36 +636,33 @@ def _efficiency(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) 
     )
 
 
-def _papers_data(job: str, jobs: pd.DataFrame) -> float:
-    sizes = [jobs.loc[key, "facts"]["transitions"] for key in _needed(job, jobs, "dataset")]
-    return 100_000 / float(np.mean(sizes)) if sizes else math.nan
-
-
 # --- measurements of encoders and data ------------------------------------------------------------------------------
 
 
 def _measurements(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
-    """Report what one small table per job holds. A job that stands in two groups, as an (S) method's, counts once."""
+    """Report the small tables of jobs. A job in two groups, as an (S) method's, counts once."""
     groups = cells.groupby("job")["group"].agg(lambda own: ", ".join(sorted(set(own))))
     once = cells.drop_duplicates("job").assign(group=lambda own: own["job"].map(groups))
     for kind, measure in (("prototypes", _prototypes), ("coverage", _coverage), ("embeddings", _embeddings)):
-        if len(rows := _records(page, once, jobs, [kind], kind)):
+        rows = _records(page, once, jobs, [kind], kind)
+        if len(rows):
             measure(page, name, rows, jobs)
     rows = _records(page, cells, jobs, ["encoder", "explored", "finetuned"], "pretrain", "updates")
     for group, own in rows.groupby("group") if len(rows) else ():
         _diagnostics(page, f"{name}-{group}", f"Group {group}: diagnostics" if group else "Diagnostics", own)
-    if len(rows := _records(page, cells, jobs, ["probe"], "probe")):
-        _probes(page, name, rows)
+    rows = _records(page, cells, jobs, ["probe"], "probe")
+    if len(rows):
+        _probes(page, rows)
 
 
 SPREAD = {"kne_3": "KNE, k = 3", "kne_half": "KNE, k = M/2", "ane": "ANE", "intr": "L_intr"}
-"""Column of ``prototypes.csv`` to what it is."""
+"""Column of ``prototypes.csv`` to its heading."""
 
 
-def _last(rows: pd.DataFrame, keys: Sequence[str], numbers: Sequence[str], window: int = 1) -> pd.DataFrame:
-    """Return, by keys, how many jobs there are, and the mean over them of each number's last values."""
-    by_job = rows.groupby([*keys, "job"], sort=False)[[*numbers]]
-    ends = by_job.agg(lambda own: own.dropna().tail(window).mean()).groupby(list(keys), sort=False)
+def _last(rows: pd.DataFrame, keys: list[str], numbers: list[str], window: int = 1) -> pd.DataFrame:
+    """Return, by keys, the number of jobs, and the mean over jobs of the last values of each number."""
+    by_job = rows.groupby([*keys, "job"], sort=False)[numbers]
+    ends = by_job.agg(lambda own: own.dropna().tail(window).mean()).groupby(keys, sort=False)
     return ends.mean().assign(n=ends.size()).reset_index()
 
 
@@ -659,8 +674,8 @@ def _prototypes(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -
         paper = published.PROTOTYPE_METRICS.get((end["method"], end["has_dispersion"]))
         line = {"variant": end["label"], "encoders": end["n"], "updates": f"{end['updates']:,.0f}"}
         for column, title in SPREAD.items():
-            told = _number(getattr(paper, column, math.nan), ".3f")
-            line[title] = _beside(f"{end[column] * 1e4:.3f}", told)
+            printed = _number(getattr(paper, column, math.nan), ".3f")
+            line[title] = _beside(f"{end[column] * 1e4:.3f}", printed)
         table.append(line)
     page.table(
         "Spread of the prototypes at the end of pre-training, in units of 1e-4, mean over encoders; lower is wider. "
@@ -674,16 +689,15 @@ def _prototypes(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -
 
 
 def _coverage(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> None:
-    """How much of a domain the data covers along pre-training: random policy against explorers."""
+    """Show how much of a domain the data covers along pre-training: random policy against explorers."""
     explorers = rows["method"].astype(str) + " explorer"
     rows["label"] = explorers.mask(rows["source"] == "random", "random policy")
-    # Several explorers stand beside the same random data: what is equal is one curve.
+    # Several explorers share one random dataset: equal rows are one curve.
     rows = rows.drop_duplicates(["domain", "label", "env_steps", "coverage", "samples"])
-    numbers = ["env_steps", "samples", "coverage"]
-    ends = _last(rows, ["domain", "label"], numbers)
-    ends["all windows"] = _last(rows, ["domain", "label"], numbers, window=10)["coverage"]
-    for column in (*numbers, "all windows"):
-        form = "{:.4f}" if column in ("coverage", "all windows") else "{:,.0f}"
+    ends = _last(rows, ["domain", "label"], ["env_steps", "samples", "coverage"])
+    ends["all windows"] = _last(rows, ["domain", "label"], ["coverage"], window=10)["coverage"]
+    formats = {"env_steps": "{:,.0f}", "samples": "{:,.0f}", "coverage": "{:.4f}", "all windows": "{:.4f}"}
+    for column, form in formats.items():
         ends[column] = ends[column].map(form.format)
     page.table(
         "Coverage at the end: particle estimate over observations sampled from the last window of the training, which "
@@ -693,13 +707,13 @@ def _coverage(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> 
     )
     points = rows.rename(columns={"domain": "panel", "job": "line", "env_steps": "x", "coverage": "y"})
     caption = "Coverage along pre-training, a line per run; other numbers of samples do not compare."
-    steps = "env steps of the explorer, all domains"
-    page.figure(f"{name}-curves", caption, draw(points, steps, "particle estimate"))
+    figure = draw(points, "env steps of the explorer, all domains", "particle estimate")
+    page.figure(f"{name}-curves", caption, figure)
 
 
 def _embeddings(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> None:
     for place, (job, own) in enumerate(rows.groupby("job", sort=False), 1):
-        shares = _json(jobs.loc[job, "path"] / "explained.json").get("explained_variance_ratio", ())
+        shares = read_json(jobs.loc[job, "path"] / "explained.json", error=RecordError)["explained_variance_ratio"]
         axes = {f"pc{i}": f"component {i} ({share:.0%})" for i, share in enumerate(shares, 1)}
         points = pd.DataFrame({"label": own["source"]})
         pairs = [points.assign(x=own[x], y=own[y], panel=f"{axes[y]} over {axes[x]}") for x, y in combinations(axes, 2)]
@@ -715,9 +729,9 @@ DIAGNOSTICS = {
     "prototypes_in_use": "prototypes in use",
     "prototype_ane": "ANE of prototypes",
 }
-"""Column of ``pretrain.csv`` to what it is; the first three are drawn."""
+"""Column of ``pretrain.csv`` to its heading; the first three are drawn."""
 WINDOW = 5
-"""Rows at the end of a record that a final value averages over."""
+"""A final value is the mean over this many rows at the end of a record."""
 PLATEAU = 0.99
 """Share of ln M: a comparative loss that stays below has left the plateau, where all prototypes look alike."""
 
@@ -725,53 +739,43 @@ PLATEAU = 0.99
 def left_plateau(record: pd.DataFrame) -> float:
     """Return after how many encoder updates a comparative loss has left its plateau for good.
 
-    Args:
-        record: rows of ``pretrain.csv``, in order.
-
-    Returns:
-        Updates at the first row from which the loss stays below :data:`PLATEAU` of ln M; infinity if the record ends on
-        the plateau, and NaN if there is no such loss.
+    This is the first row of ``pretrain.csv`` from which the loss stays below :data:`PLATEAU` of ln M; infinity if the
+    record ends on the plateau, and NaN if there is no such loss.
     """
-    if not {"comp", "ln_num_prototypes"} <= set(record):
+    known = record.reindex(columns=["updates", "comp", "ln_num_prototypes"]).dropna()
+    if known.empty:
         return math.nan
-    known = record.dropna(subset=["comp", "ln_num_prototypes"])
-    is_on = (known["comp"] >= PLATEAU * known["ln_num_prototypes"]).to_numpy()
-    first = int(np.flatnonzero(is_on)[-1]) + 1 if is_on.any() else 0
-    if first == len(known):
-        return math.inf if len(known) else math.nan
-    return float(known["updates"].iloc[first])
+    on_plateau = np.flatnonzero(known["comp"] >= PLATEAU * known["ln_num_prototypes"])
+    first = on_plateau[-1] + 1 if len(on_plateau) else 0
+    return float(known["updates"].iloc[first]) if first < len(known) else math.inf
 
 
-def _diagnostics(page: Page, name: str, what: str, rows: pd.DataFrame) -> None:
-    shown = {column: title for column, title in DIAGNOSTICS.items() if column in rows}
+def _diagnostics(page: Page, name: str, title: str, rows: pd.DataFrame) -> None:
+    shown = {column: heading for column, heading in DIAGNOSTICS.items() if column in rows}
+    headings = list(shown.values())
     points = rows.rename(columns={"job": "line", "updates": "x", **shown})
     points["n"] = points.groupby("label")["line"].transform("nunique").astype(str)
-    drawn = list(shown.values())[:3]
-    points = points.melt(["label", "line", "x", "n"], drawn, "panel", "y").dropna(subset="y")
+    points = points.melt(["label", "line", "x", "n"], headings[:3], "panel", "y").dropna(subset="y")
     if len(points):
         has_loss = points["panel"].iloc[0] == DIAGNOSTICS["comp"]
         logs = rows["ln_num_prototypes"].dropna().unique() if has_loss else ()
         marks = {f"ln M = {value:.3f}": value for value in logs}
-        caption = f"{what} along pre-training, a line per encoder (n in the legend)."
+        caption = f"{title} along pre-training, a line per encoder (n in the legend)."
         page.figure(name, caption, draw(points, "encoder updates", marks=marks))
     ends = _last(rows, ["label"], list(shown), WINDOW).rename(columns={"n": "encoders", **shown})
-    ends[list(shown.values())] = ends[list(shown.values())].map(lambda value: _number(value, ".4g"))
-    by_label = {label: [own for _, own in each.groupby("job")] for label, each in rows.groupby("label")}
-    updates = {label: _or(own["updates"].max() for own in each) for label, each in by_label.items()}
-    left = {label: _plateau(map(left_plateau, each)) for label, each in by_label.items()}
-    for place, (title, told) in enumerate({"updates": updates, "left the plateau at": left}.items(), 1):
-        ends.insert(place, title, ends["label"].map(told))
+    ends[headings] = ends[headings].map(lambda value: _number(value, ".4g"))
+    by_run = rows.groupby(["label", "job"])
+    left = pd.Series({run: left_plateau(record) for run, record in by_run})
+    summary = pd.DataFrame({"updates": by_run["updates"].max(), "left the plateau at": left})
+    summary = summary.groupby(level=0).agg(_or).replace("inf", "not left", regex=True)
+    for place, column in enumerate(summary, 1):
+        ends.insert(place, column, ends["label"].map(summary[column]))
     page.table(
-        f"{what} at the end of pre-training. Mean of the last {WINDOW} rows of a record, then over encoders. The "
+        f"{title} at the end of pre-training. Mean of the last {WINDOW} rows of a record, then over encoders. The "
         f"plateau is left where the comparative loss stays below {PLATEAU:.0%} of ln M from then on: at ln M, or with "
         "a cosine near 1, nothing has been learned yet.",
         ends,
     )
-
-
-def _plateau(updates: Iterable[float]) -> str:
-    known = sorted({at for at in updates if not math.isnan(at)})
-    return " or ".join("not left" if math.isinf(at) else f"{at:,.0f}" for at in known)
 
 
 MEASURES = {
@@ -780,10 +784,10 @@ MEASURES = {
     "effective_rank": ("Effective rank (at most the number of observations)", 1),
     "mean_cosine": ("Mean pairwise cosine", 4),
 }
-"""Measure of a probe's table to what it is and its digits."""
+"""Measure of ``probe.csv`` to its heading and digits."""
 
 
-def _probes(page: Page, name: str, rows: pd.DataFrame) -> None:
+def _probes(page: Page, rows: pd.DataFrame) -> None:
     """Show a table per measure and embedding, with a column per domain and colours."""
     page.text(
         f"R2 is that of held-out episodes: {_or(rows['samples'])} observations per probe, "
@@ -799,9 +803,9 @@ def _probes(page: Page, name: str, rows: pd.DataFrame) -> None:
     groups = ", " + means["group"] if means["group"].nunique() > 1 else ""
     means = means.assign(at=means["domain"] + colors, encoder=means["label"] + groups)
     means["seen"] = means["seen"].map({"yes": "seen", "no": "unseen"})
-    for embedding, measure in product(means["embedding"].unique(), MEASURES):
+    for embedding, (measure, (title, digits)) in product(means["embedding"].unique(), MEASURES.items()):
         own = means[(means["embedding"] == embedding) & (means["measure"] == measure)]
-        (title, digits), places = MEASURES[measure], own.groupby(["encoder", "group", "at"], sort=False)
+        places = own.groupby(["encoder", "group", "at"], sort=False)
         counts = places["job"].nunique()
         cells = {
             place: f"{_spread(here['value'], digits, n=counts.nunique() > 1)}\n{' or '.join(here['seen'].unique())}"

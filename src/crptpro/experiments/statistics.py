@@ -1,8 +1,8 @@
-"""What to say of many runs in one number: aggregates over tasks, and bootstrap intervals that know of shared encoders.
+"""Aggregates of runs over tasks, and bootstrap intervals that account for shared encoders.
 
 Aggregates take one array ``[..., R]`` per task, with its runs along the last axis, and reduce runs and tasks. Source:
-Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, 2021, arXiv 2108.13264; they agree
-with its code google-research/rliable where every task has the same number of runs.
+Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, 2021, arXiv 2108.13264. They agree
+with google-research/rliable where every task has the same number of runs.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ Array = NDArray[np.float64]
 MIN_RUNS = 5
 """A task with fewer runs has no interval: percentile intervals of fewer draws are far too narrow."""
 COVERAGE = {5: 0.84, 6: 0.86, 8: 0.89, 10: 0.90}
-"""How often a 95 % percentile interval of the mean of so many draws of a normal law holds the law's mean."""
+"""Number of normal draws to the coverage of a 95 % percentile interval of their mean."""
 CONFIDENCE, REPLICATES, SEED = 0.95, 2_000, 0
-"""Of every interval; the same runs give the same interval, in whatever order they come."""
+"""Of every interval; the same runs give the same interval in any order."""
 
 
 def mean(scores: Sequence[Array]) -> Array:
@@ -48,13 +48,13 @@ def iqm(scores: Sequence[Array]) -> Array:
 
 
 def optimality_gap(scores: Sequence[Array]) -> Array:
-    """Return by how much normalised runs fall short of 1 on average; more than 1 makes up for nothing."""
+    """Return the mean shortfall of normalised runs from 1; a run above 1 counts as 1."""
     return mean([np.maximum(1.0 - task, 0.0) for task in scores])
 
 
 def probability_of_improvement(scores: Sequence[Array], others: Sequence[Array]) -> Array:
     """Return ``P(X > Y) + P(X = Y) / 2`` over all pairs of runs of two methods on the same task, mean over tasks."""
-    # The p-value, which nobody reads here, divides by zero where all runs are alike.
+    # The p-value is not used; it divides by zero if all runs are equal.
     with np.errstate(all="ignore"):
         wins = [
             mannwhitneyu(x, y, axis=-1, method="asymptotic").statistic / (x.shape[-1] * y.shape[-1])
@@ -69,7 +69,7 @@ def relative_mean(scores: Sequence[Array], others: Sequence[Array]) -> Array:
 
 
 class Estimate(NamedTuple):
-    """A number or a curve ``[K]``, its interval (``None`` below :data:`MIN_RUNS` runs of a task), what it stands on."""
+    """A number or a curve ``[K]``, its interval (``None`` below :data:`MIN_RUNS` runs of a task), its sample."""
 
     value: Array
     low: Array | None
@@ -92,23 +92,23 @@ def estimate(
     replicates: int = REPLICATES,
     seed: int = SEED,
 ) -> Estimate:
-    """Aggregate the runs of one method, or of two that are compared, with a two-level stratified bootstrap interval.
+    """Aggregate the runs of one method, or of two to compare, with a two-level stratified bootstrap interval.
 
-    A replicate redraws the encoders, once for all tasks that share them, and then, for each run's place, a downstream
-    run of the encoder drawn; tasks are kept (Davison & Hinkley, Bootstrap Methods and their Application, 1997, section
-    3.8). Where all runs stand on one encoder intervals speak of that encoder only.
+    A replicate redraws the encoders, once for all tasks that share them, and then, in place of each run, a downstream
+    run of the drawn encoder; tasks are kept (Davison & Hinkley, Bootstrap Methods and their Application, 1997, section
+    3.8). If all runs share one encoder, the interval is about that encoder only.
 
     Args:
-        statistic: an aggregate of this module; of two methods one that takes both.
+        statistic: an aggregate of this module; for two methods one that takes both.
         *methods: a row per run, with columns ``task``, ``encoder`` and ``run`` (names; a run without a pre-trained
-            encoder is its own), and the numbers asked for. A run that stands under several tasks is redrawn alike in
-            all of them. Two methods need the same tasks.
-        columns: numbers to aggregate: one score, or a curve's.
+            encoder is its own), and the numbers. A run under several tasks is redrawn alike in all of them. Two methods
+            need the same tasks.
+        columns: numbers to aggregate: one score, or the points of a curve.
         replicates: of the bootstrap.
         seed: of the bootstrap.
 
     Raises:
-        ValueError: no run, a number that is not finite, or tasks that only one method has.
+        ValueError: no run, a number that is not finite, or a task that only one method has.
 
     Examples:
         >>> runs = pd.DataFrame({"task": "walker_run", "run": list("abcde"), "score": [1.0, 2.0, 3.0, 4.0, 5.0]})
@@ -122,9 +122,9 @@ def estimate(
         raise ValueError(f"Only one of the methods has runs on {', '.join(map(str, odd))}.")
     arrays = [[task[list(columns)].to_numpy(float).T for task in sample.values()] for sample in samples]
     value = np.asarray(statistic(*arrays))
-    every = [task for sample in samples for task in sample.values()]
-    runs, encoders = (len(set().union(*(task[name] for task in every))) for name in ("run", "encoder"))
-    if min(map(len, every)) < MIN_RUNS:
+    tables = [task for sample in samples for task in sample.values()]
+    runs, encoders = (pd.concat(tables)[name].nunique() for name in ("run", "encoder"))
+    if min(map(len, tables)) < MIN_RUNS:
         return Estimate(value, None, None, runs, encoders)
     rng = np.random.default_rng(seed)
     redrawn = []
@@ -137,10 +137,10 @@ def estimate(
 
 
 def _resample(tasks: Sequence[pd.DataFrame], replicates: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
-    """Draw encoders with replacement, jointly for the tasks that share them, and then runs of those drawn.
+    """Draw encoders with replacement, jointly for the tasks that share them, and then runs of the drawn encoders.
 
-    A task keeps its places: the first encoder's ``n`` runs become ``n`` runs of the first encoder drawn, redrawn with
-    replacement, and so on. Tasks with the same runs are redrawn alike. Returns indices ``[B, R_t]`` per task.
+    The first encoder's ``n`` runs become ``n`` runs of the first encoder drawn, redrawn with replacement, and so on.
+    Tasks with the same runs are redrawn alike. Returns indices ``[B, R_t]`` per task.
     """
     encoders = [task["encoder"].tolist() for task in tasks]
     names = [np.unique(labels) for labels in encoders]
@@ -154,7 +154,7 @@ def _resample(tasks: Sequence[pd.DataFrame], replicates: int, rng: np.random.Gen
     for task, labels, own, stratum in zip(tasks, encoders, names, strata):
         same = (tuple(labels), tuple(task["run"]))
         if same not in drawn:
-            place = np.searchsorted(own, labels)  # [R] which encoder a run stands on
+            place = np.searchsorted(own, labels)  # [R] number of each run's encoder
             counts = np.bincount(place)
             by_encoder = np.argsort(place, kind="stable")
             first = np.cumsum(counts) - counts
@@ -178,7 +178,7 @@ def _by_task(method: pd.DataFrame, columns: Sequence[str]) -> dict[str, pd.DataF
 
 
 def _strata(names: Sequence[NDArray]) -> list[int]:
-    """Number the sets of tasks that hang together by shared encoders."""
+    """Return, for each task, the number of its set: tasks that share encoders, directly or through others."""
     codes, unique = pd.factorize(np.concatenate(names))
     tasks = np.repeat(np.arange(len(names)), [len(own) for own in names])
     size = len(names) + len(unique)
