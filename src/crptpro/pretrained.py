@@ -339,7 +339,7 @@ def _as_pretrained(trained: Any, actor: nn.Module | None) -> Pretrained:
     }
     card = {
         "method": result["method"],
-        "loss": {"class": f"{type(loss).__module__}.{type(loss).__qualname__}", "config": _loss_options(loss)},
+        "loss": {"class": class_name(loss), "config": loss_options(loss)},
         "training": result.get("training"),
     }
     actor = result.get("actor") if actor is None else actor
@@ -357,8 +357,13 @@ def _slimmed(source: Pretrained) -> Pretrained:
     return replace(source, **left_out, card=card)
 
 
-def _loss_options(loss: nn.Module) -> dict[str, Any]:
-    """The constructor's plain options, read back from the attributes of the same names."""
+def class_name(loss: nn.Module) -> str:
+    """Return the class of a loss with its module, as cards and checkpoints name it."""
+    return f"{type(loss).__module__}.{type(loss).__qualname__}"
+
+
+def loss_options(loss: nn.Module) -> dict[str, Any]:
+    """Return the plain options of a loss's constructor, read back from the attributes of the same names."""
     if isinstance(config := getattr(loss, "config", None), dict):
         return config
     options = {}

@@ -42,7 +42,7 @@ def test_one_observation_outside_does_not_end_a_plateau() -> None:
     for updates, comp in ((100, UNIFORM), (200, 6.1), (300, UNIFORM), (400, 6.1)):
         assert monitor.observe(updates, comp=comp, cosine=0.5) == "plateau"
     assert monitor.observe(500, comp=6.0, cosine=0.5) == "learning"
-    assert monitor.plateaus == [[100, 400]]
+    assert monitor.verdict(500)["plateaus"] == [{"entered": 100, "left": 400}]
 
 
 def test_a_plateau_beyond_patience_is_dead_and_can_still_recover(caplog: pytest.LogCaptureFixture) -> None:

@@ -14,14 +14,7 @@ from torchrl.objectives import SoftUpdate
 
 from crptpro.artifact import read_artifact, write_artifact
 from crptpro.errors import CheckpointError, NonFiniteError
-from crptpro.modules import (
-    DeterministicActor,
-    PixelEncoder,
-    SquashedGaussianActor,
-    TwinCritic,
-    resolve_precision,
-    set_compute_dtype,
-)
+from crptpro.modules import PixelEncoder, SquashedGaussianActor, TwinCritic, resolve_precision, set_compute_dtype
 from crptpro.objectives import RADSACLoss, SkillDDPGLoss
 from crptpro.provenance import provenance
 from crptpro.training.compile import accelerate
@@ -79,7 +72,7 @@ class PixelAgent(nn.Module):
 def save_agent(path: str | Path, agent: PixelAgent, *, card: Mapping[str, Any]) -> Path:
     """Write encoder and actor into a directory with a card, whole or not at all.
 
-    The card has what else the reader should know. A :class:`~crptpro.modules.PixelEncoder` can be rebuilt from it.
+    ``card`` is what else the reader should know.
     """
     modules = {"encoder": agent.encoder, "actor": agent.actor}
     content = {
@@ -96,8 +89,8 @@ def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[P
 
     Args:
         path: directory.
-        encoder: a module of the class that the agent was trained with, for an encoder of your own; its weights are
-            loaded. A :class:`~crptpro.modules.PixelEncoder` is rebuilt from the card.
+        encoder: for an encoder of your own, a module of its class, whose weights are loaded. A
+            :class:`~crptpro.modules.PixelEncoder` is rebuilt from the card.
 
     Returns:
         The agent, ready to act, and its card.
@@ -124,10 +117,15 @@ def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[P
 class SACLearner:
     """Steps critic, actor and temperature, and moves the target critic, on the reference schedule.
 
-    Each of the three has its own Adam, as in Proto-RL's and CRPTpro's released agents. Actor and temperature step at
-    every ``actor_interval``-th agent step, the target moves at every ``target_interval``-th.
+    Each of the three has its own Adam, as in Proto-RL's and CRPTpro's released agents.
 
-    ``critic_tau`` is the EMA rate of the target critic; ``compile`` compiles the losses.
+    Args:
+        loss: with its networks.
+        learning_rate: of the three.
+        critic_tau: EMA rate of the target critic.
+        actor_interval: agent steps between two steps of actor and temperature.
+        target_interval: agent steps between two moves of the target.
+        compile: compile the losses.
     """
 
     def __init__(
@@ -213,12 +211,3 @@ def make_sac_loss(
     actor = SquashedGaussianActor(feature_dim, action_dim, **widths) if actor is None else actor
     critic = TwinCritic(feature_dim, action_dim, **widths)
     return loss_class(actor.to(device), critic.to(device), **options)
-
-
-def make_skill_ddpg_loss(
-    feature_dim: int, action_dim: int, skill_dim: int, *, hidden_dim: int, device: torch.device, **options: Any
-) -> SkillDDPGLoss:
-    """Return the loss of BeCL's explorer with fresh networks on a device; ``options`` are the loss's."""
-    actor = DeterministicActor(feature_dim, action_dim, skill_dim=skill_dim, hidden_dim=hidden_dim)
-    critic = TwinCritic(feature_dim + skill_dim, action_dim, hidden_dim=hidden_dim, has_tanh=True)
-    return SkillDDPGLoss(actor.to(device), critic.to(device), **options)
