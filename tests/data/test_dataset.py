@@ -169,7 +169,7 @@ def test_a_checkpoint_refers_to_the_dataset(dataset: FrameDataset, tmp_path: Pat
     assert sum(file.stat().st_size for file in files) < 10_000
     dataset.loads(tmp_path / "checkpoint")
     other = FrameDataset.open(write_dataset(tmp_path / "other", episodes[:3]))
-    with pytest.raises(DatasetError, match="transitions 12 there, 26 asked for"):
+    with pytest.raises(DatasetError, match="transitions 12 there, 26 requested"):
         other.loads(tmp_path / "checkpoint")
 
 
@@ -301,9 +301,9 @@ def test_files_that_lack_finished_episodes_are_named_and_left_alone(tmp_path: Pa
 
 @pytest.mark.parametrize("finished", [True, False])
 @pytest.mark.parametrize(("asked", "message"), [
-    ({"seed": 4}, "seed 0 there, 4 asked for"),
-    ({"transitions": 70}, "transitions 27 there, 70 asked for"),
-    ({"colors": "reversed_image"}, "colors 'normal' there, 'reversed_image' asked for"),
+    ({"seed": 4}, "seed 0 there, 4 requested"),
+    ({"transitions": 70}, "transitions 27 there, 70 requested"),
+    ({"colors": "reversed_image"}, "colors 'normal' there, 'reversed_image' requested"),
 ])  # fmt: skip
 def test_another_request_for_the_same_place_is_refused(
     tmp_path: Path, finished: bool, asked: dict[str, Any], message: str

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -35,13 +34,15 @@ class FrameDataset(ReplayBuffer):
     """The frames of one domain, sampled as pairs of consecutive stacks (x_t, x_t+1).
 
     ``sample(B)`` draws uniformly, with replacement, from all transitions and returns a TensorDict ``[B]`` with
-    ``pixels`` and ``("next", "pixels")`` uint8 ``[B, 3k, H, W]`` (oldest to newest, equal to what a live frame stack
-    showed, episode starts included), ``action`` float32 ``[B, A]``, ``("next", "reward")`` float32 ``[B, 1]``,
-    ``("next", "done" | "terminated" | "truncated")`` bool ``[B, 1]``, ``index``, the position in the ``episode``
-    (``step``), and ``number``, ``("next", "number")``: the rows of the observations' newest frames, which
-    :meth:`observations` reads. A pair never crosses an episode.
 
-    Frames are mapped from disk without write access: several processes can open one dataset, threads may sample one
+    - ``pixels`` and ``("next", "pixels")``, uint8 ``[B, 3k, H, W]``, oldest to newest, equal to a live frame stack,
+      episode starts included; a pair never crosses an episode;
+    - ``action`` float32 ``[B, A]``, ``("next", "reward")`` float32 ``[B, 1]``,
+      ``("next", "done" | "terminated" | "truncated")`` bool ``[B, 1]``;
+    - ``index``, ``episode``, ``step`` in the episode, and ``number``, ``("next", "number")``: the rows of the
+      observations' newest frames, which :meth:`observations` reads.
+
+    Frames are mapped from disk without write access: several processes can open one dataset, and threads may sample one
     object. :meth:`open` reads a finished dataset; :meth:`create` begins or continues one, and ``extend`` fills it with
     what :class:`~crptpro.data.FrameReplay` takes, but each episode must begin at its reset::
 
@@ -53,9 +54,8 @@ class FrameDataset(ReplayBuffer):
 
     Args:
         storage: what to read.
-        **options: of TorchRL's ``ReplayBuffer``: ``batch_size`` (default of ``sample()``), ``generator`` (torch's
-            global one by default), ``transform``, ``sampler``, ``prefetch`` (whose threads may hand out the batches of
-            one generator in another order).
+        **options: of TorchRL's ``ReplayBuffer``: ``batch_size`` (default of ``sample()``), ``generator`` (default:
+            torch's global one), ``transform``, ``sampler``, ``prefetch`` (its threads may reorder batches).
     """
 
     def __init__(self, storage: FrameStorage, **options: Any):
@@ -71,12 +71,12 @@ class FrameDataset(ReplayBuffer):
         Args:
             path: its directory.
             frame_stack: k, frames per stack.
-            device: ``"cpu"`` maps the frames from disk; another device holds a copy of them and samples there. It needs
-                a generator of the same device.
+            device: ``"cpu"`` maps the frames from disk; another device holds a copy of them and samples there, with a
+                generator on the same device.
             **options: see the class.
 
         Raises:
-            DatasetError: naming the file that is missing, unfinished, truncated or foreign.
+            DatasetError: a file is missing, unfinished, truncated or foreign.
         """
         return cls(FrameStorage(as_path(path), frame_stack, device).load(), **options)
 
@@ -86,8 +86,8 @@ class FrameDataset(ReplayBuffer):
     ) -> FrameDataset:
         """Begin a dataset, or continue one that was interrupted; a complete one is opened.
 
-        It is complete, and can be sampled, after so many transitions; the last episode is cut to fit. ``about`` are
-        further facts of the card that two attempts must agree in: ``task``, ``seed``, ``action_repeat``, ...
+        It is complete, and can be sampled, after ``transitions``; the last episode is cut to fit. ``about`` holds
+        further facts for the card that every attempt must repeat: ``task``, ``seed``, ``action_repeat``, ...
 
         Raises:
             DatasetError: if the directory holds something else, or another process is writing there.
@@ -98,7 +98,7 @@ class FrameDataset(ReplayBuffer):
             request[name] = as_int(request[name], name, minimum=0 if name == "seed" else 1)
         if not (path / CARD_FILE).exists():
             writer = EpisodeWriter(path, request)
-            if not (path / CARD_FILE).exists():
+            if writer.transitions < writer.target:
                 return cls(FrameStorage(path, frame_stack), writer=writer)
         _require_request(path, read_card(path)["request"], request)
         return cls.open(path, frame_stack=frame_stack)
@@ -114,7 +114,7 @@ class FrameDataset(ReplayBuffer):
 
     @property
     def is_complete(self) -> bool:
-        """Whether all transitions that were asked for are there."""
+        """Whether all requested transitions are there."""
         return bool(self.card)
 
     @property
@@ -195,7 +195,7 @@ class FrameStorage(StackStorage):
         self.set()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what tells this dataset from another one: a checkpoint does not copy it."""
+        """Return what identifies this dataset: a checkpoint does not copy it."""
         return {"request": self.card.get("request", {}), "frame_stack": self.frame_stack}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -214,10 +214,10 @@ def _load(path: Path, frame_stack: int, device: str) -> FrameStorage:
 
 
 class EpisodeWriter(ImmutableDatasetWriter):
-    """Appends episodes 0, 1, 2, ... to a directory until they hold the transitions asked for.
+    """Appends episodes 0, 1, 2, ... to a directory until they hold the requested transitions.
 
     The rows of an episode are on the disk before ``collection.json`` counts them; what a kill left behind them is cut
-    off when the next episode is written. As long as no episode is durable, another request takes this one's place.
+    off when the next episode is written. As long as no episode is durable, another request replaces this one.
     The directory is locked until the dataset is complete or :meth:`close` is called.
     """
 
@@ -234,13 +234,10 @@ class EpisodeWriter(ImmutableDatasetWriter):
             raise DatasetError(f"{path} is not empty and not a collection. Choose another directory or empty it.")
         self._lock = DirectoryLock(path, error=DatasetError)
         try:
-            if not (path / CARD_FILE).exists():  # another process may have finished it just now
-                self._resume()
+            self._resume()
         except BaseException:
             self.close()
             raise
-        if (path / CARD_FILE).exists():
-            self.close()
 
     @property
     def transitions(self) -> int:
@@ -259,7 +256,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
     def extend(self, data: TensorDictBase) -> Tensor:
         """Take transitions of one environment in temporal order, as :class:`~crptpro.data.FrameReplay` does.
 
-        Those beyond the ones asked for are left out. Returns the indices of those that became durable, int64.
+        Surplus ones are left out. Returns the indices of those that became durable, int64.
         """
         before, stack = self.transitions, self._storage.frame_stack
         if before >= self.target:
@@ -287,10 +284,12 @@ class EpisodeWriter(ImmutableDatasetWriter):
             return
         columns = self._pending_columns()
         self._pending = []
-        described = {name: [str(values.dtype), list(values.shape[1:])] for name, values in columns.items()}
+        described = {
+            name: [str(values.dtype).removeprefix("torch."), list(values.shape[1:])] for name, values in columns.items()
+        }
         if self.episodes and described != self.state["columns"]:
             raise DatasetError(
-                f"{self.path} holds rows of {self.state['columns']}, but episode {self.episodes} brings {described}. "
+                f"{self.path} holds rows of {self.state['columns']}, but episode {self.episodes} has {described}. "
                 "Collect it into another directory."
             )
         total = self.transitions + len(columns["transitions/row"])
@@ -301,7 +300,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
             self._save(columns=described, transitions=total, episodes=self.episodes + 1)
         except (OSError, DiskSpaceError) as reason:
             if not is_disk_full(reason):
-                raise DatasetError(f"{self.path} cannot be written: {reason}.") from reason
+                raise
             raise DiskSpaceError(
                 f"The disk under {self.path} is full after {self.transitions} transitions ({self.episodes} whole "
                 "episodes), which are kept. Free space and run the same command again."
@@ -319,8 +318,8 @@ class EpisodeWriter(ImmutableDatasetWriter):
             if before.get(name) is not None and card.get(name, before[name]) != before[name]:
                 raise DatasetError(
                     f"{self.path} was begun with the {name} {before[name]!r}, now it is {card[name]!r}: their pixels "
-                    f"differ. Continue with MUJOCO_GL={before.get('backend')} where it is that renderer, or remove "
-                    "the directory to begin anew."
+                    f"differ. Continue with MUJOCO_GL={before.get('backend')} on that renderer, or remove the "
+                    "directory to begin again."
                 )
         if not self._has_noted:
             self._has_noted = True
@@ -332,34 +331,28 @@ class EpisodeWriter(ImmutableDatasetWriter):
         """Free the directory; an unfinished dataset can be continued later."""
         self._lock.release()
 
-    def _pending_columns(self) -> dict[str, np.ndarray]:
+    def _pending_columns(self) -> dict[str, Tensor]:
         """Return the rows of the running episode by file."""
         parts = self._pending
-
-        def whole(name: Any) -> np.ndarray:
-            return torch.cat([part.columns[name] for part in parts]).numpy()
-
-        frames = [parts[0].newest[:1], *(part.following for part in parts)]
-        columns = {"frames/pixels": torch.cat(frames).numpy()}
+        rows = {name: torch.cat([part.columns[name] for part in parts]) for name in parts[0].columns}
+        columns = {"frames/pixels": torch.cat([parts[0].newest[:1], *(part.following for part in parts)])}
         for name in ("qpos", "qvel"):
-            if name in parts[0].columns:
-                values = np.concatenate([whole(name), whole(("next", name))[-1:]])
-                columns[f"frames/{name}"] = values.astype(np.float64)
-        flags = {name: whole(name).copy() for name in ("done", "terminated", "truncated")}
-        if not flags["done"][-1, 0]:
-            flags["done"][-1] = flags["truncated"][-1] = True
-        step = np.arange(len(flags["done"]))
+            if name in rows:
+                columns[f"frames/{name}"] = torch.cat([rows[name], rows["next", name][-1:]]).double()
+        if not rows["done"][-1, 0]:
+            rows["done"][-1] = rows["truncated"][-1] = True
+        step = torch.arange(len(rows["done"]), device="cpu")
         return columns | {
-            "transitions/action": whole("action").astype(np.float32),
-            "transitions/next/reward": whole("reward").astype(np.float32),
-            **{f"transitions/next/{name}": values for name, values in flags.items()},
+            "transitions/action": rows["action"].float(),
+            "transitions/next/reward": rows["reward"].float(),
+            **{f"transitions/next/{name}": rows[name] for name in ("done", "terminated", "truncated")},
             "transitions/row": self.transitions + self.episodes + step,
-            "transitions/step": step.astype(np.int32),
-            "transitions/episode": np.full(len(step), self.episodes, np.int32),
+            "transitions/step": step.int(),
+            "transitions/episode": torch.full_like(step, self.episodes, dtype=torch.int32),
         }
 
     def _resume(self) -> None:
-        for stale in self.path.glob(".*.partial"):  # of a process that was killed: it had the lock
+        for stale in self.path.glob(".*.partial"):  # of a killed process
             stale.unlink(missing_ok=True)
         file = self.path / COLLECTION_FILE
         state = read_json(file, error=DatasetError) if file.exists() else self.state
@@ -392,12 +385,12 @@ class EpisodeWriter(ImmutableDatasetWriter):
         self.close()
 
 
-def _append(path: Path, values: np.ndarray, rows: int) -> None:
+def _append(path: Path, values: Tensor, rows: int) -> None:
     """Write rows behind the first ``rows`` of a file, through to the disk."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "ab") as file:
         file.truncate(rows * (values.nbytes // len(values)))
-        file.write(np.ascontiguousarray(values).tobytes())
+        file.write(values.numpy().tobytes())
         file.flush()
         os.fsync(file.fileno())
 
@@ -406,22 +399,22 @@ def _sizes(path: Path, state: Mapping[str, Any]) -> dict[Path, int]:
     """Return the files of a card, or of a collection, and their sizes in bytes."""
     rows = {"transitions": state["transitions"], "frames": state["transitions"] + state["episodes"]}
     return {
-        path / f"{name}.memmap": rows[name.split("/")[0]] * math.prod(shape) * np.dtype(dtype).itemsize
+        path / f"{name}.memmap": rows[name.split("/")[0]] * math.prod(shape) * getattr(torch, dtype).itemsize
         for name, (dtype, shape) in state["columns"].items()
     }
 
 
-def _require_request(path: Path, found: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
+def _require_request(path: Path, found: Mapping[str, Any], request: Mapping[str, Any]) -> None:
     """Compare the request that a directory was filled for with the one that is made now."""
     differing = [
-        f"{name} {found.get(name)!r} there, {value!r} asked for"
-        for name, value in asked.items()
+        f"{name} {found.get(name)!r} there, {value!r} requested"
+        for name, value in request.items()
         if found.get(name) != value
     ]
     if differing:
         raise DatasetError(
-            f"{path} is a dataset of other settings: {'; '.join(differing)}. Ask for the same, choose another "
-            "directory, or remove this one to collect anew."
+            f"{path} is a dataset of other settings: {'; '.join(differing)}. Use the same settings, choose another "
+            "directory, or remove this one to collect it again."
         )
 
 
@@ -455,9 +448,9 @@ def _why_no_card(path: Path) -> str:
         return f"{path} is not a directory. A dataset is made by collect_random or `crptpro collect`."
     if (path / COLLECTION_FILE).exists():
         state = read_json(path / COLLECTION_FILE, error=DatasetError)
-        asked = state.get("request", {}).get("transitions")
+        target = state.get("request", {}).get("transitions")
         return (
-            f"{path} is unfinished: {state.get('transitions', 0)} of {asked} transitions are collected. "
+            f"{path} is unfinished: {state.get('transitions', 0)} of {target} transitions are collected. "
             "Run the same collect command again to complete it."
         )
     kinds = sorted(child.parent.name for child in path.glob(f"*/{CARD_FILE}"))

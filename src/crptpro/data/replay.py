@@ -11,7 +11,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
-from torchrl.envs.transforms import Transform
 
 from crptpro.artifact import require_disk
 from crptpro.data.storage import RingStorage, StackStorage, map_rows, read_rows
@@ -31,7 +30,7 @@ class FrameReplay(ReplayBuffer):
     """TorchRL replay buffer whose frames are stored once, in RAM or on disk.
 
     40,000 transitions of 84 x 84 frames take 0.85 GB instead of the 5.1 GB of stored stacks. It takes what TorchRL
-    environments and collectors hand out and is first in, first out::
+    environments and collectors return and is first in, first out::
 
         replay = FrameReplay(40_000, action_dim=6, transform=RandomShift(pad=4, in_keys=[...]))
         for rollout in Collector(env, policy, frames_per_batch=100, total_frames=-1):
@@ -58,27 +57,24 @@ class FrameReplay(ReplayBuffer):
     of the next observation (:func:`~crptpro.data.storage.n_step_return`). Indexing reads single transitions.
     Deviation: url_benchmark draws an episode uniformly, and then an anchor in it; here every anchor is equally likely.
 
-    A ring on disk is its own checkpoint: :meth:`state_dict` holds a few counters, and loading one restores exactly the
-    content of its moment, provided that at most ``slack`` frames were written since. With checkpoints every n
-    transitions, of which the last two are kept, ``slack >= 2 * n`` (plus a frame per episode) is enough. Copies and
-    pickles of it hold their frames in RAM. Threads may sample and extend one buffer.
+    A ring on disk is its own checkpoint: :meth:`state_dict` holds a few counters, and loading it restores the content
+    exactly, provided that at most ``slack`` frames were written since. With checkpoints every n transitions, of which
+    the last two are kept, ``slack >= 2 * n`` (plus a frame per episode) is enough. Copies and pickles hold their frames
+    in RAM. Threads may sample and extend one buffer.
 
     Args:
-        capacity: most transitions that can be sampled. Very short episodes (below 50 transitions) lower it, because
-            each has one frame more than transitions.
+        capacity: most transitions that can be sampled; episodes below 50 transitions lower it, because each has one
+            frame more than transitions.
         frame_shape: ``(C, H, W)`` of a single frame.
         action_dim: A, length of an action.
-        path: directory of the ring's files; RAM if ``None``. It must not be shared by two running buffers.
-        slack: frames that may be written after a checkpoint before it is worthless.
+        path: directory of the ring's files, for this buffer alone; RAM if ``None``.
+        slack: frames that may be written after a checkpoint before it can no longer be restored.
         frame_stack: k, frames per stack.
-        extra_columns: further entries of a transition's root, such as the skill that chose the action: name to
-            ``(shape, dtype)``.
+        extra_columns: further entries of a transition's root, such as a skill: name to ``(shape, dtype)``.
         n_step: n, agent steps from an observation to the next one of a sample.
         discount: gamma of the n-step return.
         returns_pixels: ``False`` leaves the stacks out of samples, for a transform that has features by number.
-        batch_size: default of ``sample``.
-        generator: source of randomness; torch's global generator if ``None``.
-        transform: of samples, as in TorchRL; see also ``append_transform``.
+        **options: of TorchRL's ``ReplayBuffer``: ``batch_size``, ``generator``, ``transform``.
 
     Raises:
         DiskSpaceError: if the disk cannot hold the ring.
@@ -108,9 +104,7 @@ class FrameReplay(ReplayBuffer):
         n_step: int = 1,
         discount: float = 0.99,
         returns_pixels: bool = True,
-        batch_size: int | None = None,
-        generator: torch.Generator | None = None,
-        transform: Transform | None = None,
+        **options: Any,
     ):
         capacity, slack = as_int(capacity, "capacity", minimum=1), as_int(slack, "slack", minimum=0)
         frame_stack = as_int(frame_stack, "frame_stack", minimum=1)
@@ -143,24 +137,17 @@ class FrameReplay(ReplayBuffer):
             path=directory,
         )
         storage.returns_pixels = bool(returns_pixels)
-        super().__init__(
-            storage=storage,
-            sampler=_WindowSampler(),
-            writer=_RingWriter(extra),
-            collate_fn=as_it_is,
-            batch_size=None if batch_size is None else as_int(batch_size, "batch_size", minimum=1),
-            generator=generator,
-            transform=transform,
-        )
+        parts = {"sampler": _WindowSampler(), "writer": _RingWriter(extra), "collate_fn": as_it_is}
+        super().__init__(storage=storage, **parts | options)
 
     @property
     def window(self) -> int:
-        """Frames that the observations of samples, and the newest one, lie among; their numbers differ modulo this."""
+        """Frames within which all sampled observations and the newest one are; their numbers differ modulo this."""
         return self._storage.window
 
     @property
     def frames_written(self) -> int:
-        """Frames stored so far, those that were overwritten included; the newest one's number is one less."""
+        """Frames stored so far, overwritten ones included; the newest one's number is one less."""
         return self._storage.frames
 
     def observations(self, numbers: Tensor) -> Tensor:
@@ -169,7 +156,7 @@ class FrameReplay(ReplayBuffer):
             return self._storage.observations(numbers)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return a few counters (ring on disk) or the whole content (ring in RAM); the generator is the caller's."""
+        """Return a few counters (ring on disk) or the whole content (ring in RAM), without the generator."""
         with self._replay_lock:
             return {"ring": self._storage.state_dict()}
 
@@ -210,12 +197,12 @@ def stack_frames(buffer: ReplayBuffer, *, frame_stack: int = 3, **options: Any) 
 
 
 class StoredReplay(StackStorage):
-    """The observations in the files of a :class:`FrameReplay`, oldest first, without writing to them.
+    """The observations in the files of a :class:`FrameReplay`, oldest first, read-only.
 
-    A ring that went round holds the newest part alone. Nobody may be writing to ``path``, which was the replay's.
+    ``path`` is the replay's directory, which nobody may be writing to.
 
     Raises:
-        DatasetError: if there is no replay of square RGB frames, or not a single transition in it.
+        DatasetError: if there is no replay of square RGB frames, or it has no transition.
     """
 
     def __init__(self, path: str | Path, *, frame_stack: int = 3) -> None:
@@ -248,7 +235,7 @@ def as_it_is(sample: TensorDictBase) -> TensorDictBase:
 
 
 class _RingWriter(ImmutableDatasetWriter):
-    """Hands what a buffer is extended by to the ring, checked: about 0.25 ms for a single transition."""
+    """Checks transitions and writes them to the ring: about 0.25 ms for a single one."""
 
     def __init__(self, extra: Mapping[str, tuple[tuple[int, ...], torch.dtype]]):
         super().__init__()
@@ -297,7 +284,7 @@ class _WindowSampler(RandomSampler):
         if not len(admissible):
             raise DatasetError(
                 f"None of the replay's {length} transitions is followed by enough of its own episode for "
-                f"n_step={storage.n_step}: use a smaller n_step, or let more be stored before the first update "
+                f"n_step={storage.n_step}: use a smaller n_step, or store more before the first update "
                 "(random_agent_steps)."
             )
         misfits = (~storage.has_window(index)).nonzero().squeeze(-1)
