@@ -1,4 +1,4 @@
-"""One user seed, many independent streams; and the global generators of Python, NumPy and torch."""
+"""Independent seeds from one user seed, and the global generators of Python, NumPy and torch."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def seed_everything(seed: int) -> None:
 
 @contextmanager
 def kept_global_rng() -> Iterator[None]:
-    """Restore the global generators at the end of the body.
+    """Restore the global generators at the end of a ``with`` block.
 
     Examples:
         >>> seed_everything(0)

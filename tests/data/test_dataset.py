@@ -152,7 +152,7 @@ def test_indexing_follows_tensors(dataset: FrameDataset, index: Any) -> None:
     expected = dataset.transitions["row"][list(index) if isinstance(index, range) else index]
     assert torch.equal(dataset[index]["number"], expected)
     assert len(dataset[dataset.transitions["episode"] == 2]) == LENGTHS[2]
-    with pytest.raises(IndexError, match="26 transitions"):
+    with pytest.raises(IndexError, match="26 is out of bounds"):
         dataset[26]
 
 

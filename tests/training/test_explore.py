@@ -109,7 +109,6 @@ def test_a_run_of_other_settings_is_refused_by_name(tmp_path: Path) -> None:
     [
         ("apt-s", {"domains": DOMAINS}, "apt-s pre-trains on one domain, got 2"),
         ("proto-rl-c", {"domains": [LEFT, LEFT]}, "named twice"),
-        ("proto-rl-c", {"domains": [world("a/b")]}, "cannot name a directory"),
         ("proto-rl-c", {"domains": ["walkr"]}, "Nearest: walker"),
         ("proto-rl-c", {"env_steps": 10}, "nothing would be learned"),
         ("crptpro", {}, "learns from datasets and does not explore"),

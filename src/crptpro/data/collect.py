@@ -14,7 +14,7 @@ from concurrent.futures import Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -124,7 +124,7 @@ def collect_group(
                 continue
             stack.callback(dataset.writer.close)
             make = functools.partial(make_env, domain, seed=0, frame_stack=1, physics_state=True, **settings)
-            jobs.append(_Job(domain, dataset, make, seed, episode_length(domain, action_repeat=repeat)))
+            jobs.append(_Job(domain, dataset, make, episode_length(domain, action_repeat=repeat)))
         if jobs:
             _announce(jobs, root, image_size)
             for job in jobs if workers > 1 else ():
@@ -137,7 +137,9 @@ def collect_group(
             if any(needs_gl(job.domain) for job in jobs):
                 # Proven here once, for as many renderers as will run: some drivers hang when several start together.
                 select_backend(processes=workers)
-            _collect(jobs, workers, progress)
+            with closing(_Workers({job.domain.name: job.make for job in jobs}, workers)) as pool:
+                for job in jobs:
+                    _collect(job, seed, pool, progress)
     return paths
 
 
@@ -165,75 +167,59 @@ def collect_episode(
     return env.rollout(limit, policy, callback, auto_reset=False, tensordict=first, return_contiguous=True)
 
 
-class _Job:
-    """One dataset; its episodes are planned, and appended, in the order of their indices."""
+class _Job(NamedTuple):
+    """A dataset to be collected."""
 
-    def __init__(
-        self, domain: Domain, dataset: FrameDataset, make: Callable[[], EnvBase], seed: int, length: int | None
-    ):
-        self.domain, self.dataset, self.make, self.seed = domain, dataset, make, seed
-        self.writer: Any = dataset.writer
-        self.planned, self.usual_length = self.writer.episodes, length
-        self.longest = max(LONGEST_EPISODE_AGENT_STEPS, length or 0)
-        self.queue: deque[tuple[str, Future]] = deque()
+    domain: Domain
+    dataset: FrameDataset
+    make: Callable[[], EnvBase]
+    length: int | None  # agent steps of an episode, if known
 
     @property
     def missing(self) -> int:
         """Transitions that are not durable yet."""
-        return self.writer.target - self.writer.transitions
-
-    def next_plan(self) -> dict[str, Any] | None:
-        """Return the next episode worth starting, or ``None`` if those under way should suffice."""
-        index, name = self.planned, self.domain.name
-        under_way = index - self.writer.episodes
-        if self.missing <= under_way * (self.usual_length or 1):
-            return None
-        self.planned += 1
-        return {
-            "domain": name,
-            "title": f"episode {index} of {name}",
-            "env_seed": derive_seed(self.seed, "collect", name, index),
-            "action_seed": derive_seed(self.seed, "collect-actions", name, index),
-            "limit": min(self.missing - under_way, self.longest),
-        }
-
-    def accept(self, card: Mapping[str, Any], rollout: TensorDictBase) -> None:
-        """Append an episode, which is durable when this returns."""
-        self.writer.note_environment(card)
-        self.usual_length = self.usual_length or len(rollout)
-        self.dataset.extend(rollout)
-        self.writer.end_episode()
+        writer: Any = self.dataset.writer
+        return writer.target - writer.transitions
 
 
 def _announce(jobs: list[_Job], root: Path, image_size: int) -> None:
     """Say how much will be written (action and state: at most 1 kB each), and refuse what the disk cannot hold."""
     sizes = {}
     for job in jobs:
-        frames = job.missing + -(-job.missing // (job.usual_length or 100))  # one more per episode
+        frames = job.missing + -(-job.missing // (job.length or 100))  # one more per episode
         sizes[job.domain.name] = size = frames * 3 * image_size**2 + job.missing * 1000
         what = f"{size / 1e9:.2g} GB for {job.missing:,} transitions"
         logger.info("%s: %s into %s", job.domain.name, what, job.dataset.path)
     require_disk(root, sum(sizes.values()), f"Collecting {', '.join(sizes)}")
 
 
-def _collect(jobs: list[_Job], workers: int, progress: bool) -> None:
-    ahead = 2 * workers if workers > 1 else 1
-    with closing(_Workers({job.domain.name: job.make for job in jobs}, workers)) as pool:
-        for job in jobs:
-            name, writer = job.domain.name, job.writer
-            bar = Progress(writer.target, writer.transitions, "transitions", label=name, is_shown=progress, lines=10)
-            while not job.dataset.is_complete:
-                for each in jobs:  # all workers on the first that needs one: each makes each environment once
-                    while not job.queue or sum(len(other.queue) for other in jobs) < ahead:
-                        if (plan := each.next_plan()) is None:
-                            break
-                        each.queue.append((plan["title"], pool.submit(plan)))
-                title, future = job.queue.popleft()
-                job.accept(*pickle.loads(pool.result(future, title)))
-                bar.reach(writer.transitions)
-                bar.show()
-            job.queue.clear()  # the surplus
-            bar.close()
+def _collect(job: _Job, seed: int, pool: _Workers, progress: bool) -> None:
+    """Collect one dataset; its episodes are planned, and appended, in the order of their indices."""
+    name, dataset, length = job.domain.name, job.dataset, job.length
+    writer: Any = dataset.writer
+    longest = max(LONGEST_EPISODE_AGENT_STEPS, length or 0)
+    bar = Progress(writer.target, writer.transitions, "transitions", label=name, is_shown=progress, lines=10)
+    queue: deque[tuple[str, Future]] = deque()
+    while not dataset.is_complete:
+        while len(queue) < pool.ahead and job.missing > len(queue) * (length or 1):
+            index = writer.episodes + len(queue)
+            plan: dict[str, Any] = {
+                "domain": name,
+                "title": f"episode {index} of {name}",
+                "env_seed": derive_seed(seed, "collect", name, index),
+                "action_seed": derive_seed(seed, "collect-actions", name, index),
+                "limit": min(job.missing - len(queue), longest),
+            }
+            queue.append((plan["title"], pool.submit(plan)))
+        title, future = queue.popleft()
+        card, rollout = pickle.loads(pool.result(future, title))
+        length = length or len(rollout)
+        writer.note_environment(card)
+        dataset.extend(rollout)
+        writer.end_episode()
+        bar.reach(writer.transitions)
+        bar.show()
+    bar.close()
 
 
 class _Workers:
@@ -241,6 +227,7 @@ class _Workers:
 
     def __init__(self, factories: Mapping[str, Callable[[], EnvBase]], workers: int):
         self.workers, self._steps = workers, SPAWN.RawValue("q", 0)
+        self.ahead = 2 * workers if workers > 1 else 1  # episodes under way
         self._worker = _Worker(factories, self._steps)
         self._work = _work if workers > 1 else self._worker.roll
         self._pool: Any = WorkerPool(workers, _prepare, factories, self._steps) if workers > 1 else Inline()

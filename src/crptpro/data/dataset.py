@@ -196,13 +196,11 @@ class FrameStorage(StackStorage):
 
     def state_dict(self) -> dict[str, Any]:
         """Return what identifies this dataset: a checkpoint does not copy it."""
-        return {"request": self.card.get("request", {}), "frame_stack": self.frame_stack}
+        return {**self.card.get("request", {}), "frame_stack": self.frame_stack}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Check that a checkpoint belongs to this dataset."""
-        mine = self.state_dict()
-        _require_request(self.path, mine.pop("request"), state_dict["request"])
-        _require_request(self.path, mine, {"frame_stack": state_dict["frame_stack"]})
+        _require_request(self.path, self.state_dict(), state_dict)
 
     def __reduce__(self) -> Any:
         self._require_complete()
@@ -308,7 +306,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
         self._storage.max_size = total
         if total >= self.target:
             self._finish()
-            self._storage.load()  # read back once before anybody is told that it is there
+            self._storage.load()  # read back before it is reported as complete
 
     def note_environment(self, card: Mapping[str, Any]) -> None:
         """Note what renders the frames for the card; another ``backend`` or ``gl_renderer`` than before is refused."""
@@ -376,7 +374,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
         self.state |= changes
 
     def _finish(self) -> None:
-        """Write the card, which is the mark of a complete dataset, and release everything."""
+        """Write the card, which marks a complete dataset, and unlock the directory."""
         sessions = self.state["sessions"]
         card = {"image_size": self.state["columns"]["frames/pixels"][1][-1], **self.request, **self.state}
         card |= {"frames": self.transitions + self.episodes, **provenance()}

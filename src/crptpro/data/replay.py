@@ -21,8 +21,8 @@ _TAKEN = {
     *("pixels", "action", "reward", "done", "terminated", "truncated", "discount"),
     *("index", "row_of", "step", "number", "next"),
 }
-# Redraws before the admissible anchors are listed, which costs 50 times a redraw for 100,000 transitions. With
-# episodes of 500 transitions two draws nearly always suffice; only rings of very short episodes get that far.
+# Redraws before the admissible transitions are listed, which costs 50 times a redraw for 100,000 transitions. With
+# episodes of 500 transitions two draws nearly always suffice; only rings of very short episodes need the list.
 _REDRAWS = 8
 
 
@@ -79,16 +79,6 @@ class FrameReplay(ReplayBuffer):
     Raises:
         DiskSpaceError: if the disk cannot hold the ring.
         CheckpointError: if ``path`` holds a ring of another size.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> replay = FrameReplay(100, frame_shape=(3, 4, 4), action_dim=1)
-        >>> pixels, end = torch.zeros(2, 3, 4, 4, dtype=torch.uint8), torch.tensor([[False], [True]])
-        >>> following = {"pixels": pixels + 1, "reward": torch.ones(2, 1), "done": end, "terminated": end}
-        >>> replay.extend(TensorDict({"pixels": pixels, "action": torch.zeros(2, 1), "next": following}, [2]))
-        tensor([0, 2])
-        >>> replay.sample(5)["next", "pixels"].shape
-        torch.Size([5, 9, 4, 4])
     """
 
     def __init__(
@@ -131,7 +121,6 @@ class FrameReplay(ReplayBuffer):
             slack=slack,
             columns=columns,
             frame_stack=frame_stack,
-            root_columns=("action", *extra),
             n_step=as_int(n_step, "n_step", minimum=1),
             discount=as_float(discount, "discount", minimum=0, maximum=1),
             path=directory,

@@ -172,8 +172,8 @@ class StackStorage(Storage):
         return range(len(self.pixels))
 
     def get(self, index: Any, **how: Any) -> TensorDict:
-        """Return transitions by an int, a slice, a mask, or integers of any shape; 0 is the oldest."""
-        positions = self._positions(index)
+        """Return transitions by any index of a one-dimensional tensor; 0 is the oldest."""
+        positions = torch.arange(len(self), device=self.device)[index]
         flat = positions.reshape(-1)
         sample = self.columns_at(flat, **how).set("index", flat)
         if self.returns_pixels:
@@ -197,22 +197,6 @@ class StackStorage(Storage):
         rows = stack_rows(numbers, self.step[numbers % count], self.frame_stack)
         return gather_stacks(self.pixels, rows % count)
 
-    def _positions(self, index: Any) -> Tensor:
-        if isinstance(index, tuple) and len(index) == 1:
-            index = index[0]
-        length = len(self)
-        if isinstance(index, slice):
-            return torch.arange(*index.indices(length), device=self.device)
-        positions = torch.as_tensor(index, device=self.device)
-        if positions.dtype is torch.bool:
-            return positions.nonzero().squeeze(-1)
-        positions = positions.long()
-        # On a GPU the comparison would wait for the device; there the gather itself checks its indices.
-        is_checked = positions.numel() and positions.device.type == "cpu"
-        if is_checked and not (-length <= int(positions.min()) and int(positions.max()) < length):
-            raise IndexError(f"index {index} is out of range for {length} transitions.")
-        return torch.where(positions < 0, positions + length, positions)
-
     def set(self, *_: Any, **__: Any) -> None:
         """Refuse: rows depend on each other."""
         raise DatasetError("Frames are stored once, so that transitions depend on each other: use extend.")
@@ -230,15 +214,14 @@ class StackStorage(Storage):
 class RingStorage(StackStorage):
     """Frame rows in a ring of ``window + slack`` rows, and the valid transitions among them.
 
-    A row holds one frame, and the transition that starts at it, if one does. A transition is valid while it
-    is among the newest ``capacity`` and all its frames are among the newest ``window`` rows. So a state from
-    a moment ago needs no row that was overwritten since, as long as at most ``slack`` rows were.
-
-    ``columns`` maps every per-row quantity to its shape and dtype; ``root_columns`` belong to the observation, the
-    others are returned under ``"next"``.
+    A row holds one frame, and the transition that starts at it, if any. A transition is valid while it is among the
+    newest ``capacity`` and all its frames are among the newest ``window`` rows. So an earlier state needs no row that
+    was overwritten since, as long as at most ``slack`` rows were. ``columns`` maps every per-row quantity to its shape
+    and dtype.
     """
 
     COUNTERS = ("frames", "transitions", "oldest", "episode_step", "is_open")
+    NEXT_COLUMNS = ("reward", "done", "terminated", "truncated")
 
     def __init__(
         self,
@@ -248,7 +231,6 @@ class RingStorage(StackStorage):
         slack: int,
         columns: Mapping[str, tuple[tuple[int, ...], torch.dtype]],
         frame_stack: int,
-        root_columns: tuple[str, ...],
         n_step: int,
         discount: float,
         path: Path | None,
@@ -256,7 +238,6 @@ class RingStorage(StackStorage):
         super().__init__(capacity)
         self.rows, self.window, self.slack, self.path = window + slack, window, slack, path
         self.frame_stack, self.n_step, self.discount = frame_stack, n_step, discount
-        self.root_columns = root_columns
         # Counters only grow; modulo the number of rows they are slots. `oldest` is the first valid transition.
         self.frames = self.transitions = self.oldest = self.episode_step = 0
         self.is_open = False
@@ -344,10 +325,10 @@ class RingStorage(StackStorage):
         last = (row + n_step - 1) % self.rows
         root, following = {"number": number}, {"number": number + n_step}
         for name in self.column_names:
-            if name in self.root_columns:
-                root[name] = self.content[name][row]
-            else:
+            if name in self.NEXT_COLUMNS:
                 following[name] = self.content[name][last]
+            else:
+                root[name] = self.content[name][row]
         if n_step > 1:
             window = (row.unsqueeze(-1) + torch.arange(n_step, device="cpu")) % self.rows
             rewards, ended = self.content["reward"][window], self.content["terminated"][window]

@@ -29,13 +29,6 @@ class CollapseMonitor:
         num_prototypes: M; ``None`` for a loss without prototypes, which is watched by cosine only.
         patience_updates: length of a plateau, in updates, beyond which the run is called dead.
         cosine_threshold: mean pairwise cosine above which embeddings count as collapsed.
-
-    Examples:
-        >>> monitor = CollapseMonitor(512, patience_updates=1_000)
-        >>> [monitor.observe(u, comp=c, cosine=0.5) for u, c in [(100, 6.63), (200, 6.24), (1300, 6.24)]]
-        ['learning', 'plateau', 'dead']
-        >>> monitor.verdict(1300)["plateau_updates"]
-        1100
     """
 
     def __init__(

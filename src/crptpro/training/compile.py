@@ -1,4 +1,4 @@
-"""The two switches that make an update faster without changing what it computes: compilation and CUDA graphs."""
+"""Compilation and CUDA graphs, which make an update faster without changing what it computes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ COMPILERS = ("torch._dynamo", "torch._inductor", "torch._functorch", "triton")
 
 
 def accelerate(update: Update, *, compile: bool = False, cuda_graph: bool = False) -> Update:
-    """Return an update that is compiled, recorded as a CUDA graph, or left alone.
+    """Return an update that is compiled, recorded as a CUDA graph, or unchanged.
 
     On a CPU nearly all of an update is convolutions and matrix products, which the compiler leaves to the same library
-    calls: it takes half a minute and gains nothing that can be told from noise. Neither switch has been timed on a GPU.
+    calls: it takes half a minute and gains nothing beyond noise. Neither switch has been timed on a GPU.
 
     Args:
         update: maps a batch of fixed shapes to detached scalars; it must not read a value back to the host.

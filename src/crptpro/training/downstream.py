@@ -110,16 +110,7 @@ class DownstreamConfig:
 
     def __post_init__(self) -> None:
         """Convert numbers to plain values, or raise a ValueError that names the setting."""
-        counts = {
-            "env_steps": 1, "batch_size": 1, "replay_capacity": 1, "random_agent_steps": 1, "knn_k": 1, "queue_size": 1,
-            "hidden_dim": 1, "action_repeat": 1, "eval_interval_env_steps": 1, "eval_episodes": 1, "eval_workers": 0,
-            "checkpoint_interval_env_steps": 1, "log_interval_env_steps": 1,
-        }  # fmt: skip
-        rates = {
-            "intrinsic_reward_coef": None, "discount": 1, "learning_rate": None, "initial_temperature": None,
-            "critic_tau": 1,
-        }  # fmt: skip
-        check_numbers(self, counts=counts, rates=rates)
+        check_numbers(self, minima={"eval_workers": 0}, maxima={"discount": 1, "critic_tau": 1})
         if self.features not in ("auto", "dense", "dense-bf16", "reencode"):
             raise ValueError(f"`features` must be auto, dense, dense-bf16 or reencode, got {self.features!r}.")
         if self.replay_capacity is not None and self.replay_capacity < self.random_agent_steps:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import logging
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,8 +43,6 @@ from crptpro.training.world import SPARE_FRAMES, EnvThread, make_replay
 from crptpro.transforms import ContrastiveReward, FrozenEncoder, ParticleReward, PrototypeReward, RandomShift
 from crptpro.transforms.rewards import warn_if_mostly_zero
 from crptpro.values import Quality, check_numbers
-
-logger = logging.getLogger(__name__)
 
 PIXELS: dict[NestedKey, NestedKey] = {"pixels": "features", ("next", "pixels"): ("next", "features")}
 """Entries of a batch, with those of their features."""
@@ -94,12 +90,7 @@ class ExploreConfig:
 
     def __post_init__(self) -> None:
         """Convert numbers to plain values, or raise a ValueError that names the setting."""
-        counts = {
-            "env_steps": 1, "batch_size": 1, "encoder_update_interval": 1, "random_agent_steps": 0,
-            "replay_capacity": 1, "hidden_dim": 1, "queue_size": 1, "log_interval": 1,
-            "checkpoint_interval_env_steps": 1,
-        }  # fmt: skip
-        check_numbers(self, counts=counts, rates={"learning_rate": None})
+        check_numbers(self, minima={"random_agent_steps": 0}, maxima={})
 
     def resolved(self, method: Method) -> Any:
         """Return the settings with the method's values where they were left open."""
@@ -250,7 +241,7 @@ def pretrain_active(
         done = run.tally
         done.update(decisions=0, updates=0)
         run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor,
-                 **{f"explorer_{e.name}": e for e in explorers})  # fmt: skip
+                 **{f"explorer_{index}": explorer for index, explorer in enumerate(explorers)})  # fmt: skip
 
         update_encoder = make_update(loss, optimizer, targets, grad_clip=recipe.grad_clip)
         for _ in run.until(plan.env_steps, checkpoint_interval=settings.checkpoint_interval_env_steps):
@@ -295,10 +286,10 @@ def pretrain_active(
 
 
 class Explorer:
-    """One domain of an active pre-training: its environment, its replay, its agent and its intrinsic reward.
+    """One domain of an active pre-training: its environment, replay, agent and intrinsic reward.
 
-    A checkpoint may fall into an episode. No simulator state is kept for it: the episode is repeated from its seed with
-    the same actions.
+    A checkpoint in the middle of an episode holds no simulator state: its episode is repeated from its seed with the
+    same actions, which a non-deterministic environment does not reproduce.
     """
 
     def __init__(
@@ -317,7 +308,7 @@ class Explorer:
         set_compute_dtype(self.learner.loss, dtype)
         self.agent = PixelAgent(loss.encoder, self.learner.loss.actor)
         self.reward = self._make_reward() if reward is None else reward
-        path = None if run.run_dir is None else run.run_dir / "replay" / name
+        path = None if run.run_dir is None else run.run_dir / "replay" / name.replace("/", "-")
         self.replay = self._make_replay(run, path, capacity, slack)
         self._parts = {**self.learner.components(), "reward": self.reward, "replay": self.replay,
                        "generators": self.generators}  # fmt: skip
@@ -327,7 +318,7 @@ class Explorer:
         self._episode_return = 0.0
 
     def begin_step(self) -> None:
-        """Choose an action, uniformly at random at first, and begin the environment's step."""
+        """Choose an action, at first uniformly at random, and begin the environment's step."""
         td = self._td = self._reset() if self._td is None else self._td
         skills = self.exploration.skill_dim
         if skills is not None:
@@ -356,7 +347,7 @@ class Explorer:
         return row
 
     def sample(self, batch_size: int) -> TensorDictBase:
-        """Draw a batch of transitions, every image under a random shift of its own."""
+        """Draw a batch of transitions, every image under its own random shift."""
         return self.replay.sample(batch_size).to(self.device)
 
     def learn(self, batch: TensorDictBase, agent_step: int) -> dict[str, Tensor]:
@@ -380,7 +371,7 @@ class Explorer:
         self._env.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return where the domain stands."""
+        """Return all that a checkpoint needs, except the simulator's state."""
         return {
             "counters": [self.agent_steps, self.episodes, self.skill],
             "actions": torch.stack(self.actions) if self.actions else None,
@@ -398,13 +389,6 @@ class Explorer:
         for action in state["actions"]:
             self._td["action"] = action
             self._take(self._env.step(self._td).result())
-        newest = self.replay.observations(torch.tensor([self.replay.frames_written - 1]))[0]
-        if not torch.equal(newest, self._td["pixels"]):
-            logger.warning(
-                "%s does not repeat an episode from its seed and actions; this run will differ from an "
-                "uninterrupted one.",
-                self.name,
-            )
 
     def _reset(self) -> TensorDictBase:
         return self._env.reset(derive_seed(self.seed, "active", self.name, "episode", self.episodes))
@@ -476,10 +460,6 @@ def _named(domains: str | Domain | Sequence[str | Domain], method: Method) -> di
     named: dict[str, str | Domain] = {}
     for domain in listed:
         name = get_domain(domain).name
-        if not re.fullmatch(r"\w[\w.:+-]*", name):
-            raise CRPTproError(
-                f"The domain {name!r} cannot name a directory and a column; use letters, digits and . : _ + - only."
-            )
         if name in named:
             raise CRPTproError(f"The domain {name!r} is named twice; each has one agent.")
         named[name] = domain

@@ -67,8 +67,7 @@ class PretrainConfig:
 
     def __post_init__(self) -> None:
         """Convert numbers to plain values, or raise a ValueError that names the setting."""
-        counts = {"updates": 1, "batch_size": 1, "warmup_updates": 0, "log_interval": 1, "checkpoint_interval": 1}
-        check_numbers(self, counts=counts, rates={"learning_rate": None, "encoder_tau": 1})
+        check_numbers(self, minima={"warmup_updates": 0}, maxima={"encoder_tau": 1})
 
     def resolved(self, method: Method) -> Any:
         """Return these settings with the method's values where they were left open."""

@@ -1,4 +1,4 @@
-"""One training run: its directory, its record, its checkpoints, its progress; it knows nothing of what is trained."""
+"""The directory, record, checkpoints and progress of one training run, whatever it trains."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from crptpro.values import as_path
 logger = logging.getLogger(__name__)
 
 CHECKPOINT_SECONDS = 300.0
-"""Between two checkpoints of a run that names no interval."""
+"""Between two checkpoints of a run without an interval."""
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
-"""Requests to stop: Ctrl-C, and what clusters send before they take a machine away."""
+"""Requests to stop: Ctrl-C, and what clusters send before they reclaim a machine."""
 
 
 class Generators(dict[str, torch.Generator]):
