@@ -111,7 +111,8 @@ def write_artifact(
     """
     from safetensors.torch import save
 
-    given, path = as_path(path), as_path(path).resolve()
+    given = as_path(path)
+    path = given.resolve()
     _require_replaceable(path, format_name)
     tensors = {}
     for name, module in modules.items():
@@ -120,7 +121,8 @@ def write_artifact(
         tensors.update({f"{name}.{k}": v.detach().cpu().contiguous().clone() for k, v in state.items()})
     content = save(tensors)
     facts = {"format": format_name, "version": version, "weights_sha256": hashlib.sha256(content).hexdigest()}
-    temporary, previous = path.with_name(f".{path.name}.writing"), _previous(path)
+    temporary = path.with_name(f".{path.name}.writing")
+    previous = _previous(path)
     try:
         shutil.rmtree(temporary, ignore_errors=True)  # of a writer that was killed
         write_whole(temporary / WEIGHTS_FILE, content)

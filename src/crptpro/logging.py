@@ -33,7 +33,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class WandbOptions:
-    """How a run appears on Weights & Biases; what is ``None`` follows W&B's own variables."""
+    """How a run appears on Weights & Biases; ``None`` follows W&B's own variables."""
 
     project: str | None = None
     """project (``WANDB_PROJECT``, else crptpro)"""
@@ -126,7 +126,8 @@ class RunLogger:
             self._has_begun = True
             self._mirror(lambda mirror: mirror.begin())
         row = {"stream": stream, **where, "unix_time_s": round(time.time(), 3), **values}
-        columns, index = self._columns(stream), len(self._rows)
+        columns = self._columns(stream)
+        index = len(self._rows)
         _append(self.path, json.dumps({key: _cell(value) for key, value in row.items()}) + "\n")
         self._rows.append({key: _cell(value) for key, value in row.items()})
         if self._columns(stream) == columns:
@@ -159,7 +160,9 @@ class RunLogger:
         for name, count in state.items():
             if (missing := count - len(self.rows(name))) > 0:
                 _LOG.warning("%s: %d rows of %r are missing that the checkpoint counted.", self.path, missing, name)
-        before, seen, kept = self._streams(), Counter[str](), []
+        before = self._streams()
+        seen = Counter[str]()
+        kept = []
         for row in self._rows:
             seen[row["stream"]] += 1
             if seen[row["stream"]] <= state.get(row["stream"], math.inf):

@@ -208,12 +208,7 @@ def _feature_moments(
 
 
 def save_pretrained(
-    trained: Any,
-    path: str | Path,
-    *,
-    slim: bool = False,
-    dtype: Literal["bfloat16"] | None = None,
-    actor: nn.Module | None = None,
+    trained: Any, path: str | Path, *, slim: bool = False, dtype: Literal["bfloat16"] | None = None
 ) -> Path:
     """Write what was trained as a directory: ``weights.safetensors`` and ``card.json``.
 
@@ -227,7 +222,6 @@ def save_pretrained(
         slim: leave out what only training reads: predictor, targets and further heads, and without prototypes the
             projector. Learning a task from it gives the same numbers; fine-tuning from it is refused.
         dtype: ``"bfloat16"`` stores the weights in half the size, rounded to 8 bits; they are loaded as float32.
-        actor: the exploring policy, where ``trained`` is a loss.
 
     Returns:
         ``path``.
@@ -240,7 +234,7 @@ def save_pretrained(
     if dtype not in (None, "bfloat16"):
         raise ValueError(f"`dtype` must be 'bfloat16' or None, got {dtype!r}.")
     path = as_path(path)
-    source = _as_pretrained(trained, actor)
+    source = _as_pretrained(trained)
     if slim:
         source = _slimmed(source)
     states: dict[str, Mapping[str, Tensor]] = {}
@@ -306,15 +300,12 @@ def shipped_encoders() -> list[str]:
     return sorted(card.parent.name for card in SHIPPED.glob(f"*/{CARD_FILE}"))
 
 
-def _as_pretrained(trained: Any, actor: nn.Module | None) -> Pretrained:
-    """Gather what is to be saved."""
+def _as_pretrained(trained: Any) -> Pretrained:
+    """Return the artifact of what was trained."""
     if isinstance(trained, Pretrained):
-        return trained if actor is None else replace(trained, actor=actor)
-    if isinstance(trained, nn.Module):
-        result: dict[str, Any] = {"loss": trained, "method": method_of(trained).name}
-    else:
-        result = {name: getattr(trained, name, None) for name in ("loss", "method", "training", "actor", "queue")}
-    loss = result["loss"]
+        return trained
+    result = None if isinstance(trained, nn.Module) else trained
+    loss = trained if result is None else getattr(result, "loss", None)
     if not isinstance(loss, nn.Module):
         raise PretrainedError(
             f"A {type(trained).__name__} cannot be saved as a pretrained encoder: it is no loss, and no result of one."
@@ -335,12 +326,11 @@ def _as_pretrained(trained: Any, actor: nn.Module | None) -> Pretrained:
         if isinstance(value, Tensor) and key != "queue" and not key.startswith(covered)
     }
     card = {
-        "method": result["method"],
+        "method": method_of(loss).name if result is None else result.method,
         "loss": {"class": class_name(loss), "config": loss_options(loss)},
-        "training": result.get("training"),
+        "training": getattr(result, "training", None),
     }
-    actor = result.get("actor") if actor is None else actor
-    queue = result.get("queue")
+    queue, actor = getattr(result, "queue", None), getattr(result, "actor", None)
     return Pretrained(encoder, **heads, **targets, queue=queue, actor=actor, card=card, rest=rest)
 
 

@@ -71,7 +71,7 @@ def git_revision() -> str:
     """Return the revision of the source checkout, ``+dirty`` if modified, or ``"unknown"``."""
     here = Path(__file__).resolve()
     git = ["git", "-C", str(here.parent)]
-    # Installed below somebody's repository (a .venv that it ignores), this file is not part of it.
+    # In a repository's ignored .venv, this file is not part of the repository.
     is_tracked = [*git, "ls-files", "--error-unmatch", here.name]
     describe = [*git, "describe", "--always", "--dirty=+dirty", "--abbrev=12"]
     try:

@@ -120,7 +120,8 @@ def check_numbers(config: Any, *, minima: Mapping[str, int], maxima: Mapping[str
         ValueError: naming the setting, its value and what is allowed.
     """
     for name, hint in get_type_hints(type(config)).items():
-        value, kinds = getattr(config, name), get_args(hint) or (hint,)
+        value = getattr(config, name)
+        kinds = get_args(hint) or (hint,)
         if value is None and NoneType in kinds:
             continue
         if name == "seed":

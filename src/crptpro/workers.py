@@ -27,7 +27,7 @@ def can_be_sent(function: Callable[..., Any]) -> bool:
     main_file = getattr(sys.modules.get("__main__"), "__file__", None)
     try:
         return b"__main__" not in pickle.dumps(function) or bool(main_file and Path(main_file).exists())
-    except Exception:  # objects may refuse in ways of their own
+    except Exception:  # objects may raise anything
         return False
 
 

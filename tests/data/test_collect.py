@@ -258,7 +258,7 @@ def start(tmp_path: Path, root: Path, *, workers: int = 2, limit: str = "pass", 
 
 
 def episodes_in(path: Path) -> int:
-    file = path / "collection.json"
+    file = path / "card.json"
     return json.loads(file.read_text())["episodes"] if file.exists() else 0
 
 

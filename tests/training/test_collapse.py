@@ -54,7 +54,7 @@ def test_a_plateau_beyond_patience_is_dead_and_can_still_recover(caplog: pytest.
     assert "DEAD RUN: do not use this encoder" in caplog.text
     monitor.observe(600, comp=5.0)
     assert monitor.observe(700, comp=5.0) == "learning"
-    assert "called dead" in caplog.text
+    assert "after it was called dead" in caplog.text
 
 
 def test_training_that_ends_on_a_short_plateau_is_announced_but_not_called_dead(

@@ -226,7 +226,8 @@ class _Workers:
     """Roll planned episodes out, in this process or in several others."""
 
     def __init__(self, factories: Mapping[str, Callable[[], EnvBase]], workers: int):
-        self.workers, self._steps = workers, SPAWN.RawValue("q", 0)
+        self.workers = workers
+        self._steps = SPAWN.RawValue("q", 0)
         self.ahead = 2 * workers if workers > 1 else 1  # episodes under way
         self._worker = _Worker(factories, self._steps)
         self._work = _work if workers > 1 else self._worker.roll

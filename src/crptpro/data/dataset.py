@@ -26,7 +26,6 @@ from crptpro.values import as_int, as_path
 logger = logging.getLogger(__name__)
 
 FORMAT, VERSION = "crptpro-frames", 2
-COLLECTION_FILE = "collection.json"
 _ABOUT = {"seed": 0, "action_repeat": 1, "camera": None, "quality": "exact", "colors": "normal"}
 
 
@@ -96,7 +95,8 @@ class FrameDataset(ReplayBuffer):
         request = {"domain": domain, "task": domain, **_ABOUT, **about, "transitions": transitions}
         for name in request.keys() & {"transitions", "seed", "action_repeat", "image_size"}:
             request[name] = as_int(request[name], name, minimum=0 if name == "seed" else 1)
-        if not (path / CARD_FILE).exists():
+        card = _read(path) if (path / CARD_FILE).exists() else None
+        if card is None or card["transitions"] < card["request"]["transitions"]:
             writer = EpisodeWriter(path, request)
             if writer.transitions < writer.target:
                 return cls(FrameStorage(path, frame_stack), writer=writer)
@@ -149,7 +149,7 @@ class FrameDataset(ReplayBuffer):
 
 
 class FrameStorage(StackStorage):
-    """The rows of a dataset, read-only; copies and other processes map the files anew.
+    """The rows of a dataset, read-only; copies and other processes map the files again.
 
     An episode of T transitions has T + 1 frames, so the frames of a transition and its successor are rows up to
     ``row`` and ``row + 1`` of the same episode.
@@ -172,7 +172,8 @@ class FrameStorage(StackStorage):
         self.frames, self.transitions = parts["frames"], parts["transitions"].clone()  # a few MB, in RAM
         if self.device.type != "cpu":
             self.frames, self.transitions = self.frames.to(self.device), self.transitions.to(self.device)
-        self.max_size, self.card, self.pixels = len(self.transitions), card, self.frames["pixels"]
+        self.card, self.max_size = card, len(self.transitions)
+        self.pixels = self.frames["pixels"]
         self.step = torch.zeros(len(self.frames), dtype=torch.int32, device=self.device)
         self.step[self.transitions["row"] + 1] = self.transitions["step"] + 1
         return self
@@ -214,9 +215,9 @@ def _load(path: Path, frame_stack: int, device: str) -> FrameStorage:
 class EpisodeWriter(ImmutableDatasetWriter):
     """Appends episodes 0, 1, 2, ... to a directory until they hold the requested transitions.
 
-    The rows of an episode are on the disk before ``collection.json`` counts them; what a kill left behind them is cut
-    off when the next episode is written. As long as no episode is durable, another request replaces this one.
-    The directory is locked until the dataset is complete or :meth:`close` is called.
+    The rows of an episode are on the disk before the card counts them; what a kill left behind them is cut off when the
+    next episode is written. As long as no episode is durable, another request replaces this one. The directory is
+    locked until the dataset is complete or :meth:`close` is called.
     """
 
     def __init__(self, path: Path, request: dict[str, Any]):
@@ -226,9 +227,9 @@ class EpisodeWriter(ImmutableDatasetWriter):
         self.state |= {"transitions": 0, "episodes": 0, "sessions": []}
         self._pending: list[Rows] = []
         self._has_noted = False
-        # The lock, and half a collection.json, are what a kill at the very start leaves.
+        # The lock, and half a card, are what a kill at the very start leaves.
         found = [each for each in path.glob("*") if each.name != ".lock" and each.suffix != ".partial"]
-        if found and path / COLLECTION_FILE not in found:
+        if found and path / CARD_FILE not in found:
             raise DatasetError(f"{path} is not empty and not a collection. Choose another directory or empty it.")
         self._lock = DirectoryLock(path, error=DatasetError)
         try:
@@ -256,13 +257,14 @@ class EpisodeWriter(ImmutableDatasetWriter):
 
         Surplus ones are left out. Returns the indices of those that became durable, int64.
         """
-        before, stack = self.transitions, self._storage.frame_stack
+        before = self.transitions
         if before >= self.target:
             raise DatasetError(f"{self.path} is complete and read-only; collect another one.")
         channels = self.state["columns"]["frames/pixels"][1][0] if before else 3
         extra: list[Any] = [name for name in ("qpos", "qvel") if name in data and data.get(name).shape[-1]]
         extra += [("next", name) for name in extra]
-        rows = read_rows(data, channels=channels, frame_stack=stack, extra=extra, what="A dataset")
+        frame_stack = self._storage.frame_stack
+        rows = read_rows(data, channels=channels, frame_stack=frame_stack, extra=extra, what="A dataset")
         last = self._pending[-1].following[-1] if self._pending else None
         for begins, part in rows.part(0, self.target - self._taken).pieces(last):
             if begins:
@@ -305,7 +307,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
             ) from reason
         self._storage.max_size = total
         if total >= self.target:
-            self._finish()
+            self.close()
             self._storage.load()  # read back before it is reported as complete
 
     def note_environment(self, card: Mapping[str, Any]) -> None:
@@ -352,10 +354,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
     def _resume(self) -> None:
         for stale in self.path.glob(".*.partial"):  # of a killed process
             stale.unlink(missing_ok=True)
-        file = self.path / COLLECTION_FILE
-        state = read_json(file, error=DatasetError) if file.exists() else self.state
-        if (state.get("format"), state.get("version")) != (FORMAT, VERSION):
-            raise DatasetError(f"{file} belongs to another release or program. Choose another directory.")
+        state = _read(self.path) if (self.path / CARD_FILE).exists() else self.state
         if not state["episodes"]:
             for part in ("frames", "transitions"):  # of an episode that was being written
                 shutil.rmtree(self.path / part, ignore_errors=True)
@@ -364,23 +363,18 @@ class EpisodeWriter(ImmutableDatasetWriter):
         _require_request(self.path, state["request"], self.request)
         for path, expected in _sizes(self.path, state).items():
             require_size(path, min(expected, path.stat().st_size if path.exists() else 0), expected)
-        self.state = state | {"request": self.request}
+        self.state = state
         logger.info("%s: continuing after %d of %d transitions", self.path.name, self.transitions, self.target)
-        if self.transitions >= self.target:
-            self._finish()
 
     def _save(self, **changes: Any) -> None:
-        write_json(self.path / COLLECTION_FILE, self.state | changes)
-        self.state |= changes
-
-    def _finish(self) -> None:
-        """Write the card, which marks a complete dataset, and unlock the directory."""
-        sessions = self.state["sessions"]
-        card = {"image_size": self.state["columns"]["frames/pixels"][1][-1], **self.request, **self.state}
-        card |= {"frames": self.transitions + self.episodes, **provenance()}
-        card["render"] = sessions[-1]["render"] if sessions else {}
-        write_json(self.path / CARD_FILE, card)
-        self.close()
+        """Write the card."""
+        state = {**self.state, **changes}
+        state["frames"] = state["transitions"] + state["episodes"]
+        state["render"] = state["sessions"][-1]["render"] if state["sessions"] else {}
+        if state["columns"]:
+            state["image_size"] = state["columns"]["frames/pixels"][1][-1]
+        write_json(self.path / CARD_FILE, {**self.request, **state, **provenance()})
+        self.state = state
 
 
 def _append(path: Path, values: Tensor, rows: int) -> None:
@@ -416,21 +410,36 @@ def _require_request(path: Path, found: Mapping[str, Any], request: Mapping[str,
         )
 
 
-def read_card(path: Path) -> dict[str, Any]:
-    """Read and check a dataset's card against its files, without reading the frames."""
-    file = path / CARD_FILE
-    if not file.exists():
-        raise DatasetError(_why_no_card(path))
-    card = read_json(file, error=DatasetError)
+def _read(path: Path) -> dict[str, Any]:
+    """Return the card of a dataset, which may be unfinished."""
+    card = read_json(path / CARD_FILE, error=DatasetError)
     found = (card.get("format"), card.get("version"))
     if found != (FORMAT, VERSION):
         raise DatasetError(
-            f"{file} has format {found[0]!r}, version {found[1]!r}; this release reads {FORMAT!r}, {VERSION}. "
-            "Collect the dataset again."
+            f"{path / CARD_FILE} has format {found[0]!r}, version {found[1]!r}; this release reads {FORMAT!r}, "
+            f"{VERSION}. Collect the dataset again."
         )
+    return card
+
+
+def read_card(path: Path) -> dict[str, Any]:
+    """Read and check a dataset's card against its files, without reading the frames."""
+    file = path / CARD_FILE
+    if not path.is_dir():
+        raise DatasetError(f"{path} is not a directory. A dataset is made by collect_random or `crptpro collect`.")
+    if not file.exists():
+        names = ", ".join(sorted(child.parent.name for child in path.glob(f"*/{CARD_FILE}")))
+        hint = f" Did you mean one of its datasets: {names}?" if names else ""
+        raise DatasetError(f"{path} has no {CARD_FILE}: it is not a dataset.{hint}")
+    card = _read(path)
     try:
+        if card["transitions"] < card["request"]["transitions"]:
+            raise DatasetError(
+                f"{path} is unfinished: {card['transitions']} of {card['request']['transitions']} transitions are "
+                "collected. Run the same collect command again to complete it."
+            )
         sizes = _sizes(path, card)
-        if card["frames"] != card["transitions"] + card["episodes"] or card["transitions"] < 1:
+        if card["frames"] != card["transitions"] + card["episodes"]:
             raise ValueError("frames")
     except (KeyError, TypeError, ValueError, AttributeError) as reason:
         raise DatasetError(f"{file} is damaged ({reason}). Collect the dataset again.") from None
@@ -439,18 +448,3 @@ def read_card(path: Path) -> dict[str, Any]:
             raise DatasetError(f"{each} is missing. Collect the dataset again.")
         require_size(each, each.stat().st_size, expected)
     return card
-
-
-def _why_no_card(path: Path) -> str:
-    if not path.is_dir():
-        return f"{path} is not a directory. A dataset is made by collect_random or `crptpro collect`."
-    if (path / COLLECTION_FILE).exists():
-        state = read_json(path / COLLECTION_FILE, error=DatasetError)
-        target = state.get("request", {}).get("transitions")
-        return (
-            f"{path} is unfinished: {state.get('transitions', 0)} of {target} transitions are collected. "
-            "Run the same collect command again to complete it."
-        )
-    kinds = sorted(child.parent.name for child in path.glob(f"*/{CARD_FILE}"))
-    hint = f" Did you mean one of its datasets: {', '.join(kinds)}?" if kinds else ""
-    return f"{path} has no {CARD_FILE}: it is not a dataset.{hint}"

@@ -51,7 +51,7 @@ class FrameReplay(ReplayBuffer):
     - ``index`` (0 is the oldest transition) and ``number``, ``("next", "number")``, int64 ``[B]``: how many frames were
       stored before the observation's newest one. A number is never used again; :meth:`observations` reads it.
 
-    With ``n_step`` above 1 only transitions are drawn whose n transitions lie in one episode and in the ring (as in
+    With ``n_step`` above 1 only transitions are drawn whose n transitions are in one episode and in the ring (as in
     url_benchmark's ``replay_buffer.py``, none is cut short). ``("next", ...)`` is then n agent steps ahead: its flags
     are the last transition's, its reward is the n-step return, and ``("next", "discount")`` ``[B, 1]`` weighs the value
     of the next observation (:func:`~crptpro.data.storage.n_step_return`). Indexing reads single transitions.
@@ -96,7 +96,8 @@ class FrameReplay(ReplayBuffer):
         returns_pixels: bool = True,
         **options: Any,
     ):
-        capacity, slack = as_int(capacity, "capacity", minimum=1), as_int(slack, "slack", minimum=0)
+        capacity = as_int(capacity, "capacity", minimum=1)
+        slack = as_int(slack, "slack", minimum=0)
         frame_stack = as_int(frame_stack, "frame_stack", minimum=1)
         frame_shape = tuple(as_int(size, "frame_shape", minimum=1) for size in frame_shape)  # type: ignore[assignment]
         extra = dict(extra_columns or {})
@@ -155,36 +156,6 @@ class FrameReplay(ReplayBuffer):
             self._storage.load_state_dict(state_dict["ring"])
 
 
-def stack_frames(buffer: ReplayBuffer, *, frame_stack: int = 3, **options: Any) -> FrameReplay:
-    """Copy a buffer of single frames, as most public data sets are, into one in RAM whose samples are stacks.
-
-    Args:
-        buffer: any TorchRL buffer or data set whose rows, in the order of their indices, are transitions of whole
-            episodes: ``pixels`` and ``("next", "pixels")`` uint8 ``[C, H, W]``, ``action`` and
-            ``("next", "reward" | "done")``.
-        frame_stack: k, frames per stack.
-        **options: ``batch_size``, ``generator`` and ``transform`` of :class:`FrameReplay`.
-
-    Examples:
-        >>> dataset = stack_frames(minari_buffer)  # doctest: +SKIP
-        >>> pretrain(ATCLoss(PixelEncoder()), {"kitchen": dataset}, updates=10_000)  # doctest: +SKIP
-    """
-    length = len(buffer)
-    if not length:
-        raise ValueError("The buffer is empty: there is nothing to stack.")
-    first = buffer[:1]
-    replay = FrameReplay(
-        2 * length,  # episodes of one transition have two frames; rows that stay empty take no memory
-        frame_shape=tuple(first["pixels"].shape[1:]),
-        action_dim=first["action"].shape[-1],
-        frame_stack=frame_stack,
-        **options,
-    )
-    for begin in range(0, length, 1000):
-        replay.extend(buffer[begin : begin + 1000])
-    return replay
-
-
 class StoredReplay(StackStorage):
     """The observations in the files of a :class:`FrameReplay`, oldest first, read-only.
 
@@ -195,9 +166,11 @@ class StoredReplay(StackStorage):
     """
 
     def __init__(self, path: str | Path, *, frame_stack: int = 3) -> None:
-        path, self.frame_stack = as_path(path), frame_stack
+        path = as_path(path)
+        self.frame_stack = frame_stack
         number, row_of = (map_rows(path / f"{name}.memmap", torch.int64, ()) for name in ("number", "row_of"))
-        self.step, rows = map_rows(path / "step.memmap", torch.int32, ()), len(number)
+        self.step = map_rows(path / "step.memmap", torch.int32, ())
+        rows = len(number)
         size = math.isqrt((path / "pixels.memmap").stat().st_size // (3 * rows))
         self.pixels = map_rows(path / "pixels.memmap", torch.uint8, (3, size, size), rows)
         # `number` counts from 1. Transitions that were overwritten, and rows never written (0), point elsewhere.
@@ -248,7 +221,7 @@ class _RingWriter(ImmutableDatasetWriter):
 
 
 class _WindowSampler(RandomSampler):
-    """Draws uniformly, with replacement, from the transitions whose window of n lies in one episode.
+    """Draws uniformly, with replacement, from the transitions whose window of n is in one episode.
 
     A draw that does not fit is redrawn, so that the cost does not grow with the ring.
     """
@@ -272,7 +245,7 @@ class _WindowSampler(RandomSampler):
         admissible = admissible[storage.has_window(admissible)]
         if not len(admissible):
             raise DatasetError(
-                f"None of the replay's {length} transitions is followed by enough of its own episode for "
+                f"None of the replay's {length} transitions is followed by enough of its episode for "
                 f"n_step={storage.n_step}: use a smaller n_step, or store more before the first update "
                 "(random_agent_steps)."
             )

@@ -183,7 +183,8 @@ class StackStorage(Storage):
 
     def observations(self, numbers: Tensor) -> Tensor:
         """Return observations by number, uint8 ``[B, k * C, H, W]``; a DatasetError if one is no longer stored."""
-        numbers, held = torch.as_tensor(numbers, dtype=torch.int64, device=self.device), self.held()
+        numbers = torch.as_tensor(numbers, dtype=torch.int64, device=self.device)
+        held = self.held()
         first = numbers - torch.clamp(self.step[numbers % len(self.pixels)], max=self.frame_stack - 1)
         gone = (first < held.start) | (numbers >= held.stop)
         if gone.any():
@@ -358,7 +359,8 @@ class RingStorage(StackStorage):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Return to the content of the moment ``state_dict`` was taken, or raise a CheckpointError."""
-        shape, counters = (state_dict["rows"], state_dict["window"]), state_dict["counters"]
+        shape = (state_dict["rows"], state_dict["window"])
+        counters = state_dict["counters"]
         if shape != (self.rows, self.window):
             raise CheckpointError(
                 f"The replay's checkpoint has {shape[0]} rows, {shape[1]} of them in use; this replay has "
@@ -386,10 +388,11 @@ class RingStorage(StackStorage):
             raise CheckpointError(f"{lost} rows that the checkpoint of {self.path} needs are gone: {why}")
 
     def _empty(self) -> None:
-        self.oldest, self.is_open = self.transitions, False  # numbers go on: none is used twice
+        self.oldest = self.transitions  # numbers continue: none is used twice
+        self.is_open = False
 
     def __getstate__(self) -> dict[str, Any]:
-        # A copy cannot share the files that this ring goes on writing: it holds the rows in RAM.
+        # A copy cannot share the files that this ring keeps writing: it holds the rows in RAM.
         return {**super().__getstate__(), "path": None}
 
 

@@ -89,8 +89,8 @@ def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[P
 
     Args:
         path: directory.
-        encoder: for an encoder of your own, a module of its class, whose weights are loaded. A
-            :class:`~crptpro.modules.PixelEncoder` is rebuilt from the card.
+        encoder: a module of the encoder's class, whose weights are loaded; needed unless it is a
+            :class:`~crptpro.modules.PixelEncoder`, which is rebuilt from the card.
 
     Returns:
         The agent, ready to act, and its card.

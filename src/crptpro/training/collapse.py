@@ -57,7 +57,7 @@ class CollapseMonitor:
     def observe(
         self, updates: int, *, comp: float | None = None, cosine: float | Mapping[str, float] | None = None
     ) -> str:
-        """Take the measurement after so many updates, and return the state after it.
+        """Take a measurement after ``updates`` updates, and return the state after it.
 
         ``comp`` is the comparative loss in nats, for a loss that has one; ``cosine`` the mean pairwise cosine of
         embeddings, one number or one per domain (their mean decides).
@@ -80,7 +80,7 @@ class CollapseMonitor:
                 length = plateau["left"] - plateau["entered"]
                 announce, recovery = logger.info, ""
                 if self.state == "dead":
-                    announce, recovery = logger.warning, " (it had been called dead)"
+                    announce, recovery = logger.warning, " (after it was called dead)"
                 announce("Update %d: left the plateau after %d updates%s.", plateau["left"], length, recovery)
                 self.state = "learning"
             elif reasons and self.state == "plateau" and updates - plateau["entered"] > self.patience_updates:
@@ -94,7 +94,7 @@ class CollapseMonitor:
         return self.state
 
     def verdict(self, updates: int) -> dict[str, Any]:
-        """Return the judgement after so many updates as plain values; changes nothing.
+        """Return the judgement after ``updates`` updates as plain values; changes nothing.
 
         ``verdict`` is ``"learning"``, ``"plateau"`` or ``"dead"``, ``plateau_updates`` the total length of the
         ``plateaus``, ``collapsed_domains`` are those whose cosine is above the threshold.
@@ -138,7 +138,7 @@ class CollapseMonitor:
         vars(self).update(copy.deepcopy(dict(state)))
 
     def _reasons(self) -> str:
-        """Say what is wrong now; empty if nothing is."""
+        """Return what is wrong now; empty if nothing is."""
         found = []
         if self.floor is not None and self.comp is not None and abs(self.comp - self.floor) <= LOSS_MARGIN * self.floor:
             found.append(f"loss {self.comp:.4f} at ln(M) = {self.floor:.4f}")

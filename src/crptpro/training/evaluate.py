@@ -120,7 +120,7 @@ def summarize(episodes: Sequence[Episode]) -> dict[str, float]:
 
 
 class Evaluator:
-    """Evaluates snapshots of an agent in worker processes while training goes on, or at once in this process.
+    """Evaluates snapshots of an agent in worker processes during training, or at once in this process.
 
     The episodes of an evaluation are delivered when :meth:`finish` is called, so that the record of a run does not
     depend on the speed of its machine. One CPU thread computes every decision either way.
@@ -141,8 +141,8 @@ class Evaluator:
         progress: bool = True,
     ) -> None:
         self.make_env, self.agent, self.episodes, self.seed = make_env, agent, episodes, seed
-        self.workers, self.progress = min(workers, episodes) if can_be_sent(make_env) else 0, progress
-        self.on_result = on_result
+        self.workers = min(workers, episodes) if can_be_sent(make_env) else 0
+        self.on_result, self.progress = on_result, progress
         self._pool: WorkerPool | None = None
         self._env: EnvBase | None = None
         self._pending: tuple[PixelAgent, dict[str, int], list[Future[Episode]]] | None = None

@@ -159,7 +159,7 @@ class ExploreResult(PretrainResult):
     env_steps: int = 0
     """simulator steps over all domains"""
     actor: nn.Module | None = field(default=None, repr=False)
-    """the exploring actor, for a method that hands it to downstream runs"""
+    """the exploring actor, for a method whose downstream runs start from it"""
     queue: Tensor | None = field(default=None, repr=False)
     """candidates of the prototype reward, float32 ``[queue_size, D]``, the oldest first"""
 
@@ -273,7 +273,8 @@ def pretrain_active(
             done["decisions"] += 1
             run.advance(plan.repeats[index])
         run.finish()
-        first, run.counters["updates"] = explorers[0], done["updates"]
+        first = explorers[0]
+        run.counters["updates"] = done["updates"]
         if run.means("pretrain"):
             write_row(run, loss, monitor, first.sample(min(settings.batch_size, 64)), first.name)
             run.write("explore")
@@ -343,7 +344,8 @@ class Explorer:
         if not transition["next", "done"].item():
             return None
         row = {"episode_return": self._episode_return, "episode_agent_steps": len(self.actions)}
-        self._td, self.actions, self._episode_return, self.episodes = None, [], 0.0, self.episodes + 1
+        self.episodes += 1
+        self._td, self.actions, self._episode_return = None, [], 0.0
         return row
 
     def sample(self, batch_size: int) -> TensorDictBase:

@@ -197,7 +197,7 @@ def pretrain(
 def finetune(pretrained: Pretrained | str | Path, datasets: Any, **options: Any) -> PretrainResult:
     """Train a pretrained artifact further, e.g. on the random data of one more domain.
 
-    The networks, the target networks and the prototypes go on from what was saved; Adam starts afresh.
+    The networks, the target networks and the prototypes continue from what was saved; Adam starts anew.
 
     Args:
         pretrained: an artifact, its directory, or the name of one that ships.
@@ -245,7 +245,7 @@ def make_optimizer(
     names = [name for name, _ in loss.named_children() if name.startswith("target_") and name.endswith("_params")]
     if not names or encoder_tau is None:
         return optimizer, schedule, None
-    # SoftUpdate begins by copying the sources; fine-tuning goes on with the targets that were saved.
+    # SoftUpdate begins by copying the sources; fine-tuning continues with the saved targets.
     kept = {name: loss._modules[name].data.clone() for name in names}
     targets = SoftUpdate(loss, tau=encoder_tau)
     for name, target in kept.items():
@@ -297,7 +297,8 @@ def scalars(losses: TensorDictBase, domain: str) -> dict[str, Tensor]:
 @torch.no_grad()
 def write_row(run: Run, loss: LossModule, monitor: CollapseMonitor, batch: TensorDictBase, domain: str) -> None:
     """Write a row of the ``pretrain`` record with the prototypes' spread, and let the monitor judge it."""
-    means, extra = run.means("pretrain"), {}
+    means = run.means("pretrain")
+    extra = {}
     weight = getattr(getattr(loss, "prototypes", None), "weight", None)
     if isinstance(weight, Tensor):
         extra["ln_num_prototypes"] = log_count = math.log(len(weight))

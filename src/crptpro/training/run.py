@@ -140,7 +140,8 @@ class Run:
         self._last_advance = self._row_position = 0
         self._started = self._saved_time = self._row_time = time.monotonic()
         self._earlier_seconds = 0.0
-        self._is_shown, self._progress = progress, Progress(0, 0, unit, is_shown=False)
+        self._is_shown = progress
+        self._progress = Progress(0, 0, unit, is_shown=False)
 
     def __enter__(self) -> Run:
         with contextlib.ExitStack() as stack:
@@ -172,11 +173,11 @@ class Run:
         self.settings = dict(settings)
         if not self.saved:
             return
-        before, now, absent = _flat(self.saved["settings"]), _flat(self.settings), "absent"
+        before, now = _flat(self.saved["settings"]), _flat(self.settings)
         differing = [
-            f"{name} was {before.get(name, absent)!r}, now {now.get(name, absent)!r}"
+            f"{name} was {before.get(name, 'absent')!r}, now {now.get(name, 'absent')!r}"
             for name in sorted({*before, *now})
-            if before.get(name, absent) != now.get(name, absent)
+            if before.get(name, "absent") != now.get(name, "absent")
         ]
         if differing:
             more = f" (and {len(differing) - 5} more)" if len(differing) > 5 else ""
@@ -311,7 +312,8 @@ class Run:
         return row
 
     def _rate_and_memory(self) -> dict[str, float]:
-        now, row = time.monotonic(), {}
+        now = time.monotonic()
+        row = {}
         if self.position > self._row_position and now > self._row_time:
             row[f"{self.unit}_per_s"] = (self.position - self._row_position) / (now - self._row_time)
         row["resident_bytes"] = psutil.Process().memory_info().rss
@@ -321,7 +323,7 @@ class Run:
         return row
 
     def rows(self, stream: str) -> list[dict[str, Any]]:
-        """Return every row of a stream, of all resumptions where there is a record."""
+        """Return every row of a stream; with a record, those of all resumptions."""
         return self.history[stream] if self.records is None else self.records.rows(stream)
 
     def last_row(self, stream: str) -> dict[str, Any]:

@@ -49,11 +49,7 @@ class EnvThread:
         has_cores = config.device == "cpu" and cpu_cores() > 1 and torch.get_num_threads() > 1
         runs_ahead = has_cores and not (needs_gl(domain) and select_backend() == "glfw")
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="environment") if runs_ahead else Inline()
-        try:
-            self.env: EnvBase = self._thread.submit(self.make_env).result()
-        except BaseException:
-            self._thread.shutdown()
-            raise
+        self.env: EnvBase = self._thread.submit(self.make_env).result()
 
     def reset(self, seed: int) -> TensorDictBase:
         """Seed the environment and begin the episode of the seed."""
