@@ -114,10 +114,11 @@ class RunLogger:
         if not counters:
             raise ValueError(f"A row of {stream!r} needs a counter, such as updates=100.")
         for key in (*counters, *metrics):
-            if key in RESERVED or (key in counters and key in metrics):
-                raise ValueError(f"{key!r} cannot name a metric of {stream!r}: it is reserved, or a counter.")
-            if not isinstance(key, str) or not key.isprintable() or re.search('[,"]', key):
-                raise ValueError(f"{key!r} cannot name a metric of {stream!r}: it would not fit a CSV header.")
+            is_taken = key in RESERVED or (key in counters and key in metrics)
+            if is_taken or not key.isprintable() or re.search('[,"]', key):
+                raise ValueError(
+                    f"{key!r} cannot name a metric of {stream!r}: it is reserved, a counter, or unfit for a CSV header."
+                )
         where = {name: as_int(value, name) for name, value in counters.items()}
         values = {key: _scalar(key, value) for key, value in metrics.items() if value is not None}
         if not self._has_begun:
