@@ -411,40 +411,43 @@ def _require_request(path: Path, found: Mapping[str, Any], request: Mapping[str,
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Return the card of a dataset, which may be unfinished."""
-    card = read_json(path / CARD_FILE, error=DatasetError)
+    """Read and check the card of a dataset, which may be unfinished."""
+    file = path / CARD_FILE
+    card = read_json(file, error=DatasetError)
     found = (card.get("format"), card.get("version"))
     if found != (FORMAT, VERSION):
         raise DatasetError(
-            f"{path / CARD_FILE} has format {found[0]!r}, version {found[1]!r}; this release reads {FORMAT!r}, "
-            f"{VERSION}. Collect the dataset again."
+            f"{file} has format {found[0]!r}, version {found[1]!r}; this release reads {FORMAT!r}, {VERSION}. "
+            "Collect the dataset again."
         )
+    try:
+        _sizes(path, card)
+        if card["frames"] != card["transitions"] + card["episodes"]:
+            raise ValueError("frames")
+        if card["transitions"] > card["request"]["transitions"]:
+            raise ValueError("transitions")
+    except (KeyError, TypeError, ValueError, AttributeError) as reason:
+        raise DatasetError(f"{file} is damaged ({reason}). Collect the dataset again.") from None
     return card
 
 
 def read_card(path: Path) -> dict[str, Any]:
-    """Read and check a dataset's card against its files, without reading the frames."""
-    file = path / CARD_FILE
+    """Read the card of a complete dataset and check it against its files, without reading the frames."""
     if not path.is_dir():
         raise DatasetError(f"{path} is not a directory. A dataset is made by collect_random or `crptpro collect`.")
-    if not file.exists():
+    if not (path / CARD_FILE).exists():
         names = ", ".join(sorted(child.parent.name for child in path.glob(f"*/{CARD_FILE}")))
         hint = f" Did you mean one of its datasets: {names}?" if names else ""
         raise DatasetError(f"{path} has no {CARD_FILE}: it is not a dataset.{hint}")
     card = _read(path)
-    try:
-        if card["transitions"] < card["request"]["transitions"]:
-            raise DatasetError(
-                f"{path} is unfinished: {card['transitions']} of {card['request']['transitions']} transitions are "
-                "collected. Run the same collect command again to complete it."
-            )
-        sizes = _sizes(path, card)
-        if card["frames"] != card["transitions"] + card["episodes"]:
-            raise ValueError("frames")
-    except (KeyError, TypeError, ValueError, AttributeError) as reason:
-        raise DatasetError(f"{file} is damaged ({reason}). Collect the dataset again.") from None
-    for each, expected in sizes.items():
-        if not each.is_file():
-            raise DatasetError(f"{each} is missing. Collect the dataset again.")
-        require_size(each, each.stat().st_size, expected)
+    target = card["request"]["transitions"]
+    if card["transitions"] < target:
+        raise DatasetError(
+            f"{path} is unfinished: {card['transitions']} of {target} transitions are collected. Run the same collect "
+            "command again to complete it."
+        )
+    for file, expected in _sizes(path, card).items():
+        if not file.is_file():
+            raise DatasetError(f"{file} is missing. Collect the dataset again.")
+        require_size(file, file.stat().st_size, expected)
     return card

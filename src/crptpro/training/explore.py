@@ -257,7 +257,8 @@ def pretrain_active(
                     batch = explorer.encode(batch)
                 losses = update_encoder(batch)
                 schedule.step()
-                run.counters["updates"] = done["updates"] = done["updates"] + 1
+                done["updates"] += 1
+                run.counters["updates"] = done["updates"]
                 run.log(scalars(losses, explorer.name))
                 if done["updates"] % settings.log_interval == 0:
                     write_row(run, loss, monitor, batch, explorer.name)
