@@ -33,26 +33,29 @@ def test_what_is_no_finite_number_is_refused_with_its_name_and_value(value: Any)
 
 @dataclass(frozen=True)
 class Stage:
-    updates: Any = None
-    tau: Any = None
-    seed: Any = 0
+    updates: int | None = None
+    tau: float | None = None
+    seed: int = 0
+    name: str = "a"
 
     def __post_init__(self) -> None:
-        check_numbers(self, counts={"updates": 1}, rates={"tau": 1})
+        check_numbers(self, minima={}, maxima={"tau": 1})
 
 
 def test_numbers_of_a_stage_are_plain_and_in_their_range_or_left_open() -> None:
-    assert repr(Stage(np.int64(3), torch.tensor(0.5), 7.0)) == "Stage(updates=3, tau=0.5, seed=7)"
+    given: tuple[Any, ...] = (np.int64(3), torch.tensor(0.5), 7.0)
+    assert repr(Stage(*given)) == "Stage(updates=3, tau=0.5, seed=7, name='a')"
     assert Stage() == Stage(None, None, 0)
     for wrong, message in (
         ({"updates": 0}, "`updates` must be at least 1, got 0"),
         ({"tau": 1.5}, r"`tau` must be at most 1, got 1\.5"),
         ({"tau": -1}, "`tau` must be at least 0, got -1"),
         ({"seed": -1}, "`seed` must be at least 0, got -1"),
+        ({"seed": None}, "`seed` must be a whole number, got None"),
         ({"seed": 2**32}, "`seed` must be at most"),
     ):
         with pytest.raises(ValueError, match=message):
-            Stage(**wrong)
+            Stage(**wrong)  # type: ignore[arg-type]
 
 
 def test_a_path_is_expanded_and_one_that_no_record_can_hold_is_refused() -> None:

@@ -1,4 +1,4 @@
-"""What is kept on disk: files and directories that are whole or not there, and are checked before use."""
+"""Files and directories that are written whole or not at all, and are verified before use."""
 
 from __future__ import annotations
 
@@ -20,18 +20,13 @@ CARD_FILE = "card.json"
 
 
 def write_whole(path: str | Path, content: str | bytes) -> Path:
-    """Write a file beside ``path`` and rename it into place: a reader, or a power cut, never meets half of it.
+    """Write a file beside ``path`` and rename it into place, so that neither a reader nor a power cut sees half of it.
 
-    Args:
-        path: of the file; its directory is made.
-        content: text becomes UTF-8, its line ends as they are.
-
-    Returns:
-        ``path``.
+    Its directory is made; text is UTF-8 with its line ends as they are. Returns ``path``.
 
     Raises:
-        DiskSpaceError: if the disk is full; what was there before is kept.
-        OSError: if it cannot be written for another reason; it names the path.
+        DiskSpaceError: the disk is full; what was there before is kept.
+        OSError: it cannot be written for another reason; names the path.
     """
     path = as_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -54,18 +49,14 @@ def write_json(path: str | Path, content: Mapping[str, Any]) -> None:
 
     Raises:
         ValueError: naming an entry that is no plain value.
-        DiskSpaceError: if the disk is full; what was there before is kept.
+        DiskSpaceError: the disk is full; what was there before is kept.
     """
     plain = as_plain(content, Path(path).name)
     write_whole(path, json.dumps(plain, indent=2, sort_keys=True) + "\n")
 
 
 def read_json(path: str | Path, *, error: type[CRPTproError] = CRPTproError) -> dict[str, Any]:
-    """Read a JSON object.
-
-    Raises:
-        CRPTproError: (or ``error``) if the file is missing, not JSON, or not an object.
-    """
+    """Read a JSON object; raises ``error`` if the file is missing, not JSON, or not an object."""
     path = as_path(path)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -79,11 +70,7 @@ def read_json(path: str | Path, *, error: type[CRPTproError] = CRPTproError) -> 
 
 
 def require_disk(path: str | Path, needed_bytes: int, what: str) -> None:
-    """Refuse, before anything is written, what the disk under ``path`` cannot hold with 5 % to spare.
-
-    Raises:
-        DiskSpaceError: naming what is needed, what is free, and where.
-    """
+    """Raise a DiskSpaceError if the disk under ``path`` cannot hold something with 5 % to spare."""
     probe = as_path(path).absolute()
     while not probe.exists():
         probe = probe.parent
@@ -91,7 +78,7 @@ def require_disk(path: str | Path, needed_bytes: int, what: str) -> None:
     if needed_bytes * 1.05 > free:
         raise DiskSpaceError(
             f"{what} needs {needed_bytes / 1e9:.2f} GB, but {probe} has {free / 1e9:.2f} GB free. "
-            "Free space, choose another directory, or ask for fewer transitions."
+            "Free space, choose another directory, or request fewer transitions."
         )
 
 
@@ -107,27 +94,25 @@ def write_artifact(
     """Write ``weights.safetensors`` and ``card.json`` beside ``path`` and rename the directory into place.
 
     The new files are read back before they replace anything. A reader sees the old artifact or the new one, never a
-    mixture; a write that fails (a full disk, a kill) leaves the old one.
+    mixture; a write that fails (a full disk, a kill) leaves the old one. Returns ``path``.
 
     Args:
         path: directory to write or replace.
         modules: name to network or to its state dict; tensors are stored as ``name.key``.
         card: plain facts; ``format``, ``version`` and ``weights_sha256`` are added.
-        format_name: what kind of artifact this is.
+        format_name: kind of artifact.
         version: of the format.
-        check: called with card and tensors as they were read back; what it raises is raised, and nothing replaced.
-
-    Returns:
-        ``path``.
+        check: called with card and tensors as they were read back; if it raises, nothing is replaced.
 
     Raises:
-        CRPTproError: if there is something else at ``path``; it is left alone.
+        CRPTproError: there is something else at ``path``; it is left alone.
         ValueError: a fact that is no plain value.
-        DiskSpaceError: if the disk is full; an artifact there is kept.
+        DiskSpaceError: the disk is full; an artifact there is kept.
     """
     from safetensors.torch import save
 
-    given, path = as_path(path), as_path(path).resolve()
+    given = as_path(path)
+    path = given.resolve()
     _require_replaceable(path, format_name)
     tensors = {}
     for name, module in modules.items():
@@ -136,7 +121,8 @@ def write_artifact(
         tensors.update({f"{name}.{k}": v.detach().cpu().contiguous().clone() for k, v in state.items()})
     content = save(tensors)
     facts = {"format": format_name, "version": version, "weights_sha256": hashlib.sha256(content).hexdigest()}
-    temporary, previous = path.with_name(f".{path.name}.writing"), _previous(path)
+    temporary = path.with_name(f".{path.name}.writing")
+    previous = _previous(path)
     try:
         shutil.rmtree(temporary, ignore_errors=True)  # of a writer that was killed
         write_whole(temporary / WEIGHTS_FILE, content)
@@ -159,13 +145,9 @@ def write_artifact(
 def read_artifact(
     path: str | Path, *, format_name: str, version: int, error: type[CRPTproError] = CRPTproError
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Read and verify an artifact.
+    """Return the card of an artifact, and its tensors by ``name.key`` on the CPU.
 
-    Returns:
-        The card, and the tensors by ``name.key`` on the CPU.
-
-    Raises:
-        CRPTproError: (or ``error``) naming what is missing, damaged, of another kind or too new.
+    Raises ``error``, naming what is missing, damaged, of another kind or too new.
     """
     path = as_path(path).resolve()
     previous = _previous(path)  # where a writer that was killed between its two renames left it
@@ -183,9 +165,9 @@ def _require_replaceable(path: Path, format_name: str) -> None:
 
 
 def identity_of(card: Mapping[str, Any]) -> str | None:
-    """Return what tells an artifact's weights from any others: the method and a checksum; ``None`` without weights.
+    """Return what identifies an artifact's weights: the method and a checksum; ``None`` without weights.
 
-    One that was saved again without what only training reads is named as the one it comes from.
+    A slim copy has the identity of the artifact that it was made from.
     """
     for key in ("slim_of", "trimmed_from"):  # the second is in the cards under results/
         if key in card:

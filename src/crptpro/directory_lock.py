@@ -16,18 +16,12 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 
 
 class DirectoryLock:
-    """Holds ``directory`` for this process, so that two of them never write one record; freed even by a kill.
+    """Locks ``directory`` for this process, so that no two processes write one record; a kill frees it too.
 
-    It is taken at construction. Use it as a context manager, or call :meth:`release`.
+    It is taken at construction. Use it as a context manager, or call :meth:`release`. Re-entrant holders in one
+    process, a run's record and its training loop, share the lock. The file ``.lock`` stays in the directory.
 
-    Args:
-        directory: Made if it is missing; the lock is the file ``.lock`` in it, which stays.
-        error: What is raised.
-        is_reentrant: Several re-entrant holders in one process share the lock: the record of a run and its training
-            loop.
-
-    Raises:
-        CRPTproError: (or ``error``) if another process holds the directory, or it cannot be written.
+    Raises ``error`` if another process holds the directory, or it cannot be written.
     """
 
     def __init__(self, directory: str | Path, *, error: type[CRPTproError] = CRPTproError, is_reentrant: bool = False):
@@ -45,10 +39,10 @@ class DirectoryLock:
         except OSError as reason:
             if reason.errno not in _NO_LOCKS:
                 raise error(f"{path} cannot be written: {reason}.") from reason
-            _LOG.warning("%s cannot be locked (%s): see to it that no two processes write to it.", path, reason)
+            _LOG.warning("%s cannot be locked (%s): make sure that no two processes write to it.", path, reason)
 
     def release(self) -> None:
-        """Free the directory, once its last holder does; calling it twice is harmless."""
+        """Free the directory once its last holder does; a second call does nothing."""
         if self._lock is not None:
             self._lock.release()
             self._lock = None

@@ -1,4 +1,4 @@
-"""The record of a run, complete on disk after every row, and its copies on Weights & Biases and TensorBoard."""
+"""The record of a run, complete on disk after every row, and its mirrors on Weights & Biases and TensorBoard."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class WandbOptions:
-    """How a run appears on Weights & Biases; what is ``None`` follows W&B's own variables."""
+    """How a run appears on Weights & Biases; ``None`` follows W&B's own variables."""
 
     project: str | None = None
     """project (``WANDB_PROJECT``, else crptpro)"""
@@ -48,17 +48,17 @@ class WandbOptions:
 
 
 class RunLogger:
-    """Writes ``metrics.jsonl`` and one CSV per stream, and copies them to W&B and TensorBoard if asked.
+    """Writes ``metrics.jsonl`` and one CSV per stream, and mirrors them to W&B and TensorBoard if requested.
 
-    Rows are complete on disk when :meth:`log` returns. ``metrics.jsonl`` is the truth: ``<stream>.csv`` is written anew
-    from it where the two disagree. Settings and mirrors begin with the first row, so that a request that is refused
-    leaves no trace. A mirror that fails is switched off with one warning; the run continues. Usable as a context
-    manager. The directory is held for this process until :meth:`close`.
+    Rows are complete on disk when :meth:`log` returns. Where the two disagree, ``<stream>.csv`` is rewritten from
+    ``metrics.jsonl``. Settings and mirrors begin with the first row, so that a refused request leaves no trace. A
+    mirror that fails is switched off with one warning; the run continues. Usable as a context manager. The directory is
+    locked for this process until :meth:`close`.
 
     Args:
         run_dir: directory of the run, created if missing; rows found there are continued.
         config: settings of the run, a mapping or a dataclass; kept in ``config.json`` with versions and hardware.
-        wandb: mirror to Weights & Biases; ``None`` for not.
+        wandb: mirror to Weights & Biases if given.
         tensorboard: mirror to TensorBoard (needs the ``tensorboard`` extra).
 
     Raises:
@@ -84,12 +84,11 @@ class RunLogger:
         for stream in self._streams():
             self._write_csv(stream)
         self._has_begun = False
-        self._mirrors: list[_Mirror] = []
-        self._wanted: dict[str, Callable[[], _Mirror]] = {}
+        self._mirrors: list[_Wandb | _TensorBoard] = []
         if wandb is not None:
-            self._wanted[_Wandb.name] = lambda: _Wandb(wandb, self.run_dir, self._config)
+            self._mirrors.append(_Wandb(wandb, self.run_dir, self._config))
         if tensorboard:
-            self._wanted[_TensorBoard.name] = lambda: _TensorBoard(self.run_dir)
+            self._mirrors.append(_TensorBoard(self.run_dir))
 
     def __enter__(self) -> RunLogger:
         return self
@@ -103,8 +102,8 @@ class RunLogger:
         Args:
             metrics: names to numbers, scalar tensors or short texts; ``None`` leaves a cell empty.
             stream: which CSV, e.g. ``"pretrain"``, ``"train"``, ``"eval"``.
-            counters: where the run is, e.g. ``updates=100`` or ``env_steps=1000, episodes=2``; at least one. The x-axis
-                of the mirrors is ``env_steps`` if given, else the first.
+            counters: where the run is, e.g. ``updates=100`` or ``env_steps=1000, episodes=2``; at least one. The
+                mirrors plot against ``env_steps`` if given, else the first.
 
         Raises:
             ValueError: no counter, a name used twice, reserved or not printable, or a value that is no scalar.
@@ -115,20 +114,21 @@ class RunLogger:
         if not counters:
             raise ValueError(f"A row of {stream!r} needs a counter, such as updates=100.")
         for key in (*counters, *metrics):
-            if key in RESERVED or (key in counters and key in metrics):
-                raise ValueError(f"{key!r} cannot name a metric of {stream!r}: it is reserved, or a counter.")
-            if not isinstance(key, str) or not key.isprintable() or re.search('[,"]', key):
-                raise ValueError(f"{key!r} cannot name a metric of {stream!r}: it would not fit a CSV header.")
+            is_taken = key in RESERVED or (key in counters and key in metrics)
+            if is_taken or not key.isprintable() or re.search('[,"]', key):
+                raise ValueError(
+                    f"{key!r} cannot name a metric of {stream!r}: it is reserved, a counter, or unfit for a CSV header."
+                )
         where = {name: as_int(value, name) for name, value in counters.items()}
         values = {key: _scalar(key, value) for key, value in metrics.items() if value is not None}
         if not self._has_begun:
             if self._config:
                 write_json(self.run_dir / "config.json", {"config": self._config, **provenance()})
             self._has_begun = True
-            for name, make in self._wanted.items():
-                self._open(name, make)
+            self._mirror(lambda mirror: mirror.begin())
         row = {"stream": stream, **where, "unix_time_s": round(time.time(), 3), **values}
-        columns, index = self._columns(stream), len(self._rows)
+        columns = self._columns(stream)
+        index = len(self._rows)
         _append(self.path, json.dumps({key: _cell(value) for key, value in row.items()}) + "\n")
         self._rows.append({key: _cell(value) for key, value in row.items()})
         if self._columns(stream) == columns:
@@ -147,21 +147,23 @@ class RunLogger:
         return [{key: value for key, value in row.items() if key != "stream"} for row in found]
 
     def state_dict(self, streams: Iterable[str]) -> dict[str, int]:
-        """Return the number of rows per stream, forced to disk; belongs into every checkpoint."""
+        """Return the number of rows per stream, synced to disk, for a checkpoint."""
         if self.path.exists():
             with open(self.path, "rb") as file:
                 os.fsync(file.fileno())
         return {name: len(self.rows(name)) for name in streams}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Take back the rows written after the checkpoint, so that the resumed run writes each row once.
+        """Remove the rows written after the checkpoint, so that the resumed run writes each row once.
 
-        Streams that ``state`` does not name, those of other stages in the same directory, are left alone.
+        Streams that ``state`` does not name belong to other stages in the same directory and are left alone.
         """
         for name, count in state.items():
             if (missing := count - len(self.rows(name))) > 0:
                 _LOG.warning("%s: %d rows of %r are missing that the checkpoint counted.", self.path, missing, name)
-        before, seen, kept = self._streams(), Counter[str](), []
+        before = self._streams()
+        seen = Counter[str]()
+        kept = []
         for row in self._rows:
             seen[row["stream"]] += 1
             if seen[row["stream"]] <= state.get(row["stream"], math.inf):
@@ -176,11 +178,11 @@ class RunLogger:
                 self._csv(stream).unlink(missing_ok=True)
 
     def writes_into(self, directory: str | Path) -> bool:
-        """Whether the record lies in ``directory`` or below it: only then is all of it that directory's own."""
+        """Whether the record is inside ``directory``: only then all of it belongs to that directory's run."""
         return self.run_dir.resolve().is_relative_to(Path(directory).resolve())
 
     def close(self) -> None:
-        """Finish the mirrors and free the directory; every row is on disk already."""
+        """Finish the mirrors and unlock the directory; every row is on disk already."""
         self._mirror(lambda mirror: mirror.close())
         self._mirrors = []
         self._lock.release()
@@ -221,56 +223,41 @@ class RunLogger:
         if not path.exists() or path.read_bytes() != content.encode():
             write_whole(path, content)
 
-    def _open(self, name: str, make: Callable[[], _Mirror]) -> None:
-        try:
-            self._mirrors.append(make())
-        except Exception as reason:
-            _LOG.warning("%s is off for this run (%s); the local record is complete.", name, reason)
-
-    def _mirror(self, call: Callable[[_Mirror], None]) -> None:
-        for mirror in list(self._mirrors):
+    def _mirror(self, call: Callable[[_Wandb | _TensorBoard], None]) -> None:
+        for mirror in list(self._mirrors) if self._has_begun else ():
             try:
                 call(mirror)
             except Exception as reason:
                 self._mirrors.remove(mirror)
                 _LOG.warning(
-                    "%s failed and is off from here (%s); the local record in %s is complete.",
-                    mirror.name, reason, self.run_dir,
-                )  # fmt: skip
+                    "%s is off from here (%s); the local record in %s is complete.", mirror.name, reason, self.run_dir
+                )
 
 
-class _Mirror:
-    """Receives copies of what the record holds; what a mirror cannot show it leaves out."""
-
-    name: str
-
-    def log(self, stream: str, counters: Mapping[str, int], values: Mapping[str, Any], index: int) -> None:
-        raise NotImplementedError
-
-    def artifact(self, path: Path, name: str, kind: str) -> None: ...
-    def close(self) -> None: ...
-
-
-class _Wandb(_Mirror):
+class _Wandb:
     """One W&B run per directory. A row's index is its step: W&B drops those that a resumed run repeats."""
 
     name = "Weights & Biases"
 
     def __init__(self, options: WandbOptions, run_dir: Path, config: Mapping[str, Any]) -> None:
+        self._options, self._run_dir, self._config = options, run_dir, config
+        self._streams: set[str] = set()
+
+    def begin(self) -> None:
         from torchrl.record.loggers import get_logger
 
-        told = os.environ.get
+        options, run_dir, environment = self._options, self._run_dir, os.environ
         arguments = {
-            "project": options.project or told("WANDB_PROJECT") or "crptpro",
-            "group": options.group or told("WANDB_RUN_GROUP"),
+            "project": options.project or environment.get("WANDB_PROJECT") or "crptpro",
+            "group": options.group or environment.get("WANDB_RUN_GROUP"),
             "tags": list(options.tags) or None,
-            "config": dict(config),
+            "config": dict(self._config),
             "id": _wandb_id(run_dir),
             "reinit": "create_new",
             "settings": {"silent": True, "console": "off", "init_timeout": 60.0},
             "log_env_packages": False,
         }
-        name = options.name or told("WANDB_NAME") or run_dir.name
+        name = options.name or environment.get("WANDB_NAME") or run_dir.name
         mode = options.mode if options.mode != "auto" else _wandb_mode()
 
         def start(mode: str) -> Any:
@@ -284,7 +271,6 @@ class _Wandb(_Mirror):
             _LOG.warning("W&B cannot be reached (%s); logging offline, `wandb sync` uploads it later.", reason)
             self._logger = start("offline")
         self._run = self._logger.experiment
-        self._streams: set[str] = set()
 
     def log(self, stream: str, counters: Mapping[str, int], values: Mapping[str, Any], index: int) -> None:
         if stream not in self._streams:
@@ -306,19 +292,24 @@ class _Wandb(_Mirror):
         self._run.finish()
 
 
-class _TensorBoard(_Mirror):
-    """Event files in ``<run_dir>/tensorboard``; they hold the numbers alone."""
+class _TensorBoard:
+    """Event files in ``<run_dir>/tensorboard``; they hold numbers only."""
 
     name = "TensorBoard"
 
     def __init__(self, run_dir: Path) -> None:
+        self._run_dir = run_dir
+
+    def begin(self) -> None:
         from torchrl.record.loggers import get_logger
 
-        self._logger: Any = get_logger("tensorboard", str(run_dir), "tensorboard")
+        self._logger: Any = get_logger("tensorboard", str(self._run_dir), "tensorboard")
 
     def log(self, stream: str, counters: Mapping[str, int], values: Mapping[str, Any], index: int) -> None:
         numbers = {f"{stream}/{key}": value for key, value in values.items() if not isinstance(value, str)}
         self._logger.log_metrics(numbers, step=counters[_axis(counters)])
+
+    def artifact(self, path: Path, name: str, kind: str) -> None: ...
 
     def close(self) -> None:
         self._logger.experiment.close()
@@ -329,7 +320,7 @@ def _axis(counters: Mapping[str, int]) -> str:
 
 
 def _wandb_mode() -> str:
-    """What W&B's own settings say, without touching the network."""
+    """Return what W&B's own settings say, without network access."""
     if mode := os.environ.get("WANDB_MODE"):
         return mode
     if os.environ.get("WANDB_API_KEY"):
@@ -343,7 +334,7 @@ def _wandb_mode() -> str:
 
 
 def _wandb_id(run_dir: Path) -> str:
-    """The id of this directory's W&B run, drawn once and kept."""
+    """Return the id of this directory's W&B run, drawn once and kept."""
     path = run_dir / "wandb_run.json"
     try:
         return str(json.loads(path.read_text())["id"])
@@ -354,7 +345,7 @@ def _wandb_id(run_dir: Path) -> str:
 
 
 def _scalar(key: str, value: Any) -> int | float | str:
-    if isinstance(value, str):  # on one line, and such that a UTF-8 file takes it
+    if isinstance(value, str):  # on one line, encodable as UTF-8
         return " ".join(value.splitlines()).encode("utf-8", "backslashreplace").decode()
     try:
         number = value.item() if hasattr(value, "item") else value
@@ -364,7 +355,7 @@ def _scalar(key: str, value: Any) -> int | float | str:
 
 
 def _cell(value: Any) -> Any:
-    """NaN and infinity become words: they are not JSON, and the CSV shows the same."""
+    """Return NaN and infinity as words: they are not JSON, and the CSV shows the same."""
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -1,4 +1,4 @@
-"""The artifact between the two halves: a pre-trained encoder, its heads and a card."""
+"""The artifact between pre-training and downstream learning: an encoder, its heads and a card."""
 
 from __future__ import annotations
 
@@ -62,8 +62,8 @@ class Pretrained:
         target_encoder: slow copy of the encoder.
         target_projector: slow copy of the projector.
         queue: candidate latents ``[Q, D]`` if the method keeps some.
-        actor: policy that explored while it was pre-trained, for methods that hand it over.
-        card: what made it.
+        actor: the exploring policy, for methods whose downstream runs start from it.
+        card: how it was made.
         rest: remaining state of the loss (further heads, coefficients), for fine-tuning.
     """
 
@@ -90,7 +90,7 @@ class Pretrained:
         return f"{self.method}-finetune" if is_finetuned else self.method
 
     def identity(self) -> str:
-        """Return what tells these weights from any others: the method and a checksum."""
+        """Return what identifies these weights: the method and a checksum."""
         if (named := identity_of(self.card)) is not None:
             return named
         digest = hashlib.sha256()
@@ -102,20 +102,18 @@ class Pretrained:
         return f"{self.method}:{digest.hexdigest()}"
 
     def require(self, *, image_size: int, frame_stack: int | None = None) -> Pretrained:
-        """Check the images that the encoder is about to be given. Returns self.
+        """Check that the encoder takes images of this size, in pixels, and stack. Returns self.
 
-        Args:
-            image_size: height and width in pixels.
-            frame_stack: RGB images per observation; ``None`` is not checked.
+        ``None``, and what an encoder's ``config`` does not say, is not checked.
 
         Raises:
-            PretrainedError: naming everything that does not fit, and both values. What an encoder does not say of
-                itself is not checked.
+            PretrainedError: naming everything that does not fit, and both values.
         """
         has = _pixel_facts(self.encoder)
+        needed = {"image_size": image_size, "frame_stack": frame_stack}
         wrong = [
             f"it was trained with {name} {has[name]}, not {value}"
-            for name, value in (("image_size", image_size), ("frame_stack", frame_stack))
+            for name, value in needed.items()
             if None not in (value, has[name]) and has[name] != value
         ]
         if wrong:
@@ -210,26 +208,20 @@ def _feature_moments(
 
 
 def save_pretrained(
-    trained: Any,
-    path: str | Path,
-    *,
-    slim: bool = False,
-    dtype: Literal["bfloat16"] | None = None,
-    actor: nn.Module | None = None,
+    trained: Any, path: str | Path, *, slim: bool = False, dtype: Literal["bfloat16"] | None = None
 ) -> Path:
     """Write what was trained as a directory: ``weights.safetensors`` and ``card.json``.
 
     It is read back and rebuilt before it replaces anything.
 
     Args:
-        trained: the result of a pre-training (``.loss``, ``.method``, ``.training``; ``.actor`` and ``.queue`` where
-            there are any); a loss with the pre-training contract (``.encoder``, and ``.projector``, ``.predictor``,
-            ``.prototypes`` where it has them); or a loaded artifact.
+        trained: the result of a pre-training (``.loss``, ``.method``, ``.training``, and optionally ``.actor`` and
+            ``.queue``); a loss with the pre-training contract (``.encoder``, and optionally ``.projector``,
+            ``.predictor``, ``.prototypes``); or a loaded artifact.
         path: directory to write; an artifact there is replaced, as a whole.
-        slim: leave out what only training reads: predictor, targets and further heads, and the projector where there
-            are no prototypes. Learning a task from it gives the same numbers; fine-tuning from it is refused.
+        slim: leave out what only training reads: predictor, targets and further heads, and without prototypes the
+            projector. Learning a task from it gives the same numbers; fine-tuning from it is refused.
         dtype: ``"bfloat16"`` stores the weights in half the size, rounded to 8 bits; they are loaded as float32.
-        actor: policy that explored meanwhile, where ``trained`` is a loss.
 
     Returns:
         ``path``.
@@ -242,7 +234,7 @@ def save_pretrained(
     if dtype not in (None, "bfloat16"):
         raise ValueError(f"`dtype` must be 'bfloat16' or None, got {dtype!r}.")
     path = as_path(path)
-    source = _as_pretrained(trained, actor)
+    source = _as_pretrained(trained)
     if slim:
         source = _slimmed(source)
     states: dict[str, Mapping[str, Tensor]] = {}
@@ -308,15 +300,12 @@ def shipped_encoders() -> list[str]:
     return sorted(card.parent.name for card in SHIPPED.glob(f"*/{CARD_FILE}"))
 
 
-def _as_pretrained(trained: Any, actor: nn.Module | None) -> Pretrained:
-    """Gather what is to be saved."""
+def _as_pretrained(trained: Any) -> Pretrained:
+    """Return the artifact of what was trained."""
     if isinstance(trained, Pretrained):
-        return trained if actor is None else replace(trained, actor=actor)
-    if isinstance(trained, nn.Module):
-        result: dict[str, Any] = {"loss": trained, "method": method_of(trained).name}
-    else:
-        result = {name: getattr(trained, name, None) for name in ("loss", "method", "training", "actor", "queue")}
-    loss = result["loss"]
+        return trained
+    result = None if isinstance(trained, nn.Module) else trained
+    loss = trained if result is None else getattr(result, "loss", None)
     if not isinstance(loss, nn.Module):
         raise PretrainedError(
             f"A {type(trained).__name__} cannot be saved as a pretrained encoder: it is no loss, and no result of one."
@@ -326,8 +315,7 @@ def _as_pretrained(trained: Any, actor: nn.Module | None) -> Pretrained:
         raise PretrainedError(f"{type(loss).__name__} has no `.encoder`; a pre-training loss exposes it.")
     heads = {role: _unwrapped(getattr(loss, role, None)) for role in HEADS}
     targets = {}
-    for target in TARGETS:
-        online = encoder if target == "target_encoder" else heads["projector"]
+    for target, online in (("target_encoder", encoder), ("target_projector", heads["projector"])):
         if online is not None and (state := _target_state(loss, target)):
             targets[target] = copy.deepcopy(online)
             targets[target].load_state_dict(state)
@@ -338,12 +326,11 @@ def _as_pretrained(trained: Any, actor: nn.Module | None) -> Pretrained:
         if isinstance(value, Tensor) and key != "queue" and not key.startswith(covered)
     }
     card = {
-        "method": result["method"],
-        "loss": {"class": f"{type(loss).__module__}.{type(loss).__qualname__}", "config": _loss_options(loss)},
-        "training": result.get("training"),
+        "method": method_of(loss).name if result is None else result.method,
+        "loss": {"class": class_name(loss), "config": loss_options(loss)},
+        "training": getattr(result, "training", None),
     }
-    actor = result.get("actor") if actor is None else actor
-    queue = result.get("queue")
+    queue, actor = getattr(result, "queue", None), getattr(result, "actor", None)
     return Pretrained(encoder, **heads, **targets, queue=queue, actor=actor, card=card, rest=rest)
 
 
@@ -357,8 +344,13 @@ def _slimmed(source: Pretrained) -> Pretrained:
     return replace(source, **left_out, card=card)
 
 
-def _loss_options(loss: nn.Module) -> dict[str, Any]:
-    """The constructor's plain options, read back from the attributes of the same names."""
+def class_name(loss: nn.Module) -> str:
+    """Return the class of a loss with its module, as cards and checkpoints name it."""
+    return f"{type(loss).__module__}.{type(loss).__qualname__}"
+
+
+def loss_options(loss: nn.Module) -> dict[str, Any]:
+    """Return the plain options of a loss's constructor, read back from the attributes of the same names."""
     if isinstance(config := getattr(loss, "config", None), dict):
         return config
     options = {}
@@ -386,22 +378,22 @@ def _pixel_facts(encoder: nn.Module) -> dict[str, Any]:
 
 
 def _unwrapped(module: Any) -> nn.Module | None:
-    """The network inside a ``TensorDictModule``, or the network itself; ``None`` for anything else."""
+    """Return the network inside a ``TensorDictModule``, or the network itself; ``None`` for anything else."""
     while isinstance(module, TensorDictModule):
         module = module.module
     return module if isinstance(module, nn.Module) else None
 
 
 def _target_state(loss: Any, target: str) -> dict[str, Tensor]:
-    """The live tensors of a target network by state-dict name, whichever way a loss holds it; empty if it has none."""
+    """Return the live tensors of a target network by state-dict name, however a loss holds it; empty if it has none."""
     if (module := _unwrapped(getattr(loss, target, None))) is not None:
         return {key: value.detach() for key, value in module.state_dict(keep_vars=True).items()}
     params = getattr(loss, "_modules", {}).get(f"{target}_params")
     if params is None:
         return {}
-    named = {".".join(k) if isinstance(k, tuple) else k: v.data for k, v in params.items(True, True)}
     is_wrapped = isinstance(getattr(loss, target.removeprefix("target_"), None), TensorDictModule)
-    return {key.removeprefix("module.") if is_wrapped else key: value for key, value in named.items()}
+    state = dict(params.data.flatten_keys(".").items())
+    return {key.removeprefix("module."): value for key, value in state.items()} if is_wrapped else state
 
 
 def _rebuilt(

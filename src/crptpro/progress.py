@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal, a line now and then in a log file."""
+"""Progress of long work: a bar on a terminal, occasional lines in a log file."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ logger = logging.getLogger(__name__)
 
 
 class Progress:
-    """How far something is, from ``done`` to ``total`` units; a log file gets so many ``lines`` of the whole."""
+    """Shows progress from ``done`` to ``total`` units; a log file gets ``lines`` over the whole."""
 
     def __init__(
         self, total: int, done: int, unit: str, *, label: str = "", is_shown: bool = True, lines: int = 20

@@ -1,4 +1,4 @@
-"""What made a number: versions, hardware and source revision, for cards and records."""
+"""Versions, hardware and source revision, for cards and records."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import torch
 PACKAGES = ("crptpro", "torch", "torchrl", "tensordict", "dm-control", "mujoco", "gymnasium", "numpy", "wandb")
 
 UNUSABLE = "unusable"
-"""How the name of a GPU begins that torch sees and cannot use."""
+"""Prefix of the name of a GPU that torch sees and cannot use."""
 
 
 @cache
@@ -35,10 +35,8 @@ def versions() -> dict[str, str]:
 def hardware() -> dict[str, Any]:
     """Return what decides how long work takes here.
 
-    Returns:
-        ``cpu``, the model; ``cpu_instructions``, that torch uses, e.g. ``"AVX512, AVX512-BF16"``
-        (in virtual machines two processors of one model may differ threefold in speed); ``cpu_cores``, that this
-        process may use; ``ram_bytes``; ``gpus``, the names torch sees (or why it cannot use one).
+    ``cpu_instructions`` are those that torch uses: in virtual machines two processors of one model may differ threefold
+    in speed. ``cpu_cores`` are those that this process may use, ``gpus`` names, or why torch cannot use one.
     """
     cpu = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
@@ -73,7 +71,7 @@ def git_revision() -> str:
     """Return the revision of the source checkout, ``+dirty`` if modified, or ``"unknown"``."""
     here = Path(__file__).resolve()
     git = ["git", "-C", str(here.parent)]
-    # Installed below somebody's repository (a .venv that it ignores), this file is not part of it.
+    # In a repository's ignored .venv, this file is not part of the repository.
     is_tracked = [*git, "ls-files", "--error-unmatch", here.name]
     describe = [*git, "describe", "--always", "--dirty=+dirty", "--abbrev=12"]
     try:

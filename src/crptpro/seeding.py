@@ -1,4 +1,4 @@
-"""One user seed, many independent streams; and the global generators of Python, NumPy and torch."""
+"""Independent seeds from one user seed, and the global generators of Python, NumPy and torch."""
 
 from __future__ import annotations
 
@@ -44,17 +44,7 @@ def seed_everything(seed: int) -> None:
 
 @contextmanager
 def kept_global_rng() -> Iterator[None]:
-    """Restore the global generators at the end of the body.
-
-    Examples:
-        >>> seed_everything(0)
-        >>> with kept_global_rng():
-        ...     seed_everything(1)
-        >>> inside = random.random()
-        >>> seed_everything(0)
-        >>> random.random() == inside
-        True
-    """
+    """Restore the global generators at the end of a ``with`` block."""
     state = GlobalRNGState().state_dict()
     try:
         yield

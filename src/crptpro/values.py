@@ -9,7 +9,8 @@ import os
 from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any, Literal, get_args
+from types import NoneType
+from typing import Any, Literal, get_args, get_type_hints
 
 import numpy as np
 import torch
@@ -19,12 +20,11 @@ Quality = Literal["exact", "fast"]
 of the pixels changed (8 % on the terrain of quadruped_escape)."""
 
 Colors = Literal["normal", "reversed_background", "reversed_image"]
-"""Colours of a world. The reversed ones swap the order of red, green and blue: of skybox and floor (the paper's unseen
-colours), or of whole images."""
+"""Colours of an environment. The reversed ones swap the order of red, green and blue: of skybox and floor (the paper's
+unseen colours), or of whole images."""
 
 QUALITIES: tuple[str, ...] = get_args(Quality)
 COLORS: tuple[str, ...] = get_args(Colors)
-
 
 MAX_SEED = 2**32 - 1
 """NumPy's largest."""
@@ -35,10 +35,6 @@ def as_int(value: Any, name: str, *, minimum: int | None = None, maximum: int | 
 
     Raises:
         ValueError: naming the setting, its value and what is allowed.
-
-    Examples:
-        >>> as_int(1e5, "transitions", minimum=1)
-        100000
     """
     number: Any = value
     if hasattr(number, "item") and getattr(number, "ndim", 0) == 0:
@@ -56,15 +52,7 @@ def as_int(value: Any, name: str, *, minimum: int | None = None, maximum: int | 
 
 
 def as_float(value: Any, name: str, *, minimum: float | None = None, maximum: float | None = None) -> float:
-    """Return a coefficient or rate as a plain finite ``float``.
-
-    Raises:
-        ValueError: naming the setting, its value and what is allowed.
-
-    Examples:
-        >>> as_float(1, "tau", minimum=0, maximum=1)
-        1.0
-    """
+    """Return a coefficient or rate as a plain finite ``float``; a ValueError as of :func:`as_int`."""
     try:
         if isinstance(value, (bool, str, bytes)):
             raise TypeError
@@ -81,11 +69,7 @@ def as_path(value: str | os.PathLike[str], name: str = "path") -> Path:
     """Return a path with ``~`` expanded.
 
     Raises:
-        ValueError: for an empty path, or one whose bytes are not UTF-8 and could not be written into a record.
-
-    Examples:
-        >>> as_path("~/runs") == Path.home() / "runs"
-        True
+        ValueError: an empty path, or one whose bytes are not UTF-8 and could not be written into a record.
     """
     text = os.fspath(value)
     if not text:
@@ -104,10 +88,6 @@ def as_plain(value: Any, name: str) -> Any:
 
     Raises:
         ValueError: naming an entry that has no such form.
-
-    Examples:
-        >>> as_plain({"size": np.int64(84), "out": Path("runs")}, "card")
-        {'size': 84, 'out': 'runs'}
     """
     if isinstance(value, Enum):
         value = value.value
@@ -120,9 +100,7 @@ def as_plain(value: Any, name: str) -> Any:
         return {str(key): as_plain(item, f"{name}.{key}") for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [as_plain(item, f"{name}[{index}]") for index, item in enumerate(value)]
-    if isinstance(value, str):
-        return str(value)
-    if isinstance(value, (os.PathLike, torch.dtype, torch.device)):
+    if isinstance(value, (str, os.PathLike, torch.dtype, torch.device)):
         return str(value)
     if isinstance(value, (np.ndarray, np.generic, torch.Tensor)):
         value = value.tolist()
@@ -132,27 +110,26 @@ def as_plain(value: Any, name: str) -> Any:
     raise ValueError(f"`{name}` is no plain value: {value!r} is a {type(value).__name__}.")
 
 
-def check_numbers(config: Any, *, counts: Mapping[str, int], rates: Mapping[str, float | None]) -> None:
-    """Convert the numbers of a stage's frozen dataclass to plain ones; ``None`` stays ``None``.
+def check_numbers(config: Any, *, minima: Mapping[str, int], maxima: Mapping[str, float]) -> None:
+    """Convert the fields of a frozen dataclass that are an ``int`` or ``float`` to plain numbers in their range.
 
-    Its ``seed`` may be from 0 to 2**32 - 1.
-
-    Args:
-        config: the dataclass, in its ``__post_init__``.
-        counts: smallest value of each whole number.
-        rates: largest value of each ``float``, ``None`` without a limit; the smallest is 0.
+    A whole number is at least 1 unless ``minima`` says otherwise, a ``float`` at least 0 and at most what ``maxima``
+    says. ``seed`` is from 0 to 2**32 - 1. ``None`` stays where the annotation allows it.
 
     Raises:
         ValueError: naming the setting, its value and what is allowed.
     """
-    values: dict[str, Any] = {"seed": as_int(config.seed, "seed", minimum=0, maximum=MAX_SEED)}
-    for name, minimum in counts.items():
-        if (value := getattr(config, name)) is not None:
-            values[name] = as_int(value, name, minimum=minimum)
-    for name, maximum in rates.items():
-        if (value := getattr(config, name)) is not None:
-            values[name] = as_float(value, name, minimum=0, maximum=maximum)
-    for name, value in values.items():
+    for name, hint in get_type_hints(type(config)).items():
+        value = getattr(config, name)
+        kinds = get_args(hint) or (hint,)
+        if value is None and NoneType in kinds:
+            continue
+        if name == "seed":
+            value = as_int(value, name, minimum=0, maximum=MAX_SEED)
+        elif int in kinds:
+            value = as_int(value, name, minimum=minima.get(name, 1))
+        elif float in kinds:
+            value = as_float(value, name, minimum=0, maximum=maxima.get(name))
         object.__setattr__(config, name, value)
 
 

@@ -1,4 +1,4 @@
-"""Worker processes that make environments: spawned, one CPU thread each, and gone when their parent is."""
+"""Worker processes that make environments: spawned, with one CPU thread each, and ended with their parent."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import torch
 from crptpro.plugins import load_again, loaded_plugins
 
 SPAWN = multiprocessing.get_context("spawn")
-"""A fork would share a GL context."""
+"""Forked processes would share a GL context."""
 
 
 def can_be_sent(function: Callable[..., Any]) -> bool:
@@ -27,15 +27,15 @@ def can_be_sent(function: Callable[..., Any]) -> bool:
     main_file = getattr(sys.modules.get("__main__"), "__file__", None)
     try:
         return b"__main__" not in pickle.dumps(function) or bool(main_file and Path(main_file).exists())
-    except Exception:  # objects may refuse in ways of their own
+    except Exception:  # objects may raise anything
         return False
 
 
 class Inline(Executor):
-    """An executor that does the work at once, where it is submitted."""
+    """An executor that does the work at once, in the thread that submits it."""
 
     def submit(self, function: Any, /, *arguments: Any, **options: Any) -> Future[Any]:
-        """Call the function; its exception is that of the result."""
+        """Call the function; the future holds its result or exception."""
         future: Future[Any] = Future()
         try:
             future.set_result(function(*arguments, **options))
@@ -63,7 +63,7 @@ class WorkerPool(ProcessPoolExecutor):
                 signal.signal(signal.SIGINT, before)
 
     def end(self) -> None:
-        """End the processes, whatever they do; nobody wants it any more."""
+        """End the processes, whatever they do."""
         for process in self.processes.values():
             process.terminate()
         for process in self.processes.values():

@@ -113,7 +113,7 @@ def test_processes_that_hang_are_noticed(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(collect, "WorkerPool", Pool)
     monkeypatch.setattr(Pool, "submit", lambda *_: Future())
     monkeypatch.setattr(collect, "STALL_S", 0.1)
-    with pytest.raises(RenderingError, match=r"episode 0 of toy-fixed.*no sign of life.*MUJOCO_GL"):
+    with pytest.raises(RenderingError, match=r"episode 0 of toy-fixed.*have made no step.*MUJOCO_GL"):
         collect_random(FIXED, tmp_path, transitions=50, workers=2, **SMALL)
 
 
@@ -127,7 +127,7 @@ def test_a_complete_dataset_is_returned_as_it_is(collected: dict[str, Path], cap
         assert collect_group([FIXED], path.parent, **ASKED) == {"toy-fixed": path}
     assert {file: file.stat().st_mtime_ns for file in path.rglob("*")} == written
     assert "is complete" in caplog.text
-    with pytest.raises(DatasetError, match=r"image_size 8 there, 9 asked for.*choose another directory"):
+    with pytest.raises(DatasetError, match=r"image_size 8 there, 9 requested.*choose another directory"):
         collect_random(FIXED, path.parent, **ASKED | {"image_size": 9})
 
 
@@ -194,7 +194,9 @@ def test_progress_is_logged_where_the_output_is_no_terminal(tmp_path: Path, capl
 
 
 def test_a_world_that_fails_is_named_with_its_cause_and_does_not_block_the_repaired_one(tmp_path: Path) -> None:
-    with pytest.raises(CRPTproError, match=r"Episode 0 of toy-failing failed: the simulator exploded") as failure:
+    with pytest.raises(
+        CRPTproError, match=r"Collecting episode 0 of toy-failing failed: the simulator exploded"
+    ) as failure:
         collect_random(FAILING, tmp_path, transitions=50, **SMALL)
     assert isinstance(failure.value.__cause__, WorldFailedError)
     assert isinstance(failure.value.__cause__.__cause__, ValueError)
@@ -256,7 +258,7 @@ def start(tmp_path: Path, root: Path, *, workers: int = 2, limit: str = "pass", 
 
 
 def episodes_in(path: Path) -> int:
-    file = path / "collection.json"
+    file = path / "card.json"
     return json.loads(file.read_text())["episodes"] if file.exists() else 0
 
 
@@ -308,7 +310,7 @@ def test_processes_that_cannot_be_started_are_an_error_that_says_why(tmp_path: P
         start(tmp_path, tmp_path / "unguarded", more=unguarded),
     ]
     limited, unguarded_said = (program.communicate(timeout=300)[1] for program in programs)
-    assert b"This shell allows 32 open files: raise that (`ulimit -n 4096`), or use fewer workers" in limited
+    assert b"Use fewer workers, or raise the limit of open files (`ulimit -n 4096`)" in limited
     assert b'needs `if __name__ == "__main__":` around its main program' in unguarded_said
 
 

@@ -17,11 +17,10 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import CatFrames, TransformedEnv
 from toy_world import ToyEnv, rollout_of, variable_length
 
-from crptpro.data import FrameReplay, StoredReplay, stack_frames, storage
+from crptpro.data import FrameReplay, StoredReplay, storage
 from crptpro.errors import CheckpointError, DatasetError, DiskSpaceError, NonFiniteError
 
 GAMMA = 0.9
@@ -380,20 +379,6 @@ def test_what_the_disk_cannot_hold_is_refused_and_nothing_of_it_is_left(
             small(path=tmp_path)
     assert not [file for file in tmp_path.iterdir() if file.is_file()]
     small(path=tmp_path)
-
-
-def test_a_buffer_of_single_frames_becomes_one_of_stacks() -> None:
-    live = TransformedEnv(ToyEnv(variable_length, seed=2), CatFrames(N=4, dim=-3, in_keys=["pixels"], padding="same"))
-    torch.manual_seed(0)
-    expected = live.rollout(40, break_when_any_done=False)
-    torch.manual_seed(0)
-    single = ReplayBuffer(storage=LazyTensorStorage(40))
-    single.extend(ToyEnv(variable_length, seed=2).rollout(40, break_when_any_done=False))
-    stacked = stack_frames(single, frame_stack=4)
-    for key in ("pixels", ("next", "pixels"), "action", ("next", "done")):
-        assert torch.equal(stacked[:][key], expected[key]), key
-    with pytest.raises(ValueError, match="empty"):
-        stack_frames(ReplayBuffer(storage=LazyTensorStorage(4)))
 
 
 # --- what a run left behind ------------------------------------------------------------------------------------------

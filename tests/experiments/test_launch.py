@@ -307,7 +307,7 @@ def test_a_slurm_job_requests_its_cores_and_a_refusal_is_reported(
 
 
 def _collected(root: Path) -> int:
-    return sum(read_json(path)["episodes"] for path in root.glob("jobs/dataset-*/*/collection.json"))
+    return sum(read_json(path)["episodes"] for path in root.glob("jobs/dataset-*/*/card.json"))
 
 
 @pytest.fixture

@@ -42,7 +42,7 @@ def test_one_observation_outside_does_not_end_a_plateau() -> None:
     for updates, comp in ((100, UNIFORM), (200, 6.1), (300, UNIFORM), (400, 6.1)):
         assert monitor.observe(updates, comp=comp, cosine=0.5) == "plateau"
     assert monitor.observe(500, comp=6.0, cosine=0.5) == "learning"
-    assert monitor.plateaus == [[100, 400]]
+    assert monitor.verdict(500)["plateaus"] == [{"entered": 100, "left": 400}]
 
 
 def test_a_plateau_beyond_patience_is_dead_and_can_still_recover(caplog: pytest.LogCaptureFixture) -> None:
@@ -54,7 +54,7 @@ def test_a_plateau_beyond_patience_is_dead_and_can_still_recover(caplog: pytest.
     assert "DEAD RUN: do not use this encoder" in caplog.text
     monitor.observe(600, comp=5.0)
     assert monitor.observe(700, comp=5.0) == "learning"
-    assert "called dead" in caplog.text
+    assert "after it was called dead" in caplog.text
 
 
 def test_training_that_ends_on_a_short_plateau_is_announced_but_not_called_dead(

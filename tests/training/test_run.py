@@ -116,7 +116,7 @@ def test_other_settings_or_fewer_updates_than_were_done_are_refused_by_name(tmp_
     other = {"batch_size": 16, "loss": {"class": "Proto", "sizes": [3, 5]}}
     with pytest.raises(CheckpointError, match=r"batch_size was 8, now 16; loss\.sizes\[1\] was 4, now 5"):
         walk(tmp_path, 6, settings=other)
-    with pytest.raises(CheckpointError, match="has done 5 updates, 4 are asked"):
+    with pytest.raises(CheckpointError, match="has done 5 updates, more than the 4 requested"):
         walk(tmp_path, 4)
 
 

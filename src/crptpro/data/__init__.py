@@ -2,6 +2,6 @@
 
 from crptpro.data.collect import collect_group, collect_random
 from crptpro.data.dataset import FrameDataset
-from crptpro.data.replay import FrameReplay, StoredReplay, stack_frames
+from crptpro.data.replay import FrameReplay, StoredReplay
 
-__all__ = ["FrameDataset", "FrameReplay", "StoredReplay", "collect_group", "collect_random", "stack_frames"]
+__all__ = ["FrameDataset", "FrameReplay", "StoredReplay", "collect_group", "collect_random"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import functools
 import logging
 import pickle
@@ -15,7 +14,7 @@ from concurrent.futures import Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -60,14 +59,14 @@ def collect_group(
 ) -> dict[str, Path]:
     """Collect the datasets of several domains with a uniform random policy, or continue interrupted collections.
 
-    The paper (section "Decoupled random collection") takes b = 100,000 transitions per domain. Every episode has its
-    own seeds, derived from ``seed``, the domain and the episode's index, so the same seed gives the same actions and,
-    on one machine and backend, the same pixels, whatever the number of workers and however often the collection was
-    interrupted. The last episode is cut to fit, and an endless one after 1000 transitions.
+    The paper (section "Decoupled random collection") takes b = 100,000 transitions per domain. The seeds of an episode
+    derive from ``seed``, the domain and the episode's index: the same seed gives the same actions and, on one machine
+    and backend, the same pixels, for any number of workers and interruptions. The last episode is cut to fit, and an
+    endless one after 1000 transitions.
 
-    With several workers the environments live in spawned processes, so a script needs the usual
-    ``if __name__ == "__main__":``. A domain whose ``make`` no other process can import, because it was defined in a
-    notebook for example, is collected in this one.
+    With several workers the environments run in spawned processes, so a script needs the usual
+    ``if __name__ == "__main__":``. A domain whose ``make`` no other process can import, e.g. one defined in a notebook,
+    is collected in this process.
 
     An episode is a rollout of ``RandomPolicy``, not a batch of a TorchRL ``Collector``, which resets before the next
     episode's seeds are known; made to do this, it took 8 % more CPU time with walker (84 x 84, software GL).
@@ -78,7 +77,7 @@ def collect_group(
         root: a directory ``root/<domain name>`` is made for each domain.
         transitions: transitions per domain (agent steps; 21 KB each at 84 x 84).
         seed: see above.
-        workers: processes, each of which renders on one core; 1 is this process.
+        workers: processes, each rendering on one core; 1 is this process.
         quality: render quality, see :func:`crptpro.envs.make_env`.
         colors: likewise; the episodes are the same in all colours.
         image_size: H = W, pixels.
@@ -90,13 +89,12 @@ def collect_group(
         The dataset's directory by domain name.
 
     Raises:
-        DatasetError: if a directory holds something else than what is asked for.
-        DiskSpaceError: if the disk cannot hold it; no frame is written then, and the same directory may be asked for
-            less.
-        UnknownNameError: for a domain nobody knows.
-        ValueError: for a number or a path that cannot be meant.
-        WorkerLostError: if a process dies; finished episodes are kept.
-        CRPTproError: if an environment fails or hangs; likewise.
+        DatasetError: a directory holds something else than the requested dataset.
+        DiskSpaceError: the disk cannot hold it; no frame is written, and a smaller request may use the same directory.
+        UnknownNameError: an unknown domain.
+        ValueError: an impossible number or path.
+        WorkerLostError: a process died; finished episodes are kept.
+        CRPTproError: an environment failed or hangs; likewise.
     """
     # Imported late: nothing that reads datasets needs the simulators.
     from crptpro.envs import episode_length, make_env, needs_gl, resolve_action_repeat
@@ -126,7 +124,7 @@ def collect_group(
                 continue
             stack.callback(dataset.writer.close)
             make = functools.partial(make_env, domain, seed=0, frame_stack=1, physics_state=True, **settings)
-            jobs.append(_Job(domain, dataset, make, seed, episode_length(domain, action_repeat=repeat)))
+            jobs.append(_Job(domain, dataset, make, episode_length(domain, action_repeat=repeat)))
         if jobs:
             _announce(jobs, root, image_size)
             for job in jobs if workers > 1 else ():
@@ -139,7 +137,9 @@ def collect_group(
             if any(needs_gl(job.domain) for job in jobs):
                 # Proven here once, for as many renderers as will run: some drivers hang when several start together.
                 select_backend(processes=workers)
-            _collect(jobs, workers, progress)
+            with closing(_Workers({job.domain.name: job.make for job in jobs}, workers)) as pool:
+                for job in jobs:
+                    _collect(job, seed, pool, progress)
     return paths
 
 
@@ -167,140 +167,122 @@ def collect_episode(
     return env.rollout(limit, policy, callback, auto_reset=False, tensordict=first, return_contiguous=True)
 
 
-class _Job:
-    """One dataset; its episodes are planned, and appended, in the order of their indices."""
+class _Job(NamedTuple):
+    """A dataset to be collected."""
 
-    def __init__(
-        self, domain: Domain, dataset: FrameDataset, make: Callable[[], EnvBase], seed: int, length: int | None
-    ):
-        self.domain, self.dataset, self.make, self.seed = domain, dataset, make, seed
-        self.writer: Any = dataset.writer
-        self.planned, self.usual_length = self.writer.episodes, length
-        self.longest = max(LONGEST_EPISODE_AGENT_STEPS, length or 0)
-        self.queue: deque[tuple[str, Future]] = deque()
+    domain: Domain
+    dataset: FrameDataset
+    make: Callable[[], EnvBase]
+    length: int | None  # agent steps of an episode, if known
 
     @property
     def missing(self) -> int:
         """Transitions that are not durable yet."""
-        return self.writer.target - self.writer.transitions
-
-    def next_plan(self) -> dict[str, Any] | None:
-        """Return the next episode worth starting, or ``None`` if those under way should suffice."""
-        index, name = self.planned, self.domain.name
-        under_way = index - self.writer.episodes
-        if self.missing <= under_way * (self.usual_length or 1):
-            return None
-        self.planned += 1
-        return {
-            "domain": name,
-            "episode": index,
-            "env_seed": derive_seed(self.seed, "collect", name, index),
-            "action_seed": derive_seed(self.seed, "collect-actions", name, index),
-            "limit": min(self.missing - under_way, self.longest),
-        }
-
-    def accept(self, card: Mapping[str, Any], rollout: TensorDictBase) -> None:
-        """Append an episode, which is durable when this returns."""
-        self.writer.note_environment(card)
-        self.usual_length = self.usual_length or len(rollout)
-        self.dataset.extend(rollout)
-        self.writer.end_episode()
+        writer: Any = self.dataset.writer
+        return writer.target - writer.transitions
 
 
 def _announce(jobs: list[_Job], root: Path, image_size: int) -> None:
     """Say how much will be written (action and state: at most 1 kB each), and refuse what the disk cannot hold."""
     sizes = {}
     for job in jobs:
-        frames = job.missing + -(-job.missing // (job.usual_length or 100))  # one more per episode
+        frames = job.missing + -(-job.missing // (job.length or 100))  # one more per episode
         sizes[job.domain.name] = size = frames * 3 * image_size**2 + job.missing * 1000
         what = f"{size / 1e9:.2g} GB for {job.missing:,} transitions"
         logger.info("%s: %s into %s", job.domain.name, what, job.dataset.path)
     require_disk(root, sum(sizes.values()), f"Collecting {', '.join(sizes)}")
 
 
-def _collect(jobs: list[_Job], workers: int, progress: bool) -> None:
-    ahead = 2 * workers if workers > 1 else 1
-    with closing(_Crew({job.domain.name: job.make for job in jobs}, workers)) as crew:
-        for job in jobs:
-            name, writer = job.domain.name, job.writer
-            bar = Progress(writer.target, writer.transitions, "transitions", label=name, is_shown=progress, lines=10)
-            while not job.dataset.is_complete:
-                for each in jobs:  # all workers on the first that needs one: each makes each environment once
-                    while not job.queue or sum(len(other.queue) for other in jobs) < ahead:
-                        if (plan := each.next_plan()) is None:
-                            break
-                        episode = f"episode {plan['episode']} of {plan['domain']}"
-                        each.queue.append((episode, crew.submit(plan, episode)))
-                episode, future = job.queue.popleft()
-                job.accept(*pickle.loads(crew.result(future, episode)))
-                bar.reach(writer.transitions)
-                bar.show()
-            job.queue.clear()  # more was under way than was needed
-            bar.close()
+def _collect(job: _Job, seed: int, pool: _Workers, progress: bool) -> None:
+    """Collect one dataset; its episodes are planned, and appended, in the order of their indices."""
+    name, dataset, length = job.domain.name, job.dataset, job.length
+    writer: Any = dataset.writer
+    longest = max(LONGEST_EPISODE_AGENT_STEPS, length or 0)
+    bar = Progress(writer.target, writer.transitions, "transitions", label=name, is_shown=progress, lines=10)
+    queue: deque[tuple[str, Future]] = deque()
+    while not dataset.is_complete:
+        while len(queue) < pool.ahead and job.missing > len(queue) * (length or 1):
+            index = writer.episodes + len(queue)
+            plan: dict[str, Any] = {
+                "domain": name,
+                "title": f"episode {index} of {name}",
+                "env_seed": derive_seed(seed, "collect", name, index),
+                "action_seed": derive_seed(seed, "collect-actions", name, index),
+                "limit": min(job.missing - len(queue), longest),
+            }
+            queue.append((plan["title"], pool.submit(plan)))
+        title, future = queue.popleft()
+        card, rollout = pickle.loads(pool.result(future, title))
+        length = length or len(rollout)
+        writer.note_environment(card)
+        dataset.extend(rollout)
+        writer.end_episode()
+        bar.reach(writer.transitions)
+        bar.show()
+    bar.close()
 
 
-class _Crew:
-    """Rolls planned episodes out: one worker where it is called, several in processes."""
+class _Workers:
+    """Roll planned episodes out, in this process or in several others."""
 
     def __init__(self, factories: Mapping[str, Callable[[], EnvBase]], workers: int):
-        self.workers, self._steps = workers, SPAWN.RawValue("q", 0)
-        self._roller = _Roller(factories, self._steps)
-        self._work = _work if workers > 1 else self._roller.roll
+        self.workers = workers
+        self._steps = SPAWN.RawValue("q", 0)
+        self.ahead = 2 * workers if workers > 1 else 1  # episodes under way
+        self._worker = _Worker(factories, self._steps)
+        self._work = _work if workers > 1 else self._worker.roll
         self._pool: Any = WorkerPool(workers, _prepare, factories, self._steps) if workers > 1 else Inline()
 
-    def submit(self, plan: dict[str, Any], episode: str) -> Future:
+    def submit(self, plan: dict[str, Any]) -> Future:
         try:
             return self._pool.submit(self._work, plan)
         except BrokenProcessPool:
-            raise self._lost(episode) from None
+            raise self._lost(plan["title"]) from None
         except OSError as reason:
-            hint = "Use fewer workers."
-            if reason.errno == errno.EMFILE:
-                import resource  # POSIX only
+            raise CRPTproError(
+                f"{self.workers} collecting processes cannot be started: {reason}. Use fewer workers, or raise the "
+                "limit of open files (`ulimit -n 4096`)."
+            ) from reason
 
-                limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-                hint = f"This shell allows {limit} open files: raise that (`ulimit -n 4096`), or use fewer workers."
-            raise CRPTproError(f"{self.workers} collecting processes cannot be started: {reason}. {hint}") from reason
-
-    def result(self, future: Future, episode: str) -> bytes:
-        """Wait for an episode as long as somebody works."""
+    def result(self, future: Future, title: str) -> bytes:
+        """Wait for an episode as long as any worker makes steps."""
         seen, seen_s = -1, 0.0
         while not wait([future], 1.0).done:
             if self._steps.value != seen:
                 seen, seen_s = self._steps.value, time.monotonic()
             elif time.monotonic() - seen_s > STALL_S:
                 raise RenderingError(
-                    f"The processes that collect {episode} have given no sign of life for {STALL_S:.0f} s; a render "
-                    f"driver that hangs is the usual cause. {_AGAIN}, with fewer workers or another backend "
-                    "(MUJOCO_GL=osmesa, or egl)."
+                    f"The processes that collect {title} have made no step for {STALL_S:.0f} s; a render driver that "
+                    f"hangs is the usual cause. {_AGAIN}, with fewer workers or another backend (MUJOCO_GL=osmesa, or "
+                    "egl)."
                 )
         try:
             return future.result()
         except BrokenProcessPool:
-            raise self._lost(episode) from None
+            raise self._lost(title) from None
 
-    def _lost(self, episode: str) -> WorkerLostError:
+    def _lost(self, title: str) -> WorkerLostError:
         processes = self._pool.processes.values()
         for process in processes:
             process.join(2.0)
-        codes = [process.exitcode for process in processes]
-        # Those that the executor ended after the first have been terminated.
-        code = next((code for code in codes if code not in (None, 0, -signal.SIGTERM)), -signal.SIGTERM)
+        # The executor terminates the others after the first has died.
+        codes = [process.exitcode for process in processes if process.exitcode not in (None, 0, -signal.SIGTERM)]
+        code = codes[0] if codes else -signal.SIGTERM
         how = f"was killed by signal {-code}" if code < 0 else f"exited with status {code}"
         hint = "Look at the messages above."
         if code == -signal.SIGKILL:
             hint = "Out of memory is the usual cause of signal 9: use fewer workers."
         elif not self._steps.value:
             hint += ' A script that collects needs `if __name__ == "__main__":` around its main program.'
-        return WorkerLostError(f"A process that collected ({episode}) {how}. {hint} {_AGAIN}.")
+        return WorkerLostError(f"A process that collected {title} {how}. {hint} {_AGAIN}.")
 
     def close(self) -> None:
-        self._roller.close()
+        self._worker.close()
         if self.workers > 1:
             self._pool.end()
 
 
-class _Roller:
+class _Worker:
     """Rolls out planned episodes, in the environment of one domain at a time, and counts ``steps``."""
 
     def __init__(self, factories: Mapping[str, Callable[[], EnvBase]], steps: Any):
@@ -326,7 +308,7 @@ class _Roller:
         except Exception as reason:
             text = str(reason).strip() or repr(reason)
             raise CRPTproError(
-                f"Episode {plan['episode']} of {plan['domain']} failed: {text}. {_AGAIN} once the cause is removed."
+                f"Collecting {plan['title']} failed: {text}. {_AGAIN} once the cause is removed."
             ) from reason
         return pickle.dumps((env.card() if hasattr(env, "card") else {}, rollout))
 
@@ -337,13 +319,13 @@ class _Roller:
         self._domain, self._env = "", None
 
 
-_roller: _Roller
+_worker: _Worker
 
 
 def _prepare(factories: Mapping[str, Callable[[], EnvBase]], steps: Any) -> None:
-    global _roller
-    _roller = _Roller(factories, steps)
+    global _worker
+    _worker = _Worker(factories, steps)
 
 
 def _work(plan: Mapping[str, Any]) -> bytes:
-    return _roller.roll(plan)
+    return _worker.roll(plan)

@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -27,7 +26,6 @@ from crptpro.values import as_int, as_path
 logger = logging.getLogger(__name__)
 
 FORMAT, VERSION = "crptpro-frames", 2
-COLLECTION_FILE = "collection.json"
 _ABOUT = {"seed": 0, "action_repeat": 1, "camera": None, "quality": "exact", "colors": "normal"}
 
 
@@ -35,13 +33,15 @@ class FrameDataset(ReplayBuffer):
     """The frames of one domain, sampled as pairs of consecutive stacks (x_t, x_t+1).
 
     ``sample(B)`` draws uniformly, with replacement, from all transitions and returns a TensorDict ``[B]`` with
-    ``pixels`` and ``("next", "pixels")`` uint8 ``[B, 3k, H, W]`` (oldest to newest, equal to what a live frame stack
-    showed, episode starts included), ``action`` float32 ``[B, A]``, ``("next", "reward")`` float32 ``[B, 1]``,
-    ``("next", "done" | "terminated" | "truncated")`` bool ``[B, 1]``, ``index``, the position in the ``episode``
-    (``step``), and ``number``, ``("next", "number")``: the rows of the observations' newest frames, which
-    :meth:`observations` reads. A pair never crosses an episode.
 
-    Frames are mapped from disk without write access: several processes can open one dataset, threads may sample one
+    - ``pixels`` and ``("next", "pixels")``, uint8 ``[B, 3k, H, W]``, oldest to newest, equal to a live frame stack,
+      episode starts included; a pair never crosses an episode;
+    - ``action`` float32 ``[B, A]``, ``("next", "reward")`` float32 ``[B, 1]``,
+      ``("next", "done" | "terminated" | "truncated")`` bool ``[B, 1]``;
+    - ``index``, ``episode``, ``step`` in the episode, and ``number``, ``("next", "number")``: the rows of the
+      observations' newest frames, which :meth:`observations` reads.
+
+    Frames are mapped from disk without write access: several processes can open one dataset, and threads may sample one
     object. :meth:`open` reads a finished dataset; :meth:`create` begins or continues one, and ``extend`` fills it with
     what :class:`~crptpro.data.FrameReplay` takes, but each episode must begin at its reset::
 
@@ -53,9 +53,8 @@ class FrameDataset(ReplayBuffer):
 
     Args:
         storage: what to read.
-        **options: of TorchRL's ``ReplayBuffer``: ``batch_size`` (default of ``sample()``), ``generator`` (torch's
-            global one by default), ``transform``, ``sampler``, ``prefetch`` (whose threads may hand out the batches of
-            one generator in another order).
+        **options: of TorchRL's ``ReplayBuffer``: ``batch_size`` (default of ``sample()``), ``generator`` (default:
+            torch's global one), ``transform``, ``sampler``, ``prefetch`` (its threads may reorder batches).
     """
 
     def __init__(self, storage: FrameStorage, **options: Any):
@@ -71,12 +70,12 @@ class FrameDataset(ReplayBuffer):
         Args:
             path: its directory.
             frame_stack: k, frames per stack.
-            device: ``"cpu"`` maps the frames from disk; another device holds a copy of them and samples there. It needs
-                a generator of the same device.
+            device: ``"cpu"`` maps the frames from disk; another device holds a copy of them and samples there, with a
+                generator on the same device.
             **options: see the class.
 
         Raises:
-            DatasetError: naming the file that is missing, unfinished, truncated or foreign.
+            DatasetError: a file is missing, unfinished, truncated or foreign.
         """
         return cls(FrameStorage(as_path(path), frame_stack, device).load(), **options)
 
@@ -86,8 +85,8 @@ class FrameDataset(ReplayBuffer):
     ) -> FrameDataset:
         """Begin a dataset, or continue one that was interrupted; a complete one is opened.
 
-        It is complete, and can be sampled, after so many transitions; the last episode is cut to fit. ``about`` are
-        further facts of the card that two attempts must agree in: ``task``, ``seed``, ``action_repeat``, ...
+        It is complete, and can be sampled, after ``transitions``; the last episode is cut to fit. ``about`` holds
+        further facts for the card that every attempt must repeat: ``task``, ``seed``, ``action_repeat``, ...
 
         Raises:
             DatasetError: if the directory holds something else, or another process is writing there.
@@ -96,9 +95,10 @@ class FrameDataset(ReplayBuffer):
         request = {"domain": domain, "task": domain, **_ABOUT, **about, "transitions": transitions}
         for name in request.keys() & {"transitions", "seed", "action_repeat", "image_size"}:
             request[name] = as_int(request[name], name, minimum=0 if name == "seed" else 1)
-        if not (path / CARD_FILE).exists():
+        card = _read(path) if (path / CARD_FILE).exists() else None
+        if card is None or card["transitions"] < card["request"]["transitions"]:
             writer = EpisodeWriter(path, request)
-            if not (path / CARD_FILE).exists():
+            if writer.transitions < writer.target:
                 return cls(FrameStorage(path, frame_stack), writer=writer)
         _require_request(path, read_card(path)["request"], request)
         return cls.open(path, frame_stack=frame_stack)
@@ -114,7 +114,7 @@ class FrameDataset(ReplayBuffer):
 
     @property
     def is_complete(self) -> bool:
-        """Whether all transitions that were asked for are there."""
+        """Whether all requested transitions are there."""
         return bool(self.card)
 
     @property
@@ -149,7 +149,7 @@ class FrameDataset(ReplayBuffer):
 
 
 class FrameStorage(StackStorage):
-    """The rows of a dataset, read-only; copies and other processes map the files anew.
+    """The rows of a dataset, read-only; copies and other processes map the files again.
 
     An episode of T transitions has T + 1 frames, so the frames of a transition and its successor are rows up to
     ``row`` and ``row + 1`` of the same episode.
@@ -172,7 +172,8 @@ class FrameStorage(StackStorage):
         self.frames, self.transitions = parts["frames"], parts["transitions"].clone()  # a few MB, in RAM
         if self.device.type != "cpu":
             self.frames, self.transitions = self.frames.to(self.device), self.transitions.to(self.device)
-        self.max_size, self.card, self.pixels = len(self.transitions), card, self.frames["pixels"]
+        self.card, self.max_size = card, len(self.transitions)
+        self.pixels = self.frames["pixels"]
         self.step = torch.zeros(len(self.frames), dtype=torch.int32, device=self.device)
         self.step[self.transitions["row"] + 1] = self.transitions["step"] + 1
         return self
@@ -195,14 +196,12 @@ class FrameStorage(StackStorage):
         self.set()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what tells this dataset from another one: a checkpoint does not copy it."""
-        return {"request": self.card.get("request", {}), "frame_stack": self.frame_stack}
+        """Return what identifies this dataset: a checkpoint does not copy it."""
+        return {**self.card.get("request", {}), "frame_stack": self.frame_stack}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Check that a checkpoint belongs to this dataset."""
-        mine = self.state_dict()
-        _require_request(self.path, mine.pop("request"), state_dict["request"])
-        _require_request(self.path, mine, {"frame_stack": state_dict["frame_stack"]})
+        _require_request(self.path, self.state_dict(), state_dict)
 
     def __reduce__(self) -> Any:
         self._require_complete()
@@ -214,11 +213,11 @@ def _load(path: Path, frame_stack: int, device: str) -> FrameStorage:
 
 
 class EpisodeWriter(ImmutableDatasetWriter):
-    """Appends episodes 0, 1, 2, ... to a directory until they hold the transitions asked for.
+    """Appends episodes 0, 1, 2, ... to a directory until they hold the requested transitions.
 
-    The rows of an episode are on the disk before ``collection.json`` counts them; what a kill left behind them is cut
-    off when the next episode is written. As long as no episode is durable, another request takes this one's place.
-    The directory is locked until the dataset is complete or :meth:`close` is called.
+    The rows of an episode are on the disk before the card counts them; what a kill left behind them is cut off when the
+    next episode is written. As long as no episode is durable, another request replaces this one. The directory is
+    locked until the dataset is complete or :meth:`close` is called.
     """
 
     def __init__(self, path: Path, request: dict[str, Any]):
@@ -228,19 +227,16 @@ class EpisodeWriter(ImmutableDatasetWriter):
         self.state |= {"transitions": 0, "episodes": 0, "sessions": []}
         self._pending: list[Rows] = []
         self._has_noted = False
-        # The lock, and half a collection.json, are what a kill at the very start leaves.
+        # The lock, and half a card, are what a kill at the very start leaves.
         found = [each for each in path.glob("*") if each.name != ".lock" and each.suffix != ".partial"]
-        if found and path / COLLECTION_FILE not in found:
+        if found and path / CARD_FILE not in found:
             raise DatasetError(f"{path} is not empty and not a collection. Choose another directory or empty it.")
         self._lock = DirectoryLock(path, error=DatasetError)
         try:
-            if not (path / CARD_FILE).exists():  # another process may have finished it just now
-                self._resume()
+            self._resume()
         except BaseException:
             self.close()
             raise
-        if (path / CARD_FILE).exists():
-            self.close()
 
     @property
     def transitions(self) -> int:
@@ -259,15 +255,16 @@ class EpisodeWriter(ImmutableDatasetWriter):
     def extend(self, data: TensorDictBase) -> Tensor:
         """Take transitions of one environment in temporal order, as :class:`~crptpro.data.FrameReplay` does.
 
-        Those beyond the ones asked for are left out. Returns the indices of those that became durable, int64.
+        Surplus ones are left out. Returns the indices of those that became durable, int64.
         """
-        before, stack = self.transitions, self._storage.frame_stack
+        before = self.transitions
         if before >= self.target:
             raise DatasetError(f"{self.path} is complete and read-only; collect another one.")
         channels = self.state["columns"]["frames/pixels"][1][0] if before else 3
         extra: list[Any] = [name for name in ("qpos", "qvel") if name in data and data.get(name).shape[-1]]
         extra += [("next", name) for name in extra]
-        rows = read_rows(data, channels=channels, frame_stack=stack, extra=extra, what="A dataset")
+        frame_stack = self._storage.frame_stack
+        rows = read_rows(data, channels=channels, frame_stack=frame_stack, extra=extra, what="A dataset")
         last = self._pending[-1].following[-1] if self._pending else None
         for begins, part in rows.part(0, self.target - self._taken).pieces(last):
             if begins:
@@ -287,10 +284,12 @@ class EpisodeWriter(ImmutableDatasetWriter):
             return
         columns = self._pending_columns()
         self._pending = []
-        described = {name: [str(values.dtype), list(values.shape[1:])] for name, values in columns.items()}
+        described = {
+            name: [str(values.dtype).removeprefix("torch."), list(values.shape[1:])] for name, values in columns.items()
+        }
         if self.episodes and described != self.state["columns"]:
             raise DatasetError(
-                f"{self.path} holds rows of {self.state['columns']}, but episode {self.episodes} brings {described}. "
+                f"{self.path} holds rows of {self.state['columns']}, but episode {self.episodes} has {described}. "
                 "Collect it into another directory."
             )
         total = self.transitions + len(columns["transitions/row"])
@@ -301,15 +300,15 @@ class EpisodeWriter(ImmutableDatasetWriter):
             self._save(columns=described, transitions=total, episodes=self.episodes + 1)
         except (OSError, DiskSpaceError) as reason:
             if not is_disk_full(reason):
-                raise DatasetError(f"{self.path} cannot be written: {reason}.") from reason
+                raise
             raise DiskSpaceError(
                 f"The disk under {self.path} is full after {self.transitions} transitions ({self.episodes} whole "
                 "episodes), which are kept. Free space and run the same command again."
             ) from reason
         self._storage.max_size = total
         if total >= self.target:
-            self._finish()
-            self._storage.load()  # read back once before anybody is told that it is there
+            self.close()
+            self._storage.load()  # read back before it is reported as complete
 
     def note_environment(self, card: Mapping[str, Any]) -> None:
         """Note what renders the frames for the card; another ``backend`` or ``gl_renderer`` than before is refused."""
@@ -319,8 +318,8 @@ class EpisodeWriter(ImmutableDatasetWriter):
             if before.get(name) is not None and card.get(name, before[name]) != before[name]:
                 raise DatasetError(
                     f"{self.path} was begun with the {name} {before[name]!r}, now it is {card[name]!r}: their pixels "
-                    f"differ. Continue with MUJOCO_GL={before.get('backend')} where it is that renderer, or remove "
-                    "the directory to begin anew."
+                    f"differ. Continue with MUJOCO_GL={before.get('backend')} on that renderer, or remove the "
+                    "directory to begin again."
                 )
         if not self._has_noted:
             self._has_noted = True
@@ -332,39 +331,30 @@ class EpisodeWriter(ImmutableDatasetWriter):
         """Free the directory; an unfinished dataset can be continued later."""
         self._lock.release()
 
-    def _pending_columns(self) -> dict[str, np.ndarray]:
+    def _pending_columns(self) -> dict[str, Tensor]:
         """Return the rows of the running episode by file."""
         parts = self._pending
-
-        def whole(name: Any) -> np.ndarray:
-            return torch.cat([part.columns[name] for part in parts]).numpy()
-
-        frames = [parts[0].newest[:1], *(part.following for part in parts)]
-        columns = {"frames/pixels": torch.cat(frames).numpy()}
+        rows = {name: torch.cat([part.columns[name] for part in parts]) for name in parts[0].columns}
+        columns = {"frames/pixels": torch.cat([parts[0].newest[:1], *(part.following for part in parts)])}
         for name in ("qpos", "qvel"):
-            if name in parts[0].columns:
-                values = np.concatenate([whole(name), whole(("next", name))[-1:]])
-                columns[f"frames/{name}"] = values.astype(np.float64)
-        flags = {name: whole(name).copy() for name in ("done", "terminated", "truncated")}
-        if not flags["done"][-1, 0]:
-            flags["done"][-1] = flags["truncated"][-1] = True
-        step = np.arange(len(flags["done"]))
+            if name in rows:
+                columns[f"frames/{name}"] = torch.cat([rows[name], rows["next", name][-1:]]).double()
+        if not rows["done"][-1, 0]:
+            rows["done"][-1] = rows["truncated"][-1] = True
+        step = torch.arange(len(rows["done"]), device="cpu")
         return columns | {
-            "transitions/action": whole("action").astype(np.float32),
-            "transitions/next/reward": whole("reward").astype(np.float32),
-            **{f"transitions/next/{name}": values for name, values in flags.items()},
+            "transitions/action": rows["action"].float(),
+            "transitions/next/reward": rows["reward"].float(),
+            **{f"transitions/next/{name}": rows[name] for name in ("done", "terminated", "truncated")},
             "transitions/row": self.transitions + self.episodes + step,
-            "transitions/step": step.astype(np.int32),
-            "transitions/episode": np.full(len(step), self.episodes, np.int32),
+            "transitions/step": step.int(),
+            "transitions/episode": torch.full_like(step, self.episodes, dtype=torch.int32),
         }
 
     def _resume(self) -> None:
-        for stale in self.path.glob(".*.partial"):  # of a process that was killed: it had the lock
+        for stale in self.path.glob(".*.partial"):  # of a killed process
             stale.unlink(missing_ok=True)
-        file = self.path / COLLECTION_FILE
-        state = read_json(file, error=DatasetError) if file.exists() else self.state
-        if (state.get("format"), state.get("version")) != (FORMAT, VERSION):
-            raise DatasetError(f"{file} belongs to another release or program. Choose another directory.")
+        state = _read(self.path) if (self.path / CARD_FILE).exists() else self.state
         if not state["episodes"]:
             for part in ("frames", "transitions"):  # of an episode that was being written
                 shutil.rmtree(self.path / part, ignore_errors=True)
@@ -373,31 +363,26 @@ class EpisodeWriter(ImmutableDatasetWriter):
         _require_request(self.path, state["request"], self.request)
         for path, expected in _sizes(self.path, state).items():
             require_size(path, min(expected, path.stat().st_size if path.exists() else 0), expected)
-        self.state = state | {"request": self.request}
+        self.state = state
         logger.info("%s: continuing after %d of %d transitions", self.path.name, self.transitions, self.target)
-        if self.transitions >= self.target:
-            self._finish()
 
     def _save(self, **changes: Any) -> None:
-        write_json(self.path / COLLECTION_FILE, self.state | changes)
-        self.state |= changes
-
-    def _finish(self) -> None:
-        """Write the card, which is the mark of a complete dataset, and release everything."""
-        sessions = self.state["sessions"]
-        card = {"image_size": self.state["columns"]["frames/pixels"][1][-1], **self.request, **self.state}
-        card |= {"frames": self.transitions + self.episodes, **provenance()}
-        card["render"] = sessions[-1]["render"] if sessions else {}
-        write_json(self.path / CARD_FILE, card)
-        self.close()
+        """Write the card."""
+        state = {**self.state, **changes}
+        state["frames"] = state["transitions"] + state["episodes"]
+        state["render"] = state["sessions"][-1]["render"] if state["sessions"] else {}
+        if state["columns"]:
+            state["image_size"] = state["columns"]["frames/pixels"][1][-1]
+        write_json(self.path / CARD_FILE, {**self.request, **state, **provenance()})
+        self.state = state
 
 
-def _append(path: Path, values: np.ndarray, rows: int) -> None:
+def _append(path: Path, values: Tensor, rows: int) -> None:
     """Write rows behind the first ``rows`` of a file, through to the disk."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "ab") as file:
         file.truncate(rows * (values.nbytes // len(values)))
-        file.write(np.ascontiguousarray(values).tobytes())
+        file.write(values.numpy().tobytes())
         file.flush()
         os.fsync(file.fileno())
 
@@ -406,30 +391,28 @@ def _sizes(path: Path, state: Mapping[str, Any]) -> dict[Path, int]:
     """Return the files of a card, or of a collection, and their sizes in bytes."""
     rows = {"transitions": state["transitions"], "frames": state["transitions"] + state["episodes"]}
     return {
-        path / f"{name}.memmap": rows[name.split("/")[0]] * math.prod(shape) * np.dtype(dtype).itemsize
+        path / f"{name}.memmap": rows[name.split("/")[0]] * math.prod(shape) * getattr(torch, dtype).itemsize
         for name, (dtype, shape) in state["columns"].items()
     }
 
 
-def _require_request(path: Path, found: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
+def _require_request(path: Path, found: Mapping[str, Any], request: Mapping[str, Any]) -> None:
     """Compare the request that a directory was filled for with the one that is made now."""
     differing = [
-        f"{name} {found.get(name)!r} there, {value!r} asked for"
-        for name, value in asked.items()
+        f"{name} {found.get(name)!r} there, {value!r} requested"
+        for name, value in request.items()
         if found.get(name) != value
     ]
     if differing:
         raise DatasetError(
-            f"{path} is a dataset of other settings: {'; '.join(differing)}. Ask for the same, choose another "
-            "directory, or remove this one to collect anew."
+            f"{path} is a dataset of other settings: {'; '.join(differing)}. Use the same settings, choose another "
+            "directory, or remove this one to collect it again."
         )
 
 
-def read_card(path: Path) -> dict[str, Any]:
-    """Read and check a dataset's card against its files, without reading the frames."""
+def _read(path: Path) -> dict[str, Any]:
+    """Read and check the card of a dataset, which may be unfinished."""
     file = path / CARD_FILE
-    if not file.exists():
-        raise DatasetError(_why_no_card(path))
     card = read_json(file, error=DatasetError)
     found = (card.get("format"), card.get("version"))
     if found != (FORMAT, VERSION):
@@ -438,28 +421,33 @@ def read_card(path: Path) -> dict[str, Any]:
             "Collect the dataset again."
         )
     try:
-        sizes = _sizes(path, card)
-        if card["frames"] != card["transitions"] + card["episodes"] or card["transitions"] < 1:
+        _sizes(path, card)
+        if card["frames"] != card["transitions"] + card["episodes"]:
             raise ValueError("frames")
+        if card["transitions"] > card["request"]["transitions"]:
+            raise ValueError("transitions")
     except (KeyError, TypeError, ValueError, AttributeError) as reason:
         raise DatasetError(f"{file} is damaged ({reason}). Collect the dataset again.") from None
-    for each, expected in sizes.items():
-        if not each.is_file():
-            raise DatasetError(f"{each} is missing. Collect the dataset again.")
-        require_size(each, each.stat().st_size, expected)
     return card
 
 
-def _why_no_card(path: Path) -> str:
+def read_card(path: Path) -> dict[str, Any]:
+    """Read the card of a complete dataset and check it against its files, without reading the frames."""
     if not path.is_dir():
-        return f"{path} is not a directory. A dataset is made by collect_random or `crptpro collect`."
-    if (path / COLLECTION_FILE).exists():
-        state = read_json(path / COLLECTION_FILE, error=DatasetError)
-        asked = state.get("request", {}).get("transitions")
-        return (
-            f"{path} is unfinished: {state.get('transitions', 0)} of {asked} transitions are collected. "
-            "Run the same collect command again to complete it."
+        raise DatasetError(f"{path} is not a directory. A dataset is made by collect_random or `crptpro collect`.")
+    if not (path / CARD_FILE).exists():
+        names = ", ".join(sorted(child.parent.name for child in path.glob(f"*/{CARD_FILE}")))
+        hint = f" Did you mean one of its datasets: {names}?" if names else ""
+        raise DatasetError(f"{path} has no {CARD_FILE}: it is not a dataset.{hint}")
+    card = _read(path)
+    target = card["request"]["transitions"]
+    if card["transitions"] < target:
+        raise DatasetError(
+            f"{path} is unfinished: {card['transitions']} of {target} transitions are collected. Run the same collect "
+            "command again to complete it."
         )
-    kinds = sorted(child.parent.name for child in path.glob(f"*/{CARD_FILE}"))
-    hint = f" Did you mean one of its datasets: {', '.join(kinds)}?" if kinds else ""
-    return f"{path} has no {CARD_FILE}: it is not a dataset.{hint}"
+    for file, expected in _sizes(path, card).items():
+        if not file.is_file():
+            raise DatasetError(f"{file} is missing. Collect the dataset again.")
+        require_size(file, file.stat().st_size, expected)
+    return card

@@ -11,7 +11,6 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
-from torchrl.envs.transforms import Transform
 
 from crptpro.artifact import require_disk
 from crptpro.data.storage import RingStorage, StackStorage, map_rows, read_rows
@@ -22,8 +21,8 @@ _TAKEN = {
     *("pixels", "action", "reward", "done", "terminated", "truncated", "discount"),
     *("index", "row_of", "step", "number", "next"),
 }
-# Redraws before the admissible anchors are listed, which costs 50 times a redraw for 100,000 transitions. With
-# episodes of 500 transitions two draws nearly always suffice; only rings of very short episodes get that far.
+# Redraws before the admissible transitions are listed, which costs 50 times a redraw for 100,000 transitions. With
+# episodes of 500 transitions two draws nearly always suffice; only rings of very short episodes need the list.
 _REDRAWS = 8
 
 
@@ -31,7 +30,7 @@ class FrameReplay(ReplayBuffer):
     """TorchRL replay buffer whose frames are stored once, in RAM or on disk.
 
     40,000 transitions of 84 x 84 frames take 0.85 GB instead of the 5.1 GB of stored stacks. It takes what TorchRL
-    environments and collectors hand out and is first in, first out::
+    environments and collectors return and is first in, first out::
 
         replay = FrameReplay(40_000, action_dim=6, transform=RandomShift(pad=4, in_keys=[...]))
         for rollout in Collector(env, policy, frames_per_batch=100, total_frames=-1):
@@ -52,47 +51,34 @@ class FrameReplay(ReplayBuffer):
     - ``index`` (0 is the oldest transition) and ``number``, ``("next", "number")``, int64 ``[B]``: how many frames were
       stored before the observation's newest one. A number is never used again; :meth:`observations` reads it.
 
-    With ``n_step`` above 1 only transitions are drawn whose n transitions lie in one episode and in the ring (as in
+    With ``n_step`` above 1 only transitions are drawn whose n transitions are in one episode and in the ring (as in
     url_benchmark's ``replay_buffer.py``, none is cut short). ``("next", ...)`` is then n agent steps ahead: its flags
     are the last transition's, its reward is the n-step return, and ``("next", "discount")`` ``[B, 1]`` weighs the value
     of the next observation (:func:`~crptpro.data.storage.n_step_return`). Indexing reads single transitions.
     Deviation: url_benchmark draws an episode uniformly, and then an anchor in it; here every anchor is equally likely.
 
-    A ring on disk is its own checkpoint: :meth:`state_dict` holds a few counters, and loading one restores exactly the
-    content of its moment, provided that at most ``slack`` frames were written since. With checkpoints every n
-    transitions, of which the last two are kept, ``slack >= 2 * n`` (plus a frame per episode) is enough. Copies and
-    pickles of it hold their frames in RAM. Threads may sample and extend one buffer.
+    A ring on disk is its own checkpoint: :meth:`state_dict` holds a few counters, and loading it restores the content
+    exactly, provided that at most ``slack`` frames were written since. With checkpoints every n transitions, of which
+    the last two are kept, ``slack >= 2 * n`` (plus a frame per episode) is enough. Copies and pickles hold their frames
+    in RAM. Threads may sample and extend one buffer.
 
     Args:
-        capacity: most transitions that can be sampled. Very short episodes (below 50 transitions) lower it, because
-            each has one frame more than transitions.
+        capacity: most transitions that can be sampled; episodes below 50 transitions lower it, because each has one
+            frame more than transitions.
         frame_shape: ``(C, H, W)`` of a single frame.
         action_dim: A, length of an action.
-        path: directory of the ring's files; RAM if ``None``. It must not be shared by two running buffers.
-        slack: frames that may be written after a checkpoint before it is worthless.
+        path: directory of the ring's files, for this buffer alone; RAM if ``None``.
+        slack: frames that may be written after a checkpoint before it can no longer be restored.
         frame_stack: k, frames per stack.
-        extra_columns: further entries of a transition's root, such as the skill that chose the action: name to
-            ``(shape, dtype)``.
+        extra_columns: further entries of a transition's root, such as a skill: name to ``(shape, dtype)``.
         n_step: n, agent steps from an observation to the next one of a sample.
         discount: gamma of the n-step return.
         returns_pixels: ``False`` leaves the stacks out of samples, for a transform that has features by number.
-        batch_size: default of ``sample``.
-        generator: source of randomness; torch's global generator if ``None``.
-        transform: of samples, as in TorchRL; see also ``append_transform``.
+        **options: of TorchRL's ``ReplayBuffer``: ``batch_size``, ``generator``, ``transform``.
 
     Raises:
         DiskSpaceError: if the disk cannot hold the ring.
         CheckpointError: if ``path`` holds a ring of another size.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> replay = FrameReplay(100, frame_shape=(3, 4, 4), action_dim=1)
-        >>> pixels, end = torch.zeros(2, 3, 4, 4, dtype=torch.uint8), torch.tensor([[False], [True]])
-        >>> following = {"pixels": pixels + 1, "reward": torch.ones(2, 1), "done": end, "terminated": end}
-        >>> replay.extend(TensorDict({"pixels": pixels, "action": torch.zeros(2, 1), "next": following}, [2]))
-        tensor([0, 2])
-        >>> replay.sample(5)["next", "pixels"].shape
-        torch.Size([5, 9, 4, 4])
     """
 
     def __init__(
@@ -108,11 +94,10 @@ class FrameReplay(ReplayBuffer):
         n_step: int = 1,
         discount: float = 0.99,
         returns_pixels: bool = True,
-        batch_size: int | None = None,
-        generator: torch.Generator | None = None,
-        transform: Transform | None = None,
+        **options: Any,
     ):
-        capacity, slack = as_int(capacity, "capacity", minimum=1), as_int(slack, "slack", minimum=0)
+        capacity = as_int(capacity, "capacity", minimum=1)
+        slack = as_int(slack, "slack", minimum=0)
         frame_stack = as_int(frame_stack, "frame_stack", minimum=1)
         frame_shape = tuple(as_int(size, "frame_shape", minimum=1) for size in frame_shape)  # type: ignore[assignment]
         extra = dict(extra_columns or {})
@@ -137,30 +122,22 @@ class FrameReplay(ReplayBuffer):
             slack=slack,
             columns=columns,
             frame_stack=frame_stack,
-            root_columns=("action", *extra),
             n_step=as_int(n_step, "n_step", minimum=1),
             discount=as_float(discount, "discount", minimum=0, maximum=1),
             path=directory,
         )
         storage.returns_pixels = bool(returns_pixels)
-        super().__init__(
-            storage=storage,
-            sampler=_WindowSampler(),
-            writer=_RingWriter(extra),
-            collate_fn=as_it_is,
-            batch_size=None if batch_size is None else as_int(batch_size, "batch_size", minimum=1),
-            generator=generator,
-            transform=transform,
-        )
+        parts = {"sampler": _WindowSampler(), "writer": _RingWriter(extra), "collate_fn": as_it_is}
+        super().__init__(storage=storage, **parts | options)
 
     @property
     def window(self) -> int:
-        """Frames that the observations of samples, and the newest one, lie among; their numbers differ modulo this."""
+        """Frames within which all sampled observations and the newest one are; their numbers differ modulo this."""
         return self._storage.window
 
     @property
     def frames_written(self) -> int:
-        """Frames stored so far, those that were overwritten included; the newest one's number is one less."""
+        """Frames stored so far, overwritten ones included; the newest one's number is one less."""
         return self._storage.frames
 
     def observations(self, numbers: Tensor) -> Tensor:
@@ -169,7 +146,7 @@ class FrameReplay(ReplayBuffer):
             return self._storage.observations(numbers)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return a few counters (ring on disk) or the whole content (ring in RAM); the generator is the caller's."""
+        """Return a few counters (ring on disk) or the whole content (ring in RAM), without the generator."""
         with self._replay_lock:
             return {"ring": self._storage.state_dict()}
 
@@ -179,49 +156,21 @@ class FrameReplay(ReplayBuffer):
             self._storage.load_state_dict(state_dict["ring"])
 
 
-def stack_frames(buffer: ReplayBuffer, *, frame_stack: int = 3, **options: Any) -> FrameReplay:
-    """Copy a buffer of single frames, as most public data sets are, into one in RAM whose samples are stacks.
-
-    Args:
-        buffer: any TorchRL buffer or data set whose rows, in the order of their indices, are transitions of whole
-            episodes: ``pixels`` and ``("next", "pixels")`` uint8 ``[C, H, W]``, ``action`` and
-            ``("next", "reward" | "done")``.
-        frame_stack: k, frames per stack.
-        **options: ``batch_size``, ``generator`` and ``transform`` of :class:`FrameReplay`.
-
-    Examples:
-        >>> dataset = stack_frames(minari_buffer)  # doctest: +SKIP
-        >>> pretrain(ATCLoss(PixelEncoder()), {"kitchen": dataset}, updates=10_000)  # doctest: +SKIP
-    """
-    length = len(buffer)
-    if not length:
-        raise ValueError("The buffer is empty: there is nothing to stack.")
-    first = buffer[:1]
-    replay = FrameReplay(
-        2 * length,  # episodes of one transition have two frames; rows that stay empty take no memory
-        frame_shape=tuple(first["pixels"].shape[1:]),
-        action_dim=first["action"].shape[-1],
-        frame_stack=frame_stack,
-        **options,
-    )
-    for begin in range(0, length, 1000):
-        replay.extend(buffer[begin : begin + 1000])
-    return replay
-
-
 class StoredReplay(StackStorage):
-    """The observations in the files of a :class:`FrameReplay`, oldest first, without writing to them.
+    """The observations in the files of a :class:`FrameReplay`, oldest first, read-only.
 
-    A ring that went round holds the newest part alone. Nobody may be writing to ``path``, which was the replay's.
+    ``path`` is the replay's directory, which nobody may be writing to.
 
     Raises:
-        DatasetError: if there is no replay of square RGB frames, or not a single transition in it.
+        DatasetError: if there is no replay of square RGB frames, or it has no transition.
     """
 
     def __init__(self, path: str | Path, *, frame_stack: int = 3) -> None:
-        path, self.frame_stack = as_path(path), frame_stack
+        path = as_path(path)
+        self.frame_stack = frame_stack
         number, row_of = (map_rows(path / f"{name}.memmap", torch.int64, ()) for name in ("number", "row_of"))
-        self.step, rows = map_rows(path / "step.memmap", torch.int32, ()), len(number)
+        self.step = map_rows(path / "step.memmap", torch.int32, ())
+        rows = len(number)
         size = math.isqrt((path / "pixels.memmap").stat().st_size // (3 * rows))
         self.pixels = map_rows(path / "pixels.memmap", torch.uint8, (3, size, size), rows)
         # `number` counts from 1. Transitions that were overwritten, and rows never written (0), point elsewhere.
@@ -248,7 +197,7 @@ def as_it_is(sample: TensorDictBase) -> TensorDictBase:
 
 
 class _RingWriter(ImmutableDatasetWriter):
-    """Hands what a buffer is extended by to the ring, checked: about 0.25 ms for a single transition."""
+    """Checks transitions and writes them to the ring: about 0.25 ms for a single one."""
 
     def __init__(self, extra: Mapping[str, tuple[tuple[int, ...], torch.dtype]]):
         super().__init__()
@@ -272,7 +221,7 @@ class _RingWriter(ImmutableDatasetWriter):
 
 
 class _WindowSampler(RandomSampler):
-    """Draws uniformly, with replacement, from the transitions whose window of n lies in one episode.
+    """Draws uniformly, with replacement, from the transitions whose window of n is in one episode.
 
     A draw that does not fit is redrawn, so that the cost does not grow with the ring.
     """
@@ -296,8 +245,8 @@ class _WindowSampler(RandomSampler):
         admissible = admissible[storage.has_window(admissible)]
         if not len(admissible):
             raise DatasetError(
-                f"None of the replay's {length} transitions is followed by enough of its own episode for "
-                f"n_step={storage.n_step}: use a smaller n_step, or let more be stored before the first update "
+                f"None of the replay's {length} transitions is followed by enough of its episode for "
+                f"n_step={storage.n_step}: use a smaller n_step, or store more before the first update "
                 "(random_agent_steps)."
             )
         misfits = (~storage.has_window(index)).nonzero().squeeze(-1)

@@ -1,4 +1,4 @@
-"""Frames stored once, and the stacks that are made of them when they are read."""
+"""Frames stored once, and the stacks built from them on reading."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MAP_NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)
 
 
 def map_rows(path: Path, dtype: torch.dtype, shape: Sequence[int], rows: int | None = None) -> Tensor:
-    """Map a raw file of rows (as many as there are by default): writing to the tensor leaves the file alone."""
+    """Map a raw file of rows (by default all that it has); writing to the tensor leaves the file alone."""
     row_bytes = math.prod(shape) * dtype.itemsize
     try:
         with open(path, "rb") as file:
@@ -38,10 +38,10 @@ def map_rows(path: Path, dtype: torch.dtype, shape: Sequence[int], rows: int | N
 
 
 def require_size(path: Path, size: int, expected: int | None) -> None:
-    """Refuse a file of ``size`` bytes where ``expected`` belong, with a DatasetError."""
+    """Refuse a file of another size, in bytes, with a DatasetError."""
     if expected is not None and size != expected:
         kind = "truncated" if size < expected else "longer than it should be"
-        raise DatasetError(f"{path} is {kind}: {size:,} bytes, {expected:,} belong there. Collect the dataset again.")
+        raise DatasetError(f"{path} is {kind}: {size:,} bytes instead of {expected:,}. Collect the dataset again.")
 
 
 def stack_rows(row: Tensor, step: Tensor, frame_stack: int) -> Tensor:
@@ -106,9 +106,9 @@ class Rows(NamedTuple):
 def read_rows(
     data: TensorDictBase, *, channels: int, frame_stack: int, extra: Sequence[NestedKey] = (), what: str
 ) -> Rows:
-    """Read what a TorchRL environment, rollout or collector hands out, ``[T]`` in temporal order or ``[]``.
+    """Read what a TorchRL environment, rollout or collector returns, ``[T]`` in temporal order or ``[]``.
 
-    ``pixels`` are single frames of so many channels or stacks of them; ``what`` is being written, for messages.
+    ``pixels`` are single frames of ``channels`` or stacks of them; messages say ``what`` is being written.
     """
     if not is_tensor_collection(data) or data.ndim > 1:
         got = f"a batch {tuple(data.shape)}" if is_tensor_collection(data) else type(data).__name__
@@ -143,7 +143,7 @@ def read_rows(
             row = int((~finite).flatten(1).any(1).nonzero()[0])
             raise NonFiniteError(
                 f"The {name} of transition {row} is {columns[name][row].tolist()}. {what} takes finite numbers only; "
-                "mend the environment, or leave the episode out."
+                "fix the environment, or leave the episode out."
             )
     columns["terminated"] = terminated = column("terminated", done)
     columns["truncated"] = column("truncated", done & ~terminated)
@@ -152,12 +152,12 @@ def read_rows(
 
 
 class StackStorage(Storage):
-    """A TorchRL storage of transitions that keeps each frame once and makes the stacks when it is read.
+    """A TorchRL storage of transitions that keeps each frame once and builds the stacks on reading.
 
-    Frames are counted as they are stored; the ``number`` of an observation is that of its newest frame.
+    Frames are numbered in the order of storing; the ``number`` of an observation is that of its newest frame.
     """
 
-    pixels: Tensor  # uint8 [rows, C, H, W]; frame n lies in row n % rows
+    pixels: Tensor  # uint8 [rows, C, H, W]; frame n is row n % rows
     step: Tensor  # [rows], frames of the same episode before each
     frame_stack: int
     device = torch.device("cpu")
@@ -172,8 +172,8 @@ class StackStorage(Storage):
         return range(len(self.pixels))
 
     def get(self, index: Any, **how: Any) -> TensorDict:
-        """Return transitions by an int, a slice, a mask, or integers of any shape; 0 is the oldest."""
-        positions = self._positions(index)
+        """Return transitions by any index of a one-dimensional tensor; 0 is the oldest."""
+        positions = torch.arange(len(self), device=self.device)[index]
         flat = positions.reshape(-1)
         sample = self.columns_at(flat, **how).set("index", flat)
         if self.returns_pixels:
@@ -182,13 +182,14 @@ class StackStorage(Storage):
         return sample if positions.ndim == 1 else sample.reshape(positions.shape)
 
     def observations(self, numbers: Tensor) -> Tensor:
-        """Return observations by number, uint8 ``[B, k * C, H, W]``; a DatasetError if one is not there any more."""
-        numbers, held = torch.as_tensor(numbers, dtype=torch.int64, device=self.device), self.held()
+        """Return observations by number, uint8 ``[B, k * C, H, W]``; a DatasetError if one is no longer stored."""
+        numbers = torch.as_tensor(numbers, dtype=torch.int64, device=self.device)
+        held = self.held()
         first = numbers - torch.clamp(self.step[numbers % len(self.pixels)], max=self.frame_stack - 1)
         gone = (first < held.start) | (numbers >= held.stop)
         if gone.any():
             raise DatasetError(
-                f"Observation {int(numbers[gone][0])} is not stored; there are {held.start} to {held.stop - 1}."
+                f"Observation {int(numbers[gone][0])} is not stored; {held.start} to {held.stop - 1} are."
             )
         return self._stacks(numbers)
 
@@ -196,22 +197,6 @@ class StackStorage(Storage):
         count = len(self.pixels)
         rows = stack_rows(numbers, self.step[numbers % count], self.frame_stack)
         return gather_stacks(self.pixels, rows % count)
-
-    def _positions(self, index: Any) -> Tensor:
-        if isinstance(index, tuple) and len(index) == 1:
-            index = index[0]
-        length = len(self)
-        if isinstance(index, slice):
-            return torch.arange(*index.indices(length), device=self.device)
-        positions = torch.as_tensor(index, device=self.device)
-        if positions.dtype is torch.bool:
-            return positions.nonzero().squeeze(-1)
-        positions = positions.long()
-        # On a GPU the comparison would wait for the device; there the gather itself checks its indices.
-        is_checked = positions.numel() and positions.device.type == "cpu"
-        if is_checked and not (-length <= int(positions.min()) and int(positions.max()) < length):
-            raise IndexError(f"index {index} is out of range for {length} transitions.")
-        return torch.where(positions < 0, positions + length, positions)
 
     def set(self, *_: Any, **__: Any) -> None:
         """Refuse: rows depend on each other."""
@@ -230,15 +215,14 @@ class StackStorage(Storage):
 class RingStorage(StackStorage):
     """Frame rows in a ring of ``window + slack`` rows, and the valid transitions among them.
 
-    A row holds one frame, and the transition that starts at it, if one does. A transition is valid while it
-    is among the newest ``capacity`` and all its frames are among the newest ``window`` rows. So a state from
-    a moment ago needs no row that was overwritten since, as long as at most ``slack`` rows were.
-
-    ``columns`` maps every per-row quantity to its shape and dtype; ``root_columns`` belong to the observation, the
-    others are returned under ``"next"``.
+    A row holds one frame, and the transition that starts at it, if any. A transition is valid while it is among the
+    newest ``capacity`` and all its frames are among the newest ``window`` rows. So an earlier state needs no row that
+    was overwritten since, as long as at most ``slack`` rows were. ``columns`` maps every per-row quantity to its shape
+    and dtype.
     """
 
     COUNTERS = ("frames", "transitions", "oldest", "episode_step", "is_open")
+    NEXT_COLUMNS = ("reward", "done", "terminated", "truncated")
 
     def __init__(
         self,
@@ -248,7 +232,6 @@ class RingStorage(StackStorage):
         slack: int,
         columns: Mapping[str, tuple[tuple[int, ...], torch.dtype]],
         frame_stack: int,
-        root_columns: tuple[str, ...],
         n_step: int,
         discount: float,
         path: Path | None,
@@ -256,12 +239,11 @@ class RingStorage(StackStorage):
         super().__init__(capacity)
         self.rows, self.window, self.slack, self.path = window + slack, window, slack, path
         self.frame_stack, self.n_step, self.discount = frame_stack, n_step, discount
-        self.root_columns = root_columns
-        # They only grow; a counter modulo the number of rows is a slot. `oldest` is the first valid transition.
+        # Counters only grow; modulo the number of rows they are slots. `oldest` is the first valid transition.
         self.frames = self.transitions = self.oldest = self.episode_step = 0
         self.is_open = False
         # ``number`` is one more than the row's counter, 0 if it was never written; ``row_of`` belongs to
-        # transitions, which have a counter of their own.
+        # transitions, which have their own counter.
         own = {"step": torch.int32, "number": torch.int64, "row_of": torch.int64}
         specs = {**columns, **{name: ((), dtype) for name, dtype in own.items()}}
         self.content: dict[NestedKey, Tensor] = {
@@ -344,10 +326,10 @@ class RingStorage(StackStorage):
         last = (row + n_step - 1) % self.rows
         root, following = {"number": number}, {"number": number + n_step}
         for name in self.column_names:
-            if name in self.root_columns:
-                root[name] = self.content[name][row]
-            else:
+            if name in self.NEXT_COLUMNS:
                 following[name] = self.content[name][last]
+            else:
+                root[name] = self.content[name][row]
         if n_step > 1:
             window = (row.unsqueeze(-1) + torch.arange(n_step, device="cpu")) % self.rows
             rewards, ended = self.content["reward"][window], self.content["terminated"][window]
@@ -377,7 +359,8 @@ class RingStorage(StackStorage):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Return to the content of the moment ``state_dict`` was taken, or raise a CheckpointError."""
-        shape, counters = (state_dict["rows"], state_dict["window"]), state_dict["counters"]
+        shape = (state_dict["rows"], state_dict["window"])
+        counters = state_dict["counters"]
         if shape != (self.rows, self.window):
             raise CheckpointError(
                 f"The replay's checkpoint has {shape[0]} rows, {shape[1]} of them in use; this replay has "
@@ -392,23 +375,24 @@ class RingStorage(StackStorage):
             setattr(self, name, value)
 
     def _check_rows(self, frames: int) -> None:
-        """Make sure that every row of a state's window still holds what it held then."""
+        """Check that no row of a state's window was overwritten since."""
         needed = torch.arange(max(0, frames - self.window), frames, device="cpu")
         if lost := int((self.number[needed % self.rows] != needed + 1).sum()):
             since = int(self.number.max()) - frames
             why = "the files were removed or replaced; put them back."
             if since > self.slack:
                 why = (
-                    f"{since} frames were written after it, with a slack of {self.slack}; begin again with a "
-                    "larger one (a run has it from `checkpoint_interval_env_steps`), or use a newer checkpoint."
+                    f"{since} frames were written after it, with a slack of {self.slack}; start again with a larger "
+                    "one (a run derives it from `checkpoint_interval_env_steps`), or use a newer checkpoint."
                 )
             raise CheckpointError(f"{lost} rows that the checkpoint of {self.path} needs are gone: {why}")
 
     def _empty(self) -> None:
-        self.oldest, self.is_open = self.transitions, False  # numbers go on: none is used twice
+        self.oldest = self.transitions  # numbers continue: none is used twice
+        self.is_open = False
 
     def __getstate__(self) -> dict[str, Any]:
-        # A copy cannot share the files that this ring goes on writing: it holds the rows in RAM.
+        # A copy cannot share the files that this ring keeps writing: it holds the rows in RAM.
         return {**super().__getstate__(), "path": None}
 
 
@@ -419,7 +403,7 @@ def n_step_return(rewards: Tensor, terminated: Tensor, discount: float) -> tuple
         R = \sum_{i=0}^{n-1} \gamma^i \Big(\prod_{j<i} d_j\Big) r_i, \qquad
         D = \gamma^n \prod_{j=0}^{n-1} d_j
 
-    with :math:`d_j = 0` where transition j terminated (a truncation is none) and 1 elsewhere. ``rewards`` and
+    with :math:`d_j = 0` where transition j terminated (truncation does not count) and 1 elsewhere. ``rewards`` and
     ``terminated`` are ``[B, n, 1]``, R and D ``[B, 1]``.
     """
     total, factor = torch.zeros_like(rewards[:, 0]), torch.ones_like(rewards[:, 0])
@@ -430,13 +414,13 @@ def n_step_return(rewards: Tensor, terminated: Tensor, discount: float) -> tuple
 
 
 def map_file(path: Path, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
-    """Map a file that writing to the tensor changes; its bytes are reserved if it is new, all of them or none."""
+    """Map a file that writing to the tensor changes; a new one has all its bytes reserved, or is not made."""
     size = math.prod(shape) * dtype.itemsize
     partial = path.with_name(f".{path.name}.partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.exists():
-            # It has its name once it is whole: a kill while it is reserved leaves nothing that looks like rows.
+            # Renamed once it is whole: a kill during the reservation leaves nothing that looks like rows.
             with open(partial, "w+b") as file:
                 # Reserved, not sparse: a disk that fills up later would end the process by a bus error.
                 os.posix_fallocate(file.fileno(), 0, size)

@@ -1,4 +1,4 @@
-"""What acts and what learns: the agent on pixels, and the learners that step its optimisers."""
+"""The agent on pixels, and the learners that step its optimisers."""
 
 from __future__ import annotations
 
@@ -8,20 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
 from crptpro.artifact import read_artifact, write_artifact
 from crptpro.errors import CheckpointError, NonFiniteError
-from crptpro.modules import (
-    DeterministicActor,
-    PixelEncoder,
-    SquashedGaussianActor,
-    TwinCritic,
-    resolve_precision,
-    set_compute_dtype,
-)
+from crptpro.modules import PixelEncoder, SquashedGaussianActor, TwinCritic, resolve_precision, set_compute_dtype
 from crptpro.objectives import RADSACLoss, SkillDDPGLoss
 from crptpro.provenance import provenance
 from crptpro.training.compile import accelerate
@@ -59,7 +52,7 @@ class PixelAgent(nn.Module):
         ``skill`` is one-hot ``[S]``, for an actor that takes one.
 
         Raises:
-            NonFiniteError: the policy has diverged; no simulator should see its actions. It says ``where``.
+            NonFiniteError: the policy has diverged, so that no simulator sees its actions; names ``where``.
         """
         if skill is not None:
             features = torch.cat([features, skill.unsqueeze(0).to(features.device)], -1)
@@ -82,7 +75,7 @@ class PixelAgent(nn.Module):
 def save_agent(path: str | Path, agent: PixelAgent, *, card: Mapping[str, Any]) -> Path:
     """Write encoder and actor into a directory with a card, whole or not at all.
 
-    The card has what else the reader should know. A :class:`~crptpro.modules.PixelEncoder` can be rebuilt from it.
+    ``card`` is what else the reader should know.
     """
     modules = {"encoder": agent.encoder, "actor": agent.actor}
     content = {
@@ -99,8 +92,8 @@ def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[P
 
     Args:
         path: directory.
-        encoder: a module of the class that the agent was trained with, for an encoder of your own; its weights are
-            loaded. A :class:`~crptpro.modules.PixelEncoder` is rebuilt from the card.
+        encoder: a module of the encoder's class, whose weights are loaded; needed unless it is a
+            :class:`~crptpro.modules.PixelEncoder`, which is rebuilt from the card.
 
     Returns:
         The agent, ready to act, and its card.
@@ -127,10 +120,15 @@ def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[P
 class SACLearner:
     """Steps critic, actor and temperature, and moves the target critic, on the reference schedule.
 
-    Each of the three has its own Adam, as in Proto-RL's and CRPTpro's released agents. Actor and temperature step at
-    every ``actor_interval``-th agent step, the target moves at every ``target_interval``-th.
+    Each of the three has its own Adam, as in Proto-RL's and CRPTpro's released agents.
 
-    ``critic_tau`` is the EMA rate of the target critic; ``compile`` compiles the losses.
+    Args:
+        loss: with its networks.
+        learning_rate: of the three.
+        critic_tau: EMA rate of the target critic.
+        actor_interval: agent steps between two steps of actor and temperature.
+        target_interval: agent steps between two moves of the target.
+        compile: compile the losses.
     """
 
     def __init__(
@@ -143,41 +141,44 @@ class SACLearner:
         target_interval: int = 2,
         compile: bool = False,
     ) -> None:
+        self._begin(loss, learning_rate, critic_tau, temperature=[loss.log_alpha])
         self.actor_interval, self.target_interval = actor_interval, target_interval
-        groups = {"critic": loss.critic.parameters(), "actor": loss.actor.parameters(), "temperature": [loss.log_alpha]}
-        self._begin(loss, groups, learning_rate, critic_tau)
         self._critic_loss = accelerate(loss.critic_loss, compile=compile)
         self._actor_loss = accelerate(loss.actor_and_temperature_loss, compile=compile)
 
-    def _begin(self, loss: Any, groups: Mapping[str, Any], learning_rate: float, critic_tau: float) -> None:
+    def _begin(self, loss: Any, learning_rate: float, critic_tau: float, **groups: Any) -> None:
         self.loss, self.targets = loss, SoftUpdate(loss, tau=critic_tau)
+        groups = {"critic": loss.critic.parameters(), "actor": loss.actor.parameters(), **groups}
         self.optimizers = {
             name: torch.optim.Adam(list(group), lr=learning_rate, fused=True) for name, group in groups.items()
         }
 
     def update(self, batch: TensorDictBase, *, agent_step: int) -> TensorDictBase:
         """Do one update on a batch with features and rewards; returns detached scalars."""
+        critic, *others = self.optimizers.values()
         losses = self._critic_loss(batch)
-        self._step(losses["loss_qvalue"], "critic")
+        _step(losses["loss_qvalue"], critic)
         if agent_step % self.actor_interval == 0:
             actor_losses = self._actor_loss(batch)
-            self._step(actor_losses["loss_actor"] + actor_losses["loss_alpha"], "actor", "temperature")
+            terms = [value for name, value in actor_losses.items() if name.startswith("loss")]
+            _step(torch.stack(terms).sum(), *others)
             losses = losses.update(actor_losses)
         if agent_step % self.target_interval == 0:
             self.targets.step()
         return losses.detach()
 
-    def _step(self, loss: Tensor, *names: str) -> None:
-        for name in names:
-            self.optimizers[name].zero_grad(set_to_none=True)
-        loss.backward()
-        for name in names:
-            self.optimizers[name].step()
-
     def components(self) -> dict[str, Any]:
         """Return what a checkpoint must hold."""
         optimizers = {f"optimizer_{name}": optimizer for name, optimizer in self.optimizers.items()}
         return {"agent_loss": self.loss, "agent_targets": self.targets, **optimizers}
+
+
+def _step(loss: Tensor, *optimizers: torch.optim.Optimizer) -> None:
+    for optimizer in optimizers:
+        optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    for optimizer in optimizers:
+        optimizer.step()
 
 
 class SkillDDPGLearner(SACLearner):
@@ -187,17 +188,10 @@ class SkillDDPGLearner(SACLearner):
     """
 
     def __init__(self, loss: SkillDDPGLoss, *, learning_rate: float = 1e-4, critic_tau: float = 0.01) -> None:
-        groups = {"critic": loss.critic.parameters(), "actor": loss.actor.parameters()}
-        self._begin(loss, groups, learning_rate, critic_tau)
-
-    def update(self, batch: TensorDictBase, *, agent_step: int) -> TensorDictBase:
-        """Do one update on a batch with features, skills and n-step rewards; returns detached scalars."""
-        losses = self.loss.critic_loss(batch)
-        self._step(losses["loss_qvalue"], "critic")
-        losses["loss_actor"] = self.loss.actor_loss(batch)
-        self._step(losses["loss_actor"], "actor")
-        self.targets.step()
-        return losses.detach()
+        self._begin(loss, learning_rate, critic_tau)
+        self.actor_interval = self.target_interval = 1
+        self._critic_loss = loss.critic_loss
+        self._actor_loss = lambda batch: TensorDict({"loss_actor": loss.actor_loss(batch)})
 
 
 def make_sac_loss(
@@ -216,12 +210,3 @@ def make_sac_loss(
     actor = SquashedGaussianActor(feature_dim, action_dim, **widths) if actor is None else actor
     critic = TwinCritic(feature_dim, action_dim, **widths)
     return loss_class(actor.to(device), critic.to(device), **options)
-
-
-def make_skill_ddpg_loss(
-    feature_dim: int, action_dim: int, skill_dim: int, *, hidden_dim: int, device: torch.device, **options: Any
-) -> SkillDDPGLoss:
-    """Return the loss of BeCL's explorer with fresh networks on a device; ``options`` are the loss's."""
-    actor = DeterministicActor(feature_dim, action_dim, skill_dim=skill_dim, hidden_dim=hidden_dim)
-    critic = TwinCritic(feature_dim + skill_dim, action_dim, hidden_dim=hidden_dim, has_tanh=True)
-    return SkillDDPGLoss(actor.to(device), critic.to(device), **options)

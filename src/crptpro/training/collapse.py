@@ -1,4 +1,4 @@
-"""Telling a plateau from a dead run: the prototype loss at ln(M), or embeddings that all point one way."""
+"""A plateau or a dead run: the prototype loss at ln(M), or embeddings that all point one way."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ logger = logging.getLogger(__name__)
 
 LOSS_MARGIN = 0.005
 """How near to ln(M) counts, as a fraction of it."""
-EXIT_OBSERVATIONS = 2
-"""Consecutive observations outside that end a plateau, so that noise does not."""
 
 
 class CollapseMonitor:
@@ -25,19 +23,12 @@ class CollapseMonitor:
     A comparative loss of ln(M) (6.238 for 512 prototypes) means that predictions or assignments are uniform; a mean
     pairwise cosine near 1 means that every observation has the same embedding. Small trials of the paper's loss stay
     there for about 1,200 updates and then leave. So being there is a ``plateau`` at first, and ``dead`` only when it
-    lasts longer than ``patience_updates``.
+    lasts longer than ``patience_updates``. Two observations in a row outside end a plateau.
 
     Args:
         num_prototypes: M; ``None`` for a loss without prototypes, which is watched by cosine only.
         patience_updates: length of a plateau, in updates, beyond which the run is called dead.
         cosine_threshold: mean pairwise cosine above which embeddings count as collapsed.
-
-    Examples:
-        >>> monitor = CollapseMonitor(512, patience_updates=1_000)
-        >>> [monitor.observe(u, comp=c, cosine=0.5) for u, c in [(100, 6.63), (200, 6.24), (1300, 6.24)]]
-        ['learning', 'plateau', 'dead']
-        >>> monitor.verdict(1300)["plateau_updates"]
-        1100
     """
 
     def __init__(
@@ -46,8 +37,8 @@ class CollapseMonitor:
         self.floor = math.log(num_prototypes) if num_prototypes and num_prototypes > 1 else None
         self.patience_updates, self.cosine_threshold = patience_updates, cosine_threshold
         self.state = "learning"
-        self.plateaus: list[list[int | None]] = []  # [entry update, exit update or None]
-        self.outside: list[int] = []  # observations outside the plateau that is not over yet
+        self.plateaus: list[dict[str, Any]] = []  # updates at which each was entered, and left
+        self.outside_since: int | None = None
         self.comp: float | None = None
         self.cosines: dict[str, float] = {}
 
@@ -66,7 +57,7 @@ class CollapseMonitor:
     def observe(
         self, updates: int, *, comp: float | None = None, cosine: float | Mapping[str, float] | None = None
     ) -> str:
-        """Take the measurement after so many updates, and return the state after it.
+        """Take a measurement after ``updates`` updates, and return the state after it.
 
         ``comp`` is the comparative loss in nats, for a loss that has one; ``cosine`` the mean pairwise cosine of
         embeddings, one number or one per domain (their mean decides).
@@ -75,44 +66,44 @@ class CollapseMonitor:
         if cosine is not None:
             self.cosines = dict(cosine) if isinstance(cosine, Mapping) else {"all": cosine}
         reasons = self._reasons()
-        if self.state == "learning":
-            if reasons:
-                self.state, self.outside = "plateau", []
-                self.plateaus.append([updates, None])
-                logger.info(
-                    "Update %d: plateau (%s). Expected to pass; called dead after %d updates of it.",
-                    updates, reasons, self.patience_updates,
+        if self.state == "learning" and reasons:
+            self.state = "plateau"
+            self.plateaus.append({"entered": updates, "left": None})
+            logger.info(
+                "Update %d: plateau (%s). Expected to pass; called dead after %d updates of it.",
+                updates, reasons, self.patience_updates,
+            )  # fmt: skip
+        elif self.state != "learning":
+            plateau = self.plateaus[-1]
+            if not reasons and self.outside_since is not None:
+                plateau["left"] = self.outside_since
+                length = plateau["left"] - plateau["entered"]
+                announce, recovery = logger.info, ""
+                if self.state == "dead":
+                    announce, recovery = logger.warning, " (after it was called dead)"
+                announce("Update %d: left the plateau after %d updates%s.", plateau["left"], length, recovery)
+                self.state = "learning"
+            elif reasons and self.state == "plateau" and updates - plateau["entered"] > self.patience_updates:
+                self.state = "dead"
+                logger.error(
+                    "Update %d: DEAD RUN: %s since update %d, longer than %d updates. "
+                    "The encoder is not learning; check the data and the temperatures.",
+                    updates, reasons, plateau["entered"], self.patience_updates,
                 )  # fmt: skip
-            return self.state
-        entered: Any = self.plateaus[-1][0]
-        self.outside = [] if reasons else [*self.outside, updates]
-        if len(self.outside) >= EXIT_OBSERVATIONS:
-            self.plateaus[-1][1] = left = self.outside[0]
-            was_dead, self.state, self.outside = self.state == "dead", "learning", []
-            logger.log(
-                logging.WARNING if was_dead else logging.INFO, "Update %s: left the plateau after %d updates%s.",
-                left, left - entered, " (it had been called dead)" if was_dead else "",
-            )  # fmt: skip
-        elif reasons and self.state == "plateau" and updates - entered > self.patience_updates:
-            self.state = "dead"
-            logger.error(
-                "Update %d: DEAD RUN: %s since update %d, longer than %d updates. "
-                "The encoder is not learning; check the data and the temperatures.",
-                updates, reasons, entered, self.patience_updates,
-            )  # fmt: skip
+        self.outside_since = None if reasons else updates
         return self.state
 
     def verdict(self, updates: int) -> dict[str, Any]:
-        """Return the judgement after so many updates as plain values; changes nothing.
+        """Return the judgement after ``updates`` updates as plain values; changes nothing.
 
         ``verdict`` is ``"learning"``, ``"plateau"`` or ``"dead"``, ``plateau_updates`` the total length of the
         ``plateaus``, ``collapsed_domains`` are those whose cosine is above the threshold.
         """
-        length = sum((updates if leave is None else leave) - (enter or 0) for enter, leave in self.plateaus)
+        ends = [updates if plateau["left"] is None else plateau["left"] for plateau in self.plateaus]
         return {
             "verdict": self.state,
-            "plateaus": [{"entered": enter, "left": leave} for enter, leave in self.plateaus],
-            "plateau_updates": length,
+            "plateaus": copy.deepcopy(self.plateaus),
+            "plateau_updates": sum(ends) - sum(plateau["entered"] for plateau in self.plateaus),
             "ln_num_prototypes": self.floor,
             "comp": self.comp,
             "cosine": dict(self.cosines),
@@ -122,18 +113,14 @@ class CollapseMonitor:
     def finish(self, updates: int) -> dict[str, Any]:
         """Announce how training ended and return :meth:`verdict`."""
         verdict = self.verdict(updates)
-        if self.state != "learning":
-            advice = (
-                "DEAD RUN: do not use this encoder; check the data and the temperatures."
-                if self.state == "dead"
-                else "The encoder has not begun to learn. That may pass (small trials of the paper's loss took about "
-                "1,200 updates); train longer."
+        if self.state == "dead":
+            logger.error("Training ended. DEAD RUN: do not use this encoder; check the data and the temperatures.")
+        elif self.state == "plateau":
+            logger.warning(
+                "Training ended on the plateau entered at update %d: the encoder has not begun to learn. That may pass "
+                "(small trials of the paper's loss took about 1,200 updates); train longer.",
+                self.plateaus[-1]["entered"],
             )
-            logger.log(
-                logging.ERROR if self.state == "dead" else logging.WARNING,
-                "Training ended at update %d on a plateau entered at update %s (%s). %s",
-                updates, self.plateaus[-1][0], self._reasons() or "not left yet", advice,
-            )  # fmt: skip
         elif verdict["collapsed_domains"]:
             logger.warning(
                 "Embeddings of %s have collapsed (pairwise cosine above %g), not those of every domain.",
@@ -143,7 +130,7 @@ class CollapseMonitor:
 
     def state_dict(self) -> dict[str, Any]:
         """Return what a resumed run needs to judge as if never interrupted."""
-        names = ("state", "plateaus", "outside", "comp", "cosines")
+        names = ("state", "plateaus", "outside_since", "comp", "cosines")
         return copy.deepcopy({name: getattr(self, name) for name in names})
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -151,11 +138,10 @@ class CollapseMonitor:
         vars(self).update(copy.deepcopy(dict(state)))
 
     def _reasons(self) -> str:
-        """Say what is wrong now; empty if nothing is."""
+        """Return what is wrong now; empty if nothing is."""
         found = []
-        floor, comp = self.floor, self.comp
-        if floor is not None and comp is not None and abs(comp - floor) <= LOSS_MARGIN * floor:
-            found.append(f"loss {comp:.4f} at ln(M) = {floor:.4f}")
+        if self.floor is not None and self.comp is not None and abs(self.comp - self.floor) <= LOSS_MARGIN * self.floor:
+            found.append(f"loss {self.comp:.4f} at ln(M) = {self.floor:.4f}")
         if self.cosines and (mean := fmean(self.cosines.values())) > self.cosine_threshold:
             found.append(f"pairwise cosine {mean:.4f}")
         return ", ".join(found)

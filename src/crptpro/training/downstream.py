@@ -42,7 +42,7 @@ from crptpro.workers import can_be_sent
 logger = logging.getLogger(__name__)
 
 WORTH_WORKERS = 20
-"""Evaluation episodes of a run from which on workers pay: starting one takes as long as an episode."""
+"""Evaluation episodes of a run from which workers pay: starting one takes as long as an episode."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class DownstreamConfig:
     eval_episodes: int = 10
     """episodes per evaluation"""
     eval_workers: int | None = None
-    """processes that evaluate while training goes on, 0.5 GB of memory each; 0 evaluates in between (default: one per
+    """processes that evaluate during training, 0.5 GB of memory each; 0 evaluates in between (default: one per
     core where that pays)"""
     checkpoint_interval_env_steps: int = 5_000
     """simulator steps between two checkpoints, taken at episode ends"""
@@ -110,16 +110,7 @@ class DownstreamConfig:
 
     def __post_init__(self) -> None:
         """Convert numbers to plain values, or raise a ValueError that names the setting."""
-        counts = {
-            "env_steps": 1, "batch_size": 1, "replay_capacity": 1, "random_agent_steps": 1, "knn_k": 1, "queue_size": 1,
-            "hidden_dim": 1, "action_repeat": 1, "eval_interval_env_steps": 1, "eval_episodes": 1, "eval_workers": 0,
-            "checkpoint_interval_env_steps": 1, "log_interval_env_steps": 1,
-        }  # fmt: skip
-        rates = {
-            "intrinsic_reward_coef": None, "discount": 1, "learning_rate": None, "initial_temperature": None,
-            "critic_tau": 1,
-        }  # fmt: skip
-        check_numbers(self, counts=counts, rates=rates)
+        check_numbers(self, minima={"eval_workers": 0}, maxima={"discount": 1, "critic_tau": 1})
         if self.features not in ("auto", "dense", "dense-bf16", "reencode"):
             raise ValueError(f"`features` must be auto, dense, dense-bf16 or reencode, got {self.features!r}.")
         if self.replay_capacity is not None and self.replay_capacity < self.random_agent_steps:
@@ -143,12 +134,12 @@ class DownstreamConfig:
 DEFAULTS: dict[str, Any] = {
     "env_steps": 500_000, "replay_capacity": 40_000, "learning_rate": 1e-4, "intrinsic_reward_coef": 0.2,
 }  # fmt: skip
-"""What a method has downstream unless its row in the table says otherwise."""
+"""Downstream settings of a method unless its row in the table says otherwise."""
 
 
 @dataclass(frozen=True)
 class DownstreamResult:
-    """What a downstream run leaves."""
+    """The result of a downstream run."""
 
     agent: PixelAgent
     """callable as a deterministic policy"""
@@ -192,8 +183,10 @@ def train_downstream(
     """
     settings: Any = dataclasses.replace(config or DownstreamConfig(), **overrides)
     artifact = _artifact(pretrained, settings.seed)
-    settings, name = settings.resolved(task, artifact), task if isinstance(task, str) else task.task
-    device, repeat = usable_device(settings.device), settings.action_repeat
+    settings = settings.resolved(task, artifact)
+    name = task if isinstance(task, str) else task.task
+    device = usable_device(settings.device)
+    repeat = settings.action_repeat
     with contextlib.ExitStack() as stack:
         run = stack.enter_context(Run(run_dir, unit="env_steps", streams=("train", "episodes", "eval"), records=records,
                                       config={"task": name, **dataclasses.asdict(settings)},
@@ -305,7 +298,8 @@ def _make_agent(
 ) -> tuple[SACLearner, PixelAgent]:
     """Return SAC on the encoder's features, or DrQ, whose critic trains the encoder, and the agent that acts."""
     action_dim, device = env.action_spec.shape[-1], torch.device(config.device)
-    is_drq, explored, actor = pretrained.method == "drq", pretrained.actor, None
+    is_drq = pretrained.method == "drq"
+    explored, actor = pretrained.actor, None
     if isinstance(explored, SquashedGaussianActor) and explored.config["action_dim"] == action_dim:
         actor = copy.deepcopy(explored).requires_grad_(True).train()  # it explored the task's own domain
     loss = make_sac_loss(
@@ -325,7 +319,7 @@ def _make_replay(run: Run, env: EnvBase, config: Any, generator: torch.Generator
             f"{run.run_dir} has done {run.saved['position']:,} env steps; to continue it needs its frames, and {path} "
             "is gone. Put it back, or start in another run directory."
         )
-    # A checkpoint holds counters and no frames: whatever the last two refer to outlives the next one.
+    # A checkpoint holds counters and no frames: the frames of the last two must outlive the next one.
     slack = 2 * (config.checkpoint_interval_env_steps // config.action_repeat) + SPARE_FRAMES
     return make_replay(run, path, env, config.replay_capacity, slack=slack, generator=generator)
 
@@ -344,7 +338,7 @@ def attach_transforms(
     """Attach to the replay what turns a sample into the learner's batch; returns what a checkpoint must hold of it.
 
     DrQ reads two shifts of every image. SAC on a frozen encoder reads features under a random shift: crops of dense
-    maps, or the shifted image encoded anew. The bonus is added to the sampled reward.
+    maps, or the shifted image encoded again. The bonus is added to the sampled reward.
     """
     device = torch.device(config.device)
     shift: dict[str, Any] = {"pad": SHIFT_PAD, "generator": generators["shift"]}
@@ -362,17 +356,18 @@ def attach_transforms(
         logger.info("no exploration bonus: the encoder of %s has no prototypes", pretrained.label)
     # An update projects its whole batch, an agent step every shift of one observation.
     keeps_projections = has_bonus and config.batch_size >= 2 * (2 * SHIFT_PAD + 1) ** 2
-    is_rounded = (asked := run.settings["features"]) == "dense-bf16"
+    setting = run.settings["features"]
+    is_rounded = setting == "dense-bf16"
     map_dtype = torch.bfloat16 if is_rounded else dtype
     slots = min(replay.window, 2 * -(-config.env_steps // config.action_repeat))
     mode, reason = choose_feature_mode(
-        "dense" if is_rounded else asked, encoder, slots, map_dtype,
+        "dense" if is_rounded else setting, encoder, slots, map_dtype,
         available_bytes=max(0, free_bytes(device) - reserved_bytes), pad=SHIFT_PAD, device=device,
         latent_dim=prototypes.weight.shape[1] if keeps_projections else None,
     )  # fmt: skip
     logger.info("features: %s", reason)
     # The two ways round differently in bfloat16: a run that is continued keeps its own.
-    run.settings["features"] = asked if is_rounded else mode
+    run.settings["features"] = setting if is_rounded else mode
     if mode == "reencode":
         keeps_projections = False
         replay.append_transform(RandomShift(in_keys=pixels, **shift))
@@ -401,19 +396,17 @@ def attach_transforms(
 
 
 def _eval_workers(task: str, make_this_env: Callable[[], EnvBase], config: Any) -> int:
-    """Return how many processes evaluate: as asked, or one per core where that works and pays."""
-    asked, works = config.eval_workers, can_be_sent(make_this_env)
-    if asked is not None:
-        if asked and not works:
+    """Return the number of evaluating processes: as set, or one per core where that works and pays."""
+    if config.eval_workers is not None:
+        if config.eval_workers and not can_be_sent(make_this_env):
             raise PretrainedError(
-                f"eval_workers is {asked}, but the environment of {task} cannot be built in another process: its "
-                "make must be a function of an importable module. Move it there, or set eval_workers=0."
+                f"eval_workers is {config.eval_workers}, but the environment of {task} cannot be built in another "
+                "process: its make must be a function of an importable module. Move it there, or set eval_workers=0."
             )
-        return asked
-    evaluations = -(-config.env_steps // config.eval_interval_env_steps) + 1
-    pays = evaluations * config.eval_episodes >= WORTH_WORKERS
-    workers = min(cpu_cores(), torch.get_num_threads())  # one thread: others want the cores
-    return workers if workers > 1 and pays and works else 0
+        return config.eval_workers
+    episodes = (-(-config.env_steps // config.eval_interval_env_steps) + 1) * config.eval_episodes
+    workers = min(cpu_cores(), torch.get_num_threads())  # a torch limited to one thread leaves the cores to others
+    return workers if workers > 1 and episodes >= WORTH_WORKERS and can_be_sent(make_this_env) else 0
 
 
 def _record_evaluation(

@@ -1,4 +1,4 @@
-"""Deterministic evaluation: whole episodes, each from its own seed, beside training or between it."""
+"""Deterministic evaluation of whole episodes, each from its own seed, during training or alone."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Episode:
     agent_steps: int
     """decisions, ``env_steps / action_repeat``"""
     seed: int
-    """what the environment was seeded with before its reset"""
+    """of the environment, set before its reset"""
 
 
 def evaluate(
@@ -52,8 +52,7 @@ def evaluate(
 ) -> list[Episode]:
     """Run a policy for whole episodes and return every episode's own return.
 
-    Every episode has a seed of its own, so that an evaluation is the same whatever was evaluated before, and in
-    however many processes.
+    Every episode has its own seed, so that neither earlier evaluations nor the number of processes change a result.
 
     Args:
         policy: maps one observation to one action.
@@ -121,10 +120,10 @@ def summarize(episodes: Sequence[Episode]) -> dict[str, float]:
 
 
 class Evaluator:
-    """Evaluates snapshots of an agent in processes of its own while training goes on, or at once in this one.
+    """Evaluates snapshots of an agent in worker processes during training, or at once in this process.
 
-    Rows are handed out when :meth:`finish` is called and not when they happen to be there, so that the record of a run
-    does not depend on the speed of its machine. Every decision is computed by one CPU thread either way.
+    The episodes of an evaluation are delivered when :meth:`finish` is called, so that the record of a run does not
+    depend on the speed of its machine. One CPU thread computes every decision either way.
 
     ``on_result`` is called with the episodes and the counters of an evaluation; without ``workers``, or where none can
     import ``make_env``, this process evaluates.
@@ -142,14 +141,14 @@ class Evaluator:
         progress: bool = True,
     ) -> None:
         self.make_env, self.agent, self.episodes, self.seed = make_env, agent, episodes, seed
-        self.workers, self.progress = min(workers, episodes) if can_be_sent(make_env) else 0, progress
-        self.on_result = on_result
+        self.workers = min(workers, episodes) if can_be_sent(make_env) else 0
+        self.on_result, self.progress = on_result, progress
         self._pool: WorkerPool | None = None
         self._env: EnvBase | None = None
         self._pending: tuple[PixelAgent, dict[str, int], list[Future[Episode]]] | None = None
 
     def start(self, **counters: int) -> None:
-        """Evaluate the agent as it is now, ``env_steps`` and other counters into the run; workers do it meanwhile."""
+        """Evaluate the agent as it is now; ``counters``, with ``env_steps``, say where the run is."""
         self._start(self.agent.snapshot(), counters)
 
     def _start(self, snapshot: PixelAgent, counters: dict[str, int]) -> None:
@@ -165,7 +164,7 @@ class Evaluator:
             self.finish()
 
     def finish(self) -> None:
-        """Wait for the evaluation that is under way, if any, and hand out its episodes."""
+        """Wait for the evaluation that is under way, if any, and deliver its episodes."""
         if self._pending is None:
             return
         agent, counters, futures = self._pending
@@ -177,9 +176,10 @@ class Evaluator:
             self._end_pool()
         if not futures:
             self._env = self._env or self.make_env()
-            options: dict[str, Any] = {"seed": self._seed(counters), "progress": self.progress}
             with _one_thread():
-                episodes = evaluate(agent, self._env, episodes=self.episodes, **options)
+                episodes = evaluate(
+                    agent, self._env, episodes=self.episodes, seed=self._seed(counters), progress=self.progress
+                )
         self._pending = None
         self.on_result(episodes, counters)
 
@@ -215,18 +215,15 @@ class Evaluator:
 
 # --- in a worker ------------------------------------------------------------------------------------------------------
 
-_make_env: Callable[[], EnvBase]
-_env: EnvBase | None = None
+_env: EnvBase
 
 
 def _prepare(make_env: Callable[[], EnvBase]) -> None:
-    global _make_env
-    _make_env = make_env
+    global _env
+    _env = make_env()
 
 
 def _evaluate(agent: bytes, episode: int, seed: int) -> Episode:
-    global _env
-    _env = _env or _make_env()
     return run_episode(pickle.loads(agent), _env, episode=episode, seed=seed)
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import logging
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,17 +16,16 @@ from torchrl.envs.transforms import Transform
 from torchrl.envs.utils import step_mdp
 from torchrl.objectives import LossModule
 
-from crptpro.artifact import require_disk
 from crptpro.data import FrameReplay
 from crptpro.domains import Domain, get_domain
 from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CRPTproError
 from crptpro.logging import RunLogger
-from crptpro.modules import computing, resolve_precision, set_compute_dtype, usable_device
-from crptpro.modules.precision import Precision
-from crptpro.objectives import AveragedSACLoss, Method, RADSACLoss, get_method, method_of
+from crptpro.modules import DeterministicActor, TwinCritic, computing
+from crptpro.modules.precision import Precision, resolve_precision, set_compute_dtype, usable_device
+from crptpro.objectives import AveragedSACLoss, Method, RADSACLoss, SkillDDPGLoss, get_method, method_of
 from crptpro.seeding import derive_seed
-from crptpro.training.agent import PixelAgent, SACLearner, SkillDDPGLearner, make_sac_loss, make_skill_ddpg_loss
+from crptpro.training.agent import PixelAgent, SACLearner, SkillDDPGLearner, make_sac_loss
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.pretrain import (
     SHIFT_PAD,
@@ -36,9 +33,9 @@ from crptpro.training.pretrain import (
     describe_loss,
     ending,
     make_optimizer,
+    make_update,
     precision_name,
     scalars,
-    total_loss,
     write_row,
 )
 from crptpro.training.run import Generators, Run
@@ -46,8 +43,6 @@ from crptpro.training.world import SPARE_FRAMES, EnvThread, make_replay
 from crptpro.transforms import ContrastiveReward, FrozenEncoder, ParticleReward, PrototypeReward, RandomShift
 from crptpro.transforms.rewards import warn_if_mostly_zero
 from crptpro.values import Quality, check_numbers
-
-logger = logging.getLogger(__name__)
 
 PIXELS: dict[NestedKey, NestedKey] = {"pixels": "features", ("next", "pixels"): ("next", "features")}
 """Entries of a batch, with those of their features."""
@@ -60,7 +55,7 @@ class ExploreConfig:
     """How agents explore while an encoder is pre-trained. ``None`` means the method's own value.
 
     Source: Proto-RL's released agent (denisyarats/proto) and CRPTpro's comparison of it across domains. Every interval
-    counts a domain's own decisions, so that no domain is left out whatever their number.
+    counts a domain's own decisions.
     """
 
     env_steps: int | None = None
@@ -95,12 +90,7 @@ class ExploreConfig:
 
     def __post_init__(self) -> None:
         """Convert numbers to plain values, or raise a ValueError that names the setting."""
-        counts = {
-            "env_steps": 1, "batch_size": 1, "encoder_update_interval": 1, "random_agent_steps": 0,
-            "replay_capacity": 1, "hidden_dim": 1, "queue_size": 1, "log_interval": 1,
-            "checkpoint_interval_env_steps": 1,
-        }  # fmt: skip
-        check_numbers(self, counts=counts, rates={"learning_rate": None})
+        check_numbers(self, minima={"random_agent_steps": 0}, maxima={})
 
     def resolved(self, method: Method) -> Any:
         """Return the settings with the method's values where they were left open."""
@@ -112,14 +102,13 @@ class ExploreConfig:
 
 @dataclass(frozen=True)
 class ExplorationPlan:
-    """How many decisions and updates an active pre-training makes, and when; domains take turns, one decision each."""
+    """How many decisions and updates an active pre-training makes; domains take turns, one decision each."""
 
     repeats: tuple[int, ...]  # simulator steps per decision, of each domain
     agent_steps: int  # decisions of each domain
-    first_update: int  # decision of a domain from which on updates come with it
-    encoder_update_interval: int  # of a domain's own decisions
-    encoder_updates_each: int  # every time
-    agent_update_interval: int  # of a domain's own decisions
+    first_update: int  # decision of a domain from which on updates follow
+    encoder_update_interval: int  # in a domain's own decisions
+    encoder_updates_each: int  # encoder updates every time
 
     @property
     def decisions(self) -> int:
@@ -138,12 +127,6 @@ class ExplorationPlan:
         times = max(0, -(-self.agent_steps // interval) - -(-self.first_update // interval))
         return times * self.encoder_updates_each * len(self.repeats)
 
-    def updates_at(self, agent_step: int) -> tuple[bool, bool]:
-        """Return whether a domain's decision (from 0) comes with updates of the encoder, and of its agent."""
-        intervals = (self.encoder_update_interval, self.agent_update_interval)
-        encoder, agent = (agent_step >= self.first_update and agent_step % interval == 0 for interval in intervals)
-        return encoder, agent
-
 
 def plan_exploration(
     method: Method, domains: Sequence[str | Domain], config: ExploreConfig | None = None
@@ -154,17 +137,16 @@ def plan_exploration(
     settings = (config or ExploreConfig()).resolved(method)
     repeats = tuple(resolve_action_repeat(domain) for domain in domains)
     plan = ExplorationPlan(
-        repeats=repeats,
+        repeats,
         agent_steps=-(-settings.env_steps // sum(repeats)),
         first_update=max(settings.random_agent_steps, method.exploration.n_step),
         encoder_update_interval=settings.encoder_update_interval,
         encoder_updates_each=method.exploration.encoder_updates_each,
-        agent_update_interval=method.exploration.agent_update_interval,
     )
     if not plan.encoder_updates:
         raise CRPTproError(
             f"{settings.env_steps:,} env steps are {plan.agent_steps:,} decisions per domain, of which the first "
-            f"{plan.first_update:,} come without updates: nothing would be learned. Ask for more env_steps or fewer "
+            f"{plan.first_update:,} come without updates: nothing would be learned. Use more env_steps or fewer "
             "random_agent_steps."
         )
     return plan
@@ -177,7 +159,7 @@ class ExploreResult(PretrainResult):
     env_steps: int = 0
     """simulator steps over all domains"""
     actor: nn.Module | None = field(default=None, repr=False)
-    """the exploring actor, for a method that hands it to downstream runs"""
+    """the exploring actor, for a method whose downstream runs start from it"""
     queue: Tensor | None = field(default=None, repr=False)
     """candidates of the prototype reward, float32 ``[queue_size, D]``, the oldest first"""
 
@@ -202,30 +184,27 @@ def pretrain_active(
     Deviation: neither the paper nor the released code says how its cross-domain active baselines are built. Turns,
     shared candidates and schedules in a domain's own decisions are this project's choice.
 
-    With ``run_dir`` the run can be killed at any moment: the same call with a newly built loss continues from the last
-    checkpoint and, on a CPU, gives the same numbers as an uninterrupted one.
-
     Args:
         loss: the objective with its networks; trained in place.
         domains: one or several, by domain or task name.
         method: name of a registered method that explores; by default that of the loss's class.
         run_dir: records (``pretrain.csv``, ``explore.csv``, ``episodes.csv``), replays and checkpoints; ``None`` keeps
-            nothing but the result.
-        config: every number.
-        records: as of :func:`~crptpro.training.pretrain`.
+            nothing but the result. The same call with a new loss resumes, as for :func:`~crptpro.training.pretrain`.
+        config: all settings.
+        records: as for :func:`~crptpro.training.pretrain`.
         progress: likewise.
         **overrides: single settings of :class:`ExploreConfig`, e.g. ``env_steps=50_000``.
 
     Raises:
-        CRPTproError: a single-domain method was given several domains, the loss does not suffice for the reward, or
-            the budget is too small for any update; otherwise as :func:`~crptpro.training.pretrain`.
+        CRPTproError: several domains for a single-domain method, or a budget too small for any update; otherwise as
+            :func:`~crptpro.training.pretrain`.
     """
     recipe = method_of(loss) if method is None else get_method(method)
-    asked = dataclasses.replace(config or ExploreConfig(), **overrides)
+    given = dataclasses.replace(config or ExploreConfig(), **overrides)
     named = _named(domains, recipe)
-    plan = plan_exploration(recipe, list(named.values()), asked)
+    plan = plan_exploration(recipe, list(named.values()), given)
     exploration: Any = recipe.exploration
-    settings = asked.resolved(recipe)
+    settings = given.resolved(recipe)
     prototypes = getattr(loss, "prototypes", None) if exploration.reward == "prototype" else None
     if prototypes is not None and settings.queue_size % len(prototypes.weight):
         raise ValueError(
@@ -247,10 +226,6 @@ def pretrain_active(
         torch.manual_seed(derive_seed(settings.seed, "active", "loss"))
         capacity = min(settings.replay_capacity, plan.agent_steps)
         slack = 4 * (settings.checkpoint_interval_env_steps // sum(plan.repeats)) + SPARE_FRAMES
-        if run.run_dir is not None and not run.saved:
-            needed = len(named) * (capacity + slack) * 3 * getattr(loss.encoder, "image_size", 84) ** 2
-            logger.info("replays: %.2f GB in %s; they stay there", needed / 1e9, run.run_dir / "replay")
-            require_disk(run.run_dir, needed, "The replays of the domains")
         optimizer, schedule, targets = make_optimizer(
             loss, recipe, learning_rate=settings.learning_rate, warmup_updates=recipe.warmup_updates,
             encoder_tau=recipe.encoder_tau, updates=plan.encoder_updates,
@@ -258,37 +233,27 @@ def pretrain_active(
         monitor = CollapseMonitor.of(loss)
         explorers: list[Explorer] = []
         for name, domain in named.items():
-            shares = exploration.reward == "prototype" and explorers  # the candidates
-            explorers.append(Explorer(name, domain, loss, recipe, settings, run, capacity=capacity, slack=slack,
-                                      dtype=dtype, reward=explorers[0].reward if shares else None))  # fmt: skip
+            # The domains share the candidates of the prototype reward.
+            shared = explorers[0].reward if explorers and exploration.reward == "prototype" else None
+            explorers.append(Explorer(name, domain, loss, exploration, settings, run, capacity=capacity, slack=slack,
+                                      dtype=dtype, reward=shared))  # fmt: skip
             stack.callback(explorers[-1].close)
         done = run.tally
         done.update(decisions=0, updates=0)
         run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor,
-                 **{f"explorer_{e.name}": e for e in explorers})  # fmt: skip
+                 **{f"explorer_{index}": explorer for index, explorer in enumerate(explorers)})  # fmt: skip
 
-        before_update = getattr(loss, "before_update", lambda: None)  # prototypes are brought to unit length
-
-        def update_encoder(batch: TensorDictBase) -> TensorDictBase:
-            before_update()
-            losses = loss(batch)
-            optimizer.zero_grad(set_to_none=True)
-            total_loss(losses).backward()
-            optimizer.step()
-            if targets is not None:
-                targets.step()
-            return losses.detach()
-
+        update_encoder = make_update(loss, optimizer, targets, grad_clip=recipe.grad_clip)
         for _ in run.until(plan.env_steps, checkpoint_interval=settings.checkpoint_interval_env_steps):
             index = done["decisions"] % len(explorers)
             explorer, agent_step = explorers[index], explorers[index].agent_steps
             explorer.begin_step()  # the next observation is drawn while the updates compute
-            trains_encoder, trains_agent = plan.updates_at(agent_step)
-            if trains_encoder or trains_agent:
+            learns = agent_step >= plan.first_update
+            trains_encoder = learns and agent_step % plan.encoder_update_interval == 0
+            trains_agent = learns and agent_step % exploration.agent_update_interval == 0
+            for left in reversed(range(plan.encoder_updates_each if trains_encoder else 0)):
                 batch = explorer.sample(settings.batch_size)
-            for again in range(plan.encoder_updates_each if trains_encoder else 0):
-                batch = explorer.sample(settings.batch_size) if again else batch
-                if again == plan.encoder_updates_each - 1 and exploration.encodes_before_update:
+                if exploration.encodes_before_update and not left:
                     batch = explorer.encode(batch)
                 losses = update_encoder(batch)
                 schedule.step()
@@ -299,21 +264,23 @@ def pretrain_active(
                     write_row(run, loss, monitor, batch, explorer.name)
                     run.write("explore")
             if trains_agent:
-                if not (trains_encoder and exploration.encodes_before_update):
+                batch = batch if trains_encoder else explorer.sample(settings.batch_size)
+                if "features" not in batch:
                     batch = explorer.encode(batch)
-                metrics = explorer.learn(batch, agent_step // plan.agent_update_interval)
+                metrics = explorer.learn(batch, agent_step // exploration.agent_update_interval)
                 run.log({f"{key}/{explorer.name}": value for key, value in metrics.items()}, "explore")
             if (row := explorer.end_step()) is not None:
                 run.write("episodes", {"domain": explorer.name, **row}, episodes=explorer.episodes)
             done["decisions"] += 1
             run.advance(plan.repeats[index])
         run.finish()
-        first, run.counters["updates"] = explorers[0], done["updates"]
+        first = explorers[0]
+        run.counters["updates"] = done["updates"]
         if run.means("pretrain"):
             write_row(run, loss, monitor, first.sample(min(settings.batch_size, 64)), first.name)
             run.write("explore")
-        stands = [{"domain": e.name, "agent_steps": e.agent_steps, "episodes": e.episodes} for e in explorers]
-        facts = {"device": str(device), "datasets": stands, "env_steps": run.position}
+        explored = [{"domain": e.name, "agent_steps": e.agent_steps, "episodes": e.episodes} for e in explorers]
+        facts = {"device": str(device), "datasets": explored, "env_steps": run.position}
         return ExploreResult(
             **ending(run, loss, recipe, monitor, done["updates"], facts), env_steps=run.position,
             actor=first.agent.actor if exploration.transfers_actor else None, queue=first.candidates(),
@@ -321,37 +288,39 @@ def pretrain_active(
 
 
 class Explorer:
-    """One domain of an active pre-training: its environment, its replay, its agent and its intrinsic reward.
+    """One domain of an active pre-training: its environment, replay, agent and intrinsic reward.
 
-    A checkpoint may fall into an episode. No simulator state is kept for it: the episode is repeated from its seed with
-    the same actions.
+    A checkpoint in the middle of an episode holds no simulator state: its episode is repeated from its seed with the
+    same actions, which a non-deterministic environment does not reproduce.
     """
 
     def __init__(
-        self, name: str, domain: str | Domain, loss: LossModule, method: Method, config: Any, run: Run, *,
+        self, name: str, domain: str | Domain, loss: LossModule, exploration: Any, config: Any, run: Run, *,
         capacity: int, slack: int, dtype: torch.dtype, reward: Transform | None,
     ) -> None:  # fmt: skip
-        self.name, self.loss, self.config = name, loss, config
-        self.exploration: Any = method.exploration
+        self.name, self.loss, self.config, self.exploration = name, loss, config, exploration
         self.seed = derive_seed(config.seed, "active", name)
         self.device = torch.device(config.device)
-        encoder, repeat = loss.encoder, resolve_action_repeat(domain)
-        self._env = EnvThread(domain, encoder, config, seed=self.seed, action_repeat=repeat)
+        repeat = resolve_action_repeat(domain)
+        self._env = EnvThread(domain, loss.encoder, config, seed=self.seed, action_repeat=repeat)
         names = ("replay", "shift", "policy", "random_actions", "skill", "reward")
         self.generators = Generators(self.seed, *names)
         torch.manual_seed(derive_seed(self.seed, "agent"))  # its networks do not depend on other domains
-        self.learner = self._make_learner(encoder.feature_dim, self._env.env.action_spec.shape[-1])
+        self.learner = self._make_learner(loss.encoder.feature_dim, self._env.env.action_spec.shape[-1])
         set_compute_dtype(self.learner.loss, dtype)
-        self.agent = PixelAgent(encoder, self.learner.loss.actor)
+        self.agent = PixelAgent(loss.encoder, self.learner.loss.actor)
         self.reward = self._make_reward() if reward is None else reward
-        self.replay = self._make_replay(run, capacity, slack)
+        path = None if run.run_dir is None else run.run_dir / "replay" / name.replace("/", "-")
+        self.replay = self._make_replay(run, path, capacity, slack)
+        self._parts = {**self.learner.components(), "reward": self.reward, "replay": self.replay,
+                       "generators": self.generators}  # fmt: skip
         self.agent_steps = self.episodes = self.skill = 0
-        self.actions: list[Tensor] = []
-        self._td: TensorDictBase | None = None
+        self.actions: list[Tensor] = []  # of the running episode
+        self._td: TensorDictBase | None = None  # its newest observation
         self._episode_return = 0.0
 
     def begin_step(self) -> None:
-        """Choose an action, uniformly at random at first, and begin the environment's step."""
+        """Choose an action, at first uniformly at random, and begin the environment's step."""
         td = self._td = self._reset() if self._td is None else self._td
         skills = self.exploration.skill_dim
         if skills is not None:
@@ -375,11 +344,12 @@ class Explorer:
         if not transition["next", "done"].item():
             return None
         row = {"episode_return": self._episode_return, "episode_agent_steps": len(self.actions)}
-        self._td, self.actions, self._episode_return, self.episodes = None, [], 0.0, self.episodes + 1
+        self.episodes += 1
+        self._td, self.actions, self._episode_return = None, [], 0.0
         return row
 
     def sample(self, batch_size: int) -> TensorDictBase:
-        """Draw a batch of transitions, every image under a random shift of its own."""
+        """Draw a batch of transitions, every image under its own random shift."""
         return self.replay.sample(batch_size).to(self.device)
 
     def learn(self, batch: TensorDictBase, agent_step: int) -> dict[str, Tensor]:
@@ -387,7 +357,7 @@ class Explorer:
         batch = self.reward(batch)
         intrinsic = batch["next", "intrinsic_reward"]
         batch["next", "reward"] = intrinsic
-        if isinstance(self.learner, SkillDDPGLearner) and batch.get(("next", "discount"), None) is None:
+        if ("next", "discount") not in batch:  # n_step is 1
             batch["next", "discount"] = DISCOUNT * (~batch["next", "terminated"]).to(intrinsic)
         losses = self.learner.update(batch, agent_step=agent_step)
         return {"intrinsic_reward": intrinsic.mean(), **dict(losses.items())}
@@ -403,17 +373,17 @@ class Explorer:
         self._env.close()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return where the domain stands."""
+        """Return all that a checkpoint needs, except the simulator's state."""
         return {
             "counters": [self.agent_steps, self.episodes, self.skill],
             "actions": torch.stack(self.actions) if self.actions else None,
-            **{name: part.state_dict() for name, part in self._parts().items()},
+            **{name: part.state_dict() for name, part in self._parts.items()},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore :meth:`state_dict`; the episode that was under way is repeated."""
         self.agent_steps, self.episodes, self.skill = state["counters"]
-        for name, part in self._parts().items():
+        for name, part in self._parts.items():
             part.load_state_dict(state[name])
         if state["actions"] is None:
             return
@@ -421,17 +391,6 @@ class Explorer:
         for action in state["actions"]:
             self._td["action"] = action
             self._take(self._env.step(self._td).result())
-        newest = self.replay.observations(torch.tensor([self.replay.frames_written - 1]))[0]
-        if not torch.equal(newest, self._td["pixels"]):
-            logger.warning(
-                "%s does not repeat an episode from its seed and actions; this run will differ from an "
-                "uninterrupted one.",
-                self.name,
-            )
-
-    def _parts(self) -> dict[str, Any]:
-        memory = {"reward": self.reward, "replay": self.replay, "generators": self.generators}
-        return {**self.learner.components(), **memory}
 
     def _reset(self) -> TensorDictBase:
         return self._env.reset(derive_seed(self.seed, "active", self.name, "episode", self.episodes))
@@ -444,37 +403,36 @@ class Explorer:
 
     def _make_learner(self, feature_dim: int, action_dim: int) -> SACLearner:
         kind, skills = self.exploration.agent, self.exploration.skill_dim
-        shared: dict[str, Any] = {
-            "hidden_dim": self.config.hidden_dim, "device": self.device, "generator": self.generators["policy"],
-        }  # fmt: skip
+        hidden_dim, generator = self.config.hidden_dim, self.generators["policy"]
         if kind == "skill-ddpg":
-            return SkillDDPGLearner(make_skill_ddpg_loss(feature_dim, action_dim, skills, **shared))
+            actor = DeterministicActor(feature_dim, action_dim, skill_dim=skills, hidden_dim=hidden_dim)
+            critic = TwinCritic(feature_dim + skills, action_dim, hidden_dim=hidden_dim, has_tanh=True)
+            ddpg = SkillDDPGLoss(actor.to(self.device), critic.to(self.device), generator=generator)
+            return SkillDDPGLearner(ddpg)
         loss_class = {"rad-sac": RADSACLoss, "averaged-sac": AveragedSACLoss}[kind]
-        shared |= {"gamma": DISCOUNT, "alpha_init": 0.1}
-        return SACLearner(make_sac_loss(loss_class, feature_dim, action_dim, **shared))
+        sac = make_sac_loss(
+            loss_class, feature_dim, action_dim, hidden_dim=hidden_dim, device=self.device, generator=generator,
+            gamma=DISCOUNT, alpha_init=0.1,
+        )  # fmt: skip
+        return SACLearner(sac)
 
     def _make_reward(self) -> Transform:
         loss, generator, kind = self.loss, self.generators["reward"], self.exploration.reward
-        if callable(kind):  # a method of one's own brings a function that builds its reward
+        if callable(kind):  # a registered method's own function
             return kind(loss, generator).to(self.device)
-        needs = ("projector", "prototypes") if kind == "prototype" else ("projector",)
-        if missing := [name for name in needs if getattr(loss, name, None) is None]:
-            raise CRPTproError(
-                f"The {kind} reward needs a loss with {' and '.join(needs)}; {type(loss).__name__} has no "
-                f"{' and no '.join(missing)}."
-            )
+        reward: Transform
         if kind == "prototype":
             warn_if_mostly_zero(len(loss.prototypes.weight), self.config.batch_size, 3)
-            reward: Transform = PrototypeReward(loss.projector, loss.prototypes, coef=None, generator=generator,
-                                                queue_size=self.config.queue_size)  # fmt: skip
+            reward = PrototypeReward(
+                loss.projector, loss.prototypes, coef=None, generator=generator, queue_size=self.config.queue_size
+            )
         elif kind == "particle":
             reward = ParticleReward(loss.projector)
         else:
             reward = ContrastiveReward(loss.projector, temperature=float(loss.temperature))
         return reward.to(self.device)
 
-    def _make_replay(self, run: Run, capacity: int, slack: int) -> FrameReplay:
-        path = None if run.run_dir is None else run.run_dir / "replay" / self.name
+    def _make_replay(self, run: Run, path: Path | None, capacity: int, slack: int) -> FrameReplay:
         skills = self.exploration.skill_dim
         replay = make_replay(
             run, path, self._env.env, capacity, slack=slack, n_step=self.exploration.n_step, discount=DISCOUNT,
@@ -485,9 +443,14 @@ class Explorer:
         if isinstance(self.learner.loss, AveragedSACLoss):
             views |= SECOND_VIEWS
             encoded |= {"pixels_view": "features_view", ("next", "pixels_view"): ("next", "features_view")}
-        shift = RandomShift(pad=SHIFT_PAD, in_keys=[*views.values(), *PIXELS], out_keys=[*views, *PIXELS],
-                            generator=self.generators["shift"])  # fmt: skip
-        replay.append_transform(shift)
+        replay.append_transform(
+            RandomShift(
+                pad=SHIFT_PAD,
+                in_keys=[*views.values(), *PIXELS],
+                out_keys=[*views, *PIXELS],
+                generator=self.generators["shift"],
+            )
+        )
         # Adds the features of every image to a batch, without gradient.
         self.encode = FrozenEncoder(self.loss.encoder, in_keys=[*encoded], out_keys=[*encoded.values()])
         return replay
@@ -499,10 +462,6 @@ def _named(domains: str | Domain | Sequence[str | Domain], method: Method) -> di
     named: dict[str, str | Domain] = {}
     for domain in listed:
         name = get_domain(domain).name
-        if not re.fullmatch(r"\w[\w.:+-]*", name):
-            raise CRPTproError(
-                f"The domain {name!r} cannot name a directory and a column; use letters, digits and . : _ + - only."
-            )
         if name in named:
             raise CRPTproError(f"The domain {name!r} is named twice; each has one agent.")
         named[name] = domain

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
-import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -26,10 +24,10 @@ from crptpro.modules import computing, resolve_precision, usable_device
 from crptpro.modules.precision import Precision
 from crptpro.objectives import Method, get_method, method_of
 from crptpro.objectives.functional import mean_pairwise_cosine, prototype_metrics
-from crptpro.pretrained import Pretrained, load_pretrained
+from crptpro.pretrained import Pretrained, class_name, load_pretrained, loss_options
 from crptpro.provenance import provenance
 from crptpro.training.collapse import CollapseMonitor
-from crptpro.training.compile import accelerate
+from crptpro.training.compile import Update, accelerate
 from crptpro.training.run import Generators, Run
 from crptpro.transforms import RandomShift
 from crptpro.values import check_numbers
@@ -69,8 +67,7 @@ class PretrainConfig:
 
     def __post_init__(self) -> None:
         """Convert numbers to plain values, or raise a ValueError that names the setting."""
-        counts = {"updates": 1, "batch_size": 1, "warmup_updates": 0, "log_interval": 1, "checkpoint_interval": 1}
-        check_numbers(self, counts=counts, rates={"learning_rate": None, "encoder_tau": 1})
+        check_numbers(self, minima={"warmup_updates": 0}, maxima={"encoder_tau": 1})
 
     def resolved(self, method: Method) -> Any:
         """Return these settings with the method's values where they were left open."""
@@ -117,21 +114,21 @@ def pretrain(
 
     Update u (from 0) uses dataset u mod N only: one batch under random shifts, one Adam step, one EMA step of the
     targets. Any ``LossModule`` works that returns scalar ``loss_*`` terms for a batch with the entries of its
-    ``in_keys``. It is trained in place.
+    ``in_keys``.
 
     With ``run_dir`` the run can be killed at any moment: the same call with a newly built loss continues from the last
     checkpoint and, on a CPU, gives the weights of an uninterrupted run. A larger ``updates`` extends a finished run.
 
     Args:
-        loss: the objective with its networks.
+        loss: the objective with its networks; trained in place.
         datasets: one or several (a sequence, or a mapping of domain names): directories,
             :class:`~crptpro.data.FrameDataset`, or any TorchRL ``ReplayBuffer`` whose samples have the loss's keys.
         method: name of a registered method, whose numbers are the defaults; by default that of the loss's class.
         run_dir: record (``pretrain.csv``, ``metrics.jsonl``) and checkpoints; ``None`` writes nothing.
-        config: every number.
+        config: all settings.
         records: used instead of a record in ``run_dir``, e.g. one that mirrors to W&B.
         progress: show a bar, or lines in a log file.
-        started_from: identity of the artifact that the loss's weights come from, where they do.
+        started_from: identity of the artifact that the loss's weights come from, if any.
         **overrides: single settings of :class:`PretrainConfig`, e.g. ``updates=10_000``.
 
     Returns:
@@ -159,6 +156,7 @@ def pretrain(
             encoder_tau=settings.encoder_tau, updates=settings.updates, cuda_graph=settings.cuda_graph,
         )  # fmt: skip
         monitor = CollapseMonitor.of(loss)
+        datasets_facts = [_facts(name, buffer) for name, buffer in buffers.items()]
         decisive = ("batch_size", "learning_rate", "warmup_updates", "encoder_tau", "seed")
         run.require_same({
             **{name: getattr(settings, name) for name in decisive},
@@ -166,7 +164,7 @@ def pretrain(
             "updates": None if recipe.schedule == "constant" else settings.updates,
             "schedule": recipe.schedule, "grad_clip": recipe.grad_clip, "precision": precision_name(dtype),
             "loss": describe_loss(loss), "started_from": started_from,
-            "datasets": [_identity(name, buffer) for name, buffer in buffers.items()],
+            "datasets": datasets_facts,
         })  # fmt: skip
         samplers = {
             f"sampler_{index}": buffer.sampler
@@ -176,27 +174,14 @@ def pretrain(
         run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor,
                  generators=generators, **samplers)  # fmt: skip
 
-        before_update = getattr(loss, "before_update", lambda: None)  # prototypes are brought to unit length
-
-        def update(batch: TensorDictBase) -> TensorDictBase:
-            before_update()
-            losses = loss(batch)
-            optimizer.zero_grad(set_to_none=True)
-            total_loss(losses).backward()
-            if recipe.grad_clip is not None:
-                nn.utils.clip_grad_norm_(loss.parameters(), recipe.grad_clip)
-            optimizer.step()
-            if targets is not None:
-                targets.step()
-            return losses.detach()
-
-        fast_update = accelerate(update, compile=settings.compile, cuda_graph=settings.cuda_graph)
+        update = make_update(loss, optimizer, targets, grad_clip=recipe.grad_clip)
+        update = accelerate(update, compile=settings.compile, cuda_graph=settings.cuda_graph)
         domains = list(buffers)
         for done in run.until(settings.updates, checkpoint_interval=settings.checkpoint_interval):
             domain = domains[done % len(domains)]
             # The buffer's transform is the random shift.
             batch = buffers[domain].sample(settings.batch_size).to(device)
-            losses = fast_update(batch)
+            losses = update(batch)
             schedule.step()
             run.log(scalars(losses, domain))
             run.advance(1)
@@ -205,14 +190,14 @@ def pretrain(
         run.finish()
         if run.means("pretrain"):  # after the checkpoint: a longer run takes this shorter row back
             write_row(run, loss, monitor, batch, domain)
-        facts = {"device": str(device), "datasets": [_facts(name, buffer) for name, buffer in buffers.items()]}
+        facts = {"device": str(device), "datasets": datasets_facts}
         return PretrainResult(**ending(run, loss, recipe, monitor, run.position, facts))
 
 
 def finetune(pretrained: Pretrained | str | Path, datasets: Any, **options: Any) -> PretrainResult:
     """Train a pretrained artifact further, e.g. on the random data of one more domain.
 
-    The networks, the target networks and the prototypes go on from what was saved; Adam starts afresh.
+    The networks, the target networks and the prototypes continue from what was saved; Adam starts anew.
 
     Args:
         pretrained: an artifact, its directory, or the name of one that ships.
@@ -260,12 +245,33 @@ def make_optimizer(
     names = [name for name, _ in loss.named_children() if name.startswith("target_") and name.endswith("_params")]
     if not names or encoder_tau is None:
         return optimizer, schedule, None
-    # SoftUpdate begins by copying the sources; fine-tuning goes on with the targets that were saved.
+    # SoftUpdate begins by copying the sources; fine-tuning continues with the saved targets.
     kept = {name: loss._modules[name].data.clone() for name in names}
     targets = SoftUpdate(loss, tau=encoder_tau)
     for name, target in kept.items():
         getattr(loss, name).data.update_(target)
     return optimizer, schedule, targets
+
+
+def make_update(
+    loss: LossModule, optimizer: torch.optim.Adam, targets: SoftUpdate | None, *, grad_clip: float | None
+) -> Update:
+    """Return what one update does with a batch; it reads no value back to the host."""
+    before_update = getattr(loss, "before_update", lambda: None)  # normalises the prototypes
+
+    def update(batch: TensorDictBase) -> TensorDictBase:
+        before_update()
+        losses = loss(batch)
+        optimizer.zero_grad(set_to_none=True)
+        total_loss(losses).backward()
+        if grad_clip is not None:
+            nn.utils.clip_grad_norm_(loss.parameters(), grad_clip)
+        optimizer.step()
+        if targets is not None:
+            targets.step()
+        return losses.detach()
+
+    return update
 
 
 def total_loss(losses: TensorDictBase) -> Tensor:
@@ -291,7 +297,8 @@ def scalars(losses: TensorDictBase, domain: str) -> dict[str, Tensor]:
 @torch.no_grad()
 def write_row(run: Run, loss: LossModule, monitor: CollapseMonitor, batch: TensorDictBase, domain: str) -> None:
     """Write a row of the ``pretrain`` record with the prototypes' spread, and let the monitor judge it."""
-    means, extra = run.means("pretrain"), {}
+    means = run.means("pretrain")
+    extra = {}
     weight = getattr(getattr(loss, "prototypes", None), "weight", None)
     if isinstance(weight, Tensor):
         extra["ln_num_prototypes"] = log_count = math.log(len(weight))
@@ -300,11 +307,10 @@ def write_row(run: Run, loss: LossModule, monitor: CollapseMonitor, batch: Tenso
         if len(weight) >= 4:
             measured = prototype_metrics(weight.detach(), offset=float(getattr(loss, "offset", 1.5)))
             extra |= {name: float(value) for name, value in measured.items()}
-    encoder, pixels = getattr(loss, "encoder", None), batch.get("pixels", None)
-    if "embedding_cosine" not in means and isinstance(encoder, nn.Module) and pixels is not None:
-        embeddings = encoder(pixels[:128])
-        if isinstance(projector := getattr(loss, "projector", None), nn.Module):
-            embeddings = projector(embeddings)
+    if "embedding_cosine" not in means and "pixels" in batch and isinstance(getattr(loss, "encoder", None), nn.Module):
+        embeddings = loss.encoder(batch["pixels"][:128])
+        if isinstance(getattr(loss, "projector", None), nn.Module):
+            embeddings = loss.projector(embeddings)
         if isinstance(embeddings, Tensor) and embeddings.ndim == 2:
             extra[f"cosine/{domain}"] = float(mean_pairwise_cosine(F.normalize(embeddings.float(), dim=-1)))
     row = run.write("pretrain", extra=extra)
@@ -320,19 +326,13 @@ def precision_name(dtype: torch.dtype) -> str:
 
 
 def describe_loss(loss: LossModule) -> dict[str, Any]:
-    """Return a loss's class, plain options, coefficients and tensor shapes: what a checkpoint must agree with."""
-    described: dict[str, Any] = {"class": f"{type(loss).__module__}.{type(loss).__qualname__}"}
-    for name, value in sorted(vars(loss).items()):
-        if not name.startswith("_") and name != "training" and isinstance(value, (bool, int, float, str)):
-            described[name] = value
-    for name in sorted(getattr(loss, "_schedulable_buffers", ())):
-        value = getattr(loss, name, None)
-        if isinstance(value, Tensor) and value.numel() == 1:
-            described[name] = value.item()
-    for name, value in loss.state_dict().items():
-        if isinstance(value, Tensor):
-            described[f"shape of {name}"] = f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
-    return described
+    """Return a loss's class, options and tensor shapes, which a checkpoint must agree with."""
+    shapes = {
+        f"shape of {name}": f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
+        for name, value in loss.state_dict().items()
+        if isinstance(value, Tensor)
+    }
+    return {"class": class_name(loss), **loss_options(loss), **shapes}
 
 
 def ending(
@@ -357,10 +357,7 @@ def ending(
 
 # --- datasets --------------------------------------------------------------------------------------------------------
 
-CARD_FACTS = (
-    "domain", "task", "transitions", "episodes", "frame_stack", "action_repeat", "image_size", "seed", "quality",
-    "colors", "backend",
-)  # fmt: skip
+CARD_FACTS = ("domain", "task", "transitions", "episodes", "action_repeat", "image_size", "seed", "quality", "colors")
 
 
 @contextlib.contextmanager
@@ -428,12 +425,6 @@ def _card(buffer: ReplayBuffer) -> dict[str, Any]:
 
 
 def _facts(name: str, buffer: ReplayBuffer) -> dict[str, Any]:
-    """Return what the card of an encoder says about a dataset."""
+    """Return what the card of an encoder says about a dataset, and what must agree for a run to be continued."""
     card = _card(buffer)
     return {"domain": name, "transitions": len(buffer), **{k: card[k] for k in CARD_FACTS if k in card}}
-
-
-def _identity(name: str, buffer: ReplayBuffer) -> dict[str, Any]:
-    """Return what must agree for a run to be continued on a dataset."""
-    card = json.dumps(_card(buffer), sort_keys=True, default=str)
-    return {"name": name, "transitions": len(buffer), "card": hashlib.sha256(card.encode()).hexdigest()[:16]}

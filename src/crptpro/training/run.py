@@ -1,4 +1,4 @@
-"""One training run: its directory, its record, its checkpoints, its progress; it knows nothing of what is trained."""
+"""The directory, record, checkpoints and progress of one training run, whatever it trains."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import threading
 import time
 import zipfile
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 import psutil
@@ -29,9 +28,9 @@ from crptpro.values import as_path
 logger = logging.getLogger(__name__)
 
 CHECKPOINT_SECONDS = 300.0
-"""Between two checkpoints of a run that names no interval."""
+"""Between two checkpoints of a run without an interval."""
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
-"""Requests to stop: Ctrl-C, and what clusters send before they take a machine away."""
+"""Requests to stop: Ctrl-C, and what clusters send before they reclaim a machine."""
 
 
 class Generators(dict[str, torch.Generator]):
@@ -62,15 +61,14 @@ class _Means:
 
     def add(self, values: Mapping[str, Tensor]) -> None:
         for name, value in values.items():
-            value = value.detach().double()
-            self.sums[name] = self.sums[name] + value if name in self.sums else value
+            self.sums[name] = self.sums.get(name, 0) + value.detach().double()
             self.counts[name] = self.counts.get(name, 0) + 1
 
     def read(self) -> dict[str, float]:
         return {name: float(total) / self.counts[name] for name, total in self.sums.items()}
 
     def state_dict(self) -> dict[str, Any]:
-        return {"sums": self.sums, "counts": self.counts}
+        return vars(self)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.sums, self.counts = dict(state["sums"]), dict(state["counts"])
@@ -93,14 +91,14 @@ class Run:
             run.finish()
 
     A run can be killed at any moment: the same call continues from its last checkpoint, and on a CPU with the same
-    number of threads the numbers are those of an uninterrupted run. Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 let the loop
-    end its pass, write a checkpoint and leave; a second Ctrl-C leaves at once. The global random generators are left as
-    they were.
+    number of threads the numbers are those of an uninterrupted run. On Ctrl-C, SIGTERM, SIGHUP or SIGUSR1 the loop
+    finishes its iteration and writes a checkpoint before it stops; a second Ctrl-C stops at once. The global random
+    generators are left as they were.
 
     Args:
         run_dir: record and checkpoints; ``None`` keeps nothing.
         unit: what the position counts, ``"updates"`` or ``"env_steps"``; the first counter of every row.
-        streams: of the record, that this run writes.
+        streams: those of the record that this run writes.
         records: used instead of a record in ``run_dir``.
         config: settings, for the record.
         progress: show a bar, or lines in a log file.
@@ -109,7 +107,7 @@ class Run:
         position: progress in ``unit``, all resumptions included.
         resumed_from: position at which this call continued; 0 for a fresh run.
         counters: further counters for every row.
-        tally: whole numbers of the loop's own that every checkpoint holds; set them before :meth:`keep`.
+        tally: the loop's own counters, which every checkpoint holds; set them before :meth:`keep`.
         history: rows that this call wrote, by stream.
 
     Raises:
@@ -142,7 +140,8 @@ class Run:
         self._last_advance = self._row_position = 0
         self._started = self._saved_time = self._row_time = time.monotonic()
         self._earlier_seconds = 0.0
-        self._is_shown, self._progress = progress, Progress(0, 0, unit, is_shown=False)
+        self._is_shown = progress
+        self._progress = Progress(0, 0, unit, is_shown=False)
 
     def __enter__(self) -> Run:
         with contextlib.ExitStack() as stack:
@@ -165,20 +164,20 @@ class Run:
         """Training time, all resumptions included."""
         return self._earlier_seconds + time.monotonic() - self._started
 
-    def saved_setting(self, name: str, asked: Any) -> Any:
-        """Return a setting as asked, or where that is ``"auto"`` as the interrupted run had it, on its machine."""
-        return self.saved.get("settings", {}).get(name, asked) if asked == "auto" else asked
+    def saved_setting(self, name: str, value: Any) -> Any:
+        """Return a setting; one that is ``"auto"`` is what the interrupted run resolved it to on its machine."""
+        return self.saved.get("settings", {}).get(name, value) if value == "auto" else value
 
     def require_same(self, settings: Mapping[str, Any]) -> None:
         """Name everything that decides the numbers of the run; a run of other settings is refused by name."""
         self.settings = dict(settings)
         if not self.saved:
             return
-        before, now, absent = _flat(self.saved["settings"]), _flat(self.settings), "absent"
+        before, now = _flat(self.saved["settings"]), _flat(self.settings)
         differing = [
-            f"{name} was {before.get(name, absent)!r}, now {now.get(name, absent)!r}"
+            f"{name} was {before.get(name, 'absent')!r}, now {now.get(name, 'absent')!r}"
             for name in sorted({*before, *now})
-            if before.get(name, absent) != now.get(name, absent)
+            if before.get(name, "absent") != now.get(name, "absent")
         ]
         if differing:
             more = f" (and {len(differing) - 5} more)" if len(differing) > 5 else ""
@@ -215,13 +214,13 @@ class Run:
     def until(self, total: int, *, checkpoint_interval: int | None = None) -> Iterator[int]:
         """Yield the position until it has reached ``total``; the body of the loop calls :meth:`advance`.
 
-        Between two passes a checkpoint is written when one is due (every ``checkpoint_interval`` in ``unit``, or every
-        :data:`CHECKPOINT_SECONDS`), or when a signal asks the run to stop.
+        Between two iterations a checkpoint is written when one is due (every ``checkpoint_interval`` in ``unit``, or
+        every :data:`CHECKPOINT_SECONDS`), or when a signal asks the run to stop.
         """
         if self.position > total and self.resumed_from:
             raise CheckpointError(
-                f"{self.run_dir} has done {self.position:,} {self.unit}, {total:,} are asked: ask for at least as "
-                "many, or choose another run directory."
+                f"{self.run_dir} has done {self.position:,} {self.unit}, more than the {total:,} requested. Request at "
+                "least as many, or choose another run directory."
             )
         self._progress = Progress(total, self.position, self.unit, is_shown=self._is_shown)
         if threading.current_thread() is threading.main_thread():  # the only one that receives signals
@@ -294,9 +293,10 @@ class Run:
         extra: Mapping[str, float] | None = None,
         **counters: int,
     ) -> dict[str, Any]:
-        """Write a row, and return it without its counters: the position, :attr:`counters` and the ones given.
+        """Write a row with the position, :attr:`counters` and ``counters``, and return it without them.
 
-        It has ``values``, or else the means since the last row, which begin again, rate and memory, and ``extra``.
+        It holds ``values``; by default the means since the last row with ``extra``, rate and memory, and the means
+        start again.
         """
         counters = {self.unit: self.position, **self.counters, **counters}
         if values is None:
@@ -312,7 +312,8 @@ class Run:
         return row
 
     def _rate_and_memory(self) -> dict[str, float]:
-        now, row = time.monotonic(), {}
+        now = time.monotonic()
+        row = {}
         if self.position > self._row_position and now > self._row_time:
             row[f"{self.unit}_per_s"] = (self.position - self._row_position) / (now - self._row_time)
         row["resident_bytes"] = psutil.Process().memory_info().rss
@@ -322,7 +323,7 @@ class Run:
         return row
 
     def rows(self, stream: str) -> list[dict[str, Any]]:
-        """Return every row of a stream, of all resumptions where there is a record."""
+        """Return every row of a stream; with a record, those of all resumptions."""
         return self.history[stream] if self.records is None else self.records.rows(stream)
 
     def last_row(self, stream: str) -> dict[str, Any]:
@@ -352,37 +353,35 @@ class Run:
             "made_with": provenance(),
         }
         try:
-            path = self._rotation.save(self._checkpoint, step=self.position, metadata={"run": self.saved})
-            for changed in (path, path.parent):
-                _sync(changed)
+            self._rotation.save(self._checkpoint, step=self.position, metadata={"run": self.saved})
         except OSError as reason:
             error, what = (DiskSpaceError, "the disk is full") if is_disk_full(reason) else (CheckpointError, reason)
             raise error(
-                f"No checkpoint could be written to {self._rotation.directory}: {what}. Earlier ones are kept; mend "
-                "that and start the same command again."
+                f"No checkpoint could be written to {self._rotation.directory}: {what}. Earlier ones are kept; fix "
+                "that and run the same command again."
             ) from reason
 
     def _find_checkpoint(self) -> None:
-        """Read the newest checkpoint that is whole; damaged newer ones are removed."""
-        damaged = []
-        for path in sorted(self._rotation.directory.glob("checkpoint-*"), reverse=True):
+        """Read the newest checkpoint that is whole; damaged newer ones are removed, since they would outrank it."""
+        paths = sorted(self._rotation.directory.glob("checkpoint-*"), reverse=True)
+        for place, path in enumerate(paths):
             try:
                 with zipfile.ZipFile(path) as archive:
                     if (broken := archive.testzip()) is not None:
                         raise CheckpointError(f"{broken} in it is damaged")
                 self.saved = dict(Checkpoint.manifest(path)["metadata"]["run"])
-                self._latest = path
-                break
             except Exception as reason:
                 logger.warning("The checkpoint %s is damaged (%s); using the one before.", path, reason)
-                damaged.append(path)
-        if damaged and not self.saved:
+                continue
+            self._latest = path
+            for damaged in paths[:place]:
+                damaged.unlink()
+            return
+        if paths:
             raise CheckpointError(
-                f"All {len(damaged)} checkpoints in {self._rotation.directory} are damaged. Remove that directory to "
+                f"All {len(paths)} checkpoints in {self._rotation.directory} are damaged. Remove that directory to "
                 "start again."
             )
-        for path in damaged:  # they would outrank the checkpoints that follow
-            path.unlink()
 
 
 def _not_finite(what: str) -> NonFiniteError:
@@ -390,16 +389,6 @@ def _not_finite(what: str) -> NonFiniteError:
         f"{what}. Training stopped and the last checkpoint is kept. "
         "Lower the learning rate, use precision='fp32', or check the data."
     )
-
-
-def _sync(path: Path) -> None:
-    """Make a file, or the names in a directory, durable."""
-    with contextlib.suppress(OSError):  # some network file systems cannot sync a directory
-        handle = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:

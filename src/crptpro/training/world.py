@@ -1,4 +1,4 @@
-"""An environment that a training loop acts in: a thread of its own, and the replay of what it showed."""
+"""The environment that a training loop acts in, in its own thread, and its replay."""
 
 from __future__ import annotations
 
@@ -26,12 +26,11 @@ SPARE_FRAMES = 2_000
 
 
 class EnvThread:
-    """Makes, steps and closes one environment in a thread of its own, where its render context is.
+    """Makes, steps and closes one environment in its own thread, which has its render context.
 
-    MuJoCo lets other threads run while it simulates and draws: the next observation is drawn while an update computes.
-    What an environment returns does not depend on when it is asked, so that this changes no number. Without cores for
-    it, and with GLFW, everything is done in the caller's thread. ``make_env`` builds another one like ``env``, which
-    shows the images that the encoder takes.
+    MuJoCo lets other threads run while it simulates and renders: the next observation is rendered while an update
+    computes. This changes no number. Without spare cores, and with GLFW, the caller's thread does everything.
+    ``make_env`` builds another one like ``env``, which shows the images that the encoder takes.
     """
 
     def __init__(self, task: str | Domain, encoder: Any, config: Any, *, seed: int, action_repeat: int) -> None:
@@ -46,15 +45,11 @@ class EnvThread:
             image_size=getattr(encoder, "image_size", 84),
             frame_stack=getattr(encoder, "in_channels", 9) // 3,
         )
-        # With one thread of torch others want the cores.
+        # A torch limited to one thread leaves the cores to others.
         has_cores = config.device == "cpu" and cpu_cores() > 1 and torch.get_num_threads() > 1
         runs_ahead = has_cores and not (needs_gl(domain) and select_backend() == "glfw")
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="environment") if runs_ahead else Inline()
-        try:
-            self.env: EnvBase = self._thread.submit(self.make_env).result()
-        except BaseException:
-            self._thread.shutdown()
-            raise
+        self.env: EnvBase = self._thread.submit(self.make_env).result()
 
     def reset(self, seed: int) -> TensorDictBase:
         """Seed the environment and begin the episode of the seed."""
@@ -66,7 +61,7 @@ class EnvThread:
         return self._thread.submit(reset).result()
 
     def step(self, td: TensorDictBase) -> Future[TensorDictBase]:
-        """Begin the step that ``td["action"]`` asks for; nobody may change ``td`` until its result is there."""
+        """Begin the step of ``td["action"]``; ``td`` may not change until the result is there."""
         return self._thread.submit(self.env.step, td)
 
     def uniform_action(self, generator: torch.Generator) -> Tensor:
