@@ -419,7 +419,9 @@ def _rebuilt(
                 f"Pass load_pretrained(..., classes={{{name!r}: ...}})."
             )
         try:
-            with torch.random.fork_rng(devices=[]), torch.device("cpu"):
+            # Without memory and initial weights, which the tensors replace; other classes may compute with them.
+            is_ours = classes[name] is _CLASSES.get(name)
+            with torch.random.fork_rng(devices=[]), torch.device("meta" if is_ours else "cpu"):
                 module = classes[name](**description.get("config", {}))
             module.load_state_dict(parts.pop(role, {}), assign=True)
         except (TypeError, ValueError) as reason:

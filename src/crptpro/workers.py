@@ -48,6 +48,9 @@ class WorkerPool(ProcessPoolExecutor):
     """An executor whose processes call ``prepare(*arguments)`` first, and ignore Ctrl-C: their parent decides."""
 
     def __init__(self, workers: int, prepare: Callable[..., None], *arguments: Any) -> None:
+        main = sys.modules["__main__"]
+        if not Path(getattr(main, "__file__", None) or ".").exists():  # "<stdin>", which no process can run again
+            del main.__file__
         super().__init__(workers, SPAWN, _begin, (loaded_plugins(), prepare, arguments))
         self.processes: dict[int, Any] = {}
 

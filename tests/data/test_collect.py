@@ -231,6 +231,17 @@ def test_a_world_that_no_other_process_can_import_is_collected_in_this_one_which
     assert len([record for record in caplog.records if record.levelname == "WARNING"]) == 2
 
 
+def test_a_program_from_standard_input_collects_with_several_processes(tmp_path: Path) -> None:
+    program = f"import sys\nsys.path.insert(0, {str(Path(__file__).parent)!r})\nfrom toy_world import SLOW\n"
+    program += "from crptpro.data import collect_random\n"
+    program += f"collect_random(SLOW, {str(tmp_path)!r}, transitions=20, workers=2, image_size=8, progress=False)"
+    run = subprocess.run([sys.executable], input=program, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    (path,) = tmp_path.iterdir()
+    assert len(FrameDataset.open(path)) == 20
+    assert "in this process" not in run.stderr
+
+
 PROGRAM = """
     import sys
     sys.path.insert(0, {here!r})

@@ -17,6 +17,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import CatFrames, TransformedEnv
 from toy_world import ToyEnv, rollout_of, variable_length
 
@@ -32,6 +33,19 @@ def frame(number: int) -> torch.Tensor:
 
 def small(capacity: int = 20, **options: Any) -> FrameReplay:
     return FrameReplay(capacity, frame_shape=(3, 2, 2), action_dim=1, **options)
+
+
+def test_a_buffer_of_single_frames_becomes_one_of_stacks() -> None:
+    live = TransformedEnv(ToyEnv(variable_length, seed=2), CatFrames(N=4, dim=-3, in_keys=["pixels"], padding="same"))
+    torch.manual_seed(0)
+    expected = live.rollout(40, break_when_any_done=False)
+    torch.manual_seed(0)
+    single = ReplayBuffer(storage=LazyTensorStorage(40))
+    single.extend(ToyEnv(variable_length, seed=2).rollout(40, break_when_any_done=False))
+    stacked = FrameReplay(40, frame_shape=(3, 8, 8), action_dim=2, frame_stack=4)
+    stacked.extend(single[:])
+    for key in ("pixels", ("next", "pixels"), "action", ("next", "done")):
+        assert torch.equal(stacked[:][key], expected[key]), key
 
 
 class Driver:

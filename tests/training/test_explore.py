@@ -110,6 +110,11 @@ def test_a_run_of_other_settings_is_refused_by_name(tmp_path: Path) -> None:
         run("apt-s", tmp_path, env_steps=20, batch_size=8)
 
 
+def test_a_loss_without_the_networks_of_the_reward_is_refused() -> None:
+    with pytest.raises(CRPTproError, match="The prototype reward needs a loss with prototypes; SimCLRLoss has none"):
+        run("proto-rl-s", loss=build("apt-s"))
+
+
 @pytest.mark.parametrize(
     ("method", "options", "message"),
     [

@@ -239,7 +239,7 @@ def test_what_is_no_dataset_or_lacks_an_entry_is_refused(tmp_path: Path) -> None
     buffer.extend(TensorDict({"pixels": torch.zeros(4, 3, 16, 16, dtype=torch.uint8)}, [4]))
     with pytest.raises(DatasetError, match=r"reads \('next', 'pixels'\), which the dataset 'x' lacks"):
         run(make_loss(), 2, datasets={"x": buffer})
-    with pytest.raises(DatasetError, match=r"shows 'pixels' as .*; the encoder takes"):
+    with pytest.raises(DatasetError, match=r"shows 'pixels' as \(3, 16, 16\); the encoder takes.*samples stacks"):
         run(make_loss(channels=9), 2)
 
 

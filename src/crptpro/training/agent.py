@@ -107,10 +107,10 @@ def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[P
             f"{path} acts on a {card.get('encoder_class')}, which only its author can build: pass encoder=."
         )
     try:
-        if encoder is None:
-            encoder = PixelEncoder(**card["modules"]["encoder"])
-        agent = PixelAgent(encoder, SquashedGaussianActor(**card["modules"]["actor"]))
-        agent.load_state_dict(tensors)
+        with torch.device("meta"):  # the tensors replace the initial weights
+            encoder = encoder or PixelEncoder(**card["modules"]["encoder"])
+            agent = PixelAgent(encoder, SquashedGaussianActor(**card["modules"]["actor"]))
+        agent.load_state_dict(tensors, assign=True)
         dtype = resolve_precision(card.get("config", {}).get("precision", "fp32"), "cpu")
     except (KeyError, TypeError, ValueError, RuntimeError) as reason:
         raise CheckpointError(f"{path} holds no agent that can be rebuilt: {reason!r}") from reason

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ from torchrl.envs.transforms import Transform
 from torchrl.envs.utils import step_mdp
 from torchrl.objectives import LossModule
 
+from crptpro.artifact import require_disk
 from crptpro.data import FrameReplay
 from crptpro.domains import Domain, get_domain
 from crptpro.envs import resolve_action_repeat
@@ -43,6 +45,8 @@ from crptpro.training.world import SPARE_FRAMES, EnvThread, make_replay
 from crptpro.transforms import ContrastiveReward, FrozenEncoder, ParticleReward, PrototypeReward, RandomShift
 from crptpro.transforms.rewards import warn_if_mostly_zero
 from crptpro.values import Quality, check_numbers
+
+logger = logging.getLogger(__name__)
 
 PIXELS: dict[NestedKey, NestedKey] = {"pixels": "features", ("next", "pixels"): ("next", "features")}
 """Entries of a batch, with those of their features."""
@@ -226,6 +230,10 @@ def pretrain_active(
         torch.manual_seed(derive_seed(settings.seed, "active", "loss"))
         capacity = min(settings.replay_capacity, plan.agent_steps)
         slack = 4 * (settings.checkpoint_interval_env_steps // sum(plan.repeats)) + SPARE_FRAMES
+        if run.run_dir is not None and not run.saved:
+            needed = len(named) * (capacity + slack) * 3 * getattr(loss.encoder, "image_size", 84) ** 2
+            logger.info("replays: %.2f GB in %s; they are kept", needed / 1e9, run.run_dir / "replay")
+            require_disk(run.run_dir, needed, "The replays of the domains")
         optimizer, schedule, targets = make_optimizer(
             loss, recipe, learning_rate=settings.learning_rate, warmup_updates=recipe.warmup_updates,
             encoder_tau=recipe.encoder_tau, updates=plan.encoder_updates,
@@ -291,7 +299,7 @@ class Explorer:
     """One domain of an active pre-training: its environment, replay, agent and intrinsic reward.
 
     A checkpoint in the middle of an episode holds no simulator state: its episode is repeated from its seed with the
-    same actions, which a non-deterministic environment does not reproduce.
+    same actions. A non-deterministic environment does not reproduce it, which is logged as a warning.
     """
 
     def __init__(
@@ -391,6 +399,9 @@ class Explorer:
         for action in state["actions"]:
             self._td["action"] = action
             self._take(self._env.step(self._td).result())
+        newest = self.replay.observations(torch.tensor([self.replay.frames_written - 1]))[0]
+        if not torch.equal(newest, self._td["pixels"]):
+            logger.warning("%s does not repeat its episode: this run will differ from an uninterrupted one.", self.name)
 
     def _reset(self) -> TensorDictBase:
         return self._env.reset(derive_seed(self.seed, "active", self.name, "episode", self.episodes))
@@ -420,6 +431,9 @@ class Explorer:
         loss, generator, kind = self.loss, self.generators["reward"], self.exploration.reward
         if callable(kind):  # a registered method's own function
             return kind(loss, generator).to(self.device)
+        needs = ("projector", "prototypes") if kind == "prototype" else ("projector",)
+        if missing := [name for name in needs if getattr(loss, name, None) is None]:
+            raise CRPTproError(f"The {kind} reward needs a loss with {missing[0]}; {type(loss).__name__} has none.")
         reward: Transform
         if kind == "prototype":
             warn_if_mostly_zero(len(loss.prototypes.weight), self.config.batch_size, 3)

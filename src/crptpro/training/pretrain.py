@@ -410,10 +410,13 @@ def _shift_for(loss: LossModule, name: str, buffer: ReplayBuffer, generator: tor
     encoder = getattr(loss, "encoder", None)
     size, channels = getattr(encoder, "image_size", None), getattr(encoder, "in_channels", None)
     for key in images if size and channels else ():
-        if tuple(sample[key].shape[-3:]) != (channels, size, size):
+        found = tuple(sample[key].shape[-3:])
+        if found != (channels, size, size):
+            remedy = "Collect with those, or build the encoder for the dataset."
+            if found == (3, size, size):
+                remedy = "A FrameReplay that is extended by single frames (replay.extend(buffer[:])) samples stacks."
             raise DatasetError(
-                f"The dataset {name!r} shows {key!r} as {tuple(sample[key].shape[-3:])}; the encoder takes "
-                f"{(channels, size, size)}. Collect with those, or build the encoder for the dataset."
+                f"The dataset {name!r} shows {key!r} as {found}; the encoder takes {(channels, size, size)}. {remedy}"
             )
     seconds = [view for view, key in views.items() if key in images]
     read = [*(views[view] for view in seconds), *images]

@@ -10,6 +10,7 @@ import threading
 import time
 import zipfile
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import psutil
@@ -353,7 +354,9 @@ class Run:
             "made_with": provenance(),
         }
         try:
-            self._rotation.save(self._checkpoint, step=self.position, metadata={"run": self.saved})
+            path = self._rotation.save(self._checkpoint, step=self.position, metadata={"run": self.saved})
+            for written in (path, path.parent):
+                _sync(written)
         except OSError as reason:
             error, what = (DiskSpaceError, "the disk is full") if is_disk_full(reason) else (CheckpointError, reason)
             raise error(
@@ -389,6 +392,16 @@ def _not_finite(what: str) -> NonFiniteError:
         f"{what}. Training stopped and the last checkpoint is kept. "
         "Lower the learning rate, use precision='fp32', or check the data."
     )
+
+
+def _sync(path: Path) -> None:
+    """Make a file, or the names in a directory, durable."""
+    with contextlib.suppress(OSError):  # some network file systems cannot sync a directory
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:
