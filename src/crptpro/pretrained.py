@@ -301,7 +301,6 @@ def shipped_encoders() -> list[str]:
 
 
 def _as_pretrained(trained: Any) -> Pretrained:
-    """Return the artifact of what was trained."""
     if isinstance(trained, Pretrained):
         return trained
     result = None if isinstance(trained, nn.Module) else trained

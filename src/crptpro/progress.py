@@ -25,7 +25,6 @@ class Progress:
         )  # fmt: skip
 
     def reach(self, done: int) -> None:
-        """Move the bar."""
         self._bar.update(done - self.done)
         self.done = done
 
@@ -48,5 +47,4 @@ class Progress:
         )  # fmt: skip
 
     def close(self) -> None:
-        """Remove the bar."""
         self._bar.close()

@@ -92,7 +92,6 @@ class Doctor:
     """only these domains, tasks or groups"""
 
     def run(self) -> None:
-        """Print the report; exit status 1 unless a run would work."""
         from crptpro.doctor import run_doctor
 
         report = run_doctor(domains=self.domains or None)
@@ -125,7 +124,6 @@ class Collect:
     """simulator steps per decision (default: the domain's, 2)"""
 
     def run(self) -> None:
-        """Collect, or continue collecting."""
         settings = {k: v for k, v in vars(self).items() if k not in ("domains", "out")}
         for name, path in collect_group(expand_groups(self.domains), self.out, **settings).items():
             logger.info("%s: %s", name, path)
@@ -165,7 +163,6 @@ class Pretraining(EncoderRun):
     config: Any = None
 
     def run(self) -> None:
-        """Pre-train, or continue, and write the artifact."""
         method = get_method(self.method)
         train: Any = training.pretrain
         if method.exploration is not None:
@@ -219,7 +216,6 @@ class Finetune(EncoderRun):
     walker 500"""
 
     def run(self) -> None:
-        """Fine-tune, or continue, and write the artifact."""
         image_size, frame_stack = image_format([self.dataset])
         pretrained = load_pretrained(self.pretrained).require(image_size=image_size, frame_stack=frame_stack)
         config = replace(self.config, updates=self.config.updates or get_method("crptpro-finetune").updates)
@@ -245,7 +241,6 @@ class Downstream:
     """mirrors"""
 
     def run(self) -> None:
-        """Train, or continue."""
         get_domain(self.task)  # an unknown name is refused before the run directory is made
         with self.logging.records(self.out, self) as records:
             result = training.train_downstream(
@@ -278,7 +273,6 @@ class Evaluate:
     """write the first episode as MP4 here (needs the `video` extra)"""
 
     def run(self) -> None:
-        """Write the requested files, and print mean and deviation."""
         is_random = self.agent == "random-policy"
         if is_random and self.task is None:
             raise CRPTproError("The random policy has no task of its own; name one, e.g. --task walker_run.")
@@ -343,7 +337,6 @@ class Probe:
     """where the encoder runs"""
 
     def run(self) -> None:
-        """Print a table, and write the requested file."""
         from crptpro.experiments import measure
 
         if self.samples < 1:
@@ -383,7 +376,6 @@ class Report:
     """directory of the report (default: DIRECTORY/report)"""
 
     def run(self) -> None:
-        """Write the page, then say where it is."""
         from crptpro.experiments.report import build_report
 
         print(build_report(self.directory, out=self.out))
@@ -465,7 +457,7 @@ def pretrain_command(arguments: Sequence[str]) -> type[Pretrain] | type[Explore]
 
 
 def main() -> None:
-    """Entry point of the ``crptpro`` command."""
+    """Run the ``crptpro`` command."""
 
     def run() -> None:
         arguments = load_plugins(sys.argv[1:])

@@ -88,7 +88,6 @@ class Reproduce:
     """ray: head of the cluster (default: RAY_ADDRESS, or one on this machine)"""
 
     def run(self) -> None:
-        """Print the plan, run what is missing, list what failed."""
         root = as_path(self.out, "out")
         slurm = self._checked_options()
         jobs, cores, gpus = launch.divide(

@@ -177,7 +177,6 @@ class _Job(NamedTuple):
 
     @property
     def missing(self) -> int:
-        """Transitions that are not durable yet."""
         writer: Any = self.dataset.writer
         return writer.target - writer.transitions
 
@@ -313,7 +312,6 @@ class _Worker:
         return pickle.dumps((env.card() if hasattr(env, "card") else {}, rollout))
 
     def close(self) -> None:
-        """Close the environment and free its render context."""
         if self._env is not None:
             self._env.close()
         self._domain, self._env = "", None

@@ -119,17 +119,14 @@ class FrameDataset(ReplayBuffer):
 
     @property
     def path(self) -> Path:
-        """The dataset's directory."""
         return self._storage.path
 
     @property
     def domain(self) -> str:
-        """The domain's name."""
         return self.card["domain"]
 
     @property
     def frame_stack(self) -> int:
-        """Frames per stack."""
         return self._storage.frame_stack
 
     @property
@@ -182,7 +179,6 @@ class FrameStorage(StackStorage):
         return self.max_size
 
     def columns_at(self, index: Tensor, **how: Any) -> TensorDict:
-        """Return everything but pixels; see the base class."""
         self._require_complete()
         columns = self.transitions.apply(lambda column: column.index_select(0, index), batch_size=index.shape)
         number = columns.pop("row")
@@ -240,12 +236,10 @@ class EpisodeWriter(ImmutableDatasetWriter):
 
     @property
     def transitions(self) -> int:
-        """Durable transitions."""
         return self.state["transitions"]
 
     @property
     def episodes(self) -> int:
-        """Durable episodes."""
         return self.state["episodes"]
 
     @property
@@ -367,7 +361,6 @@ class EpisodeWriter(ImmutableDatasetWriter):
         logger.info("%s: continuing after %d of %d transitions", self.path.name, self.transitions, self.target)
 
     def _save(self, **changes: Any) -> None:
-        """Write the card."""
         state = {**self.state, **changes}
         state["frames"] = state["transitions"] + state["episodes"]
         state["render"] = state["sessions"][-1]["render"] if state["sessions"] else {}
@@ -388,7 +381,6 @@ def _append(path: Path, values: Tensor, rows: int) -> None:
 
 
 def _sizes(path: Path, state: Mapping[str, Any]) -> dict[Path, int]:
-    """Return the files of a card, or of a collection, and their sizes in bytes."""
     rows = {"transitions": state["transitions"], "frames": state["transitions"] + state["episodes"]}
     return {
         path / f"{name}.memmap": rows[name.split("/")[0]] * math.prod(shape) * getattr(torch, dtype).itemsize

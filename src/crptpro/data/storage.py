@@ -199,7 +199,6 @@ class StackStorage(Storage):
         return gather_stacks(self.pixels, rows % count)
 
     def set(self, *_: Any, **__: Any) -> None:
-        """Refuse: rows depend on each other."""
         raise DatasetError("Frames are stored once, so that transitions depend on each other: use extend.")
 
     def dumps(self, path: str | Path) -> None:
@@ -208,7 +207,6 @@ class StackStorage(Storage):
         torch.save(self.state_dict(), Path(path) / "state.pt")
 
     def loads(self, path: str | Path) -> None:
-        """Load what :meth:`dumps` saved."""
         self.load_state_dict(torch.load(Path(path) / "state.pt", weights_only=True))
 
 
@@ -266,7 +264,6 @@ class RingStorage(StackStorage):
         return torch.cat(numbers)
 
     def _write_piece(self, rows: Rows, *, begins: bool) -> Tensor:
-        """Store transitions of one episode."""
         frames, lead = rows.following, 0
         if begins:
             first = rows.first_frames()
@@ -310,7 +307,6 @@ class RingStorage(StackStorage):
         return self.transitions - self.oldest
 
     def held(self) -> range:
-        """See the base class."""
         return range(max(0, self.frames - self.window), self.frames)
 
     def __getitem__(self, index: Any) -> TensorDict:

@@ -147,7 +147,6 @@ class AgentSteps(dm_env.Environment):
         (self.env.task.random if generator is None else generator).seed(seed)
 
     def reset(self) -> dm_env.TimeStep:
-        """Start an episode."""
         is_same = self._camera is not None and self.physics.model is self._model
         with render_context(self._make_current if is_same else None):  # quadruped_escape uploads its terrain
             self.env.reset()
@@ -216,7 +215,6 @@ class AgentSteps(dm_env.Environment):
         self._model = model
 
     def observation_spec(self) -> dict[str, specs.Array]:
-        """Describe the frame and the physical state."""
         found = {"pixels": specs.BoundedArray(self._image_shape, np.uint8, 0, 255)}
         if self.physics_state:
             model = self.physics.model
@@ -224,15 +222,12 @@ class AgentSteps(dm_env.Environment):
         return found
 
     def action_spec(self) -> specs.BoundedArray:
-        """Describe actions, float32 in [-1, 1]."""
         return specs.BoundedArray(self.env.action_spec().shape, np.float32, -1.0, 1.0)
 
     def reward_spec(self) -> specs.Array:
-        """Describe the summed reward."""
         return specs.Array((), np.float32)
 
     def close(self) -> None:
-        """Free the physics and its render context."""
         self._camera = self._model = None
         self.physics.free()
         self.env.close()

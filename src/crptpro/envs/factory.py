@@ -173,7 +173,6 @@ class FrameTransform(Transform):
         self._shape = (3, image_size, image_size)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Set uint8 and channels first."""
         observation_spec["pixels"] = Bounded(0, 255, shape=self._shape, dtype=torch.uint8)
         return observation_spec
 

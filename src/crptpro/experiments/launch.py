@@ -68,7 +68,6 @@ class Work:
 
     @property
     def directory(self) -> Path:
-        """Directory of the job."""
         return directory_of(Path(self.root), self.key)
 
     def arguments(self) -> list[str]:

@@ -28,7 +28,6 @@ class ContrastiveLoss(PretrainingLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Compute the loss and diagnostics of one batch; see the class."""
         loss, unit = self._contrast(tensordict)
         out = {"loss_contrast": loss, "embedding_cosine": mean_pairwise_cosine(unit.detach())}
         return TensorDict(out, batch_size=[])

@@ -97,7 +97,6 @@ class ProtoLoss(PretrainingLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Compute the loss terms and diagnostics of one batch; see the class."""
         latents = self._latents(self._read(tensordict, self.tensor_keys.observation))
         predictions = self._apply_network("predictor", latents)
         targets = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))

@@ -108,17 +108,14 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
     @property
     def actor(self) -> Any:
-        """The policy, on features."""
         return cast(Any, self.actor_network)[0].module
 
     @property
     def critic(self) -> Any:
-        """The critic."""
         return cast(Any, self.qvalue_network).module
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Compute all three losses against the same critic; see the class."""
         return self.critic_loss(tensordict).update(self.actor_and_temperature_loss(tensordict))
 
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -74,12 +74,10 @@ class SkillDDPGLoss(NetworkLoss):
 
     @property
     def actor(self) -> Any:
-        """The policy."""
         return self.actor_network
 
     @property
     def critic(self) -> Any:
-        """The critic."""
         return self.qvalue_network
 
     def _set_in_keys(self) -> None:
@@ -90,7 +88,6 @@ class SkillDDPGLoss(NetworkLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Compute both losses against the same critic; see the class."""
         return self.critic_loss(tensordict).set("loss_actor", self.actor_loss(tensordict))
 
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -102,7 +99,6 @@ class SkillDDPGLoss(NetworkLoss):
         return squared_errors(values.unsqueeze(-2), target)
 
     def actor_loss(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the actor's loss."""
         inputs = self._inputs(tensordict, tensordict)
         action = self._act(inputs)
         # Detached weights: the gradient passes through Q to the action and to nothing else.

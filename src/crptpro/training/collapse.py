@@ -134,7 +134,6 @@ class CollapseMonitor:
         return copy.deepcopy({name: getattr(self, name) for name in names})
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore :meth:`state_dict`."""
         vars(self).update(copy.deepcopy(dict(state)))
 
     def _reasons(self) -> str:

@@ -109,7 +109,6 @@ class DownstreamConfig:
     """where networks and features are"""
 
     def __post_init__(self) -> None:
-        """Convert numbers to plain values, or raise a ValueError that names the setting."""
         check_numbers(self, minima={"eval_workers": 0}, maxima={"discount": 1, "critic_tau": 1})
         if self.features not in ("auto", "dense", "dense-bf16", "reencode"):
             raise ValueError(f"`features` must be auto, dense, dense-bf16 or reencode, got {self.features!r}.")
@@ -289,7 +288,6 @@ def _artifact(pretrained: Pretrained | str | Path, seed: int) -> Pretrained:
 
 
 def _frozen_copy(network: nn.Module, device: torch.device, dtype: torch.dtype) -> Any:
-    """Return a frozen copy; another run may hold the artifact too."""
     return set_compute_dtype(copy.deepcopy(network).requires_grad_(False).eval().to(device), dtype)
 
 
@@ -412,7 +410,6 @@ def _eval_workers(task: str, make_this_env: Callable[[], EnvBase], config: Any) 
 def _record_evaluation(
     run: Run, task: str, method: str, episodes: Sequence[Episode], counters: Mapping[str, int]
 ) -> None:
-    """Write a row per episode, and announce the mean."""
     for e in episodes:
         row = {"episode_return": e.episode_return, "episode_agent_steps": e.agent_steps, "seed": e.seed}
         run.write("eval", {**row, "method": method}, extra=None, episode=e.episode, **counters)

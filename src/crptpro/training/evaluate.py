@@ -198,7 +198,6 @@ class Evaluator:
             self._start(agent, state["counters"])
 
     def close(self) -> None:
-        """End the processes and free the render context."""
         self._end_pool()
         if self._env is not None:
             self._env.close()

@@ -93,7 +93,6 @@ class ExploreConfig:
     """simulator steps, over all domains, between two checkpoints"""
 
     def __post_init__(self) -> None:
-        """Convert numbers to plain values, or raise a ValueError that names the setting."""
         check_numbers(self, minima={"random_agent_steps": 0}, maxima={})
 
     def resolved(self, method: Method) -> Any:
@@ -116,7 +115,6 @@ class ExplorationPlan:
 
     @property
     def decisions(self) -> int:
-        """Over all domains."""
         return self.agent_steps * len(self.repeats)
 
     @property
@@ -126,7 +124,6 @@ class ExplorationPlan:
 
     @property
     def encoder_updates(self) -> int:
-        """Over all domains."""
         interval = self.encoder_update_interval
         times = max(0, -(-self.agent_steps // interval) - -(-self.first_update // interval))
         return times * self.encoder_updates_each * len(self.repeats)
@@ -377,7 +374,6 @@ class Explorer:
         return self.reward.queue.roll(-int(self.reward.queue_pointer), 0).clone()
 
     def close(self) -> None:
-        """Free the render context."""
         self._env.close()
 
     def state_dict(self) -> dict[str, Any]:
@@ -407,7 +403,6 @@ class Explorer:
         return self._env.reset(derive_seed(self.seed, "active", self.name, "episode", self.episodes))
 
     def _take(self, transition: TensorDictBase) -> None:
-        """Continue the episode."""
         self.actions.append(transition["action"].clone())
         self._episode_return += transition["next", "reward"].item()
         self._td = step_mdp(transition)
@@ -471,7 +466,6 @@ class Explorer:
 
 
 def _named(domains: str | Domain | Sequence[str | Domain], method: Method) -> dict[str, str | Domain]:
-    """Return the domains of a run by name."""
     listed = [domains] if isinstance(domains, (str, Domain)) else list(domains)
     named: dict[str, str | Domain] = {}
     for domain in listed:

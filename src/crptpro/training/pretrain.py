@@ -66,7 +66,6 @@ class PretrainConfig:
     """updates between two checkpoints (default: about every five minutes)"""
 
     def __post_init__(self) -> None:
-        """Convert numbers to plain values, or raise a ValueError that names the setting."""
         check_numbers(self, minima={"warmup_updates": 0}, maxima={"encoder_tau": 1})
 
     def resolved(self, method: Method) -> Any:

@@ -48,7 +48,6 @@ class Generators(dict[str, torch.Generator]):
         return {name: generator.get_state() for name, generator in self.items()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore :meth:`state_dict`."""
         for name, generator in self.items():
             generator.set_state(state[name])
 

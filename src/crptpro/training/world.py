@@ -69,7 +69,6 @@ class EnvThread:
         return 2 * torch.rand(self.env.action_spec.shape, generator=generator) - 1
 
     def close(self) -> None:
-        """Free the render context."""
         with self._thread:
             self._thread.submit(self.env.close).result()
 

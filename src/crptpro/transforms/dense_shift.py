@@ -304,12 +304,10 @@ class DenseShiftFeatures(Transform):
         return copy
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave out what is derived."""
         derived = ("_lock", "_outputs", "_held", "_maps", "_embeddings")
         return {key: value for key, value in super().__getstate__().items() if key not in derived}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore without maps."""
         super().__setstate__(state)
         self.forget()
 
@@ -317,7 +315,6 @@ class DenseShiftFeatures(Transform):
         self.forget()  # whoever loads a state may number observations anew
 
     def transform_output_spec(self, output_spec: TensorSpec) -> TensorSpec:
-        """Refuse to be part of an environment."""
         raise NotImplementedError("DenseShiftFeatures reads a replay batch; on an environment use FrozenEncoder.")
 
 

@@ -79,7 +79,6 @@ class IntrinsicReward(Transform):
         return tensordict.set(self.reward_key, reward + self.coef * intrinsic)
 
     def transform_output_spec(self, output_spec: TensorSpec) -> TensorSpec:
-        """Refuse an environment, where there is no batch to compare with."""
         raise NotImplementedError(f"{type(self).__name__} rewards replay batches; attach it to a buffer.")
 
     def clone(self) -> Self:
