@@ -18,7 +18,6 @@ ORDER = [
     "domains", "transforms.base", "transforms.color_swap", "envs", "data", "modules", "objectives", "transforms",
     "pretrained", "training", "analysis", "experiments", "doctor", "cli",
 ]  # fmt: skip
-A_JOB_IS_A_COMMAND = [("experiments.launch", "cli"), ("experiments.measure", "cli")]
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 
@@ -49,8 +48,6 @@ def test_imports_point_to_an_earlier_part(path: Path) -> None:
         if not name.startswith("crptpro."):
             continue
         imported = part_of(name.removeprefix("crptpro."))
-        if (module, imported) in A_JOB_IS_A_COMMAND:
-            continue
         if own in FOUNDATION:
             assert imported in FOUNDATION, f"{module} is foundation and imports {name}"
         elif imported in ORDER:

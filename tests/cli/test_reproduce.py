@@ -119,7 +119,7 @@ class InProcess:
     def start(self, work: Work, *, is_exclusive: bool) -> Any:
         log = open(work.directory / "log.txt", "a", buffering=1)  # noqa: SIM115
         with log, redirect_stdout(log), redirect_stderr(log):
-            work.run()
+            work.run(main)
         return self
 
     def poll(self) -> str:

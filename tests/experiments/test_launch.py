@@ -208,7 +208,7 @@ def test_an_attempt_says_in_its_log_why_it_failed_and_the_time_of_earlier_ones_c
         os.utime(directory / name, (at, at))
     log = open(directory / "log.txt", "w", buffering=1)  # noqa: SIM115
     with log, redirect_stdout(log), redirect_stderr(log):
-        assert Work(str(tmp_path), wanted.key).run() == reason
+        assert Work(str(tmp_path), wanted.key).run(main) == reason
     last = (directory / "log.txt").read_text().splitlines()[-1]
     assert last == (f"error: {reason}" if reason else "finished")
     if reason:
@@ -233,7 +233,7 @@ def test_two_commands_on_one_root_do_not_run_a_job_twice(tmp_path: Path, monkeyp
         other.release()
 
     threading.Timer(0.3, finish).start()
-    assert Work(str(tmp_path), wanted.key).run() == ""
+    assert Work(str(tmp_path), wanted.key).run(main) == ""
 
 
 # --- resources ------------------------------------------------------------------------------------------------------

@@ -464,7 +464,7 @@ def main() -> None:
         if arguments[:1] == ["measure"]:  # for jobs of `reproduce`
             from crptpro.experiments import measure
 
-            measure.main(arguments[1:])
+            measure.main(arguments[1:], pretrain_command)
             return
         commands: dict[str, Any] = {
             "doctor": Doctor, "collect": Collect, "pretrain": pretrain_command(arguments), "finetune": Finetune,

@@ -22,7 +22,7 @@ import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -89,13 +89,15 @@ class Work:
     def process(self, **environment: str) -> subprocess.Popen:
         """Start a process that runs the job and prints to its log; Ctrl-C does not reach it."""
         variables = os.environ | dict.fromkeys(THREAD_VARIABLES, str(self.threads)) | environment
-        command = [sys.executable, "-m", "crptpro.experiments.launch"]
-        command += [json.dumps(dataclasses.asdict(self)), str(os.getpid())]
+        command = [sys.executable, "-m", "crptpro.cli.job", json.dumps(dataclasses.asdict(self)), str(os.getpid())]
         with open(self.directory / LOG, "ab") as log:
             return subprocess.Popen(command, env=variables, start_new_session=True, stdout=log, stderr=log)
 
-    def run(self) -> str:
-        """Run or continue the job in this process; returns why it is not finished, or an empty string."""
+    def run(self, crptpro: Callable[[], None]) -> str:
+        """Run or continue the job in this process; returns why it is not finished, or an empty string.
+
+        ``crptpro`` is the main function of the command line, which reads ``sys.argv``.
+        """
         now = datetime.datetime.now(datetime.UTC).isoformat(sep=" ", timespec="seconds")
         where = f"{socket.gethostname()}, process {os.getpid()}, {self.device}, {self.threads} threads"
         print(f"--- {now}: {where}", flush=True)
@@ -105,7 +107,8 @@ class Work:
                 return ""
             torch.set_num_threads(self.threads)
             clock = _clock(self.directory)
-            reason = _command(self.arguments(), self.directory / LOG)
+            sys.argv = ["crptpro", *self.arguments()]
+            reason = _failure_of(crptpro, self.directory / LOG)
             if not reason:
                 seconds = clock["seconds"] + time.time() - clock["began"]
                 how = {"device": self.device, "threads": self.threads, "attempts": clock["attempts"]}
@@ -130,13 +133,10 @@ def _clock(directory: Path) -> dict[str, float]:
     return clock
 
 
-def _command(arguments: Sequence[str], log: Path) -> str:
-    """Run a ``crptpro`` command in this process; returns why it failed, or an empty string."""
-    from crptpro.cli import main
-
-    sys.argv = ["crptpro", *arguments]
+def _failure_of(command: Callable[[], None], log: Path) -> str:
+    """Call a command; returns why it failed, or an empty string."""
     try:
-        main()
+        command()
     except SystemExit as end:
         if end.code in (130, 143):  # stopped by a signal
             raise
@@ -392,7 +392,8 @@ def run_jobs(
     return queue.failures
 
 
-def _leave(number: int, frame: object) -> None:
+def leave(number: int, frame: object) -> None:
+    """Handle a signal by SystemExit."""
     raise SystemExit(128 + number)
 
 
@@ -401,7 +402,7 @@ def _signals_end_it() -> Iterator[None]:
     """Let SIGTERM and SIGHUP interrupt like Ctrl-C; a signal that the caller ignores (nohup) stays ignored."""
     numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN]
     is_main = threading.current_thread() is threading.main_thread()
-    before = {number: signal.signal(number, _leave) for number in numbers if is_main}
+    before = {number: signal.signal(number, leave) for number in numbers if is_main}
     try:
         yield
     finally:
@@ -563,19 +564,3 @@ def slurm_parameters(
             raise CRPTproError(f"--sbatch {option}: write key=value, e.g. qos=high or account=robots.")
         parameters.setdefault("additional_parameters", {})[key.lstrip("-")] = value
     return parameters
-
-
-def _end_with(parent: int) -> None:
-    """Stop at the next checkpoint when the command that started this job is gone."""
-    while os.getppid() == parent:
-        time.sleep(1)
-    print("the command that started this job is gone: leaving at the next checkpoint", flush=True)
-    os.kill(os.getpid(), signal.SIGTERM)
-
-
-if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
-    signal.signal(signal.SIGTERM, _leave)
-    signal.signal(signal.SIGUSR2, signal.SIG_IGN)  # Slurm's notice of the time limit, which submitit handles
-    threading.Thread(target=_end_with, args=(int(sys.argv[2]),), daemon=True).start()
-    raise SystemExit(bool(Work(**json.loads(sys.argv[1])).run()))

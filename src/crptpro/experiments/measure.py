@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import shlex
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -37,6 +38,8 @@ PROTOTYPE_METRICS = {
     "prototype_dispersion": "intr",
 }  # fmt: skip
 """Names in the training's record to columns of ``prototypes.csv``."""
+StageOf = Callable[[Sequence[str]], type]
+"""Returns the dataclass of the stage that a command line names."""
 WINDOWS = 5
 """Parts of a timing; their median is robust against one hiccup of the machine."""
 RANDOM_AGENT_STEPS = 24
@@ -227,6 +230,7 @@ def embeddings(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
 
 
 def timing(
+    stage_of: StageOf,
     *,
     out: Path,
     training: UseAppendAction[tuple[str, ...]] = (),
@@ -245,8 +249,8 @@ def timing(
     torch.set_num_threads(threads)
     rows = []
     for command, paper_command in zip(training, paper_training, strict=True):
-        here = _Timed(command, out / "timed", device)
-        paper = _Timed(paper_command, out / "timed", device)
+        here = _Timed(stage_of, command, out / "timed", device)
+        paper = _Timed(stage_of, paper_command, out / "timed", device)
         timed, seconds, each = here.time(updates)
         paper_each = each if command == paper_command else math.nan
         if command != paper_command and paper_updates:
@@ -273,12 +277,10 @@ def timing(
 class _Timed:
     """A training's command, read as the command line does, with the plan of an exploring method."""
 
-    def __init__(self, text: str, out: Path, device: str) -> None:
-        from crptpro.cli import pretrain_command
-
+    def __init__(self, stage_of: StageOf, text: str, out: Path, device: str) -> None:
         words = shlex.split(text)
         arguments = [*words[1:], "--out", str(out), "--device", device]
-        self.stage: Any = tyro.cli(pretrain_command(words), args=arguments)
+        self.stage: Any = tyro.cli(stage_of(words), args=arguments)
         method = get_method(self.stage.method)
         config: Any = self.stage.config
         self.plan = plan_exploration(method, self.stage.sources, config) if method.exploration else None
@@ -311,7 +313,8 @@ class _Timed:
         return WINDOWS * window, float(times[-1] - times[0]), each
 
 
-def main(arguments: Sequence[str]) -> None:
-    """Run ``crptpro measure``."""
-    commands = {each.__name__: each for each in (prototypes, coverage, embeddings, timing)}
+def main(arguments: Sequence[str], stage_of: StageOf) -> None:
+    """Run ``crptpro measure``; ``stage_of`` returns the class that the command line reads a training with."""
+    commands: dict[str, Any] = {each.__name__: each for each in (prototypes, coverage, embeddings)}
+    commands["timing"] = partial(timing, stage_of)
     tyro.extras.subcommand_cli_from_dict(commands, prog="crptpro measure", args=arguments)
