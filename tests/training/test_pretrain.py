@@ -13,8 +13,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import LossModule
-from worlds import make_dataset, make_datasets, make_encoder, make_loss, record, same_state
+from toy_world import random_episode, write_dataset
+from worlds import SIZE, make_dataset, make_datasets, make_encoder, make_loss, record, same_state
 
+from crptpro.data import FrameDataset
 from crptpro.errors import CheckpointError, DatasetError, NonFiniteError
 from crptpro.objectives import ATCLoss, SimCLRLoss, get_method
 from crptpro.pretrained import load_pretrained, save_pretrained
@@ -241,6 +243,13 @@ def test_what_is_no_dataset_or_lacks_an_entry_is_refused(tmp_path: Path) -> None
         run(make_loss(), 2, datasets={"x": buffer})
     with pytest.raises(DatasetError, match=r"shows 'pixels' as \(3, 16, 16\); the encoder takes.*samples stacks"):
         run(make_loss(channels=9), 2)
+
+
+def test_the_stacks_that_an_open_dataset_samples_must_fit_the_encoder_whatever_its_card_says(tmp_path: Path) -> None:
+    single = FrameDataset.open(write_dataset(tmp_path, [random_episode(20, size=SIZE)]), frame_stack=1)
+    assert run(make_loss(channels=3), 2, datasets=single).updates == 2
+    with pytest.raises(DatasetError, match=r"shows 'pixels' as \(3, 16, 16\); the encoder takes \(9, 16, 16\)"):
+        run(make_loss(channels=9), 2, datasets=single)
 
 
 @pytest.mark.parametrize(
