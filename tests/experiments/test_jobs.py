@@ -118,7 +118,7 @@ def test_a_later_request_adds_cells_and_replaces_those_of_the_same_place(tmp_pat
 def test_a_damaged_record_is_named(tmp_path: Path) -> None:
     path = tmp_path / "experiments" / "seen-tiny.json"
     write_json(path, {"experiment": "seen", "scale": "tiny", "cells": [{"label": "a"}]})
-    with pytest.raises(RecordError, match=r"seen-tiny\.json does not say what was asked for"):
+    with pytest.raises(RecordError, match=r"seen-tiny\.json does not say what was requested"):
         load_results(tmp_path)
     write_json(tmp_path / "jobs" / "run-a" / "job.json", {"kind": "run"})
     with pytest.raises(RecordError, match=r"job\.json does not describe a job: it has no 'command'"):

@@ -58,12 +58,12 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Report:
 
 
 def test_every_experiment_is_counted_and_every_job(seen: Report) -> None:
-    counts = seen.table("Experiments: numbers that were asked for").set_index("experiment")
+    counts = seen.table("Experiments: requested and finished numbers").set_index("experiment")
     assert list(counts["finished"].items()) == [
         ("seen", "22"), ("efficiency", "24"), ("prototypes", "7"), ("coverage", "1"), ("stability", "4"),
         ("visualize", "1"), ("probe", "90"),
     ]  # fmt: skip
-    assert (counts["finished"] == counts["asked for"]).all()
+    assert (counts["finished"] == counts["requested"]).all()
     assert "22 of 22 run" in seen.text
     assert "24.9 h of work in all" in seen.text
     assert len(seen.table("probe: 90 jobs")) == 90
@@ -78,7 +78,7 @@ def test_budgets_are_shown_beside_the_papers(seen: Report) -> None:
         "downstream learning rate": "0.001", "downstream replay": "12,000", "render quality": "exact",
         "downstream runs per encoder": "2",
     }  # fmt: skip
-    assert "What this cannot show" in seen.text
+    assert "This scale does not show" in seen.text
 
 
 def test_returns_are_shown_beside_the_papers_without_intervals_of_two_runs(seen: Report) -> None:
@@ -104,14 +104,14 @@ def test_returns_are_shown_beside_the_papers_without_intervals_of_two_runs(seen:
 
 
 def test_the_cost_of_jobs_is_shown_with_the_machine(seen: Report) -> None:
-    took = seen.table("What jobs took").set_index(["kind", "of", "machine"])
+    took = seen.table("Mean cost of jobs").set_index(["kind", "of", "machine"])
     assert took.loc[("explored", "becl", "2")].tolist() == ["1", "2,997", "40,002", "2.6 h"]
     assert took.loc[("encoder", "atc", "1"), ["updates", "wall clock"]].tolist() == ["3,000", "20 min"]
     assert took.loc[("dataset", "walker", "1"), ["env_steps", "wall clock"]].tolist() == ["40,000", "10 min"]
     assert took.loc[("run", "drq", "1"), ["jobs", "wall clock"]].tolist() == ["2", "85 min"]
     machines = seen.table("Machines").set_index("machine")["where"].to_dict()
     assert machines["2"] == "Intel(R) Xeon(R) Processor, 2 cores, 24 GiB, no GPU, 1 thread"
-    assert "Times compare only within one machine" in seen.text
+    assert "Compare times within one machine only" in seen.text
 
 
 def test_hours_of_the_papers_budget_include_collecting(seen: Report) -> None:
@@ -252,12 +252,12 @@ def test_a_partial_reproduction_says_what_is_missing(made: Reproduction) -> None
     made.ask("seen", cells)
     made.ask("unseen", [("atc", "run-other", {"group": "A", "task": "finger_spin", "encoder_seed": 0})])
     report = made.report()
-    assert "1 of 3 numbers are there." in report.text
-    assert "Missing: crptpro 1, atc 1. Nothing stands in for what is missing." in report.text
-    assert report.table("The 2 that are missing")["job"].tolist() == ["run-begun", "run-none"]
+    assert "1 of 3 numbers are finished." in report.text
+    assert "Missing: crptpro 1, atc 1. Missing numbers are left out, not replaced." in report.text
+    assert report.table("The 2 missing numbers")["job"].tolist() == ["run-begun", "run-none"]
     states = report.table("run: 2 jobs").set_index("job")["state"]
     assert states.tolist() == ["begun", "finished"]
-    assert "Nothing is finished yet: 1 number asked for." in report.text
+    assert "Nothing is finished yet: 1 number requested." in report.text
     final = report.cell("Episode return at the final", "crptpro", "A walker_run")
     assert final == "500 (n = 1) · paper 513 ± 33"
 
@@ -266,7 +266,7 @@ def test_methods_are_compared_on_the_tasks_that_all_have(made: Reproduction) -> 
     cells = made.runs("crptpro", "walker_run", [500.0, 510.0]) + made.runs("crptpro", "cheetah_run", [600.0])
     made.ask("seen", [*cells, *made.runs("atc", "walker_run", [200.0])])
     report = made.report()
-    assert "Left out of what compares methods: A cheetah_run (no run of atc)." in report.text
+    assert "Left out of the comparison of methods: A cheetah_run (no run of atc)." in report.text
     assert report.cell("Over the 1 task", "mean score", "crptpro").startswith("505")
 
 
@@ -311,7 +311,7 @@ def test_hostile_names_break_neither_page(made: Reproduction) -> None:
     assert HOSTILE.replace("\n", "") in html.unescape(report.html).replace("\n", "")
     assert "<script" not in report.text
     assert "[x](javascript" not in report.text
-    assert report.cell("Experiments: numbers", "finished").startswith("1")
+    assert report.cell("Experiments: requested", "finished").startswith("1")
     assert len(list((report.folder / "figures").iterdir())) == 1
 
 

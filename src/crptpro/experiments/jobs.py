@@ -266,7 +266,7 @@ def load_results(root: str | Path) -> Results:
                 done = rows.get(cell["job"], {}).get("done", False)
                 cells.append({**about, "label": cell["label"], "job": cell["job"], "done": done} | cell["place"])
         except (KeyError, TypeError) as reason:
-            raise RecordError(f"{path} does not say what was asked for ({reason!r}); remove it.") from None
+            raise RecordError(f"{path} does not say what was requested ({reason!r}); remove it.") from None
     columns = None if cells else ["experiment", "scale", "label", "job", "done"]
     table = pd.DataFrame(cells, columns=columns, dtype=object).astype({"done": bool})
     jobs = pd.DataFrame.from_dict(rows, orient="index", columns=[*DESCRIBED, *MADE, "path", "done", "machine"])

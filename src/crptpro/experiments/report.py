@@ -276,8 +276,8 @@ def _contents(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     page.section("What is here", "contents")
     numbers = cells.groupby(["experiment", "scale"], sort=False)["done"].agg(["size", "sum"])
     page.table(
-        "Experiments: numbers that were asked for, and those that are there.",
-        numbers.set_axis(["asked for", "finished"], axis=1).reset_index(),
+        "Experiments: requested and finished numbers.",
+        numbers.set_axis(["requested", "finished"], axis=1).reset_index(),
     )
     counts = jobs.groupby("kind")["done"].agg(["sum", "size"])
     finished = ", ".join(f"{done} of {count} {kind}" for kind, done, count in counts.itertuples())
@@ -320,10 +320,10 @@ def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
         table["the paper's"] = [paper.get(name, "not printed, at least 6 evaluations") for name in table.index]
         page.table("Budgets beside the paper's.", table.reset_index(names="budget"))
         page.text(
-            "What this cannot show: which method is ahead after all of the budget, for methods that learn late look "
-            "worse here than they are; what an encoder learns after the plateau near ln M, which lasts for over a "
-            "thousand updates at batch 512; the method itself, where a smaller batch, replay or dataset changes it. "
-            f"With fewer than {stats.MIN_RUNS} runs on a task there are no intervals, and two or three rank nothing.",
+            "This scale does not show which method is ahead after the full budget: methods that learn late look worse "
+            "here. It does not show what an encoder learns after the plateau near ln M, which lasts for over a "
+            "thousand updates at batch 512, nor the method itself where a smaller batch, replay or dataset changes it. "
+            f"Fewer than {stats.MIN_RUNS} runs on a task give no interval, and two or three runs rank nothing.",
             "warning",
         )
 
@@ -350,7 +350,7 @@ def _provenance(page: Page, jobs: pd.DataFrame) -> None:
     costs["wall clock"] = groups["seconds"].mean().map(duration)
     costs.insert(0, "jobs", groups.size())
     page.table(
-        "What jobs took, means. Times compare only within one machine, and jobs that shared one slowed each other.",
+        "Mean cost of jobs. Compare times within one machine only; jobs that shared a machine slowed each other down.",
         costs.reset_index(),
     )
     sets = done["versions"].dropna().map(lambda versions: tuple(sorted(versions.items()))).value_counts()
@@ -379,15 +379,15 @@ def _experiment(page: Page, experiment: str, scale: str, cells: pd.DataFrame, jo
         page.text(known.summary)
     missing = cells[~cells["done"]]
     if len(missing) == len(cells):
-        page.text(f"Nothing is finished yet: {_count(len(cells), 'number')} asked for.", "warning")
+        page.text(f"Nothing is finished yet: {_count(len(cells), 'number')} requested.", "warning")
         return
-    page.text(f"{len(cells) - len(missing)} of {len(cells)} numbers are there.")
+    page.text(f"{len(cells) - len(missing)} of {len(cells)} numbers are finished.")
     if len(missing):
         counts = missing["label"].value_counts(sort=False)
         names = ", ".join(f"{label} {count}" for label, count in counts.items())
-        page.text(f"Missing: {names}. Nothing stands in for what is missing.", "warning")
+        page.text(f"Missing: {names}. Missing numbers are left out, not replaced.", "warning")
         places = missing.drop(columns=["experiment", "scale", "done"])
-        page.table(f"The {len(missing)} that are missing", places, fold=True)
+        page.table(f"The {len(missing)} missing numbers", places, fold=True)
     _measurements(page, name, cells, jobs)
     _efficiency(page, name, cells, jobs)
     _scores(page, name, cells, jobs)
@@ -403,9 +403,9 @@ def _scores(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> N
     last = evaluations.groupby(["group", "label", "run"], sort=False)["env_steps"].idxmax()
     runs = evaluations.loc[last].assign(expert=lambda own: own["task_name"].map(published.EXPERT_SCORES))
     page.text(
-        f"Runs of {_or(runs['env_steps'])} env steps here. n is the number of runs that a number stands on; “paper” is "
-        f"what it printed, after {published.ENV_STEPS:,} env steps (DrQ: {published.DRQ_ENV_STEPS:,}): scores of a "
-        "smaller budget do not compare with it.",
+        f"Runs of {_or(runs['env_steps'])} env steps. n is the number of runs behind a score. “paper” is the printed "
+        f"score after {published.ENV_STEPS:,} env steps (DrQ: {published.DRQ_ENV_STEPS:,}), which is not comparable "
+        "with that of a smaller budget.",
         "note",
     )
     for varied, part in runs.groupby("varied", sort=False):
@@ -472,7 +472,7 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
     labels = in_order(runs["label"])
     has_run = runs.groupby(["task", "label"], sort=False).size().unstack().notna()[labels]
     for task, row in has_run[~has_run.all(axis=1)].iterrows():
-        page.text(f"Left out of what compares methods: {task} (no run of {', '.join(row.index[~row])}).", "note")
+        page.text(f"Left out of the comparison of methods: {task} (no run of {', '.join(row.index[~row])}).", "note")
     shared = has_run.index[has_run.all(axis=1)]
     if shared.empty:
         page.text("There is no task on which every method has a run: nothing to aggregate.", "note")
@@ -495,9 +495,9 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
             line["mean / DrQ here"] = "1" if label == "drq" else f"{stats.estimate(stats.relative_mean, own, drq):.3f}"
         rows.append(line)
     page.table(
-        f"Over the {_count(len(shared), 'task')} that all methods share. A task counts once per group and colours, a "
-        "run of several once. Normalised scores are divided by the paper's DrQ; “paper” is what it printed for all of "
-        "its tasks, or what its cells for these give.",
+        f"Over the {_count(len(shared), 'task')} that all methods share. A task counts once per group and colours; a "
+        "run of several tasks counts once. Normalised scores are divided by the paper's DrQ. “paper” is its printed "
+        "mean over all of its tasks, or the mean of its cells for these tasks.",
         rows,
     )
     fewest = kept.groupby(["label", "task"]).size().groupby("label").min()
@@ -505,14 +505,15 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
         held = "; ".join(f"{count}: {share:.0%}" for count, share in stats.COVERAGE.items())
         page.text(
             f"Brackets are {stats.CONFIDENCE:.0%} intervals ({stats.REPLICATES:,} stratified bootstrap replicates that "
-            "redraw encoders and then their runs). On one encoder they speak of that encoder, not of its method. Where "
-            f"runs follow a normal law, those of a single task's mean hold the truth, by number of runs, {held}.",
+            "redraw encoders and then their runs). With one encoder they describe that encoder, not its method. For "
+            "normally distributed runs of one task, they cover the true mean with this frequency by number of runs: "
+            f"{held}.",
             "warning",
         )
     if fewest.min() < stats.MIN_RUNS:
         page.text(
-            f"Intervals stand where a method has {stats.MIN_RUNS} runs or more on every task; here some have as few as "
-            f"{fewest.min()}. The standard deviations above say how far runs lie apart.",
+            f"A method has intervals from {stats.MIN_RUNS} runs on every task; here some have as few as "
+            f"{fewest.min()}. The standard deviations above show the spread of runs.",
             "warning",
         )
     if missing := sorted(kept.loc[kept["expert"].isna(), "task_name"].unique()):
@@ -628,10 +629,10 @@ def _efficiency(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) 
             line["hours, paper's budget"] += f"\npaper {hours:g}"
         table.append({**line, "machine": ", ".join(sorted(set(jobs.loc[own["job"], "machine"]) - {""}))})
     page.table(
-        "Pre-training by number of domains: some updates timed here (n timings), projected to whole budgets; the "
-        "paper's hours are those of an NVIDIA Tesla P100. Times compare only within one machine. Hours include the "
-        "environments of methods that explore. Random data is collected once for all methods that learn from it: its "
-        "hours are those of this scale, and for the paper's budget in proportion to its transitions.",
+        "Pre-training by number of domains: projected from some timed updates (n timings) to whole budgets; the "
+        "paper's hours are those of an NVIDIA Tesla P100. Compare times within one machine only. Hours of active "
+        "methods include their environments. Random data is collected once for all methods that use it: its hours are "
+        "those of this scale, and for the paper's budget in proportion to its transitions.",
         table,
     )
 
@@ -679,7 +680,7 @@ def _prototypes(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -
         table.append(line)
     page.table(
         "Spread of the prototypes at the end of pre-training, in units of 1e-4, mean over encoders; lower is wider. "
-        "The paper's KNE has an unpublished k: it stands beside k = 3, and is not the same quantity.",
+        "The k of the paper's KNE is unpublished: its values are shown beside k = 3, which is another quantity.",
         table,
     )
     points = rows.rename(columns={"updates": "x", "job": "line", **SPREAD})
@@ -700,13 +701,13 @@ def _coverage(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> 
     for column, form in formats.items():
         ends[column] = ends[column].map(form.format)
     page.table(
-        "Coverage at the end: particle estimate over observations sampled from the last window of the training, which "
-        "is cut into up to ten of equal length, and from as many decisions of the random policy; mean over n runs; "
-        "higher is wider. Env steps are the explorer's in all domains.",
+        "Coverage at the end: particle estimate over observations from the last of up to ten equal windows of the "
+        "training, and from as many decisions of the random policy; mean over n runs; higher is wider. Env steps are "
+        "the explorer's in all domains.",
         ends.rename(columns={"label": "data"}),
     )
     points = rows.rename(columns={"domain": "panel", "job": "line", "env_steps": "x", "coverage": "y"})
-    caption = "Coverage along pre-training, a line per run; other numbers of samples do not compare."
+    caption = "Coverage along pre-training, a line per run; compare equal numbers of samples only."
     figure = draw(points, "env steps of the explorer, all domains", "particle estimate")
     page.figure(f"{name}-curves", caption, figure)
 
@@ -790,11 +791,11 @@ MEASURES = {
 def _probes(page: Page, rows: pd.DataFrame) -> None:
     """Show a table per measure and embedding, with a column per domain and colours."""
     page.text(
-        f"R2 is that of held-out episodes: {_or(rows['samples'])} observations per probe, "
-        f"{_or(rows['held_out_episodes'])} episodes of them held out. A mean over coordinates counts a negative one as "
-        "0. Episodes are held out from the regression: an encoder that learned from a domain's random data may have "
-        "seen these very observations, without their states; one that explored or is untrained has not, and of unseen "
-        "domains none has.",
+        f"R2 is computed on held-out episodes: {_or(rows['samples'])} observations per probe, "
+        f"{_or(rows['held_out_episodes'])} episodes held out. A mean over coordinates counts a negative R2 as 0. "
+        "Episodes are held out from the regression only: an encoder trained on a domain's random data may have seen "
+        "these observations, without their states. Active and untrained encoders have not, and no encoder has seen "
+        "those of unseen domains.",
         "note",
     )
     means = rows[rows["coordinate"].isna()].dropna(subset="value")
