@@ -7,7 +7,9 @@ import functools
 import hashlib
 import importlib.util
 import shutil
+import subprocess
 import sys
+import textwrap
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -220,6 +222,36 @@ def test_the_method_is_written_with_torchrls_idioms_in_sixty_lines() -> None:
     assert len(text.splitlines()) <= 60
     sac = load("plain_torchrl").main(TASK, transitions=100, updates=2, batch_size=8, agent_steps=12)
     assert all(torch.isfinite(parameter).all() for parameter in sac.parameters())
+
+
+@pytest.mark.gl
+@pytest.mark.slow
+def test_the_pieces_of_the_quickstart_run_in_the_cells_of_a_notebook(tmp_path: Path) -> None:
+    imports, _ = (RECIPES / "quickstart.py").read_text().split("\nlogger = ")
+    pieces = f"""
+        out = Path({str(tmp_path)!r})
+        datasets = collect_group([{TASK!r}], out / "data", transitions=12, workers=2)
+        loss = ProtoLoss(PixelEncoder(channels=(4,), strides=(2,)), num_prototypes=16)
+        result = pretrain(loss, datasets, run_dir=out / "pretrain", updates=2, batch_size=4)
+        encoder = save_pretrained(result, out / "encoder")
+        config = DownstreamConfig(env_steps=50, batch_size=4, replay_capacity=60, random_agent_steps=12, hidden_dim=16,
+                                  eval_interval_env_steps=50, eval_episodes=2, eval_workers=1)
+        run = train_downstream({TASK!r}, encoder, run_dir=out / "crptpro", config=config)
+        print(len(run.evaluations), "episodes evaluated")
+    """
+    # As a notebook's kernel does: cells in `__main__`, which no file holds, inside a running event loop.
+    kernel = """
+        import asyncio, sys
+        async def run_cells():
+            for number, cell in enumerate(sys.argv[1:], 1):
+                exec(compile(cell, f"<cell {number}>", "exec"), vars(sys.modules["__main__"]))
+        asyncio.run(run_cells())
+    """
+    command = [sys.executable, "-c", textwrap.dedent(kernel), imports, textwrap.dedent(pieces)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert "in this process" not in ended.stderr  # the worker processes could be used
+    assert ended.stdout.endswith("4 episodes evaluated\n")
 
 
 @pytest.mark.parametrize(
