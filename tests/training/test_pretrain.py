@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import signal
 from pathlib import Path
@@ -159,7 +160,7 @@ def test_a_run_of_other_settings_is_refused_by_name(tmp_path: Path, changed: dic
 
 def test_the_learning_rate_rises_and_falls_as_the_method_says() -> None:
     options = {"learning_rate": 1.0, "warmup_updates": 2, "encoder_tau": None, "updates": 6}
-    optimizer, schedule, _ = make_optimizer(make_loss(), get_method("atc"), **options)
+    optimizer, schedule, _ = make_optimizer(make_loss(), dataclasses.replace(get_method("atc"), **options))
     rates = []
     for _ in range(6):
         rates += schedule.get_last_lr()

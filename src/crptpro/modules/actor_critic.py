@@ -1,7 +1,6 @@
 """Actors and critics: the "RAD-SAC" agent of CRPTpro and Proto-RL, DrQ's critic of images, BeCL's skill policy.
 
 Each is a trunk from ``feature_dim`` to ``bottleneck_dim``, and perceptrons with two hidden layers of ``hidden_dim``.
-Each keeps its arguments in ``config``. A size that is not a positive whole number is a ``ValueError``.
 """
 
 from __future__ import annotations
@@ -17,8 +16,6 @@ from crptpro.modules.heads import LinearNetwork
 from crptpro.modules.precision import linear_in
 from crptpro.values import as_float
 
-BOUND_MARGIN = 1e-6
-
 
 class FeatureTrunk(nn.Module):
     """Linear layer and LayerNorm from long features to a bottleneck; DrQ and URLB's DDPG end with a tanh."""
@@ -31,7 +28,6 @@ class FeatureTrunk(nn.Module):
         self.compute_dtype = torch.float32
 
     def forward(self, features: Tensor) -> Tensor:
-        """Map ``[*, feature_dim]``, any floating dtype, to ``[*, bottleneck_dim]`` in the weights' dtype."""
         bottleneck = self.norm(linear_in(features, self.linear, self.compute_dtype))
         return torch.tanh(bottleneck) if self.has_tanh else bottleneck
 
@@ -47,7 +43,6 @@ class MLP(nn.Module):
         self.compute_dtype = torch.float32
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Map ``[*, in_dim]`` to ``[*, out_dim]``."""
         hidden = F.relu(self.first(inputs))
         return self.last(F.relu(linear_in(hidden, self.middle, self.compute_dtype)))
 
@@ -73,11 +68,10 @@ class SquashedGaussianActor(LinearNetwork):
             feature_dim=feature_dim, action_dim=action_dim, bottleneck_dim=bottleneck_dim, hidden_dim=hidden_dim
         )
         feature_dim, self.action_dim, bottleneck_dim, hidden_dim = self.config.values()
-        low, high = (as_float(bound, "log_std_bounds") for bound in log_std_bounds)
+        self.log_std_bounds = low, high = [as_float(bound, "log_std_bounds") for bound in log_std_bounds]
         if not low < high:
             raise ValueError(f"log_std_bounds must be (low, high) with low < high, got {log_std_bounds}.")
-        self.config |= {"log_std_bounds": [low, high], "has_tanh": bool(has_tanh)}
-        self.log_std_bounds = (low, high)
+        self.config |= {"log_std_bounds": self.log_std_bounds, "has_tanh": bool(has_tanh)}
         self.trunk = FeatureTrunk(feature_dim, bottleneck_dim, has_tanh=has_tanh)
         self.mlp = MLP(bottleneck_dim, hidden_dim, 2 * self.action_dim)
         self.reset_parameters()
@@ -133,7 +127,7 @@ class TwinCritic(LinearNetwork):
 
 
 class PixelCritic(nn.Module):
-    """Twin Q-functions of pixels."""
+    """Twin Q-functions ``[*, 2]`` of images ``[*, C, H, W]`` and actions ``[*, A]`` in [-1, 1]."""
 
     def __init__(self, encoder: PixelEncoder, head: TwinCritic) -> None:
         super().__init__()
@@ -145,14 +139,13 @@ class PixelCritic(nn.Module):
         self.encoder, self.head = encoder, head
 
     def forward(self, pixels: Tensor, action: Tensor) -> Tensor:
-        """Return both action values ``[*, 2]`` of images ``[*, C, H, W]`` and actions ``[*, A]`` in [-1, 1]."""
         return self.head(self.encoder(pixels), action)
 
 
 class DeterministicActor(LinearNetwork):
-    r"""Policy :math:`a = \tanh(f([h, z]))` on features h and a one-hot skill z, plus Gaussian noise: BeCL's explorer.
+    r"""Policy :math:`a = \tanh(f([h, z]))` on features h and a one-hot skill z of length K, plus Gaussian noise.
 
-    ``skill_dim`` is the number of skills K. Source: rll-research/url_benchmark ``agent/ddpg.py``.
+    BeCL's explorer; source: rll-research/url_benchmark ``agent/ddpg.py``.
     """
 
     def __init__(
@@ -192,8 +185,7 @@ class DeterministicActor(LinearNetwork):
         if noise_clip is not None:
             noise = noise.clamp(-noise_clip, noise_clip)
         action = mean + noise
-        # Straight-through gradient.
-        return action + (action.clamp(-1 + BOUND_MARGIN, 1 - BOUND_MARGIN) - action).detach()
+        return action + (action.clamp(-1 + 1e-6, 1 - 1e-6) - action).detach()
 
 
 def squashed_gaussian(loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:

@@ -19,14 +19,11 @@ from torch.autograd.function import once_differentiable
 
 ChunkFunction = Callable[[Tensor, Sequence[Tensor]], Tensor]
 
-START_TIMEOUT_S = 60.0
-
 
 def apply_to_chunks(function: ChunkFunction, chunks: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
-    """Return ``torch.cat([function(chunk, parameters) for chunk in chunks])``, computed in parallel.
+    """Return ``torch.cat([function(chunk, parameters) for chunk in chunks])``, synchronising the cores only once.
 
-    PyTorch synchronises the cores after every operation, this function once per batch. The gradient of a parameter is
-    the sum over the chunks in order, whatever the number of threads. Chunks get no gradient.
+    The gradient of a parameter is the sum over the chunks in order, whatever the number of threads. Chunks get none.
     """
     if torch.is_grad_enabled() and any(parameter.requires_grad for parameter in parameters):
         return _Chunks.apply(function, chunks, *parameters)
@@ -85,7 +82,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     together = threading.Barrier(threads)
 
     def compute_alone(_: int) -> None:
-        together.wait(START_TIMEOUT_S)  # every thread of the pool must get one of these calls
+        together.wait(60.0)  # every thread of the pool must get one of these calls
         torch.get_num_threads()  # a thread's first call sets its number to the process's
         torch.set_num_threads(1)
 

@@ -26,15 +26,13 @@ class PixelEncoder(nn.Module):
     84x84 -> 41 -> 39 -> 37 -> 35 with 32 channels gives 39,200 features. Weights are orthogonal on the flattened kernel
     (gain sqrt 2, not delta-orthogonal), biases zero, as in liuxin0824/CRPTpro and denisyarats/proto ``proto.py``.
 
-    The input is ``pixels * pixel_scale - pixel_offset``. In bfloat16 it is the raw 0..255 values, which bfloat16 holds
-    exactly, and the first kernel is scaled instead. Parameters and gradients stay float32.
+    The input is ``pixels * pixel_scale - pixel_offset``, and ``pixel_offset`` is 0.5 in URLB-style methods. In bfloat16
+    it is the raw 0..255 values, which are exact there, and the first kernel is scaled instead. Parameters and gradients
+    stay float32. Images are uint8, or floating in [0, 1], which count as already divided by 255 (one warning per
+    encoder); others are a ``ValueError``.
 
-    Images are uint8, or floating in [0, 1], which count as already divided by 255 (one warning per encoder). Other
-    images are a ``ValueError``.
-
-    ``in_channels`` are the colour channels times the stacked frames; ``pixel_offset`` is 0.5 in URLB-style methods;
-    ``init="kaiming"`` (normal, fan-in, for ReLU) is that of ATC's encoder; ``standardised`` creates the buffers of
-    :meth:`standardise` (0 and 1), to load weights into.
+    ``in_channels`` are the colour channels times the stacked frames; ``init="kaiming"`` (normal, fan-in, for ReLU) is
+    that of ATC's encoder; ``standardised`` creates the buffers of :meth:`standardise` (0 and 1), to load weights into.
 
     Attributes:
         feature_dim: length of the output, the flattened ``feature_map_shape`` (C, H, W).
@@ -92,7 +90,6 @@ class PixelEncoder(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Initialise the kernels (orthogonal ones with gain sqrt 2) and zero the biases."""
         for conv in self.convs:
             init_weights_(conv, self.config["init"], gain=math.sqrt(2.0))
 
@@ -142,10 +139,7 @@ class PixelEncoder(nn.Module):
         if pixels.dtype == torch.uint8:
             return
         if not pixels.is_floating_point():
-            raise ValueError(
-                f"Pixels must be uint8, or floating in [0, 1]; got {pixels.dtype}. Values in 0..255 need "
-                ".to(torch.uint8)."
-            )
+            raise ValueError(f"Pixels must be uint8, or floating in [0, 1], got {pixels.dtype}; use .to(torch.uint8).")
         if torch.compiler.is_compiling() or not pixels.numel():
             return
         low, high = (float(bound) for bound in torch.aminmax(pixels.detach()))

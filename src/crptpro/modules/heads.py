@@ -16,15 +16,10 @@ from crptpro.values import as_int
 
 WeightInit = Literal["orthogonal", "kaiming"]
 
-NORM_EPS = 1e-12
-
 
 @torch.no_grad()
 def init_weights_(layer: nn.Linear | nn.Conv2d, init: WeightInit = "orthogonal", gain: float = 1.0) -> None:
-    """Initialise a layer in place, with zero bias.
-
-    ``"orthogonal"`` acts on the flattened kernel, times ``gain``; ``"kaiming"`` is normal with variance 2 / fan-in.
-    """
+    """Set an orthogonal flattened kernel, times ``gain``, or a normal one of variance 2 / fan-in; and zero bias."""
     if init not in get_args(WeightInit):
         raise ValueError(f"init must be one of {', '.join(get_args(WeightInit))}, got {init!r}.")
     if init == "kaiming":
@@ -51,7 +46,6 @@ class LinearNetwork(nn.Module):
         self.config = dict(plain_sizes(**sizes))
 
     def reset_parameters(self) -> None:
-        """Initialise all weights again."""
         for layer in self.modules():
             if isinstance(layer, nn.Linear):
                 init_weights_(layer, self.init)
@@ -62,8 +56,8 @@ class LinearNetwork(nn.Module):
 class Projector(LinearNetwork):
     r"""One linear layer from features to latents of length D, :math:`g_\theta` (denisyarats/proto ``proto.py``).
 
-    The product runs in ``compute_dtype``; the result has the parameters' dtype, so normalisation, softmax and Sinkhorn
-    stay float32. ATC uses ``init="kaiming"`` (normal, fan-in, for ReLU).
+    The product runs in ``compute_dtype``; the result has the parameters' dtype. ATC uses ``init="kaiming"`` (normal,
+    fan-in, for ReLU).
     """
 
     def __init__(self, feature_dim: int = 39_200, latent_dim: int = 128, init: WeightInit = "orthogonal") -> None:
@@ -79,7 +73,7 @@ class Projector(LinearNetwork):
 
 
 class Predictor(LinearNetwork):
-    r"""Perceptron in the latent space, online branch only: :math:`v_\psi` (denisyarats/proto ``proto.py``)."""
+    r"""Perceptron in the latent space ``[*, D]``, online only: :math:`v_\psi` (denisyarats/proto ``proto.py``)."""
 
     def __init__(self, latent_dim: int = 128, hidden_dim: int = 1024) -> None:
         super().__init__(latent_dim=latent_dim, hidden_dim=hidden_dim)
@@ -89,7 +83,6 @@ class Predictor(LinearNetwork):
         self.reset_parameters()
 
     def forward(self, latents: Tensor) -> Tensor:
-        """Map ``[*, D]`` to ``[*, D]``."""
         return self.output(F.relu(self.hidden(latents)))
 
 
@@ -97,7 +90,7 @@ class Prototypes(nn.Module):
     """M trainable vectors of length D, of which only the direction counts (the idea is SwaV's, arXiv 2006.09882).
 
     Orthogonal initialisation (a tight frame when M > D). :meth:`normalize_` before every update keeps the rows at unit
-    length, as in denisyarats/proto and liuxin0824/CRPTpro ``proto.py``; losses read :meth:`unit_weight`.
+    length, as in liuxin0824/CRPTpro ``proto.py``; losses read :meth:`unit_weight`.
     """
 
     def __init__(self, num_prototypes: int = 512, latent_dim: int = 128) -> None:
@@ -108,19 +101,18 @@ class Prototypes(nn.Module):
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
-        """Set an orthogonal matrix with rows scaled to unit length."""
         nn.init.orthogonal_(self.weight)
         self.normalize_()
 
     @torch.no_grad()
     def normalize_(self) -> Prototypes:
         """Scale every row to unit length in place, outside autograd. Returns self."""
-        self.weight.div_(self.weight.norm(dim=-1, keepdim=True).clamp_min(NORM_EPS))
+        self.weight.copy_(F.normalize(self.weight, dim=-1))
         return self
 
     def unit_weight(self) -> Tensor:
         """Return the rows at unit length ``[M, D]``; as in the released code, the length is a constant to autograd."""
-        return self.weight / self.weight.detach().norm(dim=-1, keepdim=True).clamp_min(NORM_EPS)
+        return self.weight / self.weight.detach().norm(dim=-1, keepdim=True).clamp_min(1e-12)
 
     def forward(self, latents: Tensor) -> Tensor:
         """Cosine scores ``[*, M]`` in [-1, 1] of l2-normalised latents ``[*, D]``."""
@@ -149,8 +141,7 @@ class AnchorHead(nn.Module):
 class SkillHead(LinearNetwork):
     """BeCL's head: embedding of the features, then projection (Rooshy-yang/BeCL ``agent/becl.py``, arXiv 2305.04477).
 
-    features -> hidden ReLU -> hidden ReLU -> D (embedding) -> hidden ReLU -> D (projection), D the number of skills in
-    the source. Only the product with the features runs in ``compute_dtype``.
+    D is the number of skills in the source. Only the product with the features runs in ``compute_dtype``.
     """
 
     def __init__(self, feature_dim: int = 39_200, latent_dim: int = 16, hidden_dim: int = 1024) -> None:
@@ -173,8 +164,7 @@ class SkillHead(LinearNetwork):
 
 def latent_dim_of(head: nn.Module) -> int | None:
     """Return the latent length D in the ``config`` of a head, or None."""
-    config = getattr(head, "config", None)
-    return config.get("latent_dim") if isinstance(config, dict) else None
+    return getattr(head, "config", {}).get("latent_dim")
 
 
 def require_one_latent_dim(**heads: nn.Module) -> None:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from crptpro.errors import CRPTproError
 
 Precision = Literal["auto", "fp32", "bf16"]
+PRECISION_NAMES = {torch.float32: "fp32", torch.bfloat16: "bf16"}
 CPUINFO = Path("/proc/cpuinfo")
 
 _Module = TypeVar("_Module", bound=nn.Module)
@@ -23,9 +24,8 @@ _Module = TypeVar("_Module", bound=nn.Module)
 def resolve_precision(precision: Precision, device: torch.device | str) -> torch.dtype:
     """Return the compute dtype of a precision for a device; an unknown name is a ``ValueError``.
 
-    ``"fp32"`` is the reference. ``"auto"`` is bf16 where the hardware is faster in it: CUDA of compute capability 8 or
-    newer, a CPU with AMX or AVX512-BF16. float32 on a CUDA device disables TF32 for the whole process, so that fp32
-    means the same on every device.
+    ``"auto"`` is bf16 where that is faster: CUDA of compute capability 8 or newer, a CPU with AMX or AVX512-BF16.
+    float32 on a CUDA device disables TF32 for the whole process, so that fp32 means the same on every device.
     """
     if precision not in ("auto", "fp32", "bf16"):
         raise ValueError(f"precision must be 'auto', 'fp32' or 'bf16', got {precision!r}.")
@@ -94,8 +94,7 @@ def linear_in(inputs: Tensor, layer: nn.Linear, compute_dtype: torch.dtype) -> T
 
 def device_of(module: nn.Module) -> torch.device | None:
     """Return the device of a network's first parameter or buffer, or None."""
-    first = next(chain(module.parameters(), module.buffers()), None)
-    return None if first is None else first.device
+    return next((tensor.device for tensor in chain(module.parameters(), module.buffers())), None)
 
 
 def usable_device(name: str | torch.device) -> torch.device:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
@@ -18,7 +19,7 @@ from crptpro.values import as_float
 class NetworkLoss(LossModule):
     """A loss whose networks hold its parameters, in a copy too; re-initialising them updates the targets.
 
-    A subclass converts its networks with ``convert_to_functional`` and lists the outputs of ``forward``.
+    A subclass converts its networks and lists the outputs of ``forward``.
     """
 
     default_out_keys: tuple[str, ...] = ()
@@ -27,6 +28,13 @@ class NetworkLoss(LossModule):
         super().__init__(*arguments, **options)
         self.out_keys = list(self.default_out_keys)
         self._set_in_keys()
+
+    def _convert(self, targets: Sequence[str] = (), **networks: nn.Module) -> None:
+        with warnings.catch_warnings():
+            # TorchRL wants annotations of names that are only made and read by name.
+            warnings.filterwarnings("ignore", "The name .* wasn't part of the annotations")
+            for name, network in networks.items():
+                self.convert_to_functional(network, name, create_target_params=name in targets)
 
     @property
     def network_names(self) -> list[str]:
@@ -55,10 +63,6 @@ class NetworkLoss(LossModule):
         params = getattr(self, f"target_{name}_params" if target else f"{name}_params")
         return params.to_module(getattr(self, name), preserve_module_state=False)
 
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        super()._forward_value_estimator_keys(**kwargs)
-        self._set_in_keys()
-
     def _set_in_keys(self) -> None:
         self._in_keys = [getattr(self.tensor_keys, field.name) for field in fields(self.tensor_keys)]
 
@@ -75,11 +79,7 @@ class PretrainingLoss(NetworkLoss):
     tensor_keys: Any
 
     encoder: nn.Module
-    encoder_params: Any
-    target_encoder_params: Any
     projector: nn.Module
-    projector_params: Any
-    target_projector_params: Any
 
     method_name: str | None = None  #: method of the table that built this loss, if any
 
@@ -87,10 +87,6 @@ class PretrainingLoss(NetworkLoss):
     def views(self) -> dict[NestedKey, NestedKey]:
         """Entries that training loops make by a second augmentation of another: ``{"pixels_view": "pixels"}``."""
         return {}
-
-    def _convert(self, targets: Sequence[str] = (), **networks: nn.Module) -> None:
-        for name, network in networks.items():
-            self.convert_to_functional(network, name, create_target_params=name in targets)
 
     def _register_coefficients(self, **values: float | None) -> None:
         # float64 scalars do not promote float32 tensors.
@@ -102,13 +98,8 @@ class PretrainingLoss(NetworkLoss):
         with self._holding(name, target=target):
             return getattr(self, name)(inputs)
 
-    def _latents(self, pixels: Tensor) -> Tensor:
-        return self._apply_network("projector", self._apply_network("encoder", pixels))
-
-    @torch.no_grad()
-    def _target_latents(self, pixels: Tensor) -> Tensor:
-        features = self._apply_network("encoder", pixels, target=True)
-        return self._apply_network("projector", features, target=True)
+    def _latents(self, pixels: Tensor, *, target: bool = False) -> Tensor:
+        return self._apply_network("projector", self._apply_network("encoder", pixels, target=target), target=target)
 
     def _read(self, tensordict: TensorDictBase, key: NestedKey, *, event_dims: int = 3) -> Tensor:
         """Return an entry with one batch dimension before its last ``event_dims``."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -42,14 +42,9 @@ class ATCLoss(ContrastiveLoss):
     .. math:: L = -\frac1B\sum_i \log\mathrm{softmax}_j\big(W(a_i + \mathrm{MLP}(a_i))\cdot p_j\big)_i .
 
     A loss of ln B (6.238 for a batch of 512) is chance. The source masks the ends of episodes; here ``("next",
-    "pixels")`` is the true successor also there. The default heads are ``Projector(encoder.feature_dim, latent_dim)``
-    with ATC's Kaiming-normal weights, and ``AnchorHead(latent_dim, hidden_dim)``; heads of different latent lengths are
-    a ``ValueError``.
+    "pixels")`` is the true successor also there. The default heads are a ``Projector`` with ATC's Kaiming-normal
+    weights and an ``AnchorHead``; heads of different latent lengths are a ``ValueError``.
     """
-
-    anchor_head: nn.Module
-    anchor_head_params: Any
-    target_anchor_head_params: Any
 
     def __init__(
         self,
@@ -71,7 +66,8 @@ class ATCLoss(ContrastiveLoss):
 
     def _contrast(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         anchors = self._latents(self._read(tensordict, self.tensor_keys.observation))
-        positives = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))
+        with torch.no_grad():
+            positives = self._latents(self._read(tensordict, self.tensor_keys.next_observation), target=True)
         queries = self._apply_network("anchor_head", anchors)
         with torch.autocast(queries.device.type, enabled=False):
             return info_nce(queries, positives.to(queries.dtype)), F.normalize(anchors.detach(), dim=-1)
@@ -86,7 +82,7 @@ class SimCLRLoss(ContrastiveLoss):
     .. math:: L = -\frac1{2B}\sum_i \log\frac{\exp(z_i\cdot z_{p(i)}/\tau)}{\sum_{j\ne i}\exp(z_i\cdot z_j/\tau)} .
 
     Deviation: APT has published no code for DeepMind Control; loss and temperature are those of the authors' code
-    for Atari, the head (``Projector(encoder.feature_dim, latent_dim)``) is that of the other methods here.
+    for Atari, the head (a ``Projector``) is that of the other methods here.
     """
 
     @dataclass
@@ -114,7 +110,6 @@ class SimCLRLoss(ContrastiveLoss):
 
     @property
     def views(self) -> dict[NestedKey, NestedKey]:
-        """The second view of the observation, by its key."""
         return {self.tensor_keys.observation_view: self.tensor_keys.observation}
 
     def _contrast(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -129,9 +124,8 @@ class BeCLLoss(ContrastiveLoss):
     r"""Behaviour contrastive learning (BeCL, arXiv 2305.04477; Rooshy-yang/BeCL ``agent/becl.py``).
 
     :func:`~crptpro.objectives.functional.becl_loss` of :math:`h(f_\theta(x'))`, where :math:`x'` is the next
-    observation (three agent steps ahead in the method's n-step batches) and the head h is ``projector``, by default
-    ``SkillHead(encoder.feature_dim, skill_dim, hidden_dim)``. All rows should come from one domain, where skills are
-    comparable. A batch of one has the loss 0.
+    observation (three agent steps ahead in the method's n-step batches) and the head h is ``projector``, by default a
+    ``SkillHead``. All rows should come from one domain, where skills are comparable. A batch of one has the loss 0.
     """
 
     @dataclass

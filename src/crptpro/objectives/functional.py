@@ -69,8 +69,8 @@ def prototype_dispersion(
 def knn_distances(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
     """Euclidean distances ``[N, k]`` of queries ``[N, D]`` to the k nearest of keys ``[K, D]``, ascending.
 
-    A matrix product finds the neighbours, but is inexact near zero. The k distances are recomputed from differences, so
-    that a key equal to the query is at exactly 0. Fewer keys than ``k`` are a ``ValueError``.
+    They are found by a matrix product, which is inexact near zero, and recomputed from differences, so that a key equal
+    to the query is at exactly 0. Fewer keys than ``k`` are a ``ValueError``.
     """
     if not 1 <= k <= keys.shape[0]:
         raise ValueError(f"k must be between 1 and the number of keys {keys.shape[0]}, got {k}.")
@@ -93,7 +93,7 @@ def particle_reward(
     scale: float | Tensor = 1.0,
     clip: float = 0.0,
 ) -> Tensor:
-    """Return :func:`particle_entropy` of features ``[N, D]``: of the distances to the k nearest of ``keys`` ``[K, D]``.
+    """Return :func:`particle_entropy` of the distances of features ``[N, D]`` to the k nearest of ``keys`` ``[K, D]``.
 
     The keys are by default the features; ``average=False`` uses the k-th distance alone.
     """
@@ -200,8 +200,7 @@ def prototype_ane(prototypes: Tensor) -> Tensor:
 def prototype_kne(prototypes: Tensor, *, k: int = 3) -> Tensor:
     """Mean over unit rows ``[M, D]`` of the cosine to the k-th nearest other one (the paper's KNE); k at most M - 1.
 
-    The paper does not state k. With k = 3, 512 spread vectors in 128 dimensions give about +0.2; its negative
-    values only fit a k near M / 2.
+    With k = 3, 512 spread vectors in 128 dimensions give about +0.2; the paper's negative values fit a k near M / 2.
     """
     count = prototypes.shape[0]
     if not 1 <= k < count:

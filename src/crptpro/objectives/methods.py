@@ -9,7 +9,7 @@ import difflib
 import functools
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from torch import nn
@@ -19,13 +19,7 @@ from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.modules import PixelEncoder
 from crptpro.objectives.contrastive import ATCLoss, BeCLLoss, SimCLRLoss
 from crptpro.objectives.proto import ProtoLoss
-from crptpro.values import as_float, as_int
-
-
-def _check_counts(row: Any, minima: Mapping[str, int]) -> None:
-    for name, minimum in minima.items():
-        if (value := getattr(row, name)) is not None:
-            object.__setattr__(row, name, as_int(value, name, minimum=minimum))
+from crptpro.values import check_numbers
 
 
 @dataclass(frozen=True)
@@ -35,8 +29,8 @@ class Exploration:
     Every interval counts the agent steps of one domain. A number out of its range is a ``ValueError``.
     """
 
-    #: The only reward of the exploration: ``"prototype"``, ``"particle"``, ``"skill-contrast"``, or a function of the
-    #: loss and a ``torch.Generator`` that returns a transform writing ``("next", "intrinsic_reward")``.
+    #: The agent's only reward: ``"prototype"``, ``"particle"``, ``"skill-contrast"``, or a function of the loss and a
+    #: ``torch.Generator`` that returns a transform writing ``("next", "intrinsic_reward")``.
     reward: str | Callable[..., Any] = "prototype"
     agent: str = "rad-sac"  #: or ``"averaged-sac"`` (DrQ's K = M = 2 on detached features), or ``"skill-ddpg"``
     env_steps: int = 200_000  #: over all domains, random phases included
@@ -53,8 +47,7 @@ class Exploration:
     random_agent_steps: int = 1_000  #: agent steps of uniformly random actions per domain, before its updates start
 
     def __post_init__(self) -> None:
-        counts = {setting.name: 1 for setting in fields(self) if setting.type == "int"}
-        _check_counts(self, counts | {"random_agent_steps": 0, "skill_dim": 2})
+        check_numbers(self, minima={"random_agent_steps": 0, "skill_dim": 2}, maxima={})
 
 
 @dataclass(frozen=True)
@@ -80,10 +73,7 @@ class Method:
     is_builtin: bool = False  #: part of the library
 
     def __post_init__(self) -> None:
-        _check_counts(self, {"updates": 0, "batch_size": 1, "warmup_updates": 0})
-        for name, maximum in {"learning_rate": None, "encoder_tau": 1, "grad_clip": None}.items():
-            if (value := getattr(self, name)) is not None:
-                object.__setattr__(self, name, as_float(value, name, minimum=0, maximum=maximum))
+        check_numbers(self, minima={"updates": 0, "warmup_updates": 0}, maxima={"encoder_tau": 1})
         if self.schedule not in ("constant", "warmup_cosine"):
             raise ValueError(f"`schedule` must be 'constant' or 'warmup_cosine', got {self.schedule!r}.")
 
@@ -198,14 +188,12 @@ def method_names(*, presets: bool = False) -> list[str]:
 
 
 def method_of(loss: LossModule | type[LossModule]) -> Method:
-    """Return the method that trains a loss, or a class of losses.
+    """Return the method that built a loss, else the first of its class or nearest base class, else CRPTpro's numbers.
 
-    That is the method that built it, else the first of its class or nearest base class, else CRPTpro's numbers. For a
-    loss built by hand, ``encoder_tau`` is None exactly if the loss has no targets.
+    For a loss built by hand, ``encoder_tau`` is None exactly if the loss has no targets.
     """
     loss_class = loss if isinstance(loss, type) else type(loss)
-    named = _METHODS.get(getattr(loss, "method_name", None) or "")
-    if named is not None and named.loss_class is not None and issubclass(loss_class, named.loss_class):
+    if (named := _METHODS.get(getattr(loss, "method_name", None) or "")) is not None:
         return named
     listed = [row for row in _METHODS.values() if not row.is_preset]
     found = next((row for base in loss_class.__mro__ for row in listed if row.loss_class is base), None)
@@ -214,7 +202,6 @@ def method_of(loss: LossModule | type[LossModule]) -> Method:
     method = replace(found or _CRPTPRO, name=loss_class.__name__, loss_class=loss_class, is_builtin=False)
     if isinstance(loss, type):
         return method
-    has_targets = any(name.startswith("target_") for name, _ in loss.named_children())
-    if has_targets == (method.encoder_tau is not None):
-        return method
-    return replace(method, encoder_tau=_CRPTPRO.encoder_tau if has_targets else None)
+    if not any(name.startswith("target_") for name, _ in loss.named_children()):
+        return replace(method, encoder_tau=None)
+    return method if method.encoder_tau is not None else replace(method, encoder_tau=_CRPTPRO.encoder_tau)

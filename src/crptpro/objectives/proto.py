@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import cast
 
 import torch
 import torch.nn.functional as F
@@ -28,27 +28,19 @@ class ProtoLoss(PretrainingLoss):
       :math:`q = \mathrm{sinkhorn}(\hat z' C^T)` (no gradient),
     * :math:`L_{intr}` = :func:`~crptpro.objectives.functional.prototype_dispersion` of the prototypes.
 
-    Images must already be augmented. A training loop calls :meth:`before_update` before each forward, which keeps the
-    prototype rows at unit length as in the released code.
+    Images must already be augmented. A training loop calls :meth:`before_update` before each forward.
 
     ``forward`` returns scalars ``loss_comp`` and ``loss_intr`` (already times alpha; their sum is minimised) and,
     detached, ``comp``, ``intr`` (without alpha), ``assignment_entropy`` (nats), ``prototypes_in_use`` (count),
     ``embedding_cosine`` (mean pairwise cosine of the online latents), ``prototype_ane``. A ``loss_comp`` that stays at
     ln M (6.238 for 512 prototypes), or an ``embedding_cosine`` that stays near 1, is a collapse.
 
-    The default heads are ``Projector(encoder.feature_dim, latent_dim)``, ``Predictor(latent_dim, hidden_dim)`` and
-    ``Prototypes(num_prototypes, latent_dim)``; ``hidden_dim`` is 1024 in the paper's table, 512 in the released code.
-    ``intr_loss_coef`` is alpha, ``offset`` > 1 and ``sinkhorn_iterations`` are those of the functions above, and
-    ``assignment_temperature`` replaces tau in the assignments. A coefficient out of its range, or heads of different
-    latent lengths, are a ``ValueError``.
+    The predictor's ``hidden_dim`` is 1024 in the paper's table, 512 in the released code. ``intr_loss_coef`` is alpha,
+    and ``assignment_temperature`` replaces tau in the assignments. A coefficient out of its range, or heads of
+    different latent lengths, are a ``ValueError``.
     """
 
-    predictor: nn.Module
-    predictor_params: Any
-    target_predictor_params: Any
     prototypes: Prototypes
-    prototypes_params: Any
-    target_prototypes_params: Any
 
     default_out_keys = (
         "loss_comp", "loss_intr", "comp", "intr", "assignment_entropy", "prototypes_in_use", "embedding_cosine",
@@ -90,7 +82,7 @@ class ProtoLoss(PretrainingLoss):
         )  # fmt: skip
 
     def before_update(self) -> ProtoLoss:
-        """Scale the prototype rows to unit length in place, outside autograd. Returns self."""
+        """Scale the prototype rows to unit length in place, as the released code does. Returns self."""
         with self._holding("prototypes"):
             self.prototypes.normalize_()
         return self
@@ -99,7 +91,8 @@ class ProtoLoss(PretrainingLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         latents = self._latents(self._read(tensordict, self.tensor_keys.observation))
         predictions = self._apply_network("predictor", latents)
-        targets = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))
+        with torch.no_grad():
+            targets = self._latents(self._read(tensordict, self.tensor_keys.next_observation), target=True)
         # From here on in the precision of the prototypes, also under autocast or after a half-precision head.
         with torch.autocast(latents.device.type, enabled=False):
             with self._holding("prototypes"):

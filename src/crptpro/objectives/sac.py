@@ -1,4 +1,4 @@
-"""Soft actor-critic: RAD-SAC on frozen features, its average over two views, and DrQ with the encoder inside."""
+"""Losses of agents: RAD-SAC on frozen features, its average over two views, DrQ with the encoder, DDPG with skills."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, ValueEstimators
 
-from crptpro.modules import PixelEncoder, SquashedGaussianActor, TwinCritic
+from crptpro.modules import DeterministicActor, PixelEncoder, SquashedGaussianActor, TwinCritic
 from crptpro.modules.actor_critic import PixelCritic, standard_normal_like
 from crptpro.objectives.base import NetworkLoss, require_positive
 from crptpro.values import as_float
@@ -47,12 +47,11 @@ class RADSACLoss(NetworkLoss, SACLoss):
     * ``loss_alpha`` = mean(exp(log_alpha) * sg(-log pi - target_entropy)), gradient to ``log_alpha`` only.
 
     With the ``steps_to_next_obs`` of TorchRL's ``MultiStepTransform``, gamma is raised to the number n of steps.
-
-    Features never receive a gradient. Differences from ``SACLoss``: squared error; the temperature loss of the
-    released code (not its logarithm); the log-std squash and pre-tanh log-probability of
+    Features never receive a gradient. Differences from ``SACLoss``: squared error; alpha in place of its logarithm in
+    the temperature loss; the log-std squash and pre-tanh log-probability of
     :class:`~crptpro.modules.SquashedGaussianActor`; one critic network with two outputs and a shared trunk; and
-    separate :meth:`critic_loss` and :meth:`actor_and_temperature_loss`, because actor, temperature and target are
-    updated every second time, against the updated critic.
+    separate :meth:`critic_loss` and :meth:`actor_and_temperature_loss`, because the actor learns every second time,
+    against the updated critic.
 
     Deviation: the released code always bootstraps; here ``terminated`` cuts it, which no task of the paper has.
 
@@ -136,7 +135,6 @@ class RADSACLoss(NetworkLoss, SACLoss):
         entropy = -log_prob.detach()
         out = {
             "loss_actor": (self._alpha * log_prob - value).mean(),
-            # SACLoss uses log_alpha in place of alpha.
             "loss_alpha": (self.log_alpha.exp() * (entropy - self.target_entropy)).mean(),
             "alpha": self._alpha,
             "entropy": entropy.mean(),
@@ -188,7 +186,6 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
     @torch.no_grad()
     def reset_parameters_recursive(self) -> None:
-        """Re-initialise actor and critic, copy the critic into its target, restore the initial temperature."""
         super().reset_parameters_recursive()
         self.log_alpha.copy_(self.alpha_init.log())
 
@@ -197,9 +194,7 @@ class AveragedSACLoss(RADSACLoss):
     """:class:`RADSACLoss` with two views of each observation (DrQ, arXiv 2004.13649, K = M = 2).
 
     Each view of the next observation has its own action; y is the mean of their targets. ``loss_qvalue`` is the sum,
-    not the mean, over the views, as in denisyarats/drq ``drq.py``; ``loss_actor`` and ``loss_alpha`` use the first
-    view. The noise is drawn for the next actions of the first and the second view, then for the actor.
-
+    not the mean, over the views, as in denisyarats/drq ``drq.py``; ``loss_actor`` and ``loss_alpha`` use the first one.
     The exploration agent of APT learns with it on detached features (forhaoliu/mini_apt averages likewise).
     """
 
@@ -216,9 +211,7 @@ class DrQLoss(AveragedSACLoss):
 
     Actor and critic share the convolutions, which learn from ``loss_qvalue`` alone; the target critic copies
     convolutions and head. In DrQ, actor and critic have ``has_tanh=True``. ``options`` are those of
-    :class:`RADSACLoss`; a critic that does not fit the encoder is a ``ValueError``.
-
-    Deviation: as in :class:`RADSACLoss`, ``terminated`` cuts the bootstrap.
+    :class:`RADSACLoss`, with its deviation; a critic that does not fit the encoder is a ``ValueError``.
     """
 
     @dataclass
@@ -233,7 +226,6 @@ class DrQLoss(AveragedSACLoss):
 
     @property
     def encoder(self) -> PixelEncoder:
-        """The convolutions that actor and critic share."""
         return self.critic.encoder
 
     @torch.no_grad()
@@ -243,3 +235,108 @@ class DrQLoss(AveragedSACLoss):
 
     def _q_values_on_features(self, features: Tensor, action: Tensor) -> Tensor:
         return self.critic.head(features, action)
+
+
+class SkillDDPGLoss(NetworkLoss):
+    r"""DDPG of the unsupervised RL benchmark (rll-research/url_benchmark ``agent/ddpg.py``; BeCL's own agent).
+
+    With :math:`s = [h, z]` the features of an observation and its skill, :math:`s^+ = [h^+, z]` n steps later:
+
+    * :math:`y = R_n + d_n \min(Q_1', Q_2')(s^+, a^+)`, where :math:`R_n` is ``("next", "reward")`` and
+      :math:`d_n = \gamma^n \prod (\text{discounts of the environment})` is ``("next", "discount")``;
+    * ``loss_qvalue`` = MSE(Q1, y) + MSE(Q2, y), gradient to the critic only;
+    * ``loss_actor`` = -mean(min(Q1, Q2)(s, a)), gradient to the actor only.
+
+    Both actions have Gaussian noise clipped to ``noise_clip``, from ``generator`` (torch's global one if None). Only
+    the critic has a target; in the released code its trunk ends with a tanh. Features never receive a gradient.
+    Diagnostics and both halves of ``forward`` are as in :class:`RADSACLoss`. A misfitting critic is a ``ValueError``.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        observation: NestedKey = "features"  # at the root and under "next"
+        skill: NestedKey = "skill"  # one-hot, at the root
+        action: NestedKey = "action"
+        reward: NestedKey = "reward"  # n-step return, under "next"
+        discount: NestedKey = "discount"  # of the value n steps later, under "next"
+
+    default_keys = _AcceptedKeys
+    tensor_keys: Any
+    default_out_keys = ("loss_actor", "loss_qvalue", *REGRESSION_KEYS)
+
+    actor_network: DeterministicActor
+    qvalue_network: TwinCritic
+    qvalue_network_params: Any
+
+    def __init__(
+        self,
+        actor: DeterministicActor,
+        critic: TwinCritic,
+        *,
+        noise_clip: float = 0.3,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        inputs = actor.config["feature_dim"] + actor.skill_dim
+        if critic.config["feature_dim"] != inputs:
+            raise ValueError(
+                f"The critic was built for {critic.config['feature_dim']} inputs, the actor sees {inputs} (features "
+                f"and skill); build the critic with feature_dim={inputs}."
+            )
+        super().__init__()
+        self.noise_clip = as_float(noise_clip, "noise_clip", minimum=0)
+        self.generator = generator
+        self._convert(("qvalue_network",), actor_network=actor, qvalue_network=critic)
+
+    @property
+    def actor(self) -> Any:
+        return self.actor_network
+
+    @property
+    def critic(self) -> Any:
+        return self.qvalue_network
+
+    def _set_in_keys(self) -> None:
+        keys = self.tensor_keys
+        following = (keys.observation, keys.reward, keys.discount)
+        root = [keys.observation, keys.skill, keys.action]
+        self._in_keys = [*root, *(unravel_key(("next", key)) for key in following)]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.critic_loss(tensordict).update(self.actor_and_temperature_loss(tensordict))
+
+    def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not changed."""
+        target = self._target(tensordict)  # (B,)
+        inputs = self._inputs(tensordict, tensordict)
+        with self._holding("qvalue_network"):
+            values = self.qvalue_network(inputs, tensordict.get(self.tensor_keys.action))  # (B, 2)
+        return squared_errors(values.unsqueeze(-2), target)
+
+    def actor_and_temperature_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """``loss_actor``: there is no temperature."""
+        inputs = self._inputs(tensordict, tensordict)
+        action = self._act(inputs)
+        # Detached weights: the gradient passes through Q to the action and to nothing else.
+        with self.qvalue_network_params.data.to_module(self.qvalue_network, preserve_module_state=False):
+            value = self.qvalue_network(inputs, action).amin(-1)
+        return TensorDict({"loss_actor": -value.mean()}, batch_size=[])
+
+    @torch.no_grad()
+    def _target(self, tensordict: TensorDictBase) -> Tensor:
+        following = tensordict.get("next")
+        inputs = self._inputs(following, tensordict)
+        action = self._act(inputs)
+        with self._holding("qvalue_network", target=True):
+            value = self.qvalue_network(inputs, action).amin(-1)
+        reward = following.get(self.tensor_keys.reward).squeeze(-1)
+        discount = following.get(self.tensor_keys.discount).squeeze(-1)
+        return reward + discount * value
+
+    def _act(self, inputs: Tensor) -> Tensor:
+        with self._holding("actor_network"):
+            return self.actor_network.sample(inputs, noise_clip=self.noise_clip, generator=self.generator)
+
+    def _inputs(self, observed: TensorDictBase, root: TensorDictBase) -> Tensor:
+        features = observed.get(self.tensor_keys.observation).detach()
+        return torch.cat([features, root.get(self.tensor_keys.skill).to(features.dtype)], dim=-1)

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
 from crptpro.artifact import read_artifact, write_artifact
 from crptpro.errors import CheckpointError, NonFiniteError
-from crptpro.modules import PixelEncoder, SquashedGaussianActor, TwinCritic, resolve_precision, set_compute_dtype
+from crptpro.modules import PixelEncoder, SquashedGaussianActor, resolve_precision, set_compute_dtype
 from crptpro.objectives import RADSACLoss, SkillDDPGLoss
 from crptpro.provenance import provenance
 from crptpro.training.compile import accelerate
@@ -49,10 +49,8 @@ class PixelAgent(nn.Module):
     ) -> Tensor:
         """Return a sample of the policy, float32 ``[A]`` in ``[-1, 1]``, for features ``[1, feature_dim]``.
 
-        ``skill`` is one-hot ``[S]``, for an actor that takes one.
-
-        Raises:
-            NonFiniteError: the policy has diverged, so that no simulator sees its actions; names ``where``.
+        ``skill`` is one-hot ``[S]``, for an actor that takes one. A policy that has diverged is a ``NonFiniteError``
+        that names ``where``, so that no simulator sees its actions.
         """
         if skill is not None:
             features = torch.cat([features, skill.unsqueeze(0).to(features.device)], -1)
@@ -73,33 +71,18 @@ class PixelAgent(nn.Module):
 
 
 def save_agent(path: str | Path, agent: PixelAgent, *, card: Mapping[str, Any]) -> Path:
-    """Write encoder and actor into a directory with a card, whole or not at all.
-
-    ``card`` is what else the reader should know.
-    """
+    """Write encoder and actor into a directory, whole or not at all; ``card`` is what else the reader should know."""
     modules = {"encoder": agent.encoder, "actor": agent.actor}
-    content = {
-        "modules": {name: getattr(module, "config", None) for name, module in modules.items()},
-        "encoder_class": type(agent.encoder).__name__,
-        **card,
-        **provenance(),
-    }
+    configs = {name: getattr(module, "config", None) for name, module in modules.items()}
+    content = {"modules": configs, "encoder_class": type(agent.encoder).__name__, **card, **provenance()}
     return write_artifact(path, modules, card=content, format_name=AGENT_FORMAT, version=AGENT_VERSION)
 
 
 def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[PixelAgent, dict[str, Any]]:
-    """Rebuild an agent from its artifact, to act in the arithmetic that its run learned in.
+    """Rebuild an agent from its directory, to act in the arithmetic that its run learned in; return it and its card.
 
-    Args:
-        path: directory.
-        encoder: a module of the encoder's class, whose weights are loaded; needed unless it is a
-            :class:`~crptpro.modules.PixelEncoder`, which is rebuilt from the card.
-
-    Returns:
-        The agent, ready to act, and its card.
-
-    Raises:
-        CheckpointError: if the directory is missing, damaged, or not an agent.
+    An encoder that is no :class:`~crptpro.modules.PixelEncoder` is needed as ``encoder``, a module of its class, whose
+    weights are loaded. A directory that is missing, damaged, or not an agent is a ``CheckpointError``.
     """
     card, tensors = read_artifact(path, format_name=AGENT_FORMAT, version=AGENT_VERSION, error=CheckpointError)
     if encoder is None and card.get("encoder_class") != PixelEncoder.__name__:
@@ -120,20 +103,14 @@ def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[P
 class SACLearner:
     """Steps critic, actor and temperature, and moves the target critic, on the reference schedule.
 
-    Each of the three has its own Adam, as in Proto-RL's and CRPTpro's released agents.
-
-    Args:
-        loss: with its networks.
-        learning_rate: of the three.
-        critic_tau: EMA rate of the target critic.
-        actor_interval: agent steps between two steps of actor and temperature.
-        target_interval: agent steps between two moves of the target.
-        compile: compile the losses.
+    Each of the three has its own Adam, as in Proto-RL's and CRPTpro's released agents. ``actor_interval`` counts agent
+    steps between two steps of actor and temperature, ``target_interval`` between two moves of the target, whose EMA
+    rate is ``critic_tau``; both are 1 in the source of ``SkillDDPGLoss``, which has no temperature.
     """
 
     def __init__(
         self,
-        loss: RADSACLoss,
+        loss: RADSACLoss | SkillDDPGLoss,
         *,
         learning_rate: float = 1e-4,
         critic_tau: float = 0.01,
@@ -141,17 +118,16 @@ class SACLearner:
         target_interval: int = 2,
         compile: bool = False,
     ) -> None:
-        self._begin(loss, learning_rate, critic_tau, temperature=[loss.log_alpha])
+        self.loss, self.targets = loss, SoftUpdate(loss, tau=critic_tau)
         self.actor_interval, self.target_interval = actor_interval, target_interval
+        groups = {"critic": [*loss.critic.parameters()], "actor": [*loss.actor.parameters()]}
+        if isinstance(loss, RADSACLoss):
+            groups["temperature"] = [loss.log_alpha]
+        self.optimizers = {
+            name: torch.optim.Adam(group, lr=learning_rate, fused=True) for name, group in groups.items()
+        }
         self._critic_loss = accelerate(loss.critic_loss, compile=compile)
         self._actor_loss = accelerate(loss.actor_and_temperature_loss, compile=compile)
-
-    def _begin(self, loss: Any, learning_rate: float, critic_tau: float, **groups: Any) -> None:
-        self.loss, self.targets = loss, SoftUpdate(loss, tau=critic_tau)
-        groups = {"critic": loss.critic.parameters(), "actor": loss.actor.parameters(), **groups}
-        self.optimizers = {
-            name: torch.optim.Adam(list(group), lr=learning_rate, fused=True) for name, group in groups.items()
-        }
 
     def update(self, batch: TensorDictBase, *, agent_step: int) -> TensorDictBase:
         """Do one update on a batch with features and rewards; returns detached scalars."""
@@ -179,34 +155,3 @@ def _step(loss: Tensor, *optimizers: torch.optim.Optimizer) -> None:
     loss.backward()
     for optimizer in optimizers:
         optimizer.step()
-
-
-class SkillDDPGLearner(SACLearner):
-    """Steps the critic, then the actor against it, then moves the target, every time (BeCL's explorer).
-
-    Source: rll-research/url_benchmark ``agent/ddpg.py``.
-    """
-
-    def __init__(self, loss: SkillDDPGLoss, *, learning_rate: float = 1e-4, critic_tau: float = 0.01) -> None:
-        self._begin(loss, learning_rate, critic_tau)
-        self.actor_interval = self.target_interval = 1
-        self._critic_loss = loss.critic_loss
-        self._actor_loss = lambda batch: TensorDict({"loss_actor": loss.actor_loss(batch)})
-
-
-def make_sac_loss(
-    loss_class: Callable[..., RADSACLoss],
-    feature_dim: int,
-    action_dim: int,
-    *,
-    hidden_dim: int,
-    device: torch.device,
-    has_tanh: bool = False,
-    actor: nn.Module | None = None,
-    **options: Any,
-) -> RADSACLoss:
-    """Return a SAC loss of fresh networks, or of a given actor, on a device; ``options`` are the loss's."""
-    widths: dict[str, Any] = {"hidden_dim": hidden_dim, "has_tanh": has_tanh}
-    actor = SquashedGaussianActor(feature_dim, action_dim, **widths) if actor is None else actor
-    critic = TwinCritic(feature_dim, action_dim, **widths)
-    return loss_class(actor.to(device), critic.to(device), **options)

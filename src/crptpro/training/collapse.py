@@ -13,22 +13,17 @@ from torch import nn
 
 logger = logging.getLogger(__name__)
 
-LOSS_MARGIN = 0.005
-"""How near to ln(M) counts, as a fraction of it."""
+LOSS_MARGIN = 0.005  # how near to ln(M) counts, as a fraction of it
 
 
 class CollapseMonitor:
     """Watch a pre-training run for collapse and announce what it sees.
 
     A comparative loss of ln(M) (6.238 for 512 prototypes) means that predictions or assignments are uniform; a mean
-    pairwise cosine near 1 means that every observation has the same embedding. Small trials of the paper's loss stay
-    there for about 1,200 updates and then leave. So being there is a ``plateau`` at first, and ``dead`` only when it
-    lasts longer than ``patience_updates``. Two observations in a row outside end a plateau.
-
-    Args:
-        num_prototypes: M; ``None`` for a loss without prototypes, which is watched by cosine only.
-        patience_updates: length of a plateau, in updates, beyond which the run is called dead.
-        cosine_threshold: mean pairwise cosine above which embeddings count as collapsed.
+    pairwise cosine above ``cosine_threshold`` means that every observation has the same embedding. Small trials of the
+    paper's loss stay there for about 1,200 updates and then leave. So being there is a ``plateau`` at first, and
+    ``dead`` only when it lasts longer than ``patience_updates``. Two observations in a row outside end a plateau. A
+    loss without prototypes (None) is watched by cosine only.
     """
 
     def __init__(
@@ -44,11 +39,8 @@ class CollapseMonitor:
 
     @classmethod
     def of(cls, loss: nn.Module) -> CollapseMonitor:
-        """Return the monitor of a loss.
-
-        Raw convolutional features are non-negative and share the background, so that healthy ones come close to a
-        cosine of 1; those of a projector do not.
-        """
+        """Return the monitor of a loss."""
+        # Healthy convolutional features, which are non-negative and share the background, come close to a cosine of 1.
         weight = getattr(getattr(loss, "prototypes", None), "weight", None)
         has_projector = isinstance(getattr(loss, "projector", None), nn.Module)
         threshold = 0.99 if has_projector else 0.9999
@@ -59,46 +51,41 @@ class CollapseMonitor:
     ) -> str:
         """Take a measurement after ``updates`` updates, and return the state after it.
 
-        ``comp`` is the comparative loss in nats, for a loss that has one; ``cosine`` the mean pairwise cosine of
-        embeddings, one number or one per domain (their mean decides).
+        ``comp`` is the comparative loss in nats, ``cosine`` the pairwise one, or one per domain (their mean decides).
         """
         self.comp = comp
         if cosine is not None:
             self.cosines = dict(cosine) if isinstance(cosine, Mapping) else {"all": cosine}
         reasons = self._reasons()
-        if self.state == "learning" and reasons:
-            self.state = "plateau"
-            self.plateaus.append({"entered": updates, "left": None})
-            logger.info(
-                "Update %d: plateau (%s). Expected to pass; called dead after %d updates of it.",
-                updates, reasons, self.patience_updates,
-            )  # fmt: skip
-        elif self.state != "learning":
-            plateau = self.plateaus[-1]
-            if not reasons and self.outside_since is not None:
-                plateau["left"] = self.outside_since
-                length = plateau["left"] - plateau["entered"]
-                announce, recovery = logger.info, ""
-                if self.state == "dead":
-                    announce, recovery = logger.warning, " (after it was called dead)"
-                announce("Update %d: left the plateau after %d updates%s.", plateau["left"], length, recovery)
-                self.state = "learning"
-            elif reasons and self.state == "plateau" and updates - plateau["entered"] > self.patience_updates:
-                self.state = "dead"
-                logger.error(
-                    "Update %d: DEAD RUN: %s since update %d, longer than %d updates. "
-                    "The encoder is not learning; check the data and the temperatures.",
-                    updates, reasons, plateau["entered"], self.patience_updates,
+        entered = self.plateaus[-1]["entered"] if self.plateaus else updates
+        if self.state == "learning":
+            if reasons:
+                self.state = "plateau"
+                self.plateaus.append({"entered": updates, "left": None})
+                logger.info(
+                    "Update %d: plateau (%s). Expected to pass; called dead after %d updates of it.",
+                    updates, reasons, self.patience_updates,
                 )  # fmt: skip
+        elif not reasons and self.outside_since is not None:
+            level, recovery = logging.INFO, ""
+            if self.state == "dead":
+                level, recovery = logging.WARNING, " (after it was called dead)"
+            length = self.outside_since - entered
+            logger.log(level, "Update %d: left the plateau after %d updates%s.", self.outside_since, length, recovery)
+            self.plateaus[-1]["left"] = self.outside_since
+            self.state = "learning"
+        elif reasons and self.state == "plateau" and updates - entered > self.patience_updates:
+            self.state = "dead"
+            logger.error(
+                "Update %d: DEAD RUN: %s since update %d, longer than %d updates. The encoder is not learning; check "
+                "the data and the temperatures.",
+                updates, reasons, entered, self.patience_updates,
+            )  # fmt: skip
         self.outside_since = None if reasons else updates
         return self.state
 
     def verdict(self, updates: int) -> dict[str, Any]:
-        """Return the judgement after ``updates`` updates as plain values; changes nothing.
-
-        ``verdict`` is ``"learning"``, ``"plateau"`` or ``"dead"``, ``plateau_updates`` the total length of the
-        ``plateaus``, ``collapsed_domains`` are those whose cosine is above the threshold.
-        """
+        """Return the judgement after ``updates`` updates as plain values; changes nothing."""
         ends = [updates if plateau["left"] is None else plateau["left"] for plateau in self.plateaus]
         return {
             "verdict": self.state,
@@ -129,7 +116,6 @@ class CollapseMonitor:
         return verdict
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a resumed run needs to judge as if never interrupted."""
         names = ("state", "plateaus", "outside_since", "comp", "cosines")
         return copy.deepcopy({name: getattr(self, name) for name in names})
 

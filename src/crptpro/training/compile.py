@@ -16,13 +16,9 @@ Update = Callable[[TensorDictBase], TensorDictBase]
 def accelerate(update: Update, *, compile: bool = False, cuda_graph: bool = False) -> Update:
     """Return an update that is compiled, recorded as a CUDA graph, or unchanged.
 
-    On a CPU nearly all of an update is convolutions and matrix products, which the compiler leaves to the same library
-    calls: it takes half a minute and gains nothing beyond noise. Neither switch has been timed on a GPU.
-
-    Args:
-        update: maps a batch of fixed shapes to detached scalars; it must not read a value back to the host.
-        compile: use ``torch.compile``.
-        cuda_graph: use :class:`tensordict.nn.CudaGraphModule`; needs a GPU.
+    The update maps a batch of fixed shapes to detached scalars and must not read a value back to the host. On a CPU
+    nearly all of it is convolutions and matrix products, which the compiler leaves to the same library calls: it takes
+    half a minute and gains nothing beyond noise. Neither switch has been timed on a GPU.
 
     Raises:
         ValueError: ``cuda_graph`` without a GPU.

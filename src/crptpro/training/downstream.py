@@ -22,15 +22,15 @@ from crptpro.domains import Domain
 from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CheckpointError, PretrainedError
 from crptpro.logging import RunLogger
-from crptpro.modules import SquashedGaussianActor, resolve_precision, set_compute_dtype, usable_device
-from crptpro.modules.precision import Precision
+from crptpro.modules import SquashedGaussianActor, TwinCritic, resolve_precision, set_compute_dtype, usable_device
+from crptpro.modules.precision import PRECISION_NAMES, Precision
 from crptpro.objectives import DrQLoss, RADSACLoss, get_method, method_names
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import derive_seed, seed_everything
-from crptpro.training.agent import PixelAgent, SACLearner, make_sac_loss, save_agent
+from crptpro.training.agent import PixelAgent, SACLearner, save_agent
 from crptpro.training.evaluate import WORKER_BYTES, Episode, Evaluator, summarize
-from crptpro.training.pretrain import SHIFT_PAD, precision_name
+from crptpro.training.pretrain import SHIFT_PAD
 from crptpro.training.run import Generators, Run
 from crptpro.training.world import SPARE_FRAMES, EnvThread, make_replay
 from crptpro.transforms import DenseShiftFeatures, FrozenEncoder, PrototypeReward, RandomShift, choose_feature_mode
@@ -41,16 +41,12 @@ from crptpro.workers import can_be_sent
 
 logger = logging.getLogger(__name__)
 
-WORTH_WORKERS = 20
-"""Evaluation episodes of a run from which workers pay: starting one takes as long as an episode."""
-
 
 @dataclass(frozen=True)
 class DownstreamConfig:
-    """How a task is learned. ``None`` means the method's own value, which is the paper's.
+    """How a task is learned, by one update per agent step. ``None`` means the method's own value, which is the paper's.
 
-    Source: CRPTpro, hyper-parameter table; Proto-RL's released agent. One update per agent step once
-    ``random_agent_steps`` transitions are stored.
+    Source: CRPTpro, hyper-parameter table; Proto-RL's released agent.
     """
 
     env_steps: int | None = None
@@ -80,16 +76,14 @@ class DownstreamConfig:
     action_repeat: int | None = None
     """simulator steps per decision (default: the domain's, 2)"""
     features: Literal["auto", "dense", "dense-bf16", "reencode"] = "auto"
-    """where the features of shifted observations come from: crops of dense maps that are stored once per observation
-    (exact; in bfloat16 rounded once, with half the memory), or the encoder at every update; auto takes dense maps
-    where the memory suffices"""
+    """features of shifted observations: crops of dense maps, stored once per observation (exact; in bfloat16 rounded
+    once, with half the memory), or the encoder at every update; auto takes dense maps where the memory suffices"""
     eval_interval_env_steps: int = 10_000
     """simulator steps between two evaluations; the first is at 0, the last at the end"""
     eval_episodes: int = 10
     """episodes per evaluation"""
     eval_workers: int | None = None
-    """processes that evaluate during training, 0.5 GB of memory each; 0 evaluates in between (default: one per
-    core where that pays)"""
+    """processes that evaluate meanwhile, 0.5 GB each; 0 evaluates in between (default: one per core where that pays)"""
     checkpoint_interval_env_steps: int = 5_000
     """simulator steps between two checkpoints, taken at episode ends"""
     log_interval_env_steps: int = 1_000
@@ -101,8 +95,7 @@ class DownstreamConfig:
     colors: Colors = "normal"
     """colours of the task: reversed_background are the paper's unseen ones, reversed_image works everywhere"""
     precision: Precision = "auto"
-    """arithmetic of the big matrix products; auto is bf16 where the hardware is faster in it. Deviation: the released
-    code computes in fp32 throughout, which fp32 gives"""
+    """arithmetic of big products; auto is bf16 where that is faster. Deviation: the released code is fp32 throughout"""
     compile: bool = False
     """compile the losses with torch.compile; changes rounding only"""
     device: str = "cpu"
@@ -122,7 +115,7 @@ class DownstreamConfig:
         """Return the settings with the method's and the domain's values where they were left open."""
         known = pretrained.method in method_names(presets=True)
         own = DEFAULTS | dict(get_method(pretrained.method).downstream if known else {})
-        values = {name: value for name, value in own.items() if getattr(self, name, self) is None}
+        values: dict[str, Any] = {name: value for name, value in own.items() if getattr(self, name, self) is None}
         if "replay_capacity" in values:
             values["replay_capacity"] = max(values["replay_capacity"], self.random_agent_steps)
         if self.action_repeat is None:
@@ -130,10 +123,8 @@ class DownstreamConfig:
         return dataclasses.replace(self, **values)
 
 
-DEFAULTS: dict[str, Any] = {
-    "env_steps": 500_000, "replay_capacity": 40_000, "learning_rate": 1e-4, "intrinsic_reward_coef": 0.2,
-}  # fmt: skip
-"""Downstream settings of a method unless its row in the table says otherwise."""
+# Settings of a method unless its row in the table says otherwise.
+DEFAULTS = {"env_steps": 500_000, "replay_capacity": 40_000, "learning_rate": 1e-4, "intrinsic_reward_coef": 0.2}
 
 
 @dataclass(frozen=True)
@@ -162,17 +153,11 @@ def train_downstream(
 ) -> DownstreamResult:
     """Learn a task with SAC on a frozen encoder (CRPTpro, Sec. III-C), or with DrQ, which trains its own encoder.
 
-    Args:
-        task: any name that :func:`crptpro.envs.make_env` knows, or a :class:`~crptpro.domains.Domain`.
-        pretrained: an artifact, its directory, the name of an encoder that ships, or one of the controls
-            ``"random-encoder"`` and ``"drq"``.
-        run_dir: records (``eval.csv``, ``train.csv``, ``episodes.csv``), checkpoints, replay and agent; ``None`` keeps
-            nothing but the result. The same call continues from the newest checkpoint there. Checkpoints are taken
-            between episodes: a kill costs the episodes since the last one and, on a CPU, changes no number.
-        config: every number; the paper's by default.
-        records: used instead of a record in ``run_dir``.
-        progress: show a bar, or lines in a log file.
-        **overrides: single settings of :class:`DownstreamConfig`, e.g. ``env_steps=100_000``.
+    ``task`` is any name that :func:`crptpro.envs.make_env` knows, or a :class:`~crptpro.domains.Domain`; ``pretrained``
+    an artifact, its directory, the name of an encoder that ships, or one of the controls ``"random-encoder"`` and
+    ``"drq"``. ``run_dir`` gets records (``eval.csv``, ``train.csv``, ``episodes.csv``), checkpoints, replay and agent.
+    The same call continues from the newest checkpoint, taken between two episodes; on a CPU, a kill changes no number.
+    ``overrides`` are single settings of :class:`DownstreamConfig`; the rest as in :func:`~crptpro.training.pretrain`.
 
     Raises:
         PretrainedError: the artifact does not fit, e.g. another image size.
@@ -181,8 +166,10 @@ def train_downstream(
         DiskSpaceError: the disk cannot hold the replay.
     """
     settings: Any = dataclasses.replace(config or DownstreamConfig(), **overrides)
-    artifact = _artifact(pretrained, settings.seed)
-    settings = settings.resolved(task, artifact)
+    if not isinstance(pretrained, Pretrained):
+        source, is_control = str(pretrained), str(pretrained) in ("drq", "random-encoder")
+        pretrained = random_pretrained(settings.seed, method=source) if is_control else load_pretrained(source)
+    settings = settings.resolved(task, pretrained)
     name = task if isinstance(task, str) else task.task
     device = usable_device(settings.device)
     repeat = settings.action_repeat
@@ -194,42 +181,40 @@ def train_downstream(
         # The budget may grow, and machines differ; everything else decides the numbers of the run.
         free = ("env_steps", "eval_workers", "compile", "device")
         run.require_same({
-            "task": name, "pretrained": artifact.identity(),
+            "task": name, "pretrained": pretrained.identity(),
             **{key: value for key, value in dataclasses.asdict(settings).items() if key not in free},
-            "precision": precision_name(dtype), "features": run.saved_setting("features", settings.features),
+            "precision": PRECISION_NAMES[dtype], "features": run.saved_setting("features", settings.features),
         })  # fmt: skip
         seed_everything(derive_seed(settings.seed, "downstream"))
         generators = Generators(settings.seed, "replay", "shift", "bonus", "policy", "random_actions")
-        env = EnvThread(task, artifact.encoder, settings, seed=settings.seed, action_repeat=repeat)
+        env = EnvThread(task, pretrained.encoder, settings, seed=settings.seed, action_repeat=repeat)
         stack.callback(env.close)
-        artifact.require(image_size=env.env.observation_spec["pixels"].shape[-1])
-        encoder = _frozen_copy(artifact.encoder, device, dtype)
-        learner, agent = _make_agent(artifact, encoder, env.env, settings, generators["policy"])
+        pretrained.require(image_size=env.env.observation_spec["pixels"].shape[-1])
+        encoder = _frozen_copy(pretrained.encoder, device, dtype)
+        learner, agent = _make_agent(pretrained, encoder, env.env, settings, generators["policy"])
         set_compute_dtype(learner.loss, dtype)
         evaluator = Evaluator(env.make_env, agent, episodes=settings.eval_episodes, seed=settings.seed,
                               workers=_eval_workers(name, env.make_env, settings), progress=progress,
-                              on_result=functools.partial(_record_evaluation, run, name, artifact.label))  # fmt: skip
+                              on_result=functools.partial(_record_evaluation, run, name, pretrained.label))  # fmt: skip
         stack.callback(evaluator.close)
         is_complete = bool(run.saved.get("is_finished")) and run.saved["position"] >= settings.env_steps
         replay = _make_replay(run, env.env, settings, generators["replay"], is_complete=is_complete)
-        memory = attach_transforms(replay, artifact, encoder, settings, generators, run, dtype=dtype,
+        memory = attach_transforms(replay, pretrained, encoder, settings, generators, run, dtype=dtype,
                                    reserved_bytes=evaluator.workers * WORKER_BYTES)  # fmt: skip
         dense = next((each for each in replay.transform if isinstance(each, DenseShiftFeatures)), None)
         counters = run.tally
-        counters.update(updates=0, episodes=0, next_evaluation=0, last_evaluation=-1)
+        counters.update(updates=0, episodes=0, last_evaluation=-1)
         run.keep(**learner.components(), **memory, generators=generators, evaluator=evaluator,
                  replay=None if is_complete else replay)  # fmt: skip
 
         def start_evaluation() -> None:
-            if run.position != counters["last_evaluation"]:  # a shorter run has ended, and was evaluated, here
-                agent_steps = run.position // repeat
-                evaluator.start(env_steps=run.position, agent_steps=agent_steps, updates=counters["updates"])
+            agent_steps = run.position // repeat
+            evaluator.start(env_steps=run.position, agent_steps=agent_steps, updates=counters["updates"])
             counters["last_evaluation"] = run.position
-            interval = settings.eval_interval_env_steps
-            counters["next_evaluation"] = (run.position // interval + 1) * interval
 
+        interval = settings.eval_interval_env_steps
         for first in run.until(settings.env_steps, checkpoint_interval=settings.checkpoint_interval_env_steps):
-            if first >= counters["next_evaluation"]:
+            if first // interval > counters["last_evaluation"] // interval:
                 start_evaluation()
             td = env.reset(derive_seed(settings.seed, "downstream", "episode", counters["episodes"]))
             episode_return, done, number = 0.0, False, None
@@ -248,9 +233,8 @@ def train_downstream(
                 if not is_random:
                     # The sample has features under random shifts, and the bonus is part of its reward.
                     batch = replay.sample(settings.batch_size).to(device)
-                    intrinsic = batch.get(("next", "intrinsic_reward"), None)
                     run.log(learner.update(batch, agent_step=agent_step))
-                    if intrinsic is not None:
+                    if (intrinsic := batch.get(("next", "intrinsic_reward"), None)) is not None:
                         run.log({"intrinsic_reward": intrinsic.mean()})
                     counters["updates"] += 1
                 transition = step.result()
@@ -267,7 +251,8 @@ def train_downstream(
             ended = {"episode_return": episode_return, "episode_agent_steps": (run.position - first) // repeat}
             run.write("episodes", ended, episodes=counters["episodes"])
 
-        start_evaluation()
+        if run.position != counters["last_evaluation"]:  # unless a finished run is called again
+            start_evaluation()
         evaluator.finish()
         run.finish()
         path = None
@@ -277,14 +262,6 @@ def train_downstream(
             if run.records is not None:
                 run.records.artifact(path, name=f"agent_{name}", kind="agent")
         return DownstreamResult(agent, run.rows("eval"), path, run.position)
-
-
-def _artifact(pretrained: Pretrained | str | Path, seed: int) -> Pretrained:
-    if isinstance(pretrained, Pretrained):
-        return pretrained
-    if str(pretrained) in ("drq", "random-encoder"):
-        return random_pretrained(seed=seed, method=str(pretrained))
-    return load_pretrained(pretrained)
 
 
 def _frozen_copy(network: nn.Module, device: torch.device, dtype: torch.dtype) -> Any:
@@ -297,14 +274,16 @@ def _make_agent(
     """Return SAC on the encoder's features, or DrQ, whose critic trains the encoder, and the agent that acts."""
     action_dim, device = env.action_spec.shape[-1], torch.device(config.device)
     is_drq = pretrained.method == "drq"
-    explored, actor = pretrained.actor, None
+    widths: dict[str, Any] = {"hidden_dim": config.hidden_dim, "has_tanh": is_drq}
+    explored = pretrained.actor
     if isinstance(explored, SquashedGaussianActor) and explored.config["action_dim"] == action_dim:
         actor = copy.deepcopy(explored).requires_grad_(True).train()  # it explored the task's own domain
-    loss = make_sac_loss(
-        functools.partial(DrQLoss, encoder.requires_grad_(True)) if is_drq else RADSACLoss,
-        encoder.feature_dim, action_dim, hidden_dim=config.hidden_dim, device=device, has_tanh=is_drq, actor=actor,
-        gamma=config.discount, alpha_init=config.initial_temperature, generator=generator,
-    )  # fmt: skip
+    else:
+        actor = SquashedGaussianActor(encoder.feature_dim, action_dim, **widths)
+    networks = actor.to(device), TwinCritic(encoder.feature_dim, action_dim, **widths).to(device)
+    options: dict[str, Any] = {"gamma": config.discount, "alpha_init": config.initial_temperature}
+    make_loss = functools.partial(DrQLoss, encoder.requires_grad_(True)) if is_drq else RADSACLoss
+    loss = make_loss(*networks, **options, generator=generator)
     rates = {"learning_rate": config.learning_rate, "critic_tau": config.critic_tau}
     return SACLearner(loss, compile=config.compile, **rates), PixelAgent(encoder, loss.actor)
 
@@ -404,7 +383,7 @@ def _eval_workers(task: str, make_this_env: Callable[[], EnvBase], config: Any) 
         return config.eval_workers
     episodes = (-(-config.env_steps // config.eval_interval_env_steps) + 1) * config.eval_episodes
     workers = min(cpu_cores(), torch.get_num_threads())  # a torch limited to one thread leaves the cores to others
-    return workers if workers > 1 and episodes >= WORTH_WORKERS and can_be_sent(make_this_env) else 0
+    return workers if workers > 1 and episodes >= 20 else 0  # starting one takes as long as an episode
 
 
 def _record_evaluation(

@@ -7,10 +7,9 @@ import logging
 import math
 import pickle
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,13 +52,7 @@ def evaluate(
     """Run a policy for whole episodes and return every episode's own return.
 
     Every episode has its own seed, so that neither earlier evaluations nor the number of processes change a result.
-
-    Args:
-        policy: maps one observation to one action.
-        env: unbatched environment with ``pixels`` uint8 ``[C, H, W]``, without an intrinsic reward.
-        episodes: how many, at least 1.
-        seed: of this evaluation.
-        progress: show a bar that vanishes when done.
+    The environment is unbatched, with ``pixels`` uint8 ``[C, H, W]`` and without an intrinsic reward.
 
     Raises:
         ValueError: fewer than one episode.
@@ -122,11 +115,9 @@ def summarize(episodes: Sequence[Episode]) -> dict[str, float]:
 class Evaluator:
     """Evaluates snapshots of an agent in worker processes during training, or at once in this process.
 
-    The episodes of an evaluation are delivered when :meth:`finish` is called, so that the record of a run does not
-    depend on the speed of its machine. One CPU thread computes every decision either way.
-
-    ``on_result`` is called with the episodes and the counters of an evaluation; without ``workers``, or where none can
-    import ``make_env``, this process evaluates.
+    ``on_result`` gets the episodes and the counters of an evaluation when :meth:`finish` is called, so that the record
+    of a run does not depend on the speed of its machine. Without ``workers``, or where none can import ``make_env``,
+    this process evaluates. One CPU thread computes every decision either way.
     """
 
     def __init__(
@@ -145,21 +136,20 @@ class Evaluator:
         self.on_result, self.progress = on_result, progress
         self._pool: WorkerPool | None = None
         self._env: EnvBase | None = None
-        self._pending: tuple[PixelAgent, dict[str, int], list[Future[Episode]]] | None = None
+        self._pending: tuple[PixelAgent, dict[str, int], int, list[Future[Episode]]] | None = None
 
-    def start(self, **counters: int) -> None:
-        """Evaluate the agent as it is now; ``counters``, with ``env_steps``, say where the run is."""
-        self._start(self.agent.snapshot(), counters)
-
-    def _start(self, snapshot: PixelAgent, counters: dict[str, int]) -> None:
+    def start(self, agent: PixelAgent | None = None, /, **counters: int) -> None:
+        """Evaluate an agent, by default the run's as it is now; ``counters``, with ``env_steps``, say where it is."""
         self.finish()
+        agent = agent or self.agent.snapshot()
+        seed = derive_seed(self.seed, "evaluation", counters["env_steps"])
         futures: list[Future[Episode]] = []
         if self.workers:
             self._pool = self._pool or WorkerPool(self.workers, _prepare, self.make_env)
-            sent = pickle.dumps(copy.deepcopy(snapshot).cpu())
-            seeds = [episode_seed(self._seed(counters), episode) for episode in range(self.episodes)]
+            sent = pickle.dumps(copy.deepcopy(agent).cpu())
+            seeds = [episode_seed(seed, episode) for episode in range(self.episodes)]
             futures = [self._pool.submit(_evaluate, sent, *numbered) for numbered in enumerate(seeds)]
-        self._pending = (snapshot, dict(counters), futures)
+        self._pending = (agent, counters, seed, futures)
         if not self.workers:
             self.finish()
 
@@ -167,19 +157,20 @@ class Evaluator:
         """Wait for the evaluation that is under way, if any, and deliver its episodes."""
         if self._pending is None:
             return
-        agent, counters, futures = self._pending
+        agent, counters, seed, futures = self._pending
         try:
             episodes = [future.result() for future in futures]
         except (BrokenProcessPool, pickle.PicklingError, OSError) as reason:
             logger.warning("The evaluating processes are lost (%s); evaluating in this process from here on.", reason)
             self.workers, futures = 0, []
-            self._end_pool()
         if not futures:
             self._env = self._env or self.make_env()
-            with _one_thread():
-                episodes = evaluate(
-                    agent, self._env, episodes=self.episodes, seed=self._seed(counters), progress=self.progress
-                )
+            threads = torch.get_num_threads()
+            torch.set_num_threads(1)  # as in the workers: sums of another order may round another way
+            try:
+                episodes = evaluate(agent, self._env, episodes=self.episodes, seed=seed, progress=self.progress)
+            finally:
+                torch.set_num_threads(threads)
         self._pending = None
         self.on_result(episodes, counters)
 
@@ -187,29 +178,20 @@ class Evaluator:
         """Return the evaluation that is under way: its episodes are not in the record yet."""
         if self._pending is None:
             return {}
-        agent, counters, _ = self._pending
+        agent, counters, *_ = self._pending
         return {"counters": counters, "agent": agent.state_dict()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Start again what was under way."""
         if state:
             agent = copy.deepcopy(self.agent)
             agent.load_state_dict(state["agent"])
-            self._start(agent, state["counters"])
+            self.start(agent, **state["counters"])
 
     def close(self) -> None:
-        self._end_pool()
-        if self._env is not None:
-            self._env.close()
-            self._env = None
-
-    def _seed(self, counters: Mapping[str, int]) -> int:
-        return derive_seed(self.seed, "evaluation", counters["env_steps"])
-
-    def _end_pool(self) -> None:
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
-            self._pool = None
+        if self._env is not None:
+            self._env.close()
 
 
 # --- in a worker ------------------------------------------------------------------------------------------------------
@@ -224,14 +206,3 @@ def _prepare(make_env: Callable[[], EnvBase]) -> None:
 
 def _evaluate(agent: bytes, episode: int, seed: int) -> Episode:
     return run_episode(pickle.loads(agent), _env, episode=episode, seed=seed)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Compute with one thread, as the workers do: sums of another order may round another way."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

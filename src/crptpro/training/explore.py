@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.transforms import Transform
 from torchrl.envs.utils import step_mdp
@@ -23,11 +23,11 @@ from crptpro.domains import Domain, get_domain
 from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CRPTproError
 from crptpro.logging import RunLogger
-from crptpro.modules import DeterministicActor, TwinCritic, computing
-from crptpro.modules.precision import Precision, resolve_precision, set_compute_dtype, usable_device
+from crptpro.modules import DeterministicActor, SquashedGaussianActor, TwinCritic, computing
+from crptpro.modules.precision import PRECISION_NAMES, Precision, resolve_precision, set_compute_dtype, usable_device
 from crptpro.objectives import AveragedSACLoss, Method, RADSACLoss, SkillDDPGLoss, get_method, method_of
 from crptpro.seeding import derive_seed
-from crptpro.training.agent import PixelAgent, SACLearner, SkillDDPGLearner, make_sac_loss
+from crptpro.training.agent import PixelAgent, SACLearner
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.pretrain import (
     SHIFT_PAD,
@@ -36,7 +36,6 @@ from crptpro.training.pretrain import (
     ending,
     make_optimizer,
     make_update,
-    precision_name,
     scalars,
     write_row,
 )
@@ -48,9 +47,6 @@ from crptpro.values import Quality, check_numbers
 
 logger = logging.getLogger(__name__)
 
-PIXELS: dict[NestedKey, NestedKey] = {"pixels": "features", ("next", "pixels"): ("next", "features")}
-"""Entries of a batch, with those of their features."""
-SECOND_VIEWS: dict[NestedKey, NestedKey] = {"pixels_view": "pixels", ("next", "pixels_view"): ("next", "pixels")}
 DISCOUNT = 0.99
 
 
@@ -83,8 +79,7 @@ class ExploreConfig:
     quality: Quality = "exact"
     """render quality"""
     precision: Precision = "auto"
-    """arithmetic of convolutions and big matrix products; auto is bf16 where the hardware is faster in it. Deviation:
-    the released code computes in fp32 throughout, which fp32 gives"""
+    """arithmetic of big products; auto is bf16 where that is faster. Deviation: the released code is fp32 throughout"""
     device: str = "cpu"
     """where networks are"""
     log_interval: int = 50
@@ -96,18 +91,16 @@ class ExploreConfig:
         check_numbers(self, minima={"random_agent_steps": 0}, maxima={})
 
     def resolved(self, method: Method) -> Any:
-        """Return the settings with the method's values where they were left open."""
-        exploration = ("env_steps", "encoder_update_interval", "random_agent_steps", "replay_capacity")
-        homes = {"batch_size": method, "learning_rate": method, **dict.fromkeys(exploration, method.exploration)}
-        values = {name: getattr(home, name) for name, home in homes.items() if getattr(self, name) is None}
-        return dataclasses.replace(self, **values)
+        homes = {"batch_size": method, "learning_rate": method}
+        left_open = [name for name, value in vars(self).items() if value is None]
+        return dataclasses.replace(self, **{n: getattr(homes.get(n, method.exploration), n) for n in left_open})
 
 
 @dataclass(frozen=True)
 class ExplorationPlan:
     """How many decisions and updates an active pre-training makes; domains take turns, one decision each."""
 
-    repeats: tuple[int, ...]  # simulator steps per decision, of each domain
+    repeats: tuple[int, ...]  # simulator steps per decision, of each domain; ``env_steps`` are over all
     agent_steps: int  # decisions of each domain
     first_update: int  # decision of a domain from which on updates follow
     encoder_update_interval: int  # in a domain's own decisions
@@ -119,7 +112,6 @@ class ExplorationPlan:
 
     @property
     def env_steps(self) -> int:
-        """Simulator steps over all domains."""
         return self.agent_steps * sum(self.repeats)
 
     @property
@@ -179,22 +171,15 @@ def pretrain_active(
     """Train a self-supervised loss on what exploring agents see (Proto-RL, APT, BeCL; here also across domains).
 
     The domains take turns, one decision each. A domain has its own environment, replay, actor, critic and temperature;
-    encoder, heads, prototypes and their optimiser are shared. Its agent learns from the intrinsic reward alone, on
-    detached features; the encoder learns from the self-supervised loss alone, on batches of one domain at a time.
+    encoder, heads, prototypes and their optimiser are shared. Its agent learns from the intrinsic reward alone, the
+    encoder from the self-supervised loss alone, on batches of one domain at a time.
 
     Deviation: neither the paper nor the released code says how its cross-domain active baselines are built. Turns,
     shared candidates and schedules in a domain's own decisions are this project's choice.
 
-    Args:
-        loss: the objective with its networks; trained in place.
-        domains: one or several, by domain or task name.
-        method: name of a registered method that explores; by default that of the loss's class.
-        run_dir: records (``pretrain.csv``, ``explore.csv``, ``episodes.csv``), replays and checkpoints; ``None`` keeps
-            nothing but the result. The same call with a new loss resumes, as for :func:`~crptpro.training.pretrain`.
-        config: all settings.
-        records: as for :func:`~crptpro.training.pretrain`.
-        progress: likewise.
-        **overrides: single settings of :class:`ExploreConfig`, e.g. ``env_steps=50_000``.
+    ``domains`` are one or several, by domain or task name. ``run_dir`` gets records (``pretrain.csv``, ``explore.csv``,
+    ``episodes.csv``), replays and checkpoints; the same call with a new loss resumes. ``overrides`` are single settings
+    of :class:`ExploreConfig`; the other arguments are those of :func:`~crptpro.training.pretrain`.
 
     Raises:
         CRPTproError: several domains for a single-domain method, or a budget too small for any update; otherwise as
@@ -206,11 +191,6 @@ def pretrain_active(
     plan = plan_exploration(recipe, list(named.values()), given)
     exploration: Any = recipe.exploration
     settings = given.resolved(recipe)
-    prototypes = getattr(loss, "prototypes", None) if exploration.reward == "prototype" else None
-    if prototypes is not None and settings.queue_size % len(prototypes.weight):
-        raise ValueError(
-            f"queue_size must be a multiple of num_prototypes, got {settings.queue_size} and {len(prototypes.weight)}."
-        )
     device = usable_device(settings.device)
     loss.to(device).train()
     with contextlib.ExitStack() as stack:
@@ -221,7 +201,7 @@ def pretrain_active(
         reward = getattr(exploration.reward, "__qualname__", exploration.reward)
         run.require_same({
             **{k: v for k, v in dataclasses.asdict(settings).items() if k != "device"},
-            "domains": list(named), "precision": precision_name(dtype), "loss": describe_loss(loss),
+            "domains": list(named), "precision": PRECISION_NAMES[dtype], "loss": describe_loss(loss),
             "exploration": {**dataclasses.asdict(exploration), "reward": reward},
         })  # fmt: skip
         torch.manual_seed(derive_seed(settings.seed, "active", "loss"))
@@ -231,10 +211,8 @@ def pretrain_active(
             needed = len(named) * (capacity + slack) * 3 * getattr(loss.encoder, "image_size", 84) ** 2
             logger.info("replays: %.2f GB in %s; they are kept", needed / 1e9, run.run_dir / "replay")
             require_disk(run.run_dir, needed, "The replays of the domains")
-        optimizer, schedule, targets = make_optimizer(
-            loss, recipe, learning_rate=settings.learning_rate, warmup_updates=recipe.warmup_updates,
-            encoder_tau=recipe.encoder_tau, updates=plan.encoder_updates,
-        )  # fmt: skip
+        recipe = dataclasses.replace(recipe, learning_rate=settings.learning_rate, updates=plan.encoder_updates)
+        optimizer, schedule, targets = make_optimizer(loss, recipe)
         monitor = CollapseMonitor.of(loss)
         explorers: list[Explorer] = []
         for name, domain in named.items():
@@ -242,22 +220,23 @@ def pretrain_active(
             shared = explorers[0].reward if explorers and exploration.reward == "prototype" else None
             explorers.append(Explorer(name, domain, loss, exploration, settings, run, capacity=capacity, slack=slack,
                                       dtype=dtype, reward=shared))  # fmt: skip
-            stack.callback(explorers[-1].close)
+            stack.callback(explorers[-1].env.close)
         done = run.tally
-        done.update(decisions=0, updates=0)
+        done["updates"] = 0
         run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor,
                  **{f"explorer_{index}": explorer for index, explorer in enumerate(explorers)})  # fmt: skip
 
         update_encoder = make_update(loss, optimizer, targets, grad_clip=recipe.grad_clip)
         for _ in run.until(plan.env_steps, checkpoint_interval=settings.checkpoint_interval_env_steps):
-            index = done["decisions"] % len(explorers)
-            explorer, agent_step = explorers[index], explorers[index].agent_steps
+            explorer = min(explorers, key=lambda each: each.agent_steps)  # they take turns
+            agent_step = explorer.agent_steps
             explorer.begin_step()  # the next observation is drawn while the updates compute
             learns = agent_step >= plan.first_update
             trains_encoder = learns and agent_step % plan.encoder_update_interval == 0
             trains_agent = learns and agent_step % exploration.agent_update_interval == 0
             for left in reversed(range(plan.encoder_updates_each if trains_encoder else 0)):
-                batch = explorer.sample(settings.batch_size)
+                # The replay's transform is the random shift, another one for every image.
+                batch = explorer.replay.sample(settings.batch_size).to(device)
                 if exploration.encodes_before_update and not left:
                     batch = explorer.encode(batch)
                 losses = update_encoder(batch)
@@ -269,20 +248,20 @@ def pretrain_active(
                     write_row(run, loss, monitor, batch, explorer.name)
                     run.write("explore")
             if trains_agent:
-                batch = batch if trains_encoder else explorer.sample(settings.batch_size)
+                batch = batch if trains_encoder else explorer.replay.sample(settings.batch_size).to(device)
                 if "features" not in batch:
                     batch = explorer.encode(batch)
                 metrics = explorer.learn(batch, agent_step // exploration.agent_update_interval)
                 run.log({f"{key}/{explorer.name}": value for key, value in metrics.items()}, "explore")
             if (row := explorer.end_step()) is not None:
                 run.write("episodes", {"domain": explorer.name, **row}, episodes=explorer.episodes)
-            done["decisions"] += 1
-            run.advance(plan.repeats[index])
+            run.advance(explorer.action_repeat)
         run.finish()
         first = explorers[0]
         run.counters["updates"] = done["updates"]
         if run.means("pretrain"):
-            write_row(run, loss, monitor, first.sample(min(settings.batch_size, 64)), first.name)
+            batch = first.replay.sample(min(settings.batch_size, 64)).to(device)
+            write_row(run, loss, monitor, batch, first.name)
             run.write("explore")
         explored = [{"domain": e.name, "agent_steps": e.agent_steps, "episodes": e.episodes} for e in explorers]
         facts = {"device": str(device), "datasets": explored, "env_steps": run.position}
@@ -295,8 +274,8 @@ def pretrain_active(
 class Explorer:
     """One domain of an active pre-training: its environment, replay, agent and intrinsic reward.
 
-    A checkpoint in the middle of an episode holds no simulator state: its episode is repeated from its seed with the
-    same actions. A non-deterministic environment does not reproduce it, which is logged as a warning.
+    A checkpoint holds no simulator state: the running episode is repeated from its seed with the same actions. A
+    non-deterministic environment does not reproduce it, which is logged as a warning.
     """
 
     def __init__(
@@ -306,12 +285,12 @@ class Explorer:
         self.name, self.loss, self.config, self.exploration = name, loss, config, exploration
         self.seed = derive_seed(config.seed, "active", name)
         self.device = torch.device(config.device)
-        repeat = resolve_action_repeat(domain)
-        self._env = EnvThread(domain, loss.encoder, config, seed=self.seed, action_repeat=repeat)
+        self.action_repeat = resolve_action_repeat(domain)
+        self.env = EnvThread(domain, loss.encoder, config, seed=self.seed, action_repeat=self.action_repeat)
         names = ("replay", "shift", "policy", "random_actions", "skill", "reward")
         self.generators = Generators(self.seed, *names)
         torch.manual_seed(derive_seed(self.seed, "agent"))  # its networks do not depend on other domains
-        self.learner = self._make_learner(loss.encoder.feature_dim, self._env.env.action_spec.shape[-1])
+        self.learner = self._make_learner(loss.encoder.feature_dim, self.env.env.action_spec.shape[-1])
         set_compute_dtype(self.learner.loss, dtype)
         self.agent = PixelAgent(loss.encoder, self.learner.loss.actor)
         self.reward = self._make_reward() if reward is None else reward
@@ -333,12 +312,12 @@ class Explorer:
                 self.skill = int(torch.randint(skills, (), generator=self.generators["skill"]))
             td["skill"] = nn.functional.one_hot(torch.tensor(self.skill), skills).float()
         if self.agent_steps < self.config.random_agent_steps:
-            td["action"] = self._env.uniform_action(self.generators["random_actions"])
+            td["action"] = self.env.uniform_action(self.generators["random_actions"])
         else:
             where = f"{self.name}, episode {self.episodes}, decision {len(self.actions)}"
             features, skill = self.agent.encode(td["pixels"]), td.get("skill", None)
             td["action"] = self.agent.explore(features, self.generators["policy"], skill=skill, where=where)
-        self._step = self._env.step(td)
+        self._step = self.env.step(td)
 
     def end_step(self) -> dict[str, float] | None:
         """Store the outcome of the step; returns the episode's return and length if it ended one."""
@@ -352,10 +331,6 @@ class Explorer:
         self.episodes += 1
         self._td, self.actions, self._episode_return = None, [], 0.0
         return row
-
-    def sample(self, batch_size: int) -> TensorDictBase:
-        """Draw a batch of transitions, every image under its own random shift."""
-        return self.replay.sample(batch_size).to(self.device)
 
     def learn(self, batch: TensorDictBase, agent_step: int) -> dict[str, Tensor]:
         """Let the agent learn from the intrinsic reward of a batch with features; returns detached scalars."""
@@ -373,11 +348,7 @@ class Explorer:
             return None
         return self.reward.queue.roll(-int(self.reward.queue_pointer), 0).clone()
 
-    def close(self) -> None:
-        self._env.close()
-
     def state_dict(self) -> dict[str, Any]:
-        """Return all that a checkpoint needs, except the simulator's state."""
         return {
             "counters": [self.agent_steps, self.episodes, self.skill],
             "actions": torch.stack(self.actions) if self.actions else None,
@@ -394,13 +365,13 @@ class Explorer:
         self._td = self._reset()
         for action in state["actions"]:
             self._td["action"] = action
-            self._take(self._env.step(self._td).result())
+            self._take(self.env.step(self._td).result())
         newest = self.replay.observations(torch.tensor([self.replay.frames_written - 1]))[0]
         if not torch.equal(newest, self._td["pixels"]):
             logger.warning("%s does not repeat its episode: this run will differ from an uninterrupted one.", self.name)
 
     def _reset(self) -> TensorDictBase:
-        return self._env.reset(derive_seed(self.seed, "active", self.name, "episode", self.episodes))
+        return self.env.reset(derive_seed(self.seed, "active", self.name, "episode", self.episodes))
 
     def _take(self, transition: TensorDictBase) -> None:
         self.actions.append(transition["action"].clone())
@@ -408,18 +379,17 @@ class Explorer:
         self._td = step_mdp(transition)
 
     def _make_learner(self, feature_dim: int, action_dim: int) -> SACLearner:
-        kind, skills = self.exploration.agent, self.exploration.skill_dim
-        hidden_dim, generator = self.config.hidden_dim, self.generators["policy"]
-        if kind == "skill-ddpg":
-            actor = DeterministicActor(feature_dim, action_dim, skill_dim=skills, hidden_dim=hidden_dim)
+        skills, hidden_dim = self.exploration.skill_dim, self.config.hidden_dim
+        generator = self.generators["policy"]
+        if self.exploration.agent == "skill-ddpg":
+            policy = DeterministicActor(feature_dim, action_dim, skill_dim=skills, hidden_dim=hidden_dim)
             critic = TwinCritic(feature_dim + skills, action_dim, hidden_dim=hidden_dim, has_tanh=True)
-            ddpg = SkillDDPGLoss(actor.to(self.device), critic.to(self.device), generator=generator)
-            return SkillDDPGLearner(ddpg)
-        loss_class = {"rad-sac": RADSACLoss, "averaged-sac": AveragedSACLoss}[kind]
-        sac = make_sac_loss(
-            loss_class, feature_dim, action_dim, hidden_dim=hidden_dim, device=self.device, generator=generator,
-            gamma=DISCOUNT, alpha_init=0.1,
-        )  # fmt: skip
+            ddpg = SkillDDPGLoss(policy.to(self.device), critic.to(self.device), generator=generator)
+            return SACLearner(ddpg, actor_interval=1, target_interval=1)
+        sac_class = {"rad-sac": RADSACLoss, "averaged-sac": AveragedSACLoss}[self.exploration.agent]
+        actor = SquashedGaussianActor(feature_dim, action_dim, hidden_dim=hidden_dim)
+        critic = TwinCritic(feature_dim, action_dim, hidden_dim=hidden_dim)
+        sac = sac_class(actor.to(self.device), critic.to(self.device), gamma=DISCOUNT, generator=generator)
         return SACLearner(sac)
 
     def _make_reward(self) -> Transform:
@@ -444,37 +414,33 @@ class Explorer:
     def _make_replay(self, run: Run, path: Path | None, capacity: int, slack: int) -> FrameReplay:
         skills = self.exploration.skill_dim
         replay = make_replay(
-            run, path, self._env.env, capacity, slack=slack, n_step=self.exploration.n_step, discount=DISCOUNT,
+            run, path, self.env.env, capacity, slack=slack, n_step=self.exploration.n_step, discount=DISCOUNT,
             extra_columns=None if skills is None else {"skill": ((skills,), torch.float32)},
             generator=self.generators["replay"],
         )  # fmt: skip
-        views, encoded = dict(getattr(self.loss, "views", {})), dict(PIXELS)
+        images: list[Any] = ["pixels", ("next", "pixels")]
+        features: list[Any] = ["features", ("next", "features")]
+        seconds: list[Any] = []
+        views: dict[Any, Any] = dict(getattr(self.loss, "views", {}))
         if isinstance(self.learner.loss, AveragedSACLoss):
-            views |= SECOND_VIEWS
-            encoded |= {"pixels_view": "features_view", ("next", "pixels_view"): ("next", "features_view")}
-        replay.append_transform(
-            RandomShift(
-                pad=SHIFT_PAD,
-                in_keys=[*views.values(), *PIXELS],
-                out_keys=[*views, *PIXELS],
-                generator=self.generators["shift"],
-            )
-        )
+            seconds = ["pixels_view", ("next", "pixels_view")]
+            views |= zip(seconds, images)
+            features += ["features_view", ("next", "features_view")]
+        read, written = [*views.values(), *images], [*views, *images]
+        generator = self.generators["shift"]
+        replay.append_transform(RandomShift(pad=SHIFT_PAD, in_keys=read, out_keys=written, generator=generator))
         # Adds the features of every image to a batch, without gradient.
-        self.encode = FrozenEncoder(self.loss.encoder, in_keys=[*encoded], out_keys=[*encoded.values()])
+        self.encode = FrozenEncoder(self.loss.encoder, in_keys=[*images, *seconds], out_keys=features)
         return replay
 
 
-def _named(domains: str | Domain | Sequence[str | Domain], method: Method) -> dict[str, str | Domain]:
-    listed = [domains] if isinstance(domains, (str, Domain)) else list(domains)
-    named: dict[str, str | Domain] = {}
-    for domain in listed:
-        name = get_domain(domain).name
-        if name in named:
-            raise CRPTproError(f"The domain {name!r} is named twice; each has one agent.")
-        named[name] = domain
+def _named(domains: str | Domain | Sequence[str | Domain], method: Method) -> dict[str, Domain]:
+    listed = [get_domain(domain) for domain in ([domains] if isinstance(domains, (str, Domain)) else domains)]
+    named = {domain.name: domain for domain in listed}
     if not named:
         raise CRPTproError("Name at least one domain to explore.")
+    if len(named) < len(listed):
+        raise CRPTproError(f"A domain is named twice: {', '.join(d.name for d in listed)}. Each has one agent.")
     if method.exploration is not None and method.exploration.is_single_domain and len(named) > 1:
         raise CRPTproError(
             f"{method.name} pre-trains on one domain, got {len(named)} ({', '.join(named)}). Run it once per domain, "

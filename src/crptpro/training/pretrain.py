@@ -21,7 +21,7 @@ from crptpro.data import FrameDataset
 from crptpro.errors import DatasetError
 from crptpro.logging import RunLogger
 from crptpro.modules import computing, resolve_precision, usable_device
-from crptpro.modules.precision import Precision
+from crptpro.modules.precision import PRECISION_NAMES, Precision
 from crptpro.objectives import Method, get_method, method_of
 from crptpro.objectives.functional import mean_pairwise_cosine, prototype_metrics
 from crptpro.pretrained import Pretrained, class_name, load_pretrained, loss_options
@@ -33,6 +33,7 @@ from crptpro.transforms import RandomShift
 from crptpro.values import check_numbers
 
 SHIFT_PAD = 4
+METHOD_FIELDS = ("updates", "batch_size", "learning_rate", "warmup_updates", "encoder_tau")
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,7 @@ class PretrainConfig:
     seed: int = 0
     """seeds sampling, shifts, and what the loss draws"""
     precision: Precision = "auto"
-    """arithmetic of convolutions and big matrix products; auto is bf16 where the hardware is faster in it. Deviation:
-    the released code computes in fp32 throughout, which fp32 gives"""
+    """arithmetic of big products; auto is bf16 where that is faster. Deviation: the released code is fp32 throughout"""
     compile: bool = False
     """compile the loss with torch.compile; changes rounding only"""
     cuda_graph: bool = False
@@ -69,9 +69,7 @@ class PretrainConfig:
         check_numbers(self, minima={"warmup_updates": 0}, maxima={"encoder_tau": 1})
 
     def resolved(self, method: Method) -> Any:
-        """Return these settings with the method's values where they were left open."""
-        own = ("updates", "batch_size", "learning_rate", "warmup_updates", "encoder_tau")
-        values = {name: getattr(method, name) for name in own if getattr(self, name) is None}
+        values = {name: getattr(method, name) for name in METHOD_FIELDS if getattr(self, name) is None}
         return dataclasses.replace(self, **values)
 
 
@@ -112,26 +110,20 @@ def pretrain(
     """Train a self-supervised loss on the datasets of several domains (CRPTpro, algorithm 1).
 
     Update u (from 0) uses dataset u mod N only: one batch under random shifts, one Adam step, one EMA step of the
-    targets. Any ``LossModule`` works that returns scalar ``loss_*`` terms for a batch with the entries of its
-    ``in_keys``.
-
-    With ``run_dir`` the run can be killed at any moment: the same call with a newly built loss continues from the last
-    checkpoint and, on a CPU, gives the weights of an uninterrupted run. A larger ``updates`` extends a finished run.
+    targets. With ``run_dir`` the run can be killed at any moment: the same call with a newly built loss continues from
+    the last checkpoint and, on a CPU, gives the same weights. A larger ``updates`` extends a finished run.
 
     Args:
-        loss: the objective with its networks; trained in place.
+        loss: any ``LossModule`` that returns scalar ``loss_*`` terms for a batch of its ``in_keys``; trained in place.
         datasets: one or several (a sequence, or a mapping of domain names): directories,
             :class:`~crptpro.data.FrameDataset`, or any TorchRL ``ReplayBuffer`` whose samples have the loss's keys.
-        method: name of a registered method, whose numbers are the defaults; by default that of the loss's class.
+        method: name of a registered method, whose numbers are the defaults; by default that of the loss.
         run_dir: record (``pretrain.csv``, ``metrics.jsonl``) and checkpoints; ``None`` writes nothing.
         config: all settings.
         records: used instead of a record in ``run_dir``, e.g. one that mirrors to W&B.
         progress: show a bar, or lines in a log file.
         started_from: identity of the artifact that the loss's weights come from, if any.
         **overrides: single settings of :class:`PretrainConfig`, e.g. ``updates=10_000``.
-
-    Returns:
-        The trained loss, its last metrics and the verdict on collapse.
 
     Raises:
         CheckpointError: ``run_dir`` holds a run of other settings (named), or another process is running in it.
@@ -150,25 +142,21 @@ def pretrain(
         stack.enter_context(computing(loss, dtype))
         buffers, generators = stack.enter_context(_opened(datasets, loss, seed=settings.seed, device=device))
         torch.manual_seed(settings.seed)
-        optimizer, schedule, targets = make_optimizer(
-            loss, recipe, learning_rate=settings.learning_rate, warmup_updates=settings.warmup_updates,
-            encoder_tau=settings.encoder_tau, updates=settings.updates, cuda_graph=settings.cuda_graph,
-        )  # fmt: skip
+        recipe = dataclasses.replace(recipe, **{name: getattr(settings, name) for name in METHOD_FIELDS})
+        optimizer, schedule, targets = make_optimizer(loss, recipe, cuda_graph=settings.cuda_graph)
         monitor = CollapseMonitor.of(loss)
         datasets_facts = [_facts(name, buffer) for name, buffer in buffers.items()]
-        decisive = ("batch_size", "learning_rate", "warmup_updates", "encoder_tau", "seed")
         run.require_same({
-            **{name: getattr(settings, name) for name in decisive},
+            **{name: getattr(settings, name) for name in (*METHOD_FIELDS, "seed")},
             # A schedule is stretched over the run, so that a run with one cannot be extended.
             "updates": None if recipe.schedule == "constant" else settings.updates,
-            "schedule": recipe.schedule, "grad_clip": recipe.grad_clip, "precision": precision_name(dtype),
-            "loss": describe_loss(loss), "started_from": started_from,
-            "datasets": datasets_facts,
+            "schedule": recipe.schedule, "grad_clip": recipe.grad_clip, "precision": PRECISION_NAMES[dtype],
+            "loss": describe_loss(loss), "started_from": started_from, "datasets": datasets_facts,
         })  # fmt: skip
         samplers = {
             f"sampler_{index}": buffer.sampler
             for index, buffer in enumerate(buffers.values())
-            if type(buffer.sampler) is not RandomSampler and hasattr(buffer.sampler, "state_dict")
+            if type(buffer.sampler) is not RandomSampler
         }
         run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor,
                  generators=generators, **samplers)  # fmt: skip
@@ -196,15 +184,9 @@ def pretrain(
 def finetune(pretrained: Pretrained | str | Path, datasets: Any, **options: Any) -> PretrainResult:
     """Train a pretrained artifact further, e.g. on the random data of one more domain.
 
-    The networks, the target networks and the prototypes continue from what was saved; Adam starts anew.
-
-    Args:
-        pretrained: an artifact, its directory, or the name of one that ships.
-        datasets: as of :func:`pretrain`.
-        **options: further arguments of :func:`pretrain`, or single settings.
-
-    Returns:
-        As of :func:`pretrain`; its card also says how the artifact was trained before.
+    All networks continue from what was saved, targets and prototypes included; Adam starts anew. ``pretrained`` is an
+    artifact, its directory, or the name of one that ships; ``datasets`` and ``options`` are those of :func:`pretrain`.
+    The result's card also says how the artifact was trained before.
 
     Raises:
         PretrainedError: the artifact cannot be read, or its loss cannot be built again.
@@ -222,31 +204,31 @@ def finetune(pretrained: Pretrained | str | Path, datasets: Any, **options: Any)
 
 
 def make_optimizer(
-    loss: LossModule, method: Method, *, learning_rate: float, warmup_updates: int, encoder_tau: float | None,
-    updates: int, cuda_graph: bool = False,
-) -> tuple[torch.optim.Adam, torch.optim.lr_scheduler.LambdaLR, SoftUpdate | None]:  # fmt: skip
-    """Return Adam, the learning-rate schedule over ``updates``, and the EMA of the target networks."""
+    loss: LossModule, method: Method, *, cuda_graph: bool = False
+) -> tuple[torch.optim.Adam, torch.optim.lr_scheduler.LambdaLR, SoftUpdate | None]:
+    """Return Adam, the learning-rate schedule over the method's updates, and the EMA of the target networks."""
     parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
     if not parameters:
         raise ValueError(f"{type(loss).__name__} has no parameters that require a gradient: nothing to train.")
-    rate = torch.tensor(learning_rate, device=parameters[0].device) if cuda_graph else learning_rate
+    rate = torch.tensor(method.learning_rate, device=parameters[0].device) if cuda_graph else method.learning_rate
     optimizer = torch.optim.Adam(parameters, lr=rate, fused=True, capturable=cuda_graph)
 
     def factor(update: int) -> float:
-        if update < warmup_updates:
-            return update / warmup_updates
+        warmup = method.warmup_updates
+        if update < warmup:
+            return update / warmup
         if method.schedule == "constant":
             return 1.0
-        progress = (update - warmup_updates) / max(updates - warmup_updates, 1)
+        progress = (update - warmup) / max(method.updates - warmup, 1)
         return (1 + math.cos(math.pi * min(progress, 1.0))) / 2
 
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, factor)
     names = [name for name, _ in loss.named_children() if name.startswith("target_") and name.endswith("_params")]
-    if not names or encoder_tau is None:
+    if not names or method.encoder_tau is None:
         return optimizer, schedule, None
     # SoftUpdate begins by copying the sources; fine-tuning continues with the saved targets.
     kept = {name: loss._modules[name].data.clone() for name in names}
-    targets = SoftUpdate(loss, tau=encoder_tau)
+    targets = SoftUpdate(loss, tau=method.encoder_tau)
     for name, target in kept.items():
         getattr(loss, name).data.update_(target)
     return optimizer, schedule, targets
@@ -319,11 +301,6 @@ def write_row(run: Run, loss: LossModule, monitor: CollapseMonitor, batch: Tenso
     run.show(loss=row["loss"])
 
 
-def precision_name(dtype: torch.dtype) -> str:
-    """Return how settings and cards call an arithmetic."""
-    return "bf16" if dtype == torch.bfloat16 else "fp32"
-
-
 def describe_loss(loss: LossModule) -> dict[str, Any]:
     """Return a loss's class, options and tensor shapes, which a checkpoint must agree with."""
     shapes = {
@@ -354,22 +331,14 @@ def ending(
     }  # fmt: skip
 
 
-# --- datasets --------------------------------------------------------------------------------------------------------
-
-CARD_FACTS = ("domain", "task", "transitions", "episodes", "action_repeat", "image_size", "seed", "quality", "colors")
-
-
 @contextlib.contextmanager
 def _opened(
     datasets: Any, loss: LossModule, *, seed: int, device: torch.device
 ) -> Iterator[tuple[dict[str, ReplayBuffer], Generators]]:
     """Yield buffers by domain, with the random shift that the loss wants, and the generators that they draw from."""
-    if isinstance(datasets, Mapping):
-        given: list[tuple[str | None, Any]] = list(datasets.items())
-    elif isinstance(datasets, (str, Path)) or hasattr(datasets, "sample"):
-        given = [(None, datasets)]
-    else:
-        given = [(None, dataset) for dataset in datasets]
+    if isinstance(datasets, (str, Path)) or hasattr(datasets, "sample"):
+        datasets = [datasets]
+    given = list(datasets.items() if isinstance(datasets, Mapping) else ((None, dataset) for dataset in datasets))
     if not given:
         raise DatasetError("pretrain needs at least one dataset, got none.")
     buffers: dict[str, ReplayBuffer] = {}
@@ -380,12 +349,11 @@ def _opened(
             raise DatasetError(
                 f"Dataset {index} is a {type(dataset).__name__}; give a directory, a FrameDataset or a ReplayBuffer."
             )
-        name = name or _card(dataset).get("domain") or f"dataset_{index}"
+        name = name or getattr(dataset, "card", {}).get("domain") or f"dataset_{index}"
         buffers[name if name not in buffers else f"{name}_{index}"] = dataset
     # TorchRL draws indices where the storage is, and its generator must be there, too.
     devices = {f"sample/{name}": getattr(buffer.storage, "device", None) for name, buffer in buffers.items()}
-    devices = {name: device for name, device in devices.items() if isinstance(device, torch.device)}
-    generators = Generators(seed, "shift", *(f"sample/{name}" for name in buffers), devices=devices)
+    generators = Generators(seed, "shift", *devices, devices=devices)
     with contextlib.ExitStack() as stack:
         for name, buffer in buffers.items():
             buffer.set_rng(generators[f"sample/{name}"])
@@ -422,11 +390,8 @@ def _shift_for(loss: LossModule, name: str, buffer: ReplayBuffer, generator: tor
     return RandomShift(pad=SHIFT_PAD, in_keys=read, out_keys=[*seconds, *images], generator=generator)
 
 
-def _card(buffer: ReplayBuffer) -> dict[str, Any]:
-    return getattr(buffer, "card", None) or {}
-
-
 def _facts(name: str, buffer: ReplayBuffer) -> dict[str, Any]:
     """Return what the card of an encoder says about a dataset, and what must agree for a run to be continued."""
-    card = _card(buffer)
-    return {"domain": name, "transitions": len(buffer), **{k: card[k] for k in CARD_FACTS if k in card}}
+    card = getattr(buffer, "card", {})
+    shown = ("domain", "task", "transitions", "episodes", "action_repeat", "image_size", "seed", "quality", "colors")
+    return {"domain": name, "transitions": len(buffer), **{k: card[k] for k in shown if k in card}}

@@ -28,8 +28,7 @@ from crptpro.values import as_path
 
 logger = logging.getLogger(__name__)
 
-CHECKPOINT_SECONDS = 300.0
-"""Between two checkpoints of a run without an interval."""
+CHECKPOINT_SECONDS = 300.0  # between two checkpoints of a run without an interval
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
 """Requests to stop: Ctrl-C, and what clusters send before they reclaim a machine."""
 
@@ -37,14 +36,14 @@ SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SI
 class Generators(dict[str, torch.Generator]):
     """Random generators by name, each with its own seed, and on the CPU unless ``devices`` names another device."""
 
-    def __init__(self, seed: int, *names: str, devices: Mapping[str, torch.device | None] | None = None) -> None:
+    def __init__(self, seed: int, *names: str, devices: Mapping[str, Any] | None = None) -> None:
         super().__init__()
         for name in names:
-            generator = torch.Generator((devices or {}).get(name) or "cpu")
+            device = (devices or {}).get(name)
+            generator = torch.Generator(device if isinstance(device, torch.device) else "cpu")
             self[name] = generator.manual_seed(derive_seed(seed, "generator", name))
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the state of every generator."""
         return {name: generator.get_state() for name, generator in self.items()}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
@@ -98,7 +97,7 @@ class Run:
     Args:
         run_dir: record and checkpoints; ``None`` keeps nothing.
         unit: what the position counts, ``"updates"`` or ``"env_steps"``; the first counter of every row.
-        streams: those of the record that this run writes.
+        streams: those of the record that this run writes; :meth:`log` takes the first by default.
         records: used instead of a record in ``run_dir``.
         config: settings, for the record.
         progress: show a bar, or lines in a log file.
@@ -139,7 +138,6 @@ class Run:
         self._signal: int | None = None
         self._last_advance = self._row_position = 0
         self._started = self._saved_time = self._row_time = time.monotonic()
-        self._earlier_seconds = 0.0
         self._is_shown = progress
         self._progress = Progress(0, 0, unit, is_shown=False)
 
@@ -162,7 +160,7 @@ class Run:
     @property
     def seconds(self) -> float:
         """Training time, all resumptions included."""
-        return self._earlier_seconds + time.monotonic() - self._started
+        return time.monotonic() - self._started
 
     def saved_setting(self, name: str, value: Any) -> Any:
         """Return a setting; one that is ``"auto"`` is what the interrupted run resolved it to on its machine."""
@@ -174,11 +172,8 @@ class Run:
         if not self.saved:
             return
         before, now = _flat(self.saved["settings"]), _flat(self.settings)
-        differing = [
-            f"{name} was {before.get(name, 'absent')!r}, now {now.get(name, 'absent')!r}"
-            for name in sorted({*before, *now})
-            if before.get(name, "absent") != now.get(name, "absent")
-        ]
+        pairs = {name: (before.get(name, "absent"), now.get(name, "absent")) for name in sorted({*before, *now})}
+        differing = [f"{name} was {old!r}, now {new!r}" for name, (old, new) in pairs.items() if old != new]
         if differing:
             more = f" (and {len(differing) - 5} more)" if len(differing) > 5 else ""
             raise CheckpointError(
@@ -202,14 +197,14 @@ class Run:
             except Exception as reason:
                 raise CheckpointError(f"The checkpoint {self._latest} does not fit this run: {reason}") from reason
             self.position = self.resumed_from = self._row_position = self.saved["position"]
-            self._earlier_seconds = self.saved["seconds"]
             self.tally.update(self.saved["tally"])
             if self.records is not None and self.saved["record"] is not None:
                 self.records.load_state_dict(self.saved["record"])
             logger.info("Continues from %s %s.", f"{self.position:,}", self.unit)
         elif self.records is not None and self.run_dir is not None and self.records.writes_into(self.run_dir):
             self.records.load_state_dict(dict.fromkeys(self.streams, 0))
-        self._started = self._saved_time = self._row_time = time.monotonic()
+        self._saved_time = self._row_time = time.monotonic()
+        self._started = self._row_time - self.saved.get("seconds", 0.0)
 
     def until(self, total: int, *, checkpoint_interval: int | None = None) -> Iterator[int]:
         """Yield the position until it has reached ``total``; the body of the loop calls :meth:`advance`.
@@ -295,17 +290,14 @@ class Run:
     ) -> dict[str, Any]:
         """Write a row with the position, :attr:`counters` and ``counters``, and return it without them.
 
-        It holds ``values``; by default the means since the last row with ``extra``, rate and memory, and the means
-        start again.
+        It holds ``extra`` and ``values``; by default the means since the last row, which start again, rate and memory.
         """
         counters = {self.unit: self.position, **self.counters, **counters}
+        row: dict[str, Any] = {**(self.means(stream) if values is None else values), **(extra or {})}
         if values is None:
-            row: dict[str, Any] = {**self.means(stream), **(extra or {})}
             self._means[stream].load_state_dict({"sums": {}, "counts": {}})
             if stream == self.streams[0]:
                 row |= self._rate_and_memory()
-        else:
-            row = dict(values)
         self.history[stream].append({**counters, **row})
         if self.records is not None:
             self.records.log(row, stream=stream, **counters)
@@ -365,25 +357,23 @@ class Run:
 
     def _find_checkpoint(self) -> None:
         """Read the newest checkpoint that is whole; damaged newer ones are removed, since they would outrank it."""
-        paths = sorted(self._rotation.directory.glob("checkpoint-*"), reverse=True)
-        for place, path in enumerate(paths):
+        damaged: list[Path] = []
+        for path in sorted(self._rotation.directory.glob("checkpoint-*"), reverse=True):
             try:
                 with zipfile.ZipFile(path) as archive:
                     if (broken := archive.testzip()) is not None:
                         raise CheckpointError(f"{broken} in it is damaged")
-                self.saved = dict(Checkpoint.manifest(path)["metadata"]["run"])
+                self.saved, self._latest = dict(Checkpoint.manifest(path)["metadata"]["run"]), path
             except Exception as reason:
                 logger.warning("The checkpoint %s is damaged (%s); using the one before.", path, reason)
+                damaged.append(path)
                 continue
-            self._latest = path
-            for damaged in paths[:place]:
-                damaged.unlink()
+            for each in damaged:
+                each.unlink()
             return
-        if paths:
-            raise CheckpointError(
-                f"All {len(paths)} checkpoints in {self._rotation.directory} are damaged. Remove that directory to "
-                "start again."
-            )
+        if damaged:
+            where = self._rotation.directory
+            raise CheckpointError(f"All checkpoints in {where} are damaged. Remove that directory to start again.")
 
 
 def _not_finite(what: str) -> NonFiniteError:

@@ -53,12 +53,8 @@ class EnvThread:
 
     def reset(self, seed: int) -> TensorDictBase:
         """Seed the environment and begin the episode of the seed."""
-
-        def reset() -> TensorDictBase:
-            self.env.set_seed(seed)
-            return self.env.reset()
-
-        return self._thread.submit(reset).result()
+        self._thread.submit(self.env.set_seed, seed).result()
+        return self._thread.submit(self.env.reset).result()
 
     def step(self, td: TensorDictBase) -> Future[TensorDictBase]:
         """Begin the step of ``td["action"]``; ``td`` may not change until the result is there."""
