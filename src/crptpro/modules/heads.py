@@ -164,7 +164,8 @@ class SkillHead(LinearNetwork):
 
 def latent_dim_of(head: nn.Module) -> int | None:
     """Return the latent length D in the ``config`` of a head, or None."""
-    return getattr(head, "config", {}).get("latent_dim")
+    config = getattr(head, "config", None)
+    return config.get("latent_dim") if isinstance(config, dict) else None
 
 
 def require_one_latent_dim(**heads: nn.Module) -> None:

@@ -191,6 +191,11 @@ def pretrain_active(
     plan = plan_exploration(recipe, list(named.values()), given)
     exploration: Any = recipe.exploration
     settings = given.resolved(recipe)
+    prototypes = getattr(loss, "prototypes", None) if exploration.reward == "prototype" else None
+    if prototypes is not None and settings.queue_size % len(prototypes.weight):
+        raise ValueError(
+            f"queue_size must be a multiple of num_prototypes, got {settings.queue_size} and {len(prototypes.weight)}."
+        )
     device = usable_device(settings.device)
     loss.to(device).train()
     with contextlib.ExitStack() as stack:
