@@ -22,9 +22,7 @@ CARD_FILE = "card.json"
 def write_whole(path: str | Path, content: str | bytes) -> Path:
     """Write a file, text in UTF-8, beside ``path`` and rename it into place: nobody sees half of it. Returns ``path``.
 
-    Raises:
-        DiskSpaceError: the disk is full; what was there before is kept.
-        OSError: it cannot be written for another reason; names the path.
+    A full disk is a DiskSpaceError, another failure an OSError with the path; what was there before is kept.
     """
     path = as_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -43,12 +41,7 @@ def write_whole(path: str | Path, content: str | bytes) -> Path:
 
 
 def write_json(path: str | Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON object, whole or not at all; NumPy and torch scalars become the numbers they mean.
-
-    Raises:
-        ValueError: naming an entry that is no plain value.
-        DiskSpaceError: the disk is full; what was there before is kept.
-    """
+    """Write a JSON object as :func:`write_whole` does; a ValueError names an entry that is no plain value."""
     plain = as_plain(content, Path(path).name)
     write_whole(path, json.dumps(plain, indent=2, sort_keys=True) + "\n")
 
@@ -160,9 +153,7 @@ def read_artifact(
     if card.get("format") != format_name:
         raise error(f"{path} is a {card.get('format', 'directory of unknown format')!r}, expected {format_name!r}.")
     if card.get("version", 0) > version:
-        raise error(
-            f"{path} has format version {card['version']}; this crptpro reads up to {version}. Upgrade crptpro."
-        )
+        raise error(f"{path} has format version {card['version']}; this crptpro reads up to {version}. Upgrade it.")
     weights = path / WEIGHTS_FILE
     try:
         content = weights.read_bytes()
@@ -181,12 +172,10 @@ def identity_of(card: Mapping[str, Any]) -> str | None:
 
     A slim copy has the identity of the artifact that it was made from.
     """
-    for key in ("slim_of", "trimmed_from"):  # the second is in the cards under results/
-        if key in card:
-            return str(card[key])
-    if "weights_sha256" in card:
-        return f"{card.get('method', 'unknown')}:{card['weights_sha256']}"
-    return None
+    if "weights_sha256" not in card:
+        return None
+    whole = card.get("slim_of") or card.get("trimmed_from")  # the second is in the cards under results/
+    return whole or f"{card.get('method', 'unknown')}:{card['weights_sha256']}"
 
 
 def _previous(path: Path) -> Path:

@@ -33,25 +33,20 @@ _LOG = logging.getLogger(__name__)
 class WandbOptions:
     """How a run appears on Weights & Biases; ``None`` follows W&B's own variables."""
 
-    project: str | None = None
-    """project (``WANDB_PROJECT``, else crptpro)"""
-    group: str | None = None
-    """runs of one comparison (``WANDB_RUN_GROUP``, else none)"""
-    name: str | None = None
-    """display name (``WANDB_NAME``, else the run directory's name)"""
+    project: str | None = None  #: ``WANDB_PROJECT``, else crptpro
+    group: str | None = None  #: runs of one comparison: ``WANDB_RUN_GROUP``, else none
+    name: str | None = None  #: ``WANDB_NAME``, else the run directory's name
     tags: tuple[str, ...] = ()
-    """tags"""
+    #: auto: ``WANDB_MODE`` if set, online if logged in, else offline (``wandb sync`` uploads it later)
     mode: Literal["auto", "online", "offline"] = "auto"
-    """auto: ``WANDB_MODE`` if set, online if logged in, else offline (``wandb sync`` uploads it later)"""
 
 
 class RunLogger:
     """Writes ``metrics.jsonl`` and one CSV per stream, and mirrors them to W&B and TensorBoard if requested.
 
-    Rows are complete on disk when :meth:`log` returns; a CSV that disagrees with ``metrics.jsonl`` is rewritten.
-    Settings and mirrors begin with the first row, so that a refused request leaves no trace. A mirror that fails is
-    switched off with one warning. The directory is locked for this process until :meth:`close`, or the end of a
-    ``with`` block.
+    Rows are on disk when :meth:`log` returns; a CSV that disagrees with ``metrics.jsonl`` is rewritten. Settings and
+    mirrors begin with the first row, so that a refused request leaves no trace. A mirror that fails is switched off
+    with one warning. The directory is locked until :meth:`close`, or the end of a ``with`` block.
 
     Args:
         run_dir: directory of the run, created if missing; rows found there are continued.
@@ -141,7 +136,8 @@ class RunLogger:
 
     def rows(self, stream: str) -> list[dict[str, Any]]:
         """Return the rows of a stream so far, oldest first, without the stream's name."""
-        return [{name: row[name] for name in row if name != "stream"} for row in self._rows if row["stream"] == stream]
+        found = [row for row in self._rows if row["stream"] == stream]
+        return [{name: value for name, value in row.items() if name != "stream"} for row in found]
 
     def state_dict(self, streams: Iterable[str]) -> dict[str, int]:
         """Return the number of rows per stream, synced to disk, for a checkpoint."""
@@ -218,9 +214,7 @@ class RunLogger:
                 call(mirror)
             except Exception as reason:
                 self._mirrors.remove(mirror)
-                _LOG.warning(
-                    "%s is off from here (%s); the local record in %s is complete.", mirror.name, reason, self.run_dir
-                )
+                _LOG.warning("%s is off (%s); the local record in %s is complete.", mirror.name, reason, self.run_dir)
 
 
 @dataclass

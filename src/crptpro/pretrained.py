@@ -127,9 +127,8 @@ class Pretrained:
             loss: Any = method.loss_class(networks["encoder"], **heads, **options)
             loss.load_state_dict(self.rest, strict=False)
         except (TypeError, RuntimeError) as reason:
-            raise PretrainedError(
-                f"{method.loss_class.__name__} cannot be rebuilt from the artifact: {reason}"
-            ) from reason
+            name = method.loss_class.__name__
+            raise PretrainedError(f"{name} cannot be rebuilt from the artifact: {reason}") from reason
         for target in networks.keys() & {*TARGETS}:
             for key, live in _target_state(loss, target).items():
                 live.copy_(networks[target].state_dict()[key])
@@ -143,14 +142,11 @@ def random_pretrained(
     """Return a control: an encoder frozen at initialisation, without heads and prototypes.
 
     Args:
-        seed: seeds the initialisation; the global generator is left as it was.
+        seed: of the initialisation; the global generator is left as it was.
         method: ``"random-encoder"``; ``"random-encoder-standardised"``, whose features have mean 0 and deviation 1 on
             ``datasets``; or ``"drq"``, which trains it.
-        datasets: directories or :class:`~crptpro.data.FrameDataset`, for the standardised one.
+        datasets: directories or :class:`~crptpro.data.FrameDataset`; the standardised one needs one.
         **encoder_config: arguments of :class:`~crptpro.modules.PixelEncoder`.
-
-    Raises:
-        PretrainedError: no dataset to standardise on.
 
     Examples:
         >>> random_pretrained(channels=(4,), strides=(2,), image_size=16).method
@@ -193,25 +189,27 @@ def save_pretrained(
         trained: the result of a pre-training (``.loss``, ``.method``, ``.training``, and optionally ``.actor`` and
             ``.queue``); a loss with the pre-training contract (``.encoder``, and optionally ``.projector``,
             ``.predictor``, ``.prototypes``); or a loaded artifact.
-        path: directory to write; an artifact there is replaced, as a whole.
+        path: directory to write and to return; an artifact there is replaced, as a whole.
         slim: leave out what only training reads: predictor, targets and further heads, and without prototypes the
             projector. Learning a task from it gives the same numbers; fine-tuning from it is refused.
         dtype: ``"bfloat16"`` stores the weights in half the size, rounded to 8 bits; they are loaded as float32.
 
-    Returns:
-        ``path``.
-
     Raises:
-        PretrainedError: if there is no encoder that can be rebuilt, or ``path`` is another kind of directory.
-        ValueError: if a network was built with something that is no plain value.
-        DiskSpaceError: if the disk is full; an artifact there is kept.
+        PretrainedError: no encoder that can be rebuilt, or ``path`` is another kind of directory.
+        ValueError: a network was built with something that is no plain value.
+        DiskSpaceError: the disk is full; an artifact there is kept.
     """
     if dtype not in (None, "bfloat16"):
         raise ValueError(f"`dtype` must be 'bfloat16' or None, got {dtype!r}.")
     path = as_path(path)
     source = _as_pretrained(trained)
     if slim:
-        source = _slimmed(source)
+        left_out: dict[str, Any] = dict.fromkeys(("predictor", *TARGETS)) | {"rest": {}}
+        if source.prototypes is None or source.projector is None:
+            left_out |= dict.fromkeys(("projector", "prototypes", "queue"))
+        whole = identity_of(source.card)
+        facts = {"slim": True} if whole is None else {"slim": True, "slim_of": whole}
+        source = replace(source, **left_out, card={**source.card, **facts})
     states: dict[str, Mapping[str, Tensor]] = {}
     described: dict[str, dict[str, Any]] = {}
     classes: dict[str, type[nn.Module]] = {}
@@ -241,18 +239,14 @@ def save_pretrained(
 
 
 def load_pretrained(path: str | Path, classes: Mapping[str, type[nn.Module]] | None = None) -> Pretrained:
-    """Read and verify an artifact; needs nothing but its directory.
+    """Read and verify an artifact; its networks are bit-equal to those saved, frozen, on the CPU.
 
     Args:
-        path: directory written by :func:`save_pretrained`, or the name of an encoder that ships with the package, see
-            :func:`shipped_encoders`.
+        path: directory written by :func:`save_pretrained`, or one of :func:`shipped_encoders`.
         classes: class name to class, for networks that are not this library's.
 
-    Returns:
-        The networks, bit-equal to those saved, frozen, on the CPU.
-
     Raises:
-        PretrainedError: naming what is missing, truncated, tampered with, of another kind, or unknown.
+        PretrainedError: something is missing, truncated, tampered with, of another kind, or unknown.
     """
     path = as_path(path)
     if not path.exists() and path.name == str(path):  # a name, not a path
@@ -291,12 +285,8 @@ def _as_pretrained(trained: Any) -> Pretrained:
         if online is not None and (state := _target_state(loss, target)):
             targets[target] = copy.deepcopy(online)
             targets[target].load_state_dict(state)
-    covered = tuple(f"{role}{suffix}" for role in ("encoder", *HEADS, *TARGETS) for suffix in (".", "_params."))
-    rest = {
-        key: value
-        for key, value in loss.state_dict().items()
-        if isinstance(value, Tensor) and key != "queue" and not key.startswith(covered)
-    }
+    covered = re.compile(rf"queue$|({'|'.join(('encoder', *HEADS, *TARGETS))})(_params)?\.")
+    rest = {k: v for k, v in loss.state_dict().items() if isinstance(v, Tensor) and not covered.match(k)}
     card = {
         "method": method_of(loss).name if result is None else result.method,
         "loss": {"class": class_name(loss), "config": loss_options(loss)},
@@ -304,16 +294,6 @@ def _as_pretrained(trained: Any) -> Pretrained:
     }
     queue, actor = getattr(result, "queue", None), getattr(result, "actor", None)
     return Pretrained(encoder, **heads, **targets, queue=queue, actor=actor, card=card, rest=rest)
-
-
-def _slimmed(source: Pretrained) -> Pretrained:
-    left_out: dict[str, Any] = dict.fromkeys(("predictor", *TARGETS)) | {"rest": {}}
-    if source.prototypes is None or source.projector is None:
-        left_out |= {"projector": None, "prototypes": None, "queue": None}
-    card: dict[str, Any] = {**source.card, "slim": True}
-    if (identity := identity_of(source.card)) is not None:
-        card["slim_of"] = identity
-    return replace(source, **left_out, card=card)
 
 
 def class_name(loss: nn.Module) -> str:
