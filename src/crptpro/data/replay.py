@@ -46,9 +46,9 @@ class FrameReplay(ReplayBuffer):
     - ``index`` (0 is the oldest transition) and ``number``, ``("next", "number")``, int64 ``[B]``: how many frames were
       stored before the observation's newest one. A number is never used again; :meth:`observations` reads it.
 
-    With ``n_step`` above 1 only transitions are drawn whose n transitions are in one episode and in the ring (none is
-    cut short). ``("next", ...)`` is then n agent steps ahead, with the last transition's flags, the n-step return as
-    reward, and a ``discount`` ``[B, 1]`` (:func:`~crptpro.data.storage.n_step_return`); indexing reads single ones.
+    With ``n_step`` above 1 only windows of n transitions are drawn that are in one episode and in the ring; none is cut
+    short. ``("next", ...)`` is then n agent steps ahead, with the last transition's flags, the n-step return as reward,
+    and a ``discount`` ``[B, 1]`` (:func:`~crptpro.data.storage.n_step_return`). Indexing reads single transitions.
     Deviation: url_benchmark draws an episode uniformly, and then an anchor in it; here every anchor is equally likely.
 
     A ring on disk is its own checkpoint: :meth:`state_dict` holds a few counters, and loading it restores the content,

@@ -101,7 +101,7 @@ class Rows(NamedTuple):
 def read_rows(
     data: TensorDictBase, *, channels: int, frame_stack: int, extra: Sequence[NestedKey] = (), what: str
 ) -> Rows:
-    """Read what a TorchRL environment, rollout or collector returns, ``[T]`` or ``[]``; ``what`` takes it."""
+    """Read what a TorchRL environment, rollout or collector returns, ``[T]`` or ``[]``; errors name ``what``."""
     if not is_tensor_collection(data) or data.ndim > 1:
         got = f"{type(data).__name__} {list(getattr(data, 'shape', ()))}"
         raise ValueError(f"{what} takes a TensorDict [T] or [] of one environment in temporal order, got {got}.")

@@ -60,7 +60,8 @@ def dense_shift_maps(
 ) -> Tensor:
     """Encode images once per stride phase, border replicated, for every shift of up to ``pad`` pixels.
 
-    Returns ``[B, phases**2, C, m, m]`` contiguous, of ``dtype`` or the encoder's compute dtype, not standardised.
+    Returns ``[B, phases**2, C, m, m]`` contiguous, of ``dtype`` or the encoder's compute dtype, phases ordered (row,
+    column); not standardised.
     """
     phases, window, _ = dense_shift_geometry(encoder, pad)
     expected = (encoder.in_channels, encoder.image_size, encoder.image_size)
@@ -211,7 +212,7 @@ class DenseShiftFeatures(Transform):
 
     @torch.no_grad()
     def unshifted(self, number: int) -> Tensor:
-        """Return the features ``[1, feature_dim]`` of one observation without a shift; a policy acts on them."""
+        """Return an observation's features ``[1, feature_dim]`` without a shift, for a policy; its maps are kept."""
         numbers, centre = torch.tensor([number]), torch.full((1, 2), self.pad)
         with self._lock:
             maps, _ = self._encode_missing(numbers)
