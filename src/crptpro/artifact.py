@@ -20,13 +20,9 @@ CARD_FILE = "card.json"
 
 
 def write_whole(path: str | Path, content: str | bytes) -> Path:
-    """Write a file beside ``path`` and rename it into place, so that neither a reader nor a power cut sees half of it.
+    """Write a file, text in UTF-8, beside ``path`` and rename it into place: nobody sees half of it. Returns ``path``.
 
-    Its directory is made; text is UTF-8 with its line ends as they are. Returns ``path``.
-
-    Raises:
-        DiskSpaceError: the disk is full; what was there before is kept.
-        OSError: it cannot be written for another reason; names the path.
+    A full disk is a DiskSpaceError, another failure an OSError with the path; what was there before is kept.
     """
     path = as_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -45,12 +41,7 @@ def write_whole(path: str | Path, content: str | bytes) -> Path:
 
 
 def write_json(path: str | Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON object, whole or not at all; NumPy and torch scalars become the numbers they mean.
-
-    Raises:
-        ValueError: naming an entry that is no plain value.
-        DiskSpaceError: the disk is full; what was there before is kept.
-    """
+    """Write a JSON object as :func:`write_whole` does; a ValueError names an entry that is no plain value."""
     plain = as_plain(content, Path(path).name)
     write_whole(path, json.dumps(plain, indent=2, sort_keys=True) + "\n")
 
@@ -93,16 +84,11 @@ def write_artifact(
 ) -> Path:
     """Write ``weights.safetensors`` and ``card.json`` beside ``path`` and rename the directory into place.
 
-    The new files are read back before they replace anything. A reader sees the old artifact or the new one, never a
-    mixture; a write that fails (a full disk, a kill) leaves the old one. Returns ``path``.
+    The new files are read back, and ``check`` is called with card and tensors, before they replace anything. A reader
+    sees the old artifact or the new one, never a mixture; a write that fails (a full disk, a kill) leaves the old one.
 
-    Args:
-        path: directory to write or replace.
-        modules: name to network or to its state dict; tensors are stored as ``name.key``.
-        card: plain facts; ``format``, ``version`` and ``weights_sha256`` are added.
-        format_name: kind of artifact.
-        version: of the format.
-        check: called with card and tensors as they were read back; if it raises, nothing is replaced.
+    ``modules`` maps names to networks or their state dicts; tensors are stored as ``name.key``. ``format``, ``version``
+    and ``weights_sha256`` are added to the plain facts of ``card``. Returns ``path``.
 
     Raises:
         CRPTproError: there is something else at ``path``; it is left alone.
@@ -113,7 +99,12 @@ def write_artifact(
 
     given = as_path(path)
     path = given.resolve()
-    _require_replaceable(path, format_name)
+    is_free = not path.exists() or (path.is_dir() and not any(path.iterdir()))
+    if not is_free and (not (path / CARD_FILE).exists() or read_json(path / CARD_FILE).get("format") != format_name):
+        raise CRPTproError(
+            f"{path} exists and is no {format_name!r}; it is not replaced. Choose another directory, such as "
+            f"{path / 'encoder'}."
+        )
     tensors = {}
     for name, module in modules.items():
         state = module.state_dict() if isinstance(module, nn.Module) else module
@@ -127,7 +118,7 @@ def write_artifact(
         shutil.rmtree(temporary, ignore_errors=True)  # of a writer that was killed
         write_whole(temporary / WEIGHTS_FILE, content)
         write_json(temporary / CARD_FILE, {**card, **facts})
-        found = _read(temporary, format_name, version, CRPTproError)
+        found = read_artifact(temporary, format_name=format_name, version=version)
         if check is not None:
             check(*found)
         if path.exists():
@@ -149,49 +140,20 @@ def read_artifact(
 
     Raises ``error``, naming what is missing, damaged, of another kind or too new.
     """
-    path = as_path(path).resolve()
-    previous = _previous(path)  # where a writer that was killed between its two renames left it
-    return _read(previous if previous.is_dir() and not path.exists() else path, format_name, version, error)
-
-
-def _require_replaceable(path: Path, format_name: str) -> None:
-    if not path.exists() or (path.is_dir() and not any(path.iterdir())):
-        return
-    if not (path / CARD_FILE).exists() or read_json(path / CARD_FILE).get("format") != format_name:
-        raise CRPTproError(
-            f"{path} exists and is no {format_name!r}; it is not replaced. Choose another directory, such as "
-            f"{path / 'encoder'}."
-        )
-
-
-def identity_of(card: Mapping[str, Any]) -> str | None:
-    """Return what identifies an artifact's weights: the method and a checksum; ``None`` without weights.
-
-    A slim copy has the identity of the artifact that it was made from.
-    """
-    for key in ("slim_of", "trimmed_from"):  # the second is in the cards under results/
-        if key in card:
-            return str(card[key])
-    if "weights_sha256" in card:
-        return f"{card.get('method', 'unknown')}:{card['weights_sha256']}"
-    return None
-
-
-def _read(
-    path: Path, format_name: str, version: int, error: type[CRPTproError]
-) -> tuple[dict[str, Any], dict[str, Tensor]]:
     from safetensors import SafetensorError
     from safetensors.torch import load
 
+    path = as_path(path).resolve()
+    previous = _previous(path)  # where a writer that was killed between its two renames left it
+    if previous.is_dir() and not path.exists():
+        path = previous
     if not path.is_dir():
         raise error(f"{path} does not exist or is not a directory; expected one with {WEIGHTS_FILE} and {CARD_FILE}.")
     card = read_json(path / CARD_FILE, error=error)
     if card.get("format") != format_name:
         raise error(f"{path} is a {card.get('format', 'directory of unknown format')!r}, expected {format_name!r}.")
     if card.get("version", 0) > version:
-        raise error(
-            f"{path} has format version {card['version']}; this crptpro reads up to {version}. Upgrade crptpro."
-        )
+        raise error(f"{path} has format version {card['version']}; this crptpro reads up to {version}. Upgrade it.")
     weights = path / WEIGHTS_FILE
     try:
         content = weights.read_bytes()
@@ -203,6 +165,17 @@ def _read(
         return card, load(content)
     except (SafetensorError, ValueError) as reason:
         raise error(f"{weights} cannot be read ({reason}).") from None
+
+
+def identity_of(card: Mapping[str, Any]) -> str | None:
+    """Return what identifies an artifact's weights: the method and a checksum; ``None`` without weights.
+
+    A slim copy has the identity of the artifact that it was made from.
+    """
+    if "weights_sha256" not in card:
+        return None
+    whole = card.get("slim_of") or card.get("trimmed_from")  # the second is in the cards under results/
+    return whole or f"{card.get('method', 'unknown')}:{card['weights_sha256']}"
 
 
 def _previous(path: Path) -> Path:

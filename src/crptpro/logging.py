@@ -14,7 +14,8 @@ import time
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlparse
@@ -25,9 +26,6 @@ from crptpro.errors import CheckpointError, writing_error
 from crptpro.provenance import provenance
 from crptpro.values import as_int, as_path, as_plain
 
-JSONL_NAME = "metrics.jsonl"
-RESERVED = ("stream", "unix_time_s")
-
 _LOG = logging.getLogger(__name__)
 
 
@@ -35,25 +33,20 @@ _LOG = logging.getLogger(__name__)
 class WandbOptions:
     """How a run appears on Weights & Biases; ``None`` follows W&B's own variables."""
 
-    project: str | None = None
-    """project (``WANDB_PROJECT``, else crptpro)"""
-    group: str | None = None
-    """runs of one comparison (``WANDB_RUN_GROUP``, else none)"""
-    name: str | None = None
-    """display name (``WANDB_NAME``, else the run directory's name)"""
+    project: str | None = None  #: ``WANDB_PROJECT``, else crptpro
+    group: str | None = None  #: runs of one comparison: ``WANDB_RUN_GROUP``, else none
+    name: str | None = None  #: ``WANDB_NAME``, else the run directory's name
     tags: tuple[str, ...] = ()
-    """tags"""
+    #: auto: ``WANDB_MODE`` if set, online if logged in, else offline (``wandb sync`` uploads it later)
     mode: Literal["auto", "online", "offline"] = "auto"
-    """auto: ``WANDB_MODE`` if set, online if logged in, else offline (``wandb sync`` uploads it later)"""
 
 
 class RunLogger:
     """Writes ``metrics.jsonl`` and one CSV per stream, and mirrors them to W&B and TensorBoard if requested.
 
-    Rows are complete on disk when :meth:`log` returns. Where the two disagree, ``<stream>.csv`` is rewritten from
-    ``metrics.jsonl``. Settings and mirrors begin with the first row, so that a refused request leaves no trace. A
-    mirror that fails is switched off with one warning; the run continues. Usable as a context manager. The directory is
-    locked for this process until :meth:`close`.
+    Rows are on disk when :meth:`log` returns; a CSV that disagrees with ``metrics.jsonl`` is rewritten. Settings and
+    mirrors begin with the first row, so that a refused request leaves no trace. A mirror that fails is switched off
+    with one warning. The directory is locked until :meth:`close`, or the end of a ``with`` block.
 
     Args:
         run_dir: directory of the run, created if missing; rows found there are continued.
@@ -77,11 +70,11 @@ class RunLogger:
         self, run_dir: str | Path, *, config: Any = None, wandb: WandbOptions | None = None, tensorboard: bool = False
     ) -> None:
         self.run_dir = as_path(run_dir, "run_dir")
-        self.path = self.run_dir / JSONL_NAME
+        self.path = self.run_dir / "metrics.jsonl"
         self._config = as_plain(config or {}, "config")
         self._lock = DirectoryLock(self.run_dir, error=CheckpointError, is_reentrant=True)
         self._rows = self._read()
-        for stream in self._streams():
+        for stream in {row["stream"] for row in self._rows}:
             self._write_csv(stream)
         self._has_begun = False
         self._mirrors: list[_Wandb | _TensorBoard] = []
@@ -101,9 +94,9 @@ class RunLogger:
 
         Args:
             metrics: names to numbers, scalar tensors or short texts; ``None`` leaves a cell empty.
-            stream: which CSV, e.g. ``"pretrain"``, ``"train"``, ``"eval"``.
-            counters: where the run is, e.g. ``updates=100`` or ``env_steps=1000, episodes=2``; at least one. The
-                mirrors plot against ``env_steps`` if given, else the first.
+            stream: which CSV, e.g. ``"train"``.
+            counters: at least one, e.g. ``env_steps=1000, episodes=2``. The mirrors plot against ``env_steps`` if
+                given, else the first.
 
         Raises:
             ValueError: no counter, a name used twice, reserved or not printable, or a value that is no scalar.
@@ -114,24 +107,24 @@ class RunLogger:
         if not counters:
             raise ValueError(f"A row of {stream!r} needs a counter, such as updates=100.")
         for key in (*counters, *metrics):
-            is_taken = key in RESERVED or (key in counters and key in metrics)
+            is_taken = key in ("stream", "unix_time_s") or (key in counters and key in metrics)
             if is_taken or not key.isprintable() or re.search('[,"]', key):
                 raise ValueError(
                     f"{key!r} cannot name a metric of {stream!r}: it is reserved, a counter, or unfit for a CSV header."
                 )
         where = {name: as_int(value, name) for name, value in counters.items()}
         values = {key: _scalar(key, value) for key, value in metrics.items() if value is not None}
-        if not self._has_begun:
-            if self._config:
-                write_json(self.run_dir / "config.json", {"config": self._config, **provenance()})
-            self._has_begun = True
-            self._mirror(lambda mirror: mirror.begin())
-        row = {"stream": stream, **where, "unix_time_s": round(time.time(), 3), **values}
-        columns = self._columns(stream)
-        index = len(self._rows)
-        _append(self.path, json.dumps({key: _cell(value) for key, value in row.items()}) + "\n")
-        self._rows.append({key: _cell(value) for key, value in row.items()})
-        if self._columns(stream) == columns:
+        if not self._has_begun and self._config:
+            write_json(self.run_dir / "config.json", {"config": self._config, **provenance()})
+        self._has_begun = True
+        columns, index = self._columns(stream), len(self._rows)
+        row = {"stream": stream, **where, "unix_time_s": round(time.time(), 3)}
+        # NaN and infinity as words: they are not JSON, and the CSV shows the same.
+        for key, value in values.items():
+            row[key] = str(value) if isinstance(value, float) and not math.isfinite(value) else value
+        _append(self.path, json.dumps(row) + "\n")
+        self._rows.append(row)
+        if row.keys() <= {"stream", *columns}:
             _append(self._csv(stream), _csv_text([[row.get(name) for name in columns]]))
         else:
             self._write_csv(stream)
@@ -144,7 +137,7 @@ class RunLogger:
     def rows(self, stream: str) -> list[dict[str, Any]]:
         """Return the rows of a stream so far, oldest first, without the stream's name."""
         found = [row for row in self._rows if row["stream"] == stream]
-        return [{key: value for key, value in row.items() if key != "stream"} for row in found]
+        return [{name: value for name, value in row.items() if name != "stream"} for row in found]
 
     def state_dict(self, streams: Iterable[str]) -> dict[str, int]:
         """Return the number of rows per stream, synced to disk, for a checkpoint."""
@@ -158,24 +151,19 @@ class RunLogger:
 
         Streams that ``state`` does not name belong to other stages in the same directory and are left alone.
         """
-        for name, count in state.items():
-            if (missing := count - len(self.rows(name))) > 0:
-                _LOG.warning("%s: %d rows of %r are missing that the checkpoint counted.", self.path, missing, name)
-        before = self._streams()
-        seen = Counter[str]()
-        kept = []
+        seen, kept = Counter[str](), []
         for row in self._rows:
             seen[row["stream"]] += 1
             if seen[row["stream"]] <= state.get(row["stream"], math.inf):
                 kept.append(row)
+        for name, count in state.items():
+            if (missing := count - seen[name]) > 0:
+                _LOG.warning("%s: %d rows of %r are missing that the checkpoint counted.", self.path, missing, name)
         if len(kept) < len(self._rows):
             self._write_rows(kept)
         self._rows = kept
-        for stream in before:
-            if stream in self._streams():
-                self._write_csv(stream)
-            else:
-                self._csv(stream).unlink(missing_ok=True)
+        for stream in seen:
+            self._write_csv(stream)
 
     def writes_into(self, directory: str | Path) -> bool:
         """Whether the record is inside ``directory``: only then all of it belongs to that directory's run."""
@@ -187,12 +175,8 @@ class RunLogger:
         self._mirrors = []
         self._lock.release()
 
-    def _streams(self) -> list[str]:
-        return list(dict.fromkeys(row["stream"] for row in self._rows))
-
     def _columns(self, stream: str) -> list[str]:
-        names = (key for row in self._rows if row["stream"] == stream for key in row)
-        return [name for name in dict.fromkeys(names) if name != "stream"]
+        return list(dict.fromkeys(name for row in self.rows(stream) for name in row))
 
     def _csv(self, stream: str) -> Path:
         return self.run_dir / f"{stream}.csv"
@@ -217,10 +201,11 @@ class RunLogger:
         write_whole(self.path, "".join(json.dumps(row) + "\n" for row in rows))
 
     def _write_csv(self, stream: str) -> None:
-        columns = self._columns(stream)
+        columns, path = self._columns(stream), self._csv(stream)
         content = _csv_text([columns, *([row.get(name) for name in columns] for row in self.rows(stream))])
-        path = self._csv(stream)
-        if not path.exists() or path.read_bytes() != content.encode():
+        if not columns:
+            path.unlink(missing_ok=True)
+        elif not path.exists() or path.read_bytes() != content.encode():
             write_whole(path, content)
 
     def _mirror(self, call: Callable[[_Wandb | _TensorBoard], None]) -> None:
@@ -229,56 +214,56 @@ class RunLogger:
                 call(mirror)
             except Exception as reason:
                 self._mirrors.remove(mirror)
-                _LOG.warning(
-                    "%s is off from here (%s); the local record in %s is complete.", mirror.name, reason, self.run_dir
-                )
+                _LOG.warning("%s is off (%s); the local record in %s is complete.", mirror.name, reason, self.run_dir)
 
 
+@dataclass
 class _Wandb:
     """One W&B run per directory. A row's index is its step: W&B drops those that a resumed run repeats."""
 
+    options: WandbOptions
+    run_dir: Path
+    config: dict[str, Any]
+    streams: set[str] = field(default_factory=set)
     name = "Weights & Biases"
 
-    def __init__(self, options: WandbOptions, run_dir: Path, config: Mapping[str, Any]) -> None:
-        self._options, self._run_dir, self._config = options, run_dir, config
-        self._streams: set[str] = set()
-
-    def begin(self) -> None:
+    @cached_property
+    def logger(self) -> Any:
+        """TorchRL's logger; the W&B run begins when it is first used."""
         from torchrl.record.loggers import get_logger
 
-        options, run_dir, environment = self._options, self._run_dir, os.environ
+        options, environment = self.options, os.environ
         arguments = {
             "project": options.project or environment.get("WANDB_PROJECT") or "crptpro",
             "group": options.group or environment.get("WANDB_RUN_GROUP"),
             "tags": list(options.tags) or None,
-            "config": dict(self._config),
-            "id": _wandb_id(run_dir),
+            "config": self.config,
+            "id": _wandb_id(self.run_dir),
             "reinit": "create_new",
             "settings": {"silent": True, "console": "off", "init_timeout": 60.0},
             "log_env_packages": False,
         }
-        name = options.name or environment.get("WANDB_NAME") or run_dir.name
+        name = options.name or environment.get("WANDB_NAME") or self.run_dir.name
         mode = options.mode if options.mode != "auto" else _wandb_mode()
 
         def start(mode: str) -> Any:
-            return get_logger("wandb", str(run_dir), name, wandb_kwargs={**arguments, "mode": mode})
+            return get_logger("wandb", str(self.run_dir), name, wandb_kwargs={**arguments, "mode": mode})
 
         try:
-            self._logger = start(mode)
+            return start(mode)
         except Exception as reason:
             if mode != "online":
                 raise
             _LOG.warning("W&B cannot be reached (%s); logging offline, `wandb sync` uploads it later.", reason)
-            self._logger = start("offline")
-        self._run = self._logger.experiment
+            return start("offline")
 
     def log(self, stream: str, counters: Mapping[str, int], values: Mapping[str, Any], index: int) -> None:
-        if stream not in self._streams:
-            self._run.define_metric(_axis(counters))
-            self._run.define_metric(f"{stream}/*", step_metric=_axis(counters))
-            self._streams.add(stream)
+        if stream not in self.streams:
+            self.logger.experiment.define_metric(_axis(counters))
+            self.logger.experiment.define_metric(f"{stream}/*", step_metric=_axis(counters))
+            self.streams.add(stream)
         row = {**counters, **{f"{stream}/{key}": value for key, value in values.items()}}
-        self._logger.log_metrics(row, step=index, override_global_step=True)
+        self.logger.log_metrics(row, step=index, override_global_step=True)
 
     def artifact(self, path: Path, name: str, kind: str) -> None:
         import wandb
@@ -286,33 +271,33 @@ class _Wandb:
         # W&B takes letters, digits, dash, underscore and dot; a Gymnasium task has a colon.
         artifact = wandb.Artifact(re.sub(r"[^\w.-]", "_", name), type=kind)
         (artifact.add_dir if path.is_dir() else artifact.add_file)(str(path))
-        self._run.log_artifact(artifact)
+        self.logger.experiment.log_artifact(artifact)
 
     def close(self) -> None:
-        self._run.finish()
+        self.logger.experiment.finish()
 
 
+@dataclass
 class _TensorBoard:
     """Event files in ``<run_dir>/tensorboard``; they hold numbers only."""
 
+    run_dir: Path
     name = "TensorBoard"
 
-    def __init__(self, run_dir: Path) -> None:
-        self._run_dir = run_dir
-
-    def begin(self) -> None:
+    @cached_property
+    def logger(self) -> Any:
         from torchrl.record.loggers import get_logger
 
-        self._logger: Any = get_logger("tensorboard", str(self._run_dir), "tensorboard")
+        return get_logger("tensorboard", str(self.run_dir), "tensorboard")
 
     def log(self, stream: str, counters: Mapping[str, int], values: Mapping[str, Any], index: int) -> None:
         numbers = {f"{stream}/{key}": value for key, value in values.items() if not isinstance(value, str)}
-        self._logger.log_metrics(numbers, step=counters[_axis(counters)])
+        self.logger.log_metrics(numbers, step=counters[_axis(counters)])
 
     def artifact(self, path: Path, name: str, kind: str) -> None: ...
 
     def close(self) -> None:
-        self._logger.experiment.close()
+        self.logger.experiment.close()
 
 
 def _axis(counters: Mapping[str, int]) -> str:
@@ -354,14 +339,9 @@ def _scalar(key: str, value: Any) -> int | float | str:
         raise ValueError(f"The metric {key!r} is no scalar: {value!r}.") from None
 
 
-def _cell(value: Any) -> Any:
-    """Return NaN and infinity as words: they are not JSON, and the CSV shows the same."""
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _csv_text(rows: Iterable[Iterable[Any]]) -> str:
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([["" if c is None else _cell(c) for c in row] for row in rows])
+    csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 

@@ -6,6 +6,7 @@ import copy
 import hashlib
 import inspect
 import logging
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -17,18 +18,11 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
+from crptpro import modules
 from crptpro.artifact import CARD_FILE, identity_of, read_artifact, write_artifact
 from crptpro.data import FrameDataset
 from crptpro.errors import PretrainedError, UnknownNameError
-from crptpro.modules import (
-    DeterministicActor,
-    PixelEncoder,
-    Predictor,
-    Projector,
-    Prototypes,
-    SkillHead,
-    SquashedGaussianActor,
-)
+from crptpro.modules import PixelEncoder
 from crptpro.objectives import get_method, method_of
 from crptpro.provenance import provenance
 from crptpro.seeding import derive_seed
@@ -43,10 +37,7 @@ NETWORKS = ("encoder", *HEADS, *TARGETS, "actor")
 SHIPPED = Path(__file__).parent / "encoders"
 """One artifact per directory; their names are what :func:`load_pretrained` takes."""
 
-_CLASSES: dict[str, type[nn.Module]] = {
-    cls.__name__: cls
-    for cls in (PixelEncoder, Projector, Predictor, Prototypes, SkillHead, SquashedGaussianActor, DeterministicActor)
-}
+_CLASSES = {name: entry for name, entry in vars(modules).items() if isinstance(entry, type)}
 _LOG = logging.getLogger(__name__)
 
 
@@ -54,28 +45,19 @@ _LOG = logging.getLogger(__name__)
 class Pretrained:
     """A pre-trained encoder and what was trained with it; networks are frozen and in evaluation mode.
 
-    Attributes:
-        encoder: images to features.
-        projector: features to latents; ``None`` if the method has none. Likewise the others.
-        predictor: latents to latents, online branch.
-        prototypes: unit vectors in the latent space.
-        target_encoder: slow copy of the encoder.
-        target_projector: slow copy of the projector.
-        queue: candidate latents ``[Q, D]`` if the method keeps some.
-        actor: the exploring policy, for methods whose downstream runs start from it.
-        card: how it was made.
-        rest: remaining state of the loss (further heads, coefficients), for fine-tuning.
+    What the method does not have is ``None``.
     """
 
-    encoder: PixelEncoder
-    projector: nn.Module | None = None
-    predictor: nn.Module | None = None
-    prototypes: nn.Module | None = None
-    target_encoder: nn.Module | None = None
-    target_projector: nn.Module | None = None
-    queue: Tensor | None = None
-    actor: nn.Module | None = None
-    card: dict[str, Any] = field(default_factory=dict)
+    encoder: PixelEncoder  #: images to features
+    projector: nn.Module | None = None  #: features to latents
+    predictor: nn.Module | None = None  #: latents to latents, online branch
+    prototypes: nn.Module | None = None  #: unit vectors in the latent space
+    target_encoder: nn.Module | None = None  #: slow copy of the encoder
+    target_projector: nn.Module | None = None  #: slow copy of the projector
+    queue: Tensor | None = None  #: candidate latents ``[Q, D]``
+    actor: nn.Module | None = None  #: the exploring policy, for methods whose downstream runs start from it
+    card: dict[str, Any] = field(default_factory=dict)  #: how it was made
+    #: Remaining state of the loss (further heads, coefficients), for fine-tuning.
     rest: dict[str, Tensor] = field(default_factory=dict, repr=False)
 
     @property
@@ -89,32 +71,29 @@ class Pretrained:
         is_finetuned = bool((self.card.get("training") or {}).get("started_from"))
         return f"{self.method}-finetune" if is_finetuned else self.method
 
+    def _networks(self) -> dict[str, nn.Module]:
+        return {name: module for name in NETWORKS if (module := getattr(self, name)) is not None}
+
     def identity(self) -> str:
         """Return what identifies these weights: the method and a checksum."""
         if (named := identity_of(self.card)) is not None:
             return named
         digest = hashlib.sha256()
-        for name in NETWORKS:
-            module = getattr(self, name)
-            for key, value in ({} if module is None else module.state_dict()).items():
-                digest.update(f"{name}.{key}".encode())
-                digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+        for key, value in nn.ModuleDict(self._networks()).state_dict().items():
+            digest.update(key.encode())
+            digest.update(value.cpu().contiguous().numpy().tobytes())
         return f"{self.method}:{digest.hexdigest()}"
 
     def require(self, *, image_size: int, frame_stack: int | None = None) -> Pretrained:
-        """Check that the encoder takes images of this size, in pixels, and stack. Returns self.
+        """Check the encoder's image size, in pixels, and stack, as far as its ``config`` says them; returns self.
 
-        ``None``, and what an encoder's ``config`` does not say, is not checked.
-
-        Raises:
-            PretrainedError: naming everything that does not fit, and both values.
+        What does not fit is a PretrainedError that names all of it with both values. ``None`` is not checked.
         """
         has = _pixel_facts(self.encoder)
-        needed = {"image_size": image_size, "frame_stack": frame_stack}
         wrong = [
             f"it was trained with {name} {has[name]}, not {value}"
-            for name, value in needed.items()
-            if None not in (value, has[name]) and has[name] != value
+            for name, value in {"image_size": image_size, "frame_stack": frame_stack}.items()
+            if value is not None and has[name] not in (None, value)
         ]
         if wrong:
             raise PretrainedError(
@@ -126,8 +105,7 @@ class Pretrained:
     def build_loss(self) -> LossModule:
         """Build the loss that this was trained with, as trainable copies of all networks, targets included.
 
-        Raises:
-            PretrainedError: its method is not registered, does not take these networks, or they were saved slim.
+        A PretrainedError if its method is not registered or does not take these networks, or they were saved slim.
         """
         if self.card.get("slim") or "trimmed_from" in self.card:
             raise PretrainedError(
@@ -140,22 +118,20 @@ class Pretrained:
                 f"The artifact was trained with {self.method!r}, which is no registered method. Call "
                 "crptpro.objectives.register_method for its loss first."
             ) from reason
-        own = copy.deepcopy(self)
-        networks = {role: module for role in HEADS if (module := getattr(own, role)) is not None}
-        for module in (own.encoder, *networks.values()):
+        networks = copy.deepcopy(self._networks())
+        heads = {name: networks[name] for name in HEADS if name in networks}
+        for module in (networks["encoder"], *heads.values()):
             module.requires_grad_(True).train()
         try:
-            options = own.card.get("loss", {}).get("config", {})
-            loss: Any = method.loss_class(own.encoder, **networks, **options)
-            loss.load_state_dict(own.rest, strict=False)
+            options = self.card.get("loss", {}).get("config", {})
+            loss: Any = method.loss_class(networks["encoder"], **heads, **options)
+            loss.load_state_dict(self.rest, strict=False)
         except (TypeError, RuntimeError) as reason:
-            raise PretrainedError(
-                f"{method.loss_class.__name__} cannot be rebuilt from the artifact: {reason}"
-            ) from reason
-        for target in TARGETS:
-            if (module := getattr(own, target)) is not None:
-                for key, live in _target_state(loss, target).items():
-                    live.copy_(module.state_dict()[key])
+            name = method.loss_class.__name__
+            raise PretrainedError(f"{name} cannot be rebuilt from the artifact: {reason}") from reason
+        for target in networks.keys() & {*TARGETS}:
+            for key, live in _target_state(loss, target).items():
+                live.copy_(networks[target].state_dict()[key])
         loss.method_name = method.name
         return loss
 
@@ -166,14 +142,11 @@ def random_pretrained(
     """Return a control: an encoder frozen at initialisation, without heads and prototypes.
 
     Args:
-        seed: seeds the initialisation; the global generator is left as it was.
+        seed: of the initialisation; the global generator is left as it was.
         method: ``"random-encoder"``; ``"random-encoder-standardised"``, whose features have mean 0 and deviation 1 on
             ``datasets``; or ``"drq"``, which trains it.
-        datasets: directories or :class:`~crptpro.data.FrameDataset`, for the standardised one.
+        datasets: directories or :class:`~crptpro.data.FrameDataset`; the standardised one needs one.
         **encoder_config: arguments of :class:`~crptpro.modules.PixelEncoder`.
-
-    Raises:
-        PretrainedError: no dataset to standardise on.
 
     Examples:
         >>> random_pretrained(channels=(4,), strides=(2,), image_size=16).method
@@ -190,17 +163,15 @@ def random_pretrained(
 
 
 @torch.no_grad()
-def _feature_moments(
-    encoder: PixelEncoder, datasets: Iterable[Any], seed: int, *, samples: int = 2_048
-) -> tuple[Tensor, Tensor]:
-    """Return mean and deviation of every feature over random observations, as many of each dataset."""
+def _feature_moments(encoder: PixelEncoder, datasets: Iterable[Any], seed: int) -> tuple[Tensor, Tensor]:
+    """Return mean and deviation of every feature over 2048 random observations, as many of each dataset."""
     opened = [FrameDataset.open(d) if isinstance(d, (str, Path)) else d for d in datasets]
     if not opened:
         raise PretrainedError("random-encoder-standardised needs datasets to standardise its features on.")
     features = []
     for index, dataset in enumerate(opened):
         dataset.set_rng(torch.Generator().manual_seed(derive_seed(seed, "standardise", index)))
-        pixels = dataset.sample(-(-samples // len(opened)))["pixels"]
+        pixels = dataset.sample(-(-2048 // len(opened)))["pixels"]
         features += [encoder(chunk) for chunk in pixels.split(64)]
     deviation, mean = torch.std_mean(torch.cat(features), dim=0, correction=0)
     # A feature that never changes stays 0 after centring, whatever it is divided by.
@@ -218,31 +189,31 @@ def save_pretrained(
         trained: the result of a pre-training (``.loss``, ``.method``, ``.training``, and optionally ``.actor`` and
             ``.queue``); a loss with the pre-training contract (``.encoder``, and optionally ``.projector``,
             ``.predictor``, ``.prototypes``); or a loaded artifact.
-        path: directory to write; an artifact there is replaced, as a whole.
+        path: directory to write and to return; an artifact there is replaced, as a whole.
         slim: leave out what only training reads: predictor, targets and further heads, and without prototypes the
             projector. Learning a task from it gives the same numbers; fine-tuning from it is refused.
         dtype: ``"bfloat16"`` stores the weights in half the size, rounded to 8 bits; they are loaded as float32.
 
-    Returns:
-        ``path``.
-
     Raises:
-        PretrainedError: if there is no encoder that can be rebuilt, or ``path`` is another kind of directory.
-        ValueError: if a network was built with something that is no plain value.
-        DiskSpaceError: if the disk is full; an artifact there is kept.
+        PretrainedError: no encoder that can be rebuilt, or ``path`` is another kind of directory.
+        ValueError: a network was built with something that is no plain value.
+        DiskSpaceError: the disk is full; an artifact there is kept.
     """
     if dtype not in (None, "bfloat16"):
         raise ValueError(f"`dtype` must be 'bfloat16' or None, got {dtype!r}.")
     path = as_path(path)
     source = _as_pretrained(trained)
     if slim:
-        source = _slimmed(source)
+        left_out: dict[str, Any] = dict.fromkeys(("predictor", *TARGETS)) | {"rest": {}}
+        if source.prototypes is None or source.projector is None:
+            left_out |= dict.fromkeys(("projector", "prototypes", "queue"))
+        whole = identity_of(source.card)
+        facts = {"slim": True} if whole is None else {"slim": True, "slim_of": whole}
+        source = replace(source, **left_out, card={**source.card, **facts})
     states: dict[str, Mapping[str, Tensor]] = {}
     described: dict[str, dict[str, Any]] = {}
     classes: dict[str, type[nn.Module]] = {}
-    for role in NETWORKS:
-        if (module := getattr(source, role)) is None:
-            continue
+    for role, module in source._networks().items():
         if not isinstance(config := getattr(module, "config", None), dict):
             message = f"The {role} is a {type(module).__name__} without a `.config` of its arguments"
             if role == "encoder":
@@ -263,23 +234,19 @@ def save_pretrained(
             name: {k: v.to(torch.bfloat16) if v.is_floating_point() else v for k, v in state.items()}
             for name, state in states.items()
         }
-    check = partial(_rebuilt, path, classes={**_CLASSES, **classes})
+    check = partial(_rebuilt, path, classes)
     return write_artifact(path, states, card=card, format_name=FORMAT, version=VERSION, check=check)
 
 
 def load_pretrained(path: str | Path, classes: Mapping[str, type[nn.Module]] | None = None) -> Pretrained:
-    """Read and verify an artifact; needs nothing but its directory.
+    """Read and verify an artifact; its networks are bit-equal to those saved, frozen, on the CPU.
 
     Args:
-        path: directory written by :func:`save_pretrained`, or the name of an encoder that ships with the package, see
-            :func:`shipped_encoders`.
+        path: directory written by :func:`save_pretrained`, or one of :func:`shipped_encoders`.
         classes: class name to class, for networks that are not this library's.
 
-    Returns:
-        The networks, bit-equal to those saved, frozen, on the CPU.
-
     Raises:
-        PretrainedError: naming what is missing, truncated, tampered with, of another kind, or unknown.
+        PretrainedError: something is missing, truncated, tampered with, of another kind, or unknown.
     """
     path = as_path(path)
     if not path.exists() and path.name == str(path):  # a name, not a path
@@ -292,7 +259,7 @@ def load_pretrained(path: str | Path, classes: Mapping[str, type[nn.Module]] | N
     if not (path / CARD_FILE).exists() and (path / "encoder" / CARD_FILE).exists():
         raise PretrainedError(f"{path} is not a pretrained artifact. Did you mean {path / 'encoder'}?")
     card, tensors = read_artifact(path, format_name=FORMAT, version=VERSION, error=PretrainedError)
-    return _rebuilt(path, card, tensors, classes={**_CLASSES, **(classes or {})})
+    return _rebuilt(path, classes or {}, card, tensors)
 
 
 def shipped_encoders() -> list[str]:
@@ -314,16 +281,12 @@ def _as_pretrained(trained: Any) -> Pretrained:
         raise PretrainedError(f"{type(loss).__name__} has no `.encoder`; a pre-training loss exposes it.")
     heads = {role: _unwrapped(getattr(loss, role, None)) for role in HEADS}
     targets = {}
-    for target, online in (("target_encoder", encoder), ("target_projector", heads["projector"])):
+    for target, online in zip(TARGETS, (encoder, heads["projector"])):
         if online is not None and (state := _target_state(loss, target)):
             targets[target] = copy.deepcopy(online)
             targets[target].load_state_dict(state)
-    covered = tuple(f"{role}{suffix}" for role in ("encoder", *HEADS, *TARGETS) for suffix in (".", "_params."))
-    rest = {
-        key: value
-        for key, value in loss.state_dict().items()
-        if isinstance(value, Tensor) and key != "queue" and not key.startswith(covered)
-    }
+    covered = re.compile(rf"queue$|({'|'.join(('encoder', *HEADS, *TARGETS))})(_params)?\.")
+    rest = {k: v for k, v in loss.state_dict().items() if isinstance(v, Tensor) and not covered.match(k)}
     card = {
         "method": method_of(loss).name if result is None else result.method,
         "loss": {"class": class_name(loss), "config": loss_options(loss)},
@@ -331,16 +294,6 @@ def _as_pretrained(trained: Any) -> Pretrained:
     }
     queue, actor = getattr(result, "queue", None), getattr(result, "actor", None)
     return Pretrained(encoder, **heads, **targets, queue=queue, actor=actor, card=card, rest=rest)
-
-
-def _slimmed(source: Pretrained) -> Pretrained:
-    left_out: dict[str, Any] = dict.fromkeys(("predictor", *TARGETS)) | {"rest": {}}
-    if source.prototypes is None or source.projector is None:
-        left_out |= {"projector": None, "prototypes": None, "queue": None}
-    card: dict[str, Any] = {**source.card, "slim": True}
-    if (identity := identity_of(source.card)) is not None:
-        card["slim_of"] = identity
-    return replace(source, **left_out, card=card)
 
 
 def class_name(loss: nn.Module) -> str:
@@ -357,23 +310,16 @@ def loss_options(loss: nn.Module) -> dict[str, Any]:
         value = getattr(loss, name, inspect.Parameter.empty)
         if isinstance(value, Tensor) and value.ndim == 0:
             value = value.item()
-        if value is None and name in HEADS:
-            continue
-        if value is None or isinstance(value, (bool, int, float, str)):
+        if isinstance(value, int | float | str) or (value is None and name not in HEADS):
             options[name] = value
     return options
 
 
 def _pixel_facts(encoder: nn.Module) -> dict[str, Any]:
     config = getattr(encoder, "config", {})
-    channels = config.get("in_channels")
-    return {
-        "image_size": config.get("image_size"),
-        "in_channels": channels,
-        "frame_stack": None if channels is None else channels // 3,
-        "pixel_scale": config.get("pixel_scale"),
-        "pixel_offset": config.get("pixel_offset"),
-    }
+    facts = {name: config.get(name) for name in ("image_size", "in_channels", "pixel_scale", "pixel_offset")}
+    channels = facts["in_channels"]
+    return facts | {"frame_stack": None if channels is None else channels // 3}
 
 
 def _unwrapped(module: Any) -> nn.Module | None:
@@ -385,29 +331,24 @@ def _unwrapped(module: Any) -> nn.Module | None:
 
 def _target_state(loss: Any, target: str) -> dict[str, Tensor]:
     """Return the live tensors of a target network by state-dict name, however a loss holds it; empty if it has none."""
-    if (module := _unwrapped(getattr(loss, target, None))) is not None:
-        return {key: value.detach() for key, value in module.state_dict(keep_vars=True).items()}
-    params = getattr(loss, "_modules", {}).get(f"{target}_params")
-    if params is None:
-        return {}
     is_wrapped = isinstance(getattr(loss, target.removeprefix("target_"), None), TensorDictModule)
-    state = dict(params.data.flatten_keys(".").items())
-    return {key.removeprefix("module."): value for key, value in state.items()} if is_wrapped else state
+    prefix = re.compile(rf"{target}(_params)?\." + (r"module\." if is_wrapped else ""))
+    return {prefix.sub("", key, 1): value for key, value in loss.state_dict().items() if prefix.match(key)}
 
 
 def _rebuilt(
-    path: Path, card: dict[str, Any], tensors: dict[str, Tensor], *, classes: Mapping[str, type[nn.Module]]
+    path: Path, classes: Mapping[str, type[nn.Module]], card: dict[str, Any], tensors: dict[str, Tensor]
 ) -> Pretrained:
     """Build the networks that a card describes around its tensors; nothing is drawn from the global generator."""
-    described = card.get("modules")
-    if not isinstance(described, dict) or "encoder" not in described:
-        held = sorted({name.split(".", 1)[0] for name in tensors})
-        raise PretrainedError(f"{path} holds {', '.join(held) or 'no weights'}, but no encoder.")
     parts: dict[str, dict[str, Tensor]] = {}
     for name, value in tensors.items():
         role, key = name.split(".", 1)
         parts.setdefault(role, {})[key] = value.float() if value.dtype == torch.bfloat16 else value
-    modules: dict[str, Any] = {}
+    described = card.get("modules")
+    if not isinstance(described, dict) or "encoder" not in described:
+        raise PretrainedError(f"{path} holds {', '.join(sorted(parts)) or 'no weights'}, but no encoder.")
+    classes = {**_CLASSES, **classes}
+    networks: dict[str, Any] = {}
     for role, description in described.items():
         if role not in NETWORKS or not isinstance(description, dict):
             raise PretrainedError(f"The card of {path} describes an unknown {role!r}; it is damaged or too new.")
@@ -427,8 +368,8 @@ def _rebuilt(
             raise PretrainedError(f"The card of {path} does not describe a {name}: {reason}") from reason
         except RuntimeError as reason:
             raise PretrainedError(f"The {role} in {path} is not the {name} of its card: {reason}") from reason
-        modules[role] = module.requires_grad_(False).eval()
+        networks[role] = module.requires_grad_(False).eval()
     queue, rest = parts.pop("queue", {}).get("latents"), parts.pop("loss", {})
     if parts:
         raise PretrainedError(f"{path} holds weights its card does not describe: {', '.join(sorted(parts))}.")
-    return Pretrained(**modules, queue=queue, card=card, rest=rest)
+    return Pretrained(**networks, queue=queue, card=card, rest=rest)

@@ -32,9 +32,7 @@ from crptpro.workers import SPAWN, Inline, WorkerPool, can_be_sent
 
 logger = logging.getLogger(__name__)
 
-STALL_S = 300.0
-"""Seconds without a step of any worker after which they count as hung."""
-
+STALL_S = 300.0  # without a step of any worker they count as hung
 _AGAIN = "What was collected is kept: run the same command again"
 
 
@@ -59,14 +57,12 @@ def collect_group(
 ) -> dict[str, Path]:
     """Collect the datasets of several domains with a uniform random policy, or continue interrupted collections.
 
-    The paper (section "Decoupled random collection") takes b = 100,000 transitions per domain. The seeds of an episode
-    derive from ``seed``, the domain and the episode's index: the same seed gives the same actions and, on one machine
-    and backend, the same pixels, for any number of workers and interruptions. The last episode is cut to fit, and an
-    endless one after 1000 transitions.
+    The paper (section "Decoupled random collection") takes b = 100,000 transitions per domain. The same ``seed`` gives
+    the same actions and, on one machine and backend, the same pixels, for any number of workers and interruptions. The
+    last episode is cut to fit, and an endless one after 1000 transitions.
 
-    With several workers the environments run in spawned processes, so a script needs the usual
-    ``if __name__ == "__main__":``. A domain whose ``make`` no other process can import, e.g. one defined in a notebook,
-    is collected in this process.
+    Several workers are spawned processes, so a script needs the usual ``if __name__ == "__main__":``. A domain whose
+    ``make`` no other process can import, e.g. one defined in a notebook, is collected in this process.
 
     An episode is a rollout of ``RandomPolicy``, not a batch of a TorchRL ``Collector``, which resets before the next
     episode's seeds are known; made to do this, it took 8 % more CPU time with walker (84 x 84, software GL).
@@ -76,9 +72,9 @@ def collect_group(
             :class:`~crptpro.domains.Domain` objects.
         root: a directory ``root/<domain name>`` is made for each domain.
         transitions: transitions per domain (agent steps; 21 KB each at 84 x 84).
-        seed: see above.
+        seed: of the episodes, each with the domain and its index.
         workers: processes, each rendering on one core; 1 is this process.
-        quality: render quality, see :func:`crptpro.envs.make_env`.
+        quality: as of :func:`crptpro.envs.make_env`.
         colors: likewise; the episodes are the same in all colours.
         image_size: H = W, pixels.
         action_repeat: env steps per agent step; the domain's (2) if ``None``.
@@ -86,7 +82,7 @@ def collect_group(
         progress: show a progress line per domain (log lines where the output is no terminal).
 
     Returns:
-        The dataset's directory by domain name.
+        The directory of each domain's dataset, by name.
 
     Raises:
         DatasetError: a directory holds something else than the requested dataset.
@@ -112,10 +108,8 @@ def collect_group(
                 raise DatasetError(f"Two of the domains would be collected into {path}; collect them apart.")
             paths[domain.name] = path
             repeat = resolve_action_repeat(domain, action_repeat)
-            settings: dict[str, Any] = {
-                "image_size": image_size, "action_repeat": repeat, "quality": quality, "colors": colors,
-                "camera": domain.camera if camera is None else camera,
-            }  # fmt: skip
+            settings: dict[str, Any] = {"image_size": image_size, "action_repeat": repeat, "quality": quality}
+            settings |= {"colors": colors, "camera": domain.camera if camera is None else camera}
             dataset = FrameDataset.create(
                 path, domain=domain.name, transitions=transitions, task=domain.task, seed=seed, **settings
             )
@@ -124,7 +118,7 @@ def collect_group(
                 continue
             stack.callback(dataset.writer.close)
             make = functools.partial(make_env, domain, seed=0, frame_stack=1, physics_state=True, **settings)
-            jobs.append(_Job(domain, dataset, make, episode_length(domain, action_repeat=repeat)))
+            jobs.append(_Job(domain, dataset, dataset.writer, make, episode_length(domain, action_repeat=repeat)))
         if jobs:
             _announce(jobs, root, image_size)
             for job in jobs if workers > 1 else ():
@@ -153,12 +147,8 @@ def collect_episode(
 ) -> TensorDictBase:
     """Roll one episode of single frames out with a uniform random policy; its two seeds determine it.
 
-    Args:
-        env: to roll out in.
-        env_seed: of the simulator.
-        action_seed: of the policy, which draws from torch's global generator.
-        limit: transitions after which the episode is cut.
-        callback: as of TorchRL's ``rollout``.
+    The policy draws from torch's global generator. ``limit`` is the number of transitions after which the episode is
+    cut, ``callback`` that of TorchRL's ``rollout``.
     """
     env.set_seed(env_seed)
     first = env.reset()
@@ -172,44 +162,38 @@ class _Job(NamedTuple):
 
     domain: Domain
     dataset: FrameDataset
+    writer: Any  # of the dataset
     make: Callable[[], EnvBase]
     length: int | None  # agent steps of an episode, if known
 
-    @property
-    def missing(self) -> int:
-        writer: Any = self.dataset.writer
-        return writer.target - writer.transitions
-
 
 def _announce(jobs: list[_Job], root: Path, image_size: int) -> None:
-    """Say how much will be written (action and state: at most 1 kB each), and refuse what the disk cannot hold."""
+    """Say how much will be written (action and state take at most 1 kB), and refuse what the disk cannot hold."""
     sizes = {}
     for job in jobs:
-        frames = job.missing + -(-job.missing // (job.length or 100))  # one more per episode
-        sizes[job.domain.name] = size = frames * 3 * image_size**2 + job.missing * 1000
-        what = f"{size / 1e9:.2g} GB for {job.missing:,} transitions"
-        logger.info("%s: %s into %s", job.domain.name, what, job.dataset.path)
+        missing = job.writer.missing
+        frames = missing + -(-missing // (job.length or 100))  # one more per episode
+        sizes[job.domain.name] = size = frames * 3 * image_size**2 + missing * 1000
+        logger.info("%s: %.2g GB for %s transitions", job.dataset.path, size / 1e9, f"{missing:,}")
     require_disk(root, sum(sizes.values()), f"Collecting {', '.join(sizes)}")
 
 
 def _collect(job: _Job, seed: int, pool: _Workers, progress: bool) -> None:
     """Collect one dataset; its episodes are planned, and appended, in the order of their indices."""
-    name, dataset, length = job.domain.name, job.dataset, job.length
-    writer: Any = dataset.writer
+    name, dataset, writer, length = job.domain.name, job.dataset, job.writer, job.length
     longest = max(LONGEST_EPISODE_AGENT_STEPS, length or 0)
     bar = Progress(writer.target, writer.transitions, "transitions", label=name, is_shown=progress, lines=10)
     queue: deque[tuple[str, Future]] = deque()
     while not dataset.is_complete:
-        while len(queue) < pool.ahead and job.missing > len(queue) * (length or 1):
+        while len(queue) < pool.ahead and writer.missing > len(queue) * (length or 1):
             index = writer.episodes + len(queue)
-            plan: dict[str, Any] = {
-                "domain": name,
-                "title": f"episode {index} of {name}",
+            title = f"episode {index} of {name}"
+            plan = {
                 "env_seed": derive_seed(seed, "collect", name, index),
                 "action_seed": derive_seed(seed, "collect-actions", name, index),
-                "limit": min(job.missing - len(queue), longest),
+                "limit": min(writer.missing - len(queue), longest),
             }
-            queue.append((plan["title"], pool.submit(plan)))
+            queue.append((title, pool.submit(title, name, plan)))
         title, future = queue.popleft()
         card, rollout = pickle.loads(pool.result(future, title))
         length = length or len(rollout)
@@ -232,11 +216,11 @@ class _Workers:
         self._work = _work if workers > 1 else self._worker.roll
         self._pool: Any = WorkerPool(workers, _prepare, factories, self._steps) if workers > 1 else Inline()
 
-    def submit(self, plan: dict[str, Any]) -> Future:
+    def submit(self, title: str, domain: str, plan: dict[str, int]) -> Future:
         try:
-            return self._pool.submit(self._work, plan)
+            return self._pool.submit(self._work, title, domain, plan)
         except BrokenProcessPool:
-            raise self._lost(plan["title"]) from None
+            raise self._lost(title) from None
         except OSError as reason:
             raise CRPTproError(
                 f"{self.workers} collecting processes cannot be started: {reason}. Use fewer workers, or raise the "
@@ -288,27 +272,24 @@ class _Worker:
         self._factories, self._steps = factories, steps
         self._domain, self._env = "", None
 
-    def roll(self, plan: Mapping[str, Any]) -> bytes:
+    def roll(self, title: str, domain: str, plan: Mapping[str, int]) -> bytes:
         """Return the environment's card and the episode, pickled: torch would send tensors as open files."""
 
         def count(*_: Any) -> None:
             self._steps.value += 1
 
         try:
-            if plan["domain"] != self._domain:
+            if domain != self._domain:
                 self.close()
-                self._domain, self._env = plan["domain"], self._factories[plan["domain"]]()
+                self._domain, self._env = domain, self._factories[domain]()
             env: Any = self._env
-            seeds = {name: plan[name] for name in ("env_seed", "action_seed", "limit")}
             with kept_global_rng():
-                rollout = collect_episode(env, callback=count, **seeds)
+                rollout = collect_episode(env, callback=count, **plan)
         except CRPTproError:
             raise
         except Exception as reason:
             text = str(reason).strip() or repr(reason)
-            raise CRPTproError(
-                f"Collecting {plan['title']} failed: {text}. {_AGAIN} once the cause is removed."
-            ) from reason
+            raise CRPTproError(f"Collecting {title} failed: {text}. {_AGAIN} once the cause is removed.") from reason
         return pickle.dumps((env.card() if hasattr(env, "card") else {}, rollout))
 
     def close(self) -> None:
@@ -325,5 +306,5 @@ def _prepare(factories: Mapping[str, Callable[[], EnvBase]], steps: Any) -> None
     _worker = _Worker(factories, steps)
 
 
-def _work(plan: Mapping[str, Any]) -> bytes:
-    return _worker.roll(plan)
+def _work(title: str, domain: str, plan: Mapping[str, int]) -> bytes:
+    return _worker.roll(title, domain, plan)

@@ -26,7 +26,6 @@ from crptpro.values import as_int, as_path
 logger = logging.getLogger(__name__)
 
 FORMAT, VERSION = "crptpro-frames", 2
-_ABOUT = {"seed": 0, "action_repeat": 1, "camera": None, "quality": "exact", "colors": "normal"}
 
 
 class FrameDataset(ReplayBuffer):
@@ -34,16 +33,16 @@ class FrameDataset(ReplayBuffer):
 
     ``sample(B)`` draws uniformly, with replacement, from all transitions and returns a TensorDict ``[B]`` with
 
-    - ``pixels`` and ``("next", "pixels")``, uint8 ``[B, 3k, H, W]``, oldest to newest, equal to a live frame stack,
-      episode starts included; a pair never crosses an episode;
+    - ``pixels`` and ``("next", "pixels")``, uint8 ``[B, 3k, H, W]``, as of a live frame stack; a pair never crosses an
+      episode;
     - ``action`` float32 ``[B, A]``, ``("next", "reward")`` float32 ``[B, 1]``,
       ``("next", "done" | "terminated" | "truncated")`` bool ``[B, 1]``;
     - ``index``, ``episode``, ``step`` in the episode, and ``number``, ``("next", "number")``: the rows of the
       observations' newest frames, which :meth:`observations` reads.
 
-    Frames are mapped from disk without write access: several processes can open one dataset, and threads may sample one
-    object. :meth:`open` reads a finished dataset; :meth:`create` begins or continues one, and ``extend`` fills it with
-    what :class:`~crptpro.data.FrameReplay` takes, but each episode must begin at its reset::
+    Frames are mapped from disk without write access: processes may share a dataset, and threads an object.
+    :meth:`open` reads a finished dataset; :meth:`create` begins or continues one, and ``extend`` fills it with what
+    :class:`~crptpro.data.FrameReplay` takes, but each episode must begin at its reset::
 
         dataset = FrameDataset.create("data/mine", domain="mine", transitions=10_000)
         for rollout in Collector(env, RandomPolicy(env.full_action_spec), frames_per_batch=100, total_frames=-1):
@@ -70,14 +69,14 @@ class FrameDataset(ReplayBuffer):
         Args:
             path: its directory.
             frame_stack: k, frames per stack.
-            device: ``"cpu"`` maps the frames from disk; another device holds a copy of them and samples there, with a
-                generator on the same device.
+            device: ``"cpu"`` maps the frames from disk; another device holds a copy and samples it, with a generator
+                on the same device.
             **options: see the class.
 
         Raises:
             DatasetError: a file is missing, unfinished, truncated or foreign.
         """
-        return cls(FrameStorage(as_path(path), frame_stack, device).load(), **options)
+        return cls(FrameStorage(as_path(path), frame_stack, device), **options)
 
     @classmethod
     def create(
@@ -85,26 +84,26 @@ class FrameDataset(ReplayBuffer):
     ) -> FrameDataset:
         """Begin a dataset, or continue one that was interrupted; a complete one is opened.
 
-        It is complete, and can be sampled, after ``transitions``; the last episode is cut to fit. ``about`` holds
-        further facts for the card that every attempt must repeat: ``task``, ``seed``, ``action_repeat``, ...
-
-        Raises:
-            DatasetError: if the directory holds something else, or another process is writing there.
+        It can be sampled after ``transitions``; the last episode is cut to fit. ``about`` holds further facts for the
+        card that every attempt must repeat: ``task``, ``seed``, ``action_repeat``, ... Another content or writer of the
+        directory is a DatasetError.
         """
         path = as_path(path)
-        request = {"domain": domain, "task": domain, **_ABOUT, **about, "transitions": transitions}
+        usual = {"task": domain, "seed": 0, "action_repeat": 1, "camera": None, "quality": "exact", "colors": "normal"}
+        request = {"domain": domain, **usual, **about, "transitions": transitions}
         for name in request.keys() & {"transitions", "seed", "action_repeat", "image_size"}:
             request[name] = as_int(request[name], name, minimum=0 if name == "seed" else 1)
         card = _read(path) if (path / CARD_FILE).exists() else None
         if card is None or card["transitions"] < card["request"]["transitions"]:
             writer = EpisodeWriter(path, request)
             if writer.transitions < writer.target:
-                return cls(FrameStorage(path, frame_stack), writer=writer)
-        _require_request(path, read_card(path)["request"], request)
-        return cls.open(path, frame_stack=frame_stack)
+                return cls(FrameStorage(path, frame_stack, is_complete=False), writer=writer)
+        dataset = cls.open(path, frame_stack=frame_stack)
+        _require_request(path, dataset.card["request"], request)
+        return dataset
 
     def observations(self, numbers: Tensor) -> Tensor:
-        """Return observations by the number of their newest frame, uint8 ``[B, k * C, H, W]``."""
+        """Return observations by number, uint8 ``[B, k * C, H, W]``."""
         return self._storage.observations(numbers)
 
     @property
@@ -152,19 +151,33 @@ class FrameStorage(StackStorage):
     ``row`` and ``row + 1`` of the same episode.
     """
 
-    def __init__(self, path: Path, frame_stack: int, device: str | torch.device = "cpu"):
+    def __init__(self, path: Path, frame_stack: int, device: str | torch.device = "cpu", *, is_complete: bool = True):
         self.frame_stack = as_int(frame_stack, "frame_stack", minimum=1)
         super().__init__(0)
         self.path, self.device = path, torch.device(device)
         self.card: dict[str, Any] = {}
+        if is_complete:
+            self.load()
 
-    def load(self) -> FrameStorage:
-        """Map the files of a complete dataset."""
-        card = read_card(self.path)
+    def load(self) -> None:
+        """Map the files of a complete dataset; a DatasetError if it is none."""
+        path = self.path
+        if not path.is_dir():
+            raise DatasetError(f"{path} is not a directory. A dataset is made by collect_random or `crptpro collect`.")
+        if not (path / CARD_FILE).exists():
+            names = ", ".join(sorted(child.parent.name for child in path.glob(f"*/{CARD_FILE}")))
+            hint = f" Did you mean one of its datasets: {names}?" if names else ""
+            raise DatasetError(f"{path} has no {CARD_FILE}: it is not a dataset.{hint}")
+        card = _read(path)
+        if card["transitions"] < (target := card["request"]["transitions"]):
+            raise DatasetError(
+                f"{path} is unfinished: {card['transitions']} of {target} transitions are collected. Run the same "
+                "collect command again to complete it."
+            )
         parts = {name: TensorDict({}, [card[name]]) for name in ("frames", "transitions")}
         for name, (dtype, shape) in card["columns"].items():
             part, *key = name.split("/")
-            values = map_rows(self.path / f"{name}.memmap", getattr(torch, dtype), shape, len(parts[part]))
+            values = map_rows(path / f"{name}.memmap", getattr(torch, dtype), shape, len(parts[part]))
             parts[part].set(tuple(key), values)
         self.frames, self.transitions = parts["frames"], parts["transitions"].clone()  # a few MB, in RAM
         if self.device.type != "cpu":
@@ -173,10 +186,6 @@ class FrameStorage(StackStorage):
         self.pixels = self.frames["pixels"]
         self.step = torch.zeros(len(self.frames), dtype=torch.int32, device=self.device)
         self.step[self.transitions["row"] + 1] = self.transitions["step"] + 1
-        return self
-
-    def __len__(self) -> int:
-        return self.max_size
 
     def columns_at(self, index: Tensor, **how: Any) -> TensorDict:
         self._require_complete()
@@ -188,8 +197,7 @@ class FrameStorage(StackStorage):
         if not self.card:
             raise DatasetError(f"{self.path} is being collected: it can be read once it is complete.")
 
-    def _empty(self) -> None:
-        self.set()
+    _empty = StackStorage.set
 
     def state_dict(self) -> dict[str, Any]:
         """Return what identifies this dataset: a checkpoint does not copy it."""
@@ -201,19 +209,15 @@ class FrameStorage(StackStorage):
 
     def __reduce__(self) -> Any:
         self._require_complete()
-        return _load, (self.path, self.frame_stack, str(self.device))
-
-
-def _load(path: Path, frame_stack: int, device: str) -> FrameStorage:
-    return FrameStorage(path, frame_stack, device).load()
+        return FrameStorage, (self.path, self.frame_stack, str(self.device))
 
 
 class EpisodeWriter(ImmutableDatasetWriter):
     """Appends episodes 0, 1, 2, ... to a directory until they hold the requested transitions.
 
-    The rows of an episode are on the disk before the card counts them; what a kill left behind them is cut off when the
-    next episode is written. As long as no episode is durable, another request replaces this one. The directory is
-    locked until the dataset is complete or :meth:`close` is called.
+    The rows of an episode are on the disk before the card counts them; what a kill left behind them is cut off by the
+    next. Until an episode is durable another request replaces this one. The directory is locked until the dataset is
+    complete or :meth:`close` is called.
     """
 
     def __init__(self, path: Path, request: dict[str, Any]):
@@ -243,14 +247,11 @@ class EpisodeWriter(ImmutableDatasetWriter):
         return self.state["episodes"]
 
     @property
-    def _taken(self) -> int:
-        return self.transitions + sum(len(part.following) for part in self._pending)
+    def missing(self) -> int:
+        return self.target - self.transitions - sum(len(part.following) for part in self._pending)
 
     def extend(self, data: TensorDictBase) -> Tensor:
-        """Take transitions of one environment in temporal order, as :class:`~crptpro.data.FrameReplay` does.
-
-        Surplus ones are left out. Returns the indices of those that became durable, int64.
-        """
+        """Take transitions as a replay does, except for surplus ones; returns the indices of durable ones, int64."""
         before = self.transitions
         if before >= self.target:
             raise DatasetError(f"{self.path} is complete and read-only; collect another one.")
@@ -260,13 +261,13 @@ class EpisodeWriter(ImmutableDatasetWriter):
         frame_stack = self._storage.frame_stack
         rows = read_rows(data, channels=channels, frame_stack=frame_stack, extra=extra, what="A dataset")
         last = self._pending[-1].following[-1] if self._pending else None
-        for begins, part in rows.part(0, self.target - self._taken).pieces(last):
+        for begins, part in rows.part(0, self.missing).pieces(last):
             if begins:
                 self.end_episode()
                 if len(part.first_frames()) > 1:
                     raise ValueError("An episode of a dataset begins at its reset, with a stack of one frame.")
             self._pending.append(part)
-            if part.columns["done"][-1] or self._taken == self.target:
+            if part.columns["done"][-1] or not self.missing:
                 self.end_episode()
         return torch.arange(before, self.transitions, device="cpu")
 
@@ -414,32 +415,9 @@ def _read(path: Path) -> dict[str, Any]:
         )
     try:
         _sizes(path, card)
-        if card["frames"] != card["transitions"] + card["episodes"]:
-            raise ValueError("frames")
-        if card["transitions"] > card["request"]["transitions"]:
-            raise ValueError("transitions")
+        target, frames = card["request"]["transitions"], card["transitions"] + card["episodes"]
+        if card["frames"] != frames or card["transitions"] > target:
+            raise ValueError("its numbers of frames, episodes and transitions disagree")
     except (KeyError, TypeError, ValueError, AttributeError) as reason:
         raise DatasetError(f"{file} is damaged ({reason}). Collect the dataset again.") from None
-    return card
-
-
-def read_card(path: Path) -> dict[str, Any]:
-    """Read the card of a complete dataset and check it against its files, without reading the frames."""
-    if not path.is_dir():
-        raise DatasetError(f"{path} is not a directory. A dataset is made by collect_random or `crptpro collect`.")
-    if not (path / CARD_FILE).exists():
-        names = ", ".join(sorted(child.parent.name for child in path.glob(f"*/{CARD_FILE}")))
-        hint = f" Did you mean one of its datasets: {names}?" if names else ""
-        raise DatasetError(f"{path} has no {CARD_FILE}: it is not a dataset.{hint}")
-    card = _read(path)
-    target = card["request"]["transitions"]
-    if card["transitions"] < target:
-        raise DatasetError(
-            f"{path} is unfinished: {card['transitions']} of {target} transitions are collected. Run the same collect "
-            "command again to complete it."
-        )
-    for file, expected in _sizes(path, card).items():
-        if not file.is_file():
-            raise DatasetError(f"{file} is missing. Collect the dataset again.")
-        require_size(file, file.stat().st_size, expected)
     return card

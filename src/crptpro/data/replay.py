@@ -12,17 +12,12 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
 
-from crptpro.artifact import require_disk
 from crptpro.data.storage import RingStorage, StackStorage, map_rows, read_rows
 from crptpro.errors import DatasetError
-from crptpro.values import as_float, as_int, as_path
+from crptpro.values import as_int, as_path
 
-_TAKEN = {
-    *("pixels", "action", "reward", "done", "terminated", "truncated", "discount"),
-    *("index", "row_of", "step", "number", "next"),
-}
-# Redraws before the admissible transitions are listed, which costs 50 times a redraw for 100,000 transitions. With
-# episodes of 500 transitions two draws nearly always suffice; only rings of very short episodes need the list.
+# Redraws before the admissible transitions are listed, which costs 50 times a redraw for 100,000 transitions. Only
+# rings of very short episodes need it.
 _REDRAWS = 8
 
 
@@ -45,31 +40,28 @@ class FrameReplay(ReplayBuffer):
 
     A sample ``[B]`` is drawn uniformly, with replacement, and has
 
-    - ``pixels`` and ``("next", "pixels")``, uint8 ``[B, frame_stack * C, H, W]``, equal to a live frame stack at every
-      step; a pair never crosses an episode nor the place where the ring is being overwritten;
+    - ``pixels`` and ``("next", "pixels")``, uint8 ``[B, frame_stack * C, H, W]``, as of a live frame stack; a pair
+      never crosses an episode nor the place where the ring is being overwritten;
     - ``action``, the ``extra_columns``, ``("next", "reward" | "done" | "terminated" | "truncated")`` ``[B, 1]``;
     - ``index`` (0 is the oldest transition) and ``number``, ``("next", "number")``, int64 ``[B]``: how many frames were
       stored before the observation's newest one. A number is never used again; :meth:`observations` reads it.
 
-    With ``n_step`` above 1 only transitions are drawn whose n transitions are in one episode and in the ring (as in
-    url_benchmark's ``replay_buffer.py``, none is cut short). ``("next", ...)`` is then n agent steps ahead: its flags
-    are the last transition's, its reward is the n-step return, and ``("next", "discount")`` ``[B, 1]`` weighs the value
-    of the next observation (:func:`~crptpro.data.storage.n_step_return`). Indexing reads single transitions.
+    With ``n_step`` above 1 only windows of n transitions are drawn that are in one episode and in the ring; none is cut
+    short. ``("next", ...)`` is then n agent steps ahead, with the last transition's flags, the n-step return as reward,
+    and a ``discount`` ``[B, 1]`` (:func:`~crptpro.data.storage.n_step_return`). Indexing reads single transitions.
     Deviation: url_benchmark draws an episode uniformly, and then an anchor in it; here every anchor is equally likely.
 
-    A ring on disk is its own checkpoint: :meth:`state_dict` holds a few counters, and loading it restores the content
-    exactly, provided that at most ``slack`` frames were written since. With checkpoints every n transitions, of which
-    the last two are kept, ``slack >= 2 * n`` (plus a frame per episode) is enough. Copies and pickles hold their frames
-    in RAM. Threads may sample and extend one buffer.
+    A ring on disk is its own checkpoint: :meth:`state_dict` holds a few counters, and loading it restores the content,
+    if at most ``slack`` frames were written since; for the last two of checkpoints every n transitions, ``2 * n`` (plus
+    a frame per episode) are enough. Copies and pickles hold their frames in RAM. Threads may share one buffer.
 
     Args:
-        capacity: most transitions that can be sampled; episodes below 50 transitions lower it, because each has one
-            frame more than transitions.
+        capacity: most transitions that can be sampled; episodes below 50 transitions lower it, for their extra frame.
         frame_shape: ``(C, H, W)`` of a single frame.
         action_dim: A, length of an action.
         path: directory of the ring's files, for this buffer alone; RAM if ``None``.
-        slack: frames that may be written after a checkpoint before it can no longer be restored.
-        frame_stack: k, frames per stack.
+        slack: frames that may be written after a checkpoint that can still be restored.
+        frame_stack: frames per stack.
         extra_columns: further entries of a transition's root, such as a skill: name to ``(shape, dtype)``.
         n_step: n, agent steps from an observation to the next one of a sample.
         discount: gamma of the n-step return.
@@ -77,8 +69,8 @@ class FrameReplay(ReplayBuffer):
         **options: of TorchRL's ``ReplayBuffer``: ``batch_size``, ``generator``, ``transform``.
 
     Raises:
-        DiskSpaceError: if the disk cannot hold the ring.
-        CheckpointError: if ``path`` holds a ring of another size.
+        DiskSpaceError: the disk cannot hold the ring.
+        CheckpointError: ``path`` holds a ring of another size.
     """
 
     def __init__(
@@ -96,35 +88,17 @@ class FrameReplay(ReplayBuffer):
         returns_pixels: bool = True,
         **options: Any,
     ):
-        capacity = as_int(capacity, "capacity", minimum=1)
-        slack = as_int(slack, "slack", minimum=0)
-        frame_stack = as_int(frame_stack, "frame_stack", minimum=1)
-        frame_shape = tuple(as_int(size, "frame_shape", minimum=1) for size in frame_shape)  # type: ignore[assignment]
-        extra = dict(extra_columns or {})
-        if taken := sorted(_TAKEN & set(extra)):
-            raise ValueError(f"extra_columns may not be named {taken}: a sample has those; choose other names.")
         columns: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
-            "pixels": (frame_shape, torch.uint8),
+            "pixels": (tuple(as_int(size, "frame_shape", minimum=1) for size in frame_shape), torch.uint8),
             "action": ((as_int(action_dim, "action_dim", minimum=1),), torch.float32),
             "reward": ((1,), torch.float32),
             **dict.fromkeys(("done", "terminated", "truncated"), ((1,), torch.bool)),
-            **extra,
         }
-        # One frame more per episode than transitions, and the frames of the oldest stack.
-        window = capacity + max(16, capacity // 50) + frame_stack
-        directory = None if path is None else as_path(path)
-        if directory is not None and not (directory / "pixels.memmap").exists():
-            row_bytes = sum(math.prod(shape) * dtype.itemsize for shape, dtype in columns.values())
-            require_disk(directory, (window + slack) * row_bytes, f"A replay of {capacity} transitions")
+        extra = dict(extra_columns or {})
+        if taken := sorted({*columns, "discount", "index", "next", "number", "row_of", "step"} & extra.keys()):
+            raise ValueError(f"extra_columns may not be named {taken}: a sample has those; choose other names.")
         storage = RingStorage(
-            capacity,
-            window=window,
-            slack=slack,
-            columns=columns,
-            frame_stack=frame_stack,
-            n_step=as_int(n_step, "n_step", minimum=1),
-            discount=as_float(discount, "discount", minimum=0, maximum=1),
-            path=directory,
+            capacity, columns | extra, slack=slack, frame_stack=frame_stack, n_step=n_step, discount=discount, path=path
         )
         storage.returns_pixels = bool(returns_pixels)
         parts = {"sampler": _WindowSampler(), "writer": _RingWriter(extra), "collate_fn": as_it_is}
@@ -159,10 +133,8 @@ class FrameReplay(ReplayBuffer):
 class StoredReplay(StackStorage):
     """The observations in the files of a :class:`FrameReplay`, oldest first, read-only.
 
-    ``path`` is the replay's directory, which nobody may be writing to.
-
-    Raises:
-        DatasetError: if there is no replay of square RGB frames, or it has no transition.
+    ``path`` is the replay's directory, which nobody may be writing to. A DatasetError without a replay of square RGB
+    frames, or a transition in it.
     """
 
     def __init__(self, path: str | Path, *, frame_stack: int = 3) -> None:
@@ -182,9 +154,6 @@ class StoredReplay(StackStorage):
         if not len(self._starts):
             raise DatasetError(f"The replay in {path} has no transition.")
         super().__init__(len(self._starts))
-
-    def __len__(self) -> int:
-        return self.max_size
 
     def observations(self, numbers: Tensor) -> Tensor:
         """Return the observations of transitions ``[B]``, 0 being the oldest, uint8 ``[B, k * 3, H, W]``."""

@@ -16,7 +16,9 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, is_tensor_collecti
 from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
+from crptpro.artifact import require_disk
 from crptpro.errors import CheckpointError, DatasetError, DiskSpaceError, NonFiniteError, is_disk_full, writing_error
+from crptpro.values import as_float, as_int, as_path
 
 PIXELS_FILE = "frames/pixels.memmap"
 
@@ -30,10 +32,9 @@ def map_rows(path: Path, dtype: torch.dtype, shape: Sequence[int], rows: int | N
     try:
         with open(path, "rb") as file:
             require_size(path, os.fstat(file.fileno()).st_size, rows and rows * row_bytes)
-            flags = mmap.MAP_PRIVATE | _MAP_NORESERVE
-            mapped = mmap.mmap(file.fileno(), 0, flags=flags, prot=mmap.PROT_READ | mmap.PROT_WRITE)
+            mapped = mmap.mmap(file.fileno(), 0, flags=mmap.MAP_PRIVATE | _MAP_NORESERVE)
     except (OSError, ValueError) as reason:  # an empty file cannot be mapped
-        raise DatasetError(f"{path} is missing or unreadable ({reason}).") from None
+        raise DatasetError(f"{path} is missing or unreadable ({reason}). Put it back, or collect again.") from None
     return torch.frombuffer(mapped, dtype=dtype).view(-1, *shape)
 
 
@@ -45,10 +46,9 @@ def require_size(path: Path, size: int, expected: int | None) -> None:
 
 
 def stack_rows(row: Tensor, step: Tensor, frame_stack: int) -> Tensor:
-    """Return the frame rows of a stack, oldest to newest, int64 ``[B, frame_stack]``.
+    """Return frame rows of stacks as of ``CatFrames(padding="same")``, oldest to newest, int64 ``[B, frame_stack]``.
 
     ``row`` int64 ``[B]`` is that of the newest frame, ``step`` ``[B]`` the number of frames of its episode before it.
-    Rows before the episode's first frame are that frame, as ``CatFrames(padding="same")`` does after a reset.
     """
     age = torch.arange(frame_stack - 1, -1, -1, device=row.device)
     return row.unsqueeze(-1) - torch.minimum(age, step.to(torch.int64).unsqueeze(-1))
@@ -70,24 +70,20 @@ class Rows(NamedTuple):
 
     @property
     def newest(self) -> Tensor:
-        """The newest frame of the observations, ``[T, C, H, W]``."""
         return self.stacks[:, -self.following.shape[1] :]
 
     def part(self, first: int, end: int) -> Rows:
-        """Return rows ``first`` to ``end``, that one excluded."""
         columns = {name: values[first:end] for name, values in self.columns.items()}
         return Rows(self.stacks[first:end], self.following[first:end], columns)
 
     def pieces(self, last: Tensor | None) -> Iterator[tuple[bool, Rows]]:
         """Split where episodes begin; yields whether a piece begins one, and its rows.
 
-        A row continues the one before if that one was not done and led to the frame that this one begins with. The
-        first one may continue an episode that is running, of which ``last`` is the newest frame.
+        A row continues the one before, or the running episode of newest frame ``last``, if that was not done and led to
+        the frame that this one begins with.
         """
         newest, length = self.newest, len(self.following)
-        if not length:
-            return
-        starts = [0] if last is None or not torch.equal(newest[0], last) else []
+        starts = [0] if last is None or not torch.equal(newest[:1], last.unsqueeze(0)) else []
         if length > 1:
             begins = (newest[1:] != self.following[:-1]).flatten(1).any(1) | self.columns["done"][:-1, 0]
             starts += (1 + begins.nonzero().squeeze(-1)).tolist()
@@ -97,24 +93,18 @@ class Rows(NamedTuple):
     def first_frames(self) -> Tensor:
         """Return the first observation's frames without those that an episode's start repeats, ``[s, C, H, W]``."""
         frames = self.stacks[0].reshape(-1, *self.following.shape[1:])
-        first = 0
-        while first + 1 < len(frames) and torch.equal(frames[first], frames[first + 1]):
-            first += 1
-        return frames[first:]
+        while len(frames) > 1 and torch.equal(frames[0], frames[1]):
+            frames = frames[1:]
+        return frames
 
 
 def read_rows(
     data: TensorDictBase, *, channels: int, frame_stack: int, extra: Sequence[NestedKey] = (), what: str
 ) -> Rows:
-    """Read what a TorchRL environment, rollout or collector returns, ``[T]`` in temporal order or ``[]``.
-
-    ``pixels`` are single frames of ``channels`` or stacks of them; messages say ``what`` is being written.
-    """
+    """Read what a TorchRL environment, rollout or collector returns, ``[T]`` or ``[]``; errors name ``what``."""
     if not is_tensor_collection(data) or data.ndim > 1:
-        got = f"a batch {tuple(data.shape)}" if is_tensor_collection(data) else type(data).__name__
-        raise ValueError(
-            f"{what} takes transitions of one environment in temporal order, a TensorDict [T] or [], got {got}."
-        )
+        got = f"{type(data).__name__} {list(getattr(data, 'shape', ()))}"
+        raise ValueError(f"{what} takes a TensorDict [T] or [] of one environment in temporal order, got {got}.")
 
     def entry(key: NestedKey, default: Tensor | None = None) -> Tensor:
         value = data.get(key, default)
@@ -152,10 +142,7 @@ def read_rows(
 
 
 class StackStorage(Storage):
-    """A TorchRL storage of transitions that keeps each frame once and builds the stacks on reading.
-
-    Frames are numbered in the order of storing; the ``number`` of an observation is that of its newest frame.
-    """
+    """A TorchRL storage of transitions; the ``number`` of an observation counts the frames stored before its newest."""
 
     pixels: Tensor  # uint8 [rows, C, H, W]; frame n is row n % rows
     step: Tensor  # [rows], frames of the same episode before each
@@ -167,8 +154,10 @@ class StackStorage(Storage):
         """Return everything but pixels of transitions ``[B]``, with both observations' numbers."""
         raise NotImplementedError
 
+    def __len__(self) -> int:
+        return self.max_size
+
     def held(self) -> range:
-        """Return the numbers of the frames that can be read."""
         return range(len(self.pixels))
 
     def get(self, index: Any, **how: Any) -> TensorDict:
@@ -213,41 +202,44 @@ class StackStorage(Storage):
 class RingStorage(StackStorage):
     """Frame rows in a ring of ``window + slack`` rows, and the valid transitions among them.
 
-    A row holds one frame, and the transition that starts at it, if any. A transition is valid while it is among the
-    newest ``capacity`` and all its frames are among the newest ``window`` rows. So an earlier state needs no row that
-    was overwritten since, as long as at most ``slack`` rows were. ``columns`` maps every per-row quantity to its shape
-    and dtype.
+    A row holds one frame, and the transition that starts at it, if any; ``columns`` has the shape and dtype of each of
+    its quantities. A transition is valid while it is among the newest ``capacity`` and all its frames are among the
+    newest ``window`` rows. So an earlier state needs no row that was overwritten since, if at most ``slack`` rows were.
     """
-
-    COUNTERS = ("frames", "transitions", "oldest", "episode_step", "is_open")
-    NEXT_COLUMNS = ("reward", "done", "terminated", "truncated")
 
     def __init__(
         self,
         capacity: int,
-        *,
-        window: int,
-        slack: int,
         columns: Mapping[str, tuple[tuple[int, ...], torch.dtype]],
+        *,
+        slack: int,
         frame_stack: int,
         n_step: int,
         discount: float,
-        path: Path | None,
+        path: str | Path | None,
     ):
-        super().__init__(capacity)
-        self.rows, self.window, self.slack, self.path = window + slack, window, slack, path
-        self.frame_stack, self.n_step, self.discount = frame_stack, n_step, discount
+        super().__init__(as_int(capacity, "capacity", minimum=1))
+        self.slack = as_int(slack, "slack", minimum=0)
+        self.frame_stack = as_int(frame_stack, "frame_stack", minimum=1)
+        self.n_step = as_int(n_step, "n_step", minimum=1)
+        self.discount = as_float(discount, "discount", minimum=0, maximum=1)
+        self.path = None if path is None else as_path(path)
+        # One frame more per episode than transitions, and the frames of the oldest stack.
+        self.window = self.max_size + max(16, self.max_size // 50) + self.frame_stack
+        self.rows = self.window + self.slack
+        if self.path is not None and not (self.path / "pixels.memmap").exists():
+            row_bytes = sum(math.prod(shape) * dtype.itemsize for shape, dtype in columns.values())
+            require_disk(self.path, self.rows * row_bytes, f"A replay of {self.max_size} transitions")
         # Counters only grow; modulo the number of rows they are slots. `oldest` is the first valid transition.
         self.frames = self.transitions = self.oldest = self.episode_step = 0
         self.is_open = False
-        # ``number`` is one more than the row's counter, 0 if it was never written; ``row_of`` belongs to
-        # transitions, which have their own counter.
+        # ``number`` is one more than the row's counter, 0 if it was never written; ``row_of`` is by transition.
         own = {"step": torch.int32, "number": torch.int64, "row_of": torch.int64}
         specs = {**columns, **{name: ((), dtype) for name, dtype in own.items()}}
         self.content: dict[NestedKey, Tensor] = {
             name: torch.zeros(self.rows, *shape, dtype=dtype, device="cpu")
-            if path is None
-            else map_file(path / f"{name}.memmap", dtype, (self.rows, *shape))
+            if self.path is None
+            else map_file(self.path / f"{name}.memmap", dtype, (self.rows, *shape))
             for name, (shape, dtype) in specs.items()
         }
         self.pixels, self.step = self.content["pixels"], self.content["step"]
@@ -314,7 +306,7 @@ class RingStorage(StackStorage):
         return self.get(index, n_step=1)
 
     def columns_at(self, index: Tensor, *, n_step: int | None = None) -> TensorDict:  # type: ignore[override]
-        """See the base class; windows of :attr:`n_step` unless another number is given."""
+        """See the base class; windows are of :attr:`n_step` transitions, or as many as given."""
         n_step = self.n_step if n_step is None else n_step
         number = self._numbers_at(index)
         row = number % self.rows
@@ -322,7 +314,7 @@ class RingStorage(StackStorage):
         last = (row + n_step - 1) % self.rows
         root, following = {"number": number}, {"number": number + n_step}
         for name in self.column_names:
-            if name in self.NEXT_COLUMNS:
+            if name in ("reward", "done", "terminated", "truncated"):
                 following[name] = self.content[name][last]
             else:
                 root[name] = self.content[name][row]
@@ -334,7 +326,7 @@ class RingStorage(StackStorage):
 
     def has_window(self, index: Tensor) -> Tensor:
         """Whether n transitions from ``index`` on, ``[B]``, at most ``len - n``, are of one episode."""
-        # An episode has one frame more than transitions, so between two of them the rows jump.
+        # Between two episodes the rows jump: each has one frame more than transitions.
         ahead = self.n_step - 1
         return self._numbers_at(index + ahead) - self._numbers_at(index) == ahead
 
@@ -343,8 +335,9 @@ class RingStorage(StackStorage):
 
     def state_dict(self) -> dict[str, Any]:
         """Return the counters, and the rows themselves if they are in RAM."""
-        counters = {name: getattr(self, name) for name in self.COUNTERS}
-        state: dict[str, Any] = {"counters": counters, "rows": self.rows, "window": self.window}
+        counters = ("frames", "transitions", "oldest", "episode_step", "is_open")
+        state: dict[str, Any] = {"counters": {name: getattr(self, name) for name in counters}}
+        state |= {"rows": self.rows, "window": self.window}
         if self.path is None:
             used = min(self.frames, self.rows)
             return state | {"content": {name: column[:used].clone() for name, column in self.content.items()}}
@@ -354,33 +347,33 @@ class RingStorage(StackStorage):
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Return to the content of the moment ``state_dict`` was taken, or raise a CheckpointError."""
-        shape = (state_dict["rows"], state_dict["window"])
-        counters = state_dict["counters"]
-        if shape != (self.rows, self.window):
+        """Restore the content of the moment ``state_dict`` was taken, or raise a CheckpointError."""
+        rows, window, counters = (state_dict[name] for name in ("rows", "window", "counters"))
+        if (rows, window) != (self.rows, self.window):
             raise CheckpointError(
-                f"The replay's checkpoint has {shape[0]} rows, {shape[1]} of them in use; this replay has "
-                f"{self.rows} and {self.window}. Use the capacity and slack it was written with."
+                f"The replay's checkpoint has {rows} rows, {window} of them in use; this replay has {self.rows} and "
+                f"{self.window}. Use the capacity and slack it was written with."
             )
         if "content" in state_dict:
             for name, column in state_dict["content"].items():
                 self.content[name][: len(column)] = column
         else:
-            self._check_rows(counters["frames"])
+            self._require_rows(counters["frames"])
         for name, value in counters.items():
             setattr(self, name, value)
 
-    def _check_rows(self, frames: int) -> None:
-        """Check that no row of a state's window was overwritten since."""
+    def _require_rows(self, frames: int) -> None:
+        """Refuse a state if a row of its window was overwritten since."""
         needed = torch.arange(max(0, frames - self.window), frames, device="cpu")
-        if lost := int((self.number[needed % self.rows] != needed + 1).sum()):
-            since = int(self.number.max()) - frames
-            why = "the files were removed or replaced; put them back."
-            if since > self.slack:
-                why = (
-                    f"{since} frames were written after it, with a slack of {self.slack}; start again with a larger "
-                    "one (a run derives it from `checkpoint_interval_env_steps`), or use a newer checkpoint."
-                )
+        lost = int((self.number[needed % self.rows] != needed + 1).sum())
+        since = int(self.number.max()) - frames
+        why = "the files were removed or replaced; put them back."
+        if since > self.slack:
+            why = (
+                f"{since} frames were written after it, with a slack of {self.slack}; start again with a larger one "
+                "(a run derives it from `checkpoint_interval_env_steps`), or use a newer checkpoint."
+            )
+        if lost:
             raise CheckpointError(f"{lost} rows that the checkpoint of {self.path} needs are gone: {why}")
 
     def _empty(self) -> None:

@@ -38,7 +38,7 @@ class PixelTransform(Transform):
     ``_apply_transform`` and, if it is not that of the image, :meth:`written_spec`.
     """
 
-    def __init__(self, in_keys: Keys | None, out_keys: Keys | None) -> None:
+    def __init__(self, in_keys: Keys | None = None, out_keys: Keys | None = None) -> None:
         next_pixels = ("next", "pixels")
         super().__init__(in_keys=["pixels", next_pixels] if in_keys is None else in_keys)
         self.out_keys = list(self.in_keys) if out_keys is None else out_keys
@@ -50,7 +50,6 @@ class PixelTransform(Transform):
         return read.clone()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Transform every key of a sampled batch; a missing key is a ``KeyError``."""
         return self._apply_to(tensordict, zip(self.in_keys, self.out_keys))
 
     def _apply_to(self, tensordict: TensorDictBase, pairs: Any) -> TensorDictBase:
@@ -70,12 +69,10 @@ class PixelTransform(Transform):
         return self._call(tensordict_reset)
 
     def transform_output_spec(self, output_spec: Composite) -> Composite:
-        """Add the specs of the root keys; a missing image is a ``KeyError``."""
         output_spec = output_spec.clone()
         observations = output_spec["full_observation_spec"]
         for in_key, out_key in self._root_pairs():
             if in_key not in observations.keys(True, True):
-                name = type(self).__name__
-                raise KeyError(f"{name} found no {in_key!r} in the observations {observations}.")
+                raise KeyError(f"{type(self).__name__} found no {in_key!r} in the observations {observations}.")
             observations[out_key] = self.written_spec(observations[in_key])
         return output_spec

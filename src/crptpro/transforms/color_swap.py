@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from crptpro.transforms.base import Keys, PixelTransform
-
-CHANNELS = 3
+from crptpro.transforms.base import PixelTransform
 
 
 class ColorSwap(PixelTransform):
@@ -16,10 +14,7 @@ class ColorSwap(PixelTransform):
     of RGB frames and stacks of them, ``[*, 3 k, H, W]``; keys as in :class:`RandomShift`.
     """
 
-    def __init__(self, in_keys: Keys | None = None, out_keys: Keys | None = None) -> None:
-        super().__init__(in_keys, out_keys)
-
     def _apply_transform(self, obs: Tensor) -> Tensor:
-        if obs.ndim < 3 or obs.shape[-3] % CHANNELS:
+        if obs.ndim < 3 or obs.shape[-3] % 3:
             raise ValueError(f"ColorSwap expects RGB frames [*, 3 k, H, W], got {tuple(obs.shape)}.")
-        return obs.unflatten(-3, (-1, CHANNELS)).flip(-3).flatten(-4, -3)
+        return obs.unflatten(-3, (-1, 3)).flip(-3).flatten(-4, -3)

@@ -1,10 +1,9 @@
 """Features of all 81 random shifts of an image as crops of a few dense maps: the same numbers, encoded once.
 
-An un-padded convolutional encoder with total stride S sees a shifted image as a crop of what it would make of the
-larger, border-replicated image. Shifts that differ by a multiple of S share one map ("phase"): the shift (dy, dx) is
-the crop at (dy // S, dx // S) of the map of phase (dy % S, dx % S), as in the shift-and-stitch of OverFeat (Sermanet et
-al. 2013, https://arxiv.org/abs/1312.6229). For the default encoder (84x84, strides 2, 1, 1, 1) and 4 pixels of shift:
-4 maps of 32x39x39, crops of 32x35x35.
+An un-padded convolutional encoder with total stride S makes of a shifted image a crop of its map of the larger,
+border-replicated image. Shifts that differ by a multiple of S share one map ("phase"): the shift (dy, dx) is the crop
+at (dy // S, dx // S) of the map of phase (dy % S, dx % S), as in the shift-and-stitch of OverFeat (Sermanet et al.
+2013, https://arxiv.org/abs/1312.6229).
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, Self
 
 import torch
 import torch.nn.functional as F
@@ -29,26 +28,14 @@ from crptpro.transforms.free_memory import free_bytes
 from crptpro.transforms.random_shift import as_numpy_bits, draw_offsets
 from crptpro.values import as_int
 
-FeatureMode = Literal["auto", "dense", "reencode"]
-
-#: What dense maps may take of the memory that is free; the rest is for networks, batches and the page cache.
-MEMORY_SHARE = 0.8
-
 logger = logging.getLogger(__name__)
 
 
-class DenseShiftGeometry(NamedTuple):
-    """Sizes that follow from an encoder and a largest shift; in brackets those of the default encoder."""
+def dense_shift_geometry(encoder: nn.Module, pad: int = 4) -> tuple[int, int, tuple[int, int, int, int]]:
+    """Return the sizes for shifts of up to ``pad`` pixels; a ``ValueError`` for an encoder that has no dense maps.
 
-    phases: int  # phases per axis: the encoder's total stride (2)
-    window: int  # side in pixels of the image that each phase encodes (92)
-    maps_shape: tuple[int, int, int, int]  # (phases**2, C, m, m) of the dense maps of one image (4, 32, 39, 39)
-
-
-def dense_shift_geometry(encoder: nn.Module, pad: int = 4) -> DenseShiftGeometry:
-    """Return the sizes of the dense maps of an encoder for shifts of up to ``pad`` pixels in each direction.
-
-    An encoder that is no ``PixelEncoder``, or whose stride is too large for shifts to share maps, is a ``ValueError``.
+    They are the phases per axis (2 for the default encoder), the side in pixels of the image that each phase encodes
+    (92), and the shape ``(phases**2, C, m, m)`` of the dense maps of one image (4, 32, 39, 39).
     """
     if not isinstance(encoder, PixelEncoder):
         raise ValueError(
@@ -64,7 +51,7 @@ def dense_shift_geometry(encoder: nn.Module, pad: int = 4) -> DenseShiftGeometry
     channels, height, width = encoder.feature_map_shape
     extra = 2 * pad // stride
     shape = (stride**2, channels, height + extra, width + extra)
-    return DenseShiftGeometry(stride, encoder.image_size + stride * extra, shape)
+    return stride, encoder.image_size + stride * extra, shape
 
 
 @torch.no_grad()
@@ -74,7 +61,7 @@ def dense_shift_maps(
     """Encode images once per stride phase, border replicated, for every shift of up to ``pad`` pixels.
 
     Returns ``[B, phases**2, C, m, m]`` contiguous, of ``dtype`` or the encoder's compute dtype, phases ordered (row,
-    column); not standardised; without gradient.
+    column); not standardised.
     """
     phases, window, _ = dense_shift_geometry(encoder, pad)
     expected = (encoder.in_channels, encoder.image_size, encoder.image_size)
@@ -93,11 +80,10 @@ def dense_shift_maps(
 def crop_features(maps: Tensor, rows: Tensor, offsets: Tensor, out: Tensor, *, pad: int = 4) -> Tensor:
     """Read the features of one shift per image, int64 ``offsets`` ``[B, 2]``, from the maps at ``rows`` ``[B]``.
 
-    Equal to ``encoder(random_shift(pixels, offsets, pad=pad))``, not standardised: bit for bit in float32 where the
-    convolution adds up each output in an order that does not depend on the image size (oneDNN on x86 does),
-    otherwise to the rounding of the convolution (about 1e-6 of the largest feature).
-
-    Writes into ``out`` ``[B, feature_dim]``, of the maps' dtype or float32 of bfloat16 maps, and returns it.
+    Writes into ``out`` ``[B, feature_dim]``, of the maps' dtype or float32 of bfloat16 maps, and returns it: what
+    ``encoder(random_shift(pixels, offsets, pad=pad))`` is, not standardised. In float32 it is equal bit for bit where
+    the convolution's order of summation does not depend on the image size (oneDNN on x86), otherwise to about 1e-6 of
+    the largest feature.
     """
     phases, channels = math.isqrt(maps.shape[1]), maps.shape[2]
     extra = 2 * pad // phases
@@ -136,24 +122,23 @@ class DenseShiftFeatures(Transform):
     """Write a frozen encoder's features of randomly shifted observations into a replay batch.
 
     Attached to a :class:`~crptpro.data.FrameReplay` it does what ``RandomShift`` and ``FrozenEncoder`` would, with the
-    same shifts from the same generator and the same bits, but encodes each observation once: the first time that it is
-    sampled. Its dense maps are kept under the number of the observation, until the replay has overwritten it. They are
-    derived: no state dictionary, copy or pickle holds them. Where the replay's numbers go back (``load_state_dict`` on
-    the one in use), call :meth:`forget`.
+    same shifts from the same generator and the same bits, but encodes each observation once, when it is first sampled.
+    Its dense maps are kept until the replay has overwritten it; no state dictionary, copy or pickle holds them. Where
+    the replay's numbers go back (``load_state_dict`` on the one in use), call :meth:`forget`.
 
-    The features of a call are valid until the next call in the same thread. Threads may sample side by side. For
-    replay batches; on an environment use :class:`~crptpro.transforms.FrozenEncoder`.
+    The features of a call are valid until the next call in the same thread; threads may sample side by side. On an
+    environment use :class:`~crptpro.transforms.FrozenEncoder`.
 
     Args:
         encoder: frozen, see :func:`dense_shift_geometry`; its weights must not change from now on.
         replay: a :class:`~crptpro.data.FrameReplay`, or what else has ``observations(numbers)``, uint8
             ``[B, C, H, W]``, and a ``window``: those that it holds at once have numbers that differ modulo this.
         pad: largest shift in pixels.
-        projector: with one, its output for all ``(2 * pad + 1)**2`` shifts of an observation is kept too (float32), and
-            ``embedding_key`` is written.
+        projector: its float32 output for all ``(2 * pad + 1)**2`` shifts of an observation is kept too, and
+            ``embedding_key`` is written; None for neither.
         dtype: of the kept maps; the encoder's compute dtype when None. bfloat16 halves the memory and rounds each
             feature to eight significant bits (exact if the encoder computes in bfloat16).
-        generator: source of the offsets; torch's global generator when None. Not part of the state dict.
+        generator: source of the offsets, which the state dict excludes; torch's global one when None.
         observations: maps to keep; what the replay can hold when None. Fewer will do for a run that stores fewer.
         in_keys: int64 ``[*]`` or ``[*, 1]``, numbers of observations; ``"number"`` and ``("next", "number")`` if None.
         out_keys: features ``[*, feature_dim]`` in the encoder's compute dtype, one key per observation; ``"features"``
@@ -161,8 +146,7 @@ class DenseShiftFeatures(Transform):
         embedding_key: with a projector, projections ``[*, D]`` of the observation of the last in key.
 
     Raises:
-        ValueError: an encoder that has no dense maps, key lists of unequal length, or a ``dtype`` that cannot be read
-            as the encoder's.
+        ValueError: an encoder without dense maps, key lists of unequal length, or a ``dtype`` unfit for the encoder's.
     """
 
     encoder: PixelEncoder
@@ -186,7 +170,7 @@ class DenseShiftFeatures(Transform):
         self.out_keys = ["features", ("next", "features")] if out_keys is None else out_keys
         require_pairs(self)
         self.pad = as_int(pad, "pad", minimum=0)
-        self.maps_shape = dense_shift_geometry(encoder, self.pad).maps_shape
+        self.maps_shape = dense_shift_geometry(encoder, self.pad)[2]
         computed = encoder.compute_dtype
         self.dtype = computed if dtype is None else dtype
         if computed != self.dtype and (self.dtype, computed) != (torch.bfloat16, torch.float32):
@@ -211,12 +195,6 @@ class DenseShiftFeatures(Transform):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Add features, and projections with a projector, to a sampled batch.
-
-        Raises:
-            KeyError: an in key is missing.
-            ValueError: ``observations`` is smaller than what the replay holds.
-        """
         numbers = [self._numbers(tensordict, key) for key in self.in_keys]
         # The lock is held until the crops are read: another thread might need the same place for a newer observation.
         with self._lock:
@@ -234,10 +212,7 @@ class DenseShiftFeatures(Transform):
 
     @torch.no_grad()
     def unshifted(self, number: int) -> Tensor:
-        """Return the features ``[1, feature_dim]`` of one observation without a shift, for a policy to act on.
-
-        Its maps are kept for the batches that will contain the observation.
-        """
+        """Return an observation's features ``[1, feature_dim]`` without a shift, for a policy; its maps are kept."""
         numbers, centre = torch.tensor([number]), torch.full((1, 2), self.pad)
         with self._lock:
             maps, _ = self._encode_missing(numbers)
@@ -283,22 +258,17 @@ class DenseShiftFeatures(Transform):
         return projector(self.encoder.standardised(features)).float()
 
     def _output(self, key: NestedKey, count: int) -> Tensor:
-        """Memory of this thread's features under a key, the same in every call of as many rows.
-
-        512 float32 crops into fresh memory took 70 to 74 ms on a CPU, into memory in use 23 to 44 ms.
-        """
+        # Used again: 512 float32 crops into fresh memory took 70 to 74 ms on a CPU, into memory in use 23 to 44 ms.
         kept: dict[str, Tensor] = self._outputs.__dict__
-        out = kept.get(str(key))
-        if out is None or len(out) != count:
-            out = kept[str(key)] = self._new_output(count)
-        return out
+        if len(kept.get(str(key), ())) != count:
+            kept[str(key)] = self._new_output(count)
+        return kept[str(key)]
 
     def _new_output(self, count: int) -> Tensor:
         dtype, device = self.encoder.compute_dtype, device_of(self.encoder)
         return torch.empty(count, self.encoder.feature_dim, dtype=dtype, device=device)
 
     def clone(self) -> Self:
-        """Return a transform without parent and maps; replay, networks and generator are shared."""
         copy = super().clone()
         copy.forget()
         return copy
@@ -319,7 +289,7 @@ class DenseShiftFeatures(Transform):
 
 
 def choose_feature_mode(
-    mode: FeatureMode,
+    mode: Literal["auto", "dense", "reencode"],
     encoder: nn.Module,
     observations: int,
     dtype: torch.dtype = torch.float32,
@@ -332,8 +302,8 @@ def choose_feature_mode(
     """Choose dense maps or re-encoding of shifted images, which give the same features; returns mode and reason.
 
     ``"auto"`` chooses dense maps for a suitable encoder if four fifths of the free memory (by default that of
-    ``device``) hold the maps of ``observations`` in ``dtype`` and, with ``latent_dim``, their projections. ``"dense"``
-    for an unsuitable encoder, or an unknown mode, is a ``ValueError``.
+    ``device``) hold the maps of ``observations`` in ``dtype`` and, with ``latent_dim``, their projections; the rest is
+    for networks, batches and the page cache. ``"dense"`` for an unsuitable encoder is a ``ValueError``.
     """
     if mode == "reencode":
         return "reencode", "re-encoding at every update, as requested"
@@ -351,10 +321,11 @@ def choose_feature_mode(
         if needed > available:
             logger.warning("The dense-shift cache was requested and may not fit: %s.", size)
         return "dense", f"dense-shift cache, as requested ({size})"
-    if needed <= MEMORY_SHARE * available:
+    budget = 0.8 * available
+    if needed <= budget:
         return "dense", f"dense-shift cache ({size})"
     in_bf16 = dense_maps_bytes(encoder, observations, torch.bfloat16, pad=pad, latent_dim=latent_dim)
-    if in_bf16 <= MEMORY_SHARE * available:
+    if in_bf16 <= budget:
         size += f"; with features=dense-bf16 it would fit in {in_bf16 / 2**30:.1f} GiB"
     return "reencode", f"re-encoding at every update: too little memory for the dense-shift cache ({size})"
 
@@ -363,5 +334,5 @@ def dense_maps_bytes(
     encoder: nn.Module, observations: int, dtype: torch.dtype, *, pad: int = 4, latent_dim: int | None = None
 ) -> int:
     """Return the memory of dense maps in bytes; see :func:`choose_feature_mode`."""
-    values = math.prod(dense_shift_geometry(encoder, pad).maps_shape)
+    values = math.prod(dense_shift_geometry(encoder, pad)[2])
     return observations * (values * dtype.itemsize + (latent_dim or 0) * 4 * (2 * pad + 1) ** 2)

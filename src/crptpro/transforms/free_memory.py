@@ -9,9 +9,6 @@ from pathlib import Path
 import psutil
 import torch
 
-CGROUPS = Path("/sys/fs/cgroup")
-OWN_CGROUPS = Path("/proc/self/cgroup")
-
 # Version 2, then version 1: the limit, the memory in use, and the reclaimable file cache.
 _FILES = (
     ("memory.max", "memory.current", "inactive_file"),
@@ -26,7 +23,7 @@ def free_bytes(device: torch.device) -> int:
     return min([int(psutil.virtual_memory().available), *cgroup_free_bytes()])
 
 
-def cgroup_free_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> Iterator[int]:
+def cgroup_free_bytes(own: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> Iterator[int]:
     """Yield the free bytes of each memory-limited cgroup around this process, which psutil ignores.
 
     ``own`` lists the groups of the process as ``number:controllers:path``; they are mounted at ``root``.

@@ -32,8 +32,7 @@ class FrozenEncoder(PixelTransform):
         self.encoder = encoder.eval()
 
     def train(self, mode: bool = True) -> FrozenEncoder:
-        """Set the transform's mode; the encoder stays in evaluation mode."""
-        self.training = mode
+        self.training = mode  # and the encoder stays in evaluation mode
         return self
 
     @torch.no_grad()
@@ -49,6 +48,5 @@ class FrozenEncoder(PixelTransform):
         return features.to(obs.device).reshape(*lead, *features.shape[1:])
 
     def written_spec(self, read: Any) -> Unbounded:
-        """Return the spec of the features of a blank image."""
         features = self._apply_transform(torch.zeros(read.shape[-3:], dtype=read.dtype, device=read.device))
         return Unbounded(shape=(*read.shape[:-3], *features.shape), dtype=features.dtype, device=read.device)

@@ -27,10 +27,9 @@ def random_shift(pixels: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
     """Crop every image ``[B, C, H, W]``, its border replicated ``pad`` times, at its own integer offset ``[B, 2]``.
 
     This is the augmentation of DrQ (denisyarats/drq) as CRPTpro and Proto-RL use it. Offsets are (row, column) in
-    ``{0, ..., 2 * pad}``; others on a CPU are a ``ValueError``. Values are copied, never interpolated.
-
-    On a CPU this copies slices, in half the time of padding and cropping. On other devices, under ``torch.compile``
-    and for a gradient, it is one gather without host synchronisation.
+    ``{0, ..., 2 * pad}``; others on a CPU are a ``ValueError``. Values are copied, never interpolated: on a CPU by
+    slices, in half the time of padding and cropping; on other devices, under ``torch.compile`` and for a gradient by
+    one gather without host synchronisation.
 
     Examples:
         >>> image = torch.arange(4).view(1, 1, 2, 2)
@@ -99,8 +98,8 @@ class RandomShift(PixelTransform):
     evaluation mode too, into which TorchRL puts every attached transform.
 
     ``in_keys`` are required; by default they are ``"pixels"`` and, if present, ``("next", "pixels")``. On an
-    environment only root keys are shifted. Without ``out_keys`` the images are replaced. ``generator`` draws the
-    offsets (torch's global one if None); clones share it, and the state dict excludes it.
+    environment only root keys are shifted. Without ``out_keys`` the images are replaced. Clones share the ``generator``
+    of the offsets (torch's global one if None), and the state dict excludes it.
     """
 
     def __init__(

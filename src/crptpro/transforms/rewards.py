@@ -17,13 +17,8 @@ from crptpro.modules.heads import latent_dim_of
 from crptpro.modules.precision import device_of
 from crptpro.objectives.base import require_positive
 from crptpro.objectives.functional import becl_loss, knn_distance, knn_distances, particle_entropy
-from crptpro.transforms.base import Keys, read_entry, require_pairs
+from crptpro.transforms.base import Keys, read_entry
 from crptpro.values import as_int
-
-#: Subtracted from each scaled distance of a particle (rll-research/url_benchmark).
-PARTICLE_CLIP = 1e-4
-#: A smaller scale means that all particles coincide; their distances are 0, and so is the reward.
-SMALLEST_SCALE = 1e-8
 
 logger = logging.getLogger(__name__)
 
@@ -32,8 +27,8 @@ class IntrinsicReward(Transform):
     r"""Computes an intrinsic reward from the features of next observations: :math:`r = r_\mathrm{ext} + c \hat r`.
 
     ``in_keys`` is one key, features ``[*, D]`` of the next observation, ``out_keys`` one key for :math:`\hat r`, of the
-    reward's shape. :math:`r` replaces ``reward_key`` ``[*, 1]``, unless ``coef``, :math:`c`, is None. ``projector`` is
-    a network on the features (None if they are projected already), which the state dictionary excludes.
+    reward's shape. :math:`r` replaces ``reward_key`` ``[*, 1]``, unless ``coef``, :math:`c`, is None. The state
+    dictionary excludes ``projector``, a network on the features (None if they are projected already).
     """
 
     projector: nn.Module | None
@@ -49,15 +44,15 @@ class IntrinsicReward(Transform):
         reward_key: NestedKey = ("next", "reward"),
     ) -> None:
         super().__init__(in_keys=in_keys, out_keys=out_keys)
-        require_pairs(self)
-        if len(self.in_keys) != 1:
-            raise ValueError(f"{type(self).__name__} reads and writes one key each, got {self.in_keys}.")
+        if len(self.in_keys) != 1 or len(self.out_keys) != 1:
+            keys = f"{self.in_keys} and {self.out_keys}"
+            raise ValueError(f"{type(self).__name__} reads and writes one key each, got {keys}.")
         self.__dict__["projector"] = projector
         self.coef = coef
         self.reward_key = reward_key
 
     def intrinsic_reward(self, features: Tensor, *extra: Tensor) -> Tensor:
-        """Return the reward of each row ``[B, D]`` of the batch before the coefficient, float32 ``[B]``."""
+        """Return the reward of rows ``[B, D]`` before the coefficient, float32 ``[B]``; updates what is remembered."""
         raise NotImplementedError
 
     def _project(self, features: Tensor) -> Tensor:
@@ -65,7 +60,6 @@ class IntrinsicReward(Transform):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the intrinsic reward of a batch and add it to the reward; stored rewards stay as they are."""
         features = read_entry(self, tensordict, self.in_keys[0])
         rows = features.reshape(-1, features.shape[-1])
         extra = [read_entry(self, tensordict, key).reshape(len(rows), -1) for key in self.extra_keys]
@@ -98,10 +92,9 @@ class PrototypeReward(IntrinsicReward):
     2. puts the M vectors :math:`z_{i_j}` into the first-in-first-out queue Q;
     3. computes :math:`\hat r_i = \lVert z_i - \mathrm{NN}_k(z_i; Q) \rVert_2`, in [0, 2].
 
-    As in the released agent (liuxin0824/CRPTpro ``proto.py``), a sample drawn k times or more gets exactly 0 (about 8 %
-    of a batch of 512 with 512 prototypes and k = 3), because its copies in Q are its neighbours. Empty rows of Q are
-    zero vectors, at distance 1. Rows that are not finite are never drawn.
-
+    As in the released agent (liuxin0824/CRPTpro ``proto.py``), a sample drawn k times or more gets exactly 0, because
+    its copies in Q are its neighbours: about 8 % of a batch of 512 with 512 prototypes and k = 3. Empty rows of Q are
+    at distance 1. Rows that are not finite are never drawn.
     Deviation: the released pre-training hands its Q over; here Q starts from zeros unless ``queue`` is given.
 
     Args:
@@ -150,7 +143,6 @@ class PrototypeReward(IntrinsicReward):
 
     @torch.no_grad()
     def intrinsic_reward(self, features: Tensor, *extra: Tensor) -> Tensor:
-        r"""Put candidates into the queue and return the reward of each row before :math:`\beta`."""
         latents = F.normalize(self._project(features), dim=-1)
         _check_latents(latents.shape[-1], self.queue.shape[-1])
         weight = self.prototypes.get_parameter("weight")
@@ -172,8 +164,7 @@ def _check_latents(length: int, expected: int) -> None:
 def warn_if_mostly_zero(num_prototypes: int, batch_size: int, knn_k: int) -> None:
     """Warn if most rows will get 0, for M prototypes and batches of B (the paper has B = M).
 
-    A row is drawn about Poisson(M / B) times, with a median of k from M / B = k - 1/3 on. With 512 prototypes, k = 3
-    and batches of 128 three quarters of the rows get 0.
+    A row is drawn about Poisson(M / B) times, with a median of k from M / B = k - 1/3 on.
     """
     too_few = int(num_prototypes / (knn_k - 1 / 3))
     if batch_size <= too_few:
@@ -187,8 +178,8 @@ def warn_if_mostly_zero(num_prototypes: int, batch_size: int, knn_k: int) -> Non
 def draw_candidates(logits: Tensor, generator: torch.Generator | None = None) -> Tensor:
     """Draw one sample per prototype, int64 ``[M]``, with probability softmax over the batch of logits ``[M, B]``.
 
-    Inversion of the cumulative distribution: one uniform number per prototype, no host synchronisation. Samples with
-    NaN are never drawn. The generator, by default the global one of the logits' device, may be on any device.
+    By inversion, without host synchronisation. Samples with NaN are never drawn. The generator, by default the global
+    one of the logits' device, may be on any device.
     """
     cumulative = logits.masked_fill(logits.isnan(), -torch.inf).softmax(dim=-1).cumsum(dim=-1)
     source = logits.device if generator is None else generator.device
@@ -206,13 +197,11 @@ class ParticleReward(IntrinsicReward):
         \hat r_i = \log\Big(1 + \frac1k \sum_{j=1}^k \mathrm{relu}\big(d_{ij} / s - 10^{-4}\big)\Big)
 
     with :math:`d_{ij}` the distance between a projection, not normalised, and its j-th nearest in the batch, itself
-    included (:math:`d_{i1} = 0`), and s the running mean of all finite distances so far, this batch included. Source of
-    this form: rll-research/url_benchmark ``utils.py`` (``PBE`` and ``RMS``).
+    included (:math:`d_{i1} = 0`), and s the running mean of all finite distances so far, this batch included (``PBE``
+    and ``RMS`` of rll-research/url_benchmark). ``options`` are :class:`~crptpro.transforms.rewards.IntrinsicReward`'s.
 
     Deviation: a batch smaller than k uses all its rows, and a single row gets 0; the published code fails. While all
     distances are 0 the reward is 0; there it is NaN.
-
-    ``options`` are those of :class:`~crptpro.transforms.rewards.IntrinsicReward`.
     """
 
     distance_mean: Tensor
@@ -228,7 +217,6 @@ class ParticleReward(IntrinsicReward):
 
     @torch.no_grad()
     def intrinsic_reward(self, features: Tensor, *extra: Tensor) -> Tensor:
-        """Update the running mean with this batch, and return the reward of each row before the coefficient."""
         latents = self._project(features)
         count = latents.shape[0]
         if count < 2:
@@ -239,8 +227,9 @@ class ParticleReward(IntrinsicReward):
         self.distance_count.add_(finite.sum())
         deviations = torch.where(finite, distances.to(self.distance_mean) - self.distance_mean, 0.0)
         self.distance_mean.add_(deviations.sum() / self.distance_count)
-        scale = self.distance_mean.clamp_min(SMALLEST_SCALE).to(distances)
-        return particle_entropy(distances, scale=scale, clip=PARTICLE_CLIP)
+        # The mean is smaller only while all particles coincide; their distances are 0, and so is the reward.
+        scale = self.distance_mean.clamp_min(1e-8).to(distances)
+        return particle_entropy(distances, scale=scale, clip=1e-4)
 
 
 class ContrastiveReward(IntrinsicReward):
@@ -255,8 +244,8 @@ class ContrastiveReward(IntrinsicReward):
 
     Deviation: a batch of one gets 0; the published code fails.
 
-    ``head`` gives the embeddings, ``skill_key`` is the one-hot skill ``[*, K]`` at the root; ``options`` are those of
-    :class:`~crptpro.transforms.rewards.IntrinsicReward`.
+    ``head`` gives the embeddings, ``skill_key`` is the one-hot skill ``[*, K]`` at the root; ``options`` are
+    :class:`~crptpro.transforms.rewards.IntrinsicReward`'s.
     """
 
     def __init__(
@@ -269,7 +258,6 @@ class ContrastiveReward(IntrinsicReward):
 
     @torch.no_grad()
     def intrinsic_reward(self, features: Tensor, *extra: Tensor) -> Tensor:
-        """Return the reward of rows ``[B, D]`` and one-hot skills ``[B, K]`` before the coefficient."""
         embeddings = self._project(features)
         if len(embeddings) < 2:
             return embeddings.new_zeros(len(embeddings))
