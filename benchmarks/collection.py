@@ -1,19 +1,15 @@
 """Collection of pixels: TorchRL's ``DMControlEnv`` and ``Collector`` beside ours, per core, and ours with workers.
 
-``python -m benchmarks.collection`` compares like with like, in one process that is held on one core, the renderer on
-one thread (``LP_NUM_THREADS=1``), domain by domain, in turns:
+``python -m benchmarks.collection`` holds its process on one core, the renderer on one thread (``LP_NUM_THREADS=1``).
+Domain by domain, in turns, TorchRL's ``Collector`` fills a ``LazyMemmapStorage`` with single frames, and
+``collect_random`` a dataset: its start included, with physical state, and files synced to the disk. TorchRL's
+environment renders at every env step, so twice per agent step at an action repeat of 2, with a new camera per image.
 
-* environments alone: single frames, nothing stored. TorchRL's render at every env step, so twice per agent step at an
-  action repeat of 2, with a camera made anew for every image.
-* collecting: TorchRL's ``Collector`` fills a ``LazyMemmapStorage`` with single frames; ours is ``collect_random``, its
-  start included, with physical state and files synced to the disk.
-
-Then ``collect_random`` with several worker processes.
+Then ``collect_random`` runs with several worker processes.
 """
 
 from __future__ import annotations
 
-import functools
 import itertools
 import logging
 import os
@@ -30,19 +26,17 @@ from torchrl.data import LazyMemmapStorage, ReplayBuffer
 from torchrl.envs import DMControlWrapper, EnvBase
 from torchrl.modules import RandomPolicy
 
-from benchmarks.measure import save, side_by_side, table
+from benchmarks import measure
 from crptpro.console import run_main
 from crptpro.data import collect_random
 from crptpro.domains import get_domain
 from crptpro.envs import make_env
-from crptpro.values import Quality
 
 TORCHRL = "TorchRL"
-QUALITIES: tuple[Quality, ...] = ("exact", "fast")
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(measure.Settings):
     """What to compare and how often."""
 
     domains: tuple[str, ...] = ("cheetah", "walker", "quadruped")
@@ -51,20 +45,13 @@ class Settings:
     """transitions of one timed block"""
     rounds: int = 5
     """timed blocks of each candidate, taken in turns"""
-    image_size: int = 84
-    """height and width in pixels"""
     workers: tuple[int, ...] = (1, 2)
     """numbers of collecting processes; none to leave this part out"""
     worker_transitions: int = 4_000
     """how much each number of them collects of the first domain, best a multiple of the largest number times 500"""
-    scratch: Path | None = None
-    """where frames are written for the time being; the system's temporary directory by default"""
-    out: Path | None = None
-    """directory of the JSON file; benchmarks/results by default"""
 
 
-def main(settings: Settings) -> dict[str, Any]:
-    """Measure, print the tables, write the JSON, and return what it holds."""
+def main(settings: Settings) -> None:
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces storages on standard output
     os.environ["LP_NUM_THREADS"] = "1"
     results: dict[str, Any] = {}
@@ -74,7 +61,7 @@ def main(settings: Settings) -> dict[str, Any]:
         os.sched_setaffinity(0, {max(cores)})
         try:
             for domain in settings.domains:
-                results[domain] = compare(domain, settings, Path(directory) / domain)
+                results[domain] = compare_collecting(domain, settings, Path(directory) / domain)
         finally:
             torch.set_num_threads(threads)
             os.sched_setaffinity(0, cores)
@@ -84,34 +71,27 @@ def main(settings: Settings) -> dict[str, Any]:
             for count in settings.workers
         }
         if calls:
-            timings = side_by_side(calls, rounds=2, warmup=0, per_call=total)
-            results["workers"] = table(timings, unit=f"transition of {domain}, with the start", to=next(iter(calls)))
-    save("collection", settings, results, settings.out)
-    return results
+            unit = f"transition of {domain}, with the start"
+            results["workers"] = measure.compare(
+                calls, unit=unit, rounds=2, warmup=0, per_call=total, to=next(iter(calls))
+            )
+    measure.save("collection", settings, results)
 
 
-def compare(domain: str, settings: Settings, place: Path) -> dict[str, Any]:
-    """Time one domain's environments alone, then collecting."""
-    size, block = settings.image_size, settings.block
-    timed = functools.partial(side_by_side, rounds=settings.rounds, warmup=1, per_call=block)
-    own = functools.partial(make_env, domain, seed=0, frame_stack=1, image_size=size)
-    envs = {TORCHRL: torchrl_env(domain, size), **{f"crptpro, {q}": own(quality=q) for q in QUALITIES}}
-    alone = timed({name: stepper(env, block) for name, env in envs.items()})
-    for env in envs.values():
-        env.close()
-    found = {"environment": table(alone, unit=f"transition of {domain}, environment alone", to=TORCHRL)}
-
+def compare_collecting(domain: str, settings: Settings, place: Path) -> dict[str, Any]:
+    block, env = settings.block, torchrl_env(domain, settings.image_size)
     storage = LazyMemmapStorage(block * (settings.rounds + 1), scratch_dir=place / "torchrl")
-    env = torchrl_env(domain, size)
     collector = Collector(
         env, RandomPolicy(env.full_action_spec), frames_per_batch=block, total_frames=-1,
         replay_buffer=ReplayBuffer(storage=storage),
     )  # fmt: skip
     batches = iter(collector)
     calls: dict[str, Callable[[], Any]] = {TORCHRL: lambda: next(batches)}
-    for quality in QUALITIES:
+    for quality in ("exact", "fast"):
         calls[f"crptpro, {quality}"] = collecting(domain, place / quality, block, settings, quality=quality)
-    found["collecting"] = table(timed(calls), unit=f"transition of {domain}, collecting", to=TORCHRL)
+    found = measure.compare(
+        calls, unit=f"transition of {domain}", rounds=settings.rounds, warmup=1, per_call=block, to=TORCHRL
+    )
     collector.shutdown()
     return found
 
@@ -121,19 +101,6 @@ def collecting(domain: str, root: Path, transitions: int, settings: Settings, **
     numbers = itertools.count()
     sizes = {"transitions": transitions, "image_size": settings.image_size, "progress": False}
     return lambda: collect_random(domain, root / str(next(numbers)), **sizes, **options)
-
-
-def stepper(env: EnvBase, transitions: int) -> Callable[[], None]:
-    """Return a call that steps an environment at random so many times, resetting it where an episode ends."""
-    policy = RandomPolicy(env.full_action_spec)
-    state = env.reset()
-
-    def step() -> None:
-        nonlocal state
-        for _ in range(transitions):
-            _, state = env.step_and_maybe_reset(policy(state))
-
-    return step
 
 
 def torchrl_env(domain: str, image_size: int) -> EnvBase:
@@ -146,8 +113,7 @@ def torchrl_env(domain: str, image_size: int) -> EnvBase:
     make_env(domain, seed=0).close()  # chooses the render backend, which dm_control reads when it is imported
     from dm_control import suite
 
-    world = max((name for name in suite.TASKS_BY_DOMAIN if found.task.startswith(f"{name}_")), key=len)
-    env = suite.load(world, found.task.removeprefix(f"{world}_"), task_kwargs={"random": 0})
+    env = suite.load(found.name, found.task.removeprefix(f"{found.name}_"), task_kwargs={"random": 0})
     return DMControlWrapper(
         env, from_pixels=True, pixels_only=True, frame_skip=found.action_repeat, camera_id=found.camera,
         render_kwargs={"height": image_size, "width": image_size},

@@ -1,8 +1,8 @@
 """The library's loops as users call them, held at every pass: what :class:`benchmarks.measure.Loop` runs.
 
-``python -m benchmarks.loops ITEM SETTINGS`` prints, whenever it is held, a JSON object of seconds per pass by what they
-were spent on, and goes on when it reads a line. Nothing of a loop is copied here: clocks are put around public methods
-that it calls. Public names of the library only: ``benchmarks.revisions`` runs this with other revisions too.
+``python -m benchmarks.loops ITEM SETTINGS`` holds its loop, prints a JSON object of seconds per pass by what they were
+spent on, and goes on when it reads a line. Nothing of a loop is copied here: clocks are put around public methods that
+it calls. Public names of the library only: ``benchmarks.revisions`` runs this with other revisions too.
 """
 
 from __future__ import annotations
@@ -10,21 +10,18 @@ from __future__ import annotations
 import functools
 import itertools
 import json
-import statistics
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
-from pathlib import Path
+from timeit import timeit
 from typing import Any
 from unittest import mock
 
 import torch
-from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from benchmarks import synthetic
-from benchmarks.synthetic import drifting_dataset, make_drifting_task
+from benchmarks.synthetic import drifting_dataset, make_drifting
 from crptpro.data import FrameDataset, FrameReplay, collect_random
 from crptpro.modules import PixelEncoder, Projector, Prototypes
 from crptpro.objectives import ProtoLoss
@@ -108,13 +105,13 @@ def pretraining(
 
 def downstream(
     hold: Hold, *, image_size: int, prototypes: int, transitions: int, task: str = "", passes: int = 2,
-    is_filled: bool = True, has_stages: bool = False, **settings: Any,
+    is_filled: bool = True, **settings: Any,
 ) -> None:  # fmt: skip
     """Time ``train_downstream(...)`` on the drifting world or a task: laps ``update``, ``store`` and ``act``.
 
     The actor learns in every second pass. ``is_filled``: drifting pictures are stored and encoded before the first
-    update; otherwise the loop fills its replay. ``has_stages``: ``update`` is split into ``sample`` (with features and
-    bonus), ``learn``, and ``wait for the image``.
+    update; otherwise the loop fills its replay. ``store`` begins when the next observation has been drawn, so that
+    ``update`` includes the wait for it.
     """
     laps = Laps(hold, passes)
     to_fill = iter([transitions] if is_filled else [])
@@ -124,12 +121,8 @@ def downstream(
             fill(replay, count, image_size, encodes=settings.get("features") != "reencode")
         laps.begin("act")
 
-    last = "wait for the image" if has_stages else "update"
-    with ExitStack() as stack:
-        stack.enter_context(laps.clock(FrameReplay, "sample", begin, "sample" if has_stages else ""))
-        stack.enter_context(laps.clock(FrameReplay, STORE, lambda *_: laps.lap(last, waits=True), after="store"))
-        if has_stages:
-            stack.callback(register_optimizer_step_post_hook(lambda *_: laps.lap("learn")).remove)
+    store = laps.clock(FrameReplay, STORE, lambda *_: laps.lap("update", waits=True), after="store")
+    with laps.clock(FrameReplay, "sample", begin), store:
         train_downstream(
             task or "drifting", fresh_pretrained(image_size=image_size, prototypes=prototypes), progress=False,
             env_steps=500_000, replay_capacity=transitions,
@@ -141,50 +134,36 @@ def downstream(
 def fill(replay: FrameReplay, transitions: int, image_size: int, *, encodes: bool) -> None:
     """Store episodes of the drifting world, and encode them where the replay's transforms keep features."""
     action_dim = replay[:1]["action"].shape[-1] if len(replay) else synthetic.ACTION_DIM
-    env = make_drifting_task(action_dim, seed=1, image_size=image_size)
+    env = make_drifting(action_dim, seed=1, image_size=image_size)
     while len(replay) < transitions:
         replay.extend(env.rollout(transitions - len(replay)))
     for first in range(0, transitions if encodes else 0, 500):
         replay[first : first + 500]
 
 
-def datasets(hold: Hold, *, root: str, image_size: int, transitions: int) -> None:
-    """Collect three datasets of the drifting world."""
-    for seed in range(3):
-        drifting_dataset(root, seed=seed, transitions=transitions, image_size=image_size)
-    hold({})
-
-
 def sampling(hold: Hold, *, path: str, batch_size: int) -> None:
     """Time ``FrameDataset.sample``."""
     dataset = FrameDataset.open(path)
     while True:
-        hold({"sample": mean_s(lambda: dataset.sample(batch_size), 20)})
+        hold({"sample": timeit(lambda: dataset.sample(batch_size), number=20) / 20})
 
 
 def opening(hold: Hold, *, path: str) -> None:
     """Time ``FrameDataset.open``."""
     while True:
-        hold({"open": mean_s(lambda: FrameDataset.open(path), 5)})
+        hold({"open": timeit(lambda: FrameDataset.open(path), number=5) / 5})
 
 
-def collecting(hold: Hold, *, root: str, image_size: int, transitions: int) -> None:
-    """Time collecting the drifting world in one process, at least two episodes, from one reset to the next."""
+def collecting(hold: Hold, *, root: str, image_size: int, transitions: int, task: str = "") -> None:
+    """Time collecting in one process, its start included: a task once, or one dataset of the drifting world a pass."""
+    sizes: dict[str, Any] = {"transitions": transitions, "image_size": image_size}
     for number in itertools.count():
-        place = Path(root) / str(number)
-        place.mkdir(parents=True)
-        clock = place / "clock"
-        drifting_dataset(place, clock=clock, transitions=transitions, image_size=image_size)
-        resets = [tuple(map(float, line.split())) for line in clock.read_text().splitlines()]
-        pairs = itertools.pairwise(resets)
-        episodes = [end - start for (start, _), (end, length) in pairs if length == synthetic.LENGTH]
-        hold({"collect": statistics.median(episodes) / synthetic.LENGTH})
-
-
-def rendering(hold: Hold, *, root: str, task: str, image_size: int, transitions: int) -> None:
-    """Collect a task once."""
-    collect_random(task, root, transitions=transitions, image_size=image_size, progress=False)
-    hold({})
+        start = time.perf_counter()
+        if task:
+            collect_random(task, root, progress=False, **sizes)
+        else:
+            drifting_dataset(root, seed=number, **sizes)
+        hold({"collect": (time.perf_counter() - start) / transitions})
 
 
 def nothing(hold: Hold) -> None:
@@ -193,16 +172,8 @@ def nothing(hold: Hold) -> None:
 
 
 ITEMS: dict[str, Callable[..., None]] = {
-    item.__name__: item
-    for item in (pretraining, downstream, datasets, sampling, opening, collecting, rendering, nothing)
+    item.__name__: item for item in (pretraining, downstream, sampling, opening, collecting, nothing)
 }
-
-
-def mean_s(call: Callable[[], Any], count: int) -> float:
-    start = time.perf_counter()
-    for _ in range(count):
-        call()
-    return (time.perf_counter() - start) / count
 
 
 def main(item: str, settings: dict[str, Any]) -> None:

@@ -19,35 +19,33 @@ from tqdm.auto import tqdm
 from crptpro.provenance import hardware, provenance
 
 ROOT = Path(__file__).parents[1]
-PAPER_UPDATES, PAPER_ENV_STEPS = 50_000, 500_000
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Wall times of one candidate, seconds per unit of work."""
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What every benchmark is told."""
 
-    median_s: float
-    best_s: float
-    worst_s: float
-    rounds: int
+    image_size: int = 84
+    """height and width in pixels"""
+    scratch: Path | None = None
+    """where frames are written for the time being, not a RAM disk; the system's temporary directory by default"""
+    out: Path = ROOT / "benchmarks" / "results"
+    """directory of the JSON file"""
 
 
-def side_by_side(
-    candidates: Mapping[str, Callable[[], Any]], *, rounds: int, warmup: int = 2, per_call: int = 1
-) -> dict[str, Timing]:
-    """Time candidates in turns, so that whatever else the machine does meets all of them alike.
+@dataclass(frozen=True, kw_only=True)
+class UpdateSettings(Settings):
+    """What every benchmark of updates is told."""
 
-    Times are per unit of work: a call does ``per_call`` of them, a :class:`Loop` says itself how long one took.
-    """
-    seconds: dict[str, list[float]] = {name: [] for name in candidates}
-    for number in tqdm(range(-warmup, rounds), desc="rounds", leave=False, disable=None):
-        for name, call in candidates.items():
-            start = time.perf_counter()
-            found = call()
-            elapsed = (time.perf_counter() - start) / per_call
-            if number >= 0:
-                seconds[name].append(found if isinstance(call, Loop) else elapsed)
-    return {n: Timing(statistics.median(s), min(s), max(s), len(s)) for n, s in seconds.items()}
+    batch_size: int = 512
+    """transitions per update"""
+    prototypes: int = 512
+    """of the pre-training loss and of the bonus"""
+
+    @property
+    def sizes(self) -> dict[str, Any]:
+        """What every network and image is sized by."""
+        return {"image_size": self.image_size, "prototypes": self.prototypes}
 
 
 class Loop:
@@ -94,19 +92,50 @@ class Loop:
         return json.loads(line)
 
 
-def table(timings: Mapping[str, Timing], *, unit: str, to: str | None = None) -> dict[str, Any]:
-    """Print times and their ratios to ``to`` (the last candidate by default); returns what it shows."""
-    to = to or list(timings)[-1]
-    ratios = {name: timing.median_s / timings[to].median_s for name, timing in timings.items()}
+def compare(
+    candidates: Mapping[str, Callable[[], Any]], *, unit: str, rounds: int, warmup: int = 2, per_call: int = 1,
+    to: str | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Time candidates in turns, so that whatever else the machine does meets all of them alike.
+
+    Times are per unit of work: a call does ``per_call`` of them, a :class:`Loop` says itself how long one took. Prints
+    times and their ratios to the candidate ``to`` (the last one by default), and returns what it prints.
+    """
+    seconds: dict[str, list[float]] = {name: [] for name in candidates}
+    for number in tqdm(range(-warmup, rounds), desc="rounds", leave=False, disable=None):
+        for name, call in candidates.items():
+            start = time.perf_counter()
+            found = call()
+            elapsed = (time.perf_counter() - start) / per_call
+            if number >= 0:
+                seconds[name].append(found if isinstance(call, Loop) else elapsed)
+    to = to or list(candidates)[-1]
+    reference = statistics.median(seconds[to])
     print(f"| one {unit} | median ms | best to worst ms | times '{to}' |\n|---|---|---|---|")
-    for name, t in timings.items():
-        spread = f"{1e3 * t.best_s:.2f} to {1e3 * t.worst_s:.2f}"
-        print(f"| {name} | {1e3 * t.median_s:.2f} | {spread} | {ratios[name]:.2f} |", flush=True)
+    timings, ratios = {}, {}
+    for name, times in seconds.items():
+        median, best, worst = statistics.median(times), min(times), max(times)
+        timings[name] = {"median_s": median, "best_s": best, "worst_s": worst, "rounds": len(times)}
+        ratios[name] = median / reference
+        print(
+            f"| {name} | {1e3 * median:.2f} | {1e3 * best:.2f} to {1e3 * worst:.2f} | {ratios[name]:.2f} |", flush=True
+        )
     return {"unit": unit, "timings": timings, "times_slower": ratios, "than": to}
 
 
-def save(name: str, settings: Any, results: Mapping[str, Any], out: Path | None) -> None:
-    """Write what was measured, how and on what, as JSON (to ``benchmarks/results`` by default), and print where."""
+def run_sections(name: str, settings: Any, sections: Mapping[Any, Callable[[], Any]], **facts: Any) -> dict[str, Any]:
+    """Run the sections that ``settings.only`` names; writes and returns ``facts`` and what the sections return."""
+    results: dict[str, Any] = facts
+    for section in settings.only:
+        print(f"\n## {section}\n", flush=True)
+        results[section] = sections[section]()
+        # At once: what has been measured must not be lost with a section for which memory is too small.
+        save(name, settings, results)
+    return results
+
+
+def save(name: str, settings: Settings, results: Mapping[str, Any]) -> None:
+    """Write what was measured, how and on what, as ``<name>.json``, and print where."""
     facts = hardware()
     machine = (
         f"{torch.get_num_threads()} threads on {facts['cpu_cores']} cores of {facts['cpu']} "
@@ -120,16 +149,12 @@ def save(name: str, settings: Any, results: Mapping[str, Any], out: Path | None)
         "machine": machine,
         **provenance(),
     }
-    path = (out or ROOT / "benchmarks" / "results") / f"{name}.json"
+    path = settings.out / f"{name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=1, default=_plain) + "\n")
+    path.write_text(json.dumps(content, indent=1, default=_without_place) + "\n")
     print(f"\n{machine}\n{path}\n", flush=True)
 
 
 def _without_place(argument: Any) -> str:
     """Results are published: where a directory lies on one machine is nobody's business, its name may be."""
     return Path(argument).name if Path(argument).is_absolute() else str(argument)
-
-
-def _plain(value: Any) -> Any:
-    return asdict(value) if isinstance(value, Timing) else _without_place(value)

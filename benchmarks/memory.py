@@ -19,13 +19,13 @@ from typing import Any, Literal
 import psutil
 import tyro
 
-from benchmarks.measure import Loop, save
+from benchmarks.measure import Loop, UpdateSettings, save
 from benchmarks.synthetic import drifting_dataset
 from crptpro.console import run_main
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(UpdateSettings):
     """The sizes at which each stage is measured."""
 
     task: str = "cheetah_run"
@@ -34,33 +34,23 @@ class Settings:
     """length of the collection; its memory does not grow with it"""
     dataset_transitions: int = 5_000
     """transitions of each of the three datasets of the pre-training"""
-    image_size: int = 84
-    """height and width in pixels"""
-    batch_size: int = 512
-    """transitions per update, of pre-training and downstream"""
     updates: int = 6
-    """updates of each, an even number; the peak is reached in the first ones"""
+    """updates of pre-training and downstream, an even number; the peak is reached in the first ones"""
     replay_transitions: int = 40_000
     """downstream replay"""
     features: tuple[Literal["dense", "reencode"], ...] = ("dense", "reencode")
     """downstream runs: dense features (16 GB at 40,000 transitions), or encoding at every update"""
-    scratch: Path | None = None
-    """where frames are written for the time being, not a RAM disk; the system's temporary directory by default"""
-    out: Path | None = None
-    """directory of the JSON file; benchmarks/results by default"""
 
 
-def main(settings: Settings) -> dict[str, Any]:
-    """Measure, print the tables, write the JSON, and return what it holds."""
+def main(settings: Settings) -> None:
     image = {"image_size": settings.image_size}
-    learned = {**image, "batch_size": settings.batch_size, "prototypes": 512}
-    peaks: dict[str, int] = {}
+    learned = {**settings.sizes, "batch_size": settings.batch_size}
+    peaks: dict[str, int] = {"imports": peak_bytes("nothing")}
     disk: dict[str, float] = {}
     with tempfile.TemporaryDirectory(prefix="crptpro-memory-", dir=settings.scratch) as directory:
         work = Path(directory)
-        peaks["imports"] = peak_bytes("nothing")
         collected: dict[str, Any] = {"task": settings.task, "transitions": settings.collect_transitions, **image}
-        peaks["collection"] = peak_bytes("rendering", root=work / "collected", **collected)
+        peaks["collection"] = peak_bytes("collecting", root=work / "collected", **collected)
         disk["dataset"] = disk_bytes(work / "collected") / settings.collect_transitions
         sizes: dict[str, Any] = {**image, "transitions": settings.dataset_transitions}
         paths = [drifting_dataset(work, seed=seed, **sizes) for seed in range(3)]
@@ -80,9 +70,7 @@ def main(settings: Settings) -> dict[str, Any]:
     print("\n| memory beyond the page cache, peak of all processes | GB |\n|---|---|")
     for name, peak in peaks.items():
         print(f"| {name} | {peak / 1e9:.2f} |")
-    results = {"peak_bytes": peaks, "bytes_per_transition": disk}
-    save("memory", settings, results, settings.out)
-    return results
+    save("memory", settings, {"peak_bytes": peaks, "bytes_per_transition": disk})
 
 
 def peak_bytes(item: str, *, calls: int = 0, **settings: Any) -> int:

@@ -1,9 +1,8 @@
 """A released agent that the user has checked out, timed beside ours: liuxin0824/CRPTpro or denisyarats/proto.
 
-Both keep ``proto.py``, ``utils.py`` and ``replay_buffer.py`` in their root and read packages of 2020. The few names
-that these use are stood in for: an import that succeeds and nothing more, except that ``RandomCrop`` of kornia crops
-(integer offsets, one per sample, as the pinned kornia does) and ``instantiate`` of hydra builds. Nothing of the agents'
-own arithmetic is touched.
+Both keep ``proto.py``, ``utils.py`` and ``replay_buffer.py`` in their root and read packages of 2020. Stand-ins replace
+the few names that these use. Most only let an import succeed; kornia's ``RandomCrop`` crops at integer offsets, one per
+sample, as the pinned kornia does, and hydra's ``instantiate`` builds. The agents' own arithmetic is untouched.
 """
 
 from __future__ import annotations
@@ -19,10 +18,8 @@ from unittest import mock
 import torch
 from torch import Tensor, nn
 
-from benchmarks.plain import Batch
+from benchmarks.plain import Batch, crop
 from crptpro.errors import CRPTproError
-
-FILES = ("proto.py", "utils.py", "replay_buffer.py")
 
 
 class RandomCrop(nn.Module):
@@ -30,13 +27,10 @@ class RandomCrop(nn.Module):
 
     def __init__(self, size: Sequence[int]) -> None:
         super().__init__()
-        self.size = tuple(size)
+        self.size = size
 
     def forward(self, images: Tensor) -> Tensor:
-        """Crop ``[B, C, H, W]``."""
-        windows = images.unfold(2, self.size[0], 1).unfold(3, self.size[1], 1)
-        row, column = (torch.randint(windows.shape[axis], (len(images),)) for axis in (2, 3))
-        return windows[torch.arange(len(images)), :, row, column]
+        return crop(images, self.size)
 
 
 def load(directory: Path) -> dict[str, ModuleType]:
@@ -45,11 +39,6 @@ def load(directory: Path) -> dict[str, ModuleType]:
     Raises:
         CRPTproError: ``directory`` is no such checkout, or does not import.
     """
-    if missing := [file for file in FILES if not (directory / file).is_file()]:
-        raise CRPTproError(
-            f"{directory} has no {', '.join(missing)}: --peer wants a checkout of liuxin0824/CRPTpro or "
-            "denisyarats/proto."
-        )
     augmentation = SimpleNamespace(RandomCrop=RandomCrop)
     hydra = SimpleNamespace(utils=SimpleNamespace(instantiate=lambda cfg: cfg.cls(**vars(cfg.params))))
     stand_ins: dict[str, Any] = {
@@ -57,17 +46,20 @@ def load(directory: Path) -> dict[str, ModuleType]:
         "hydra.utils": hydra.utils, "kornia": SimpleNamespace(augmentation=augmentation),
         "kornia.augmentation": augmentation,
     }  # fmt: skip
-    names = [Path(file).stem for file in FILES]
+    names = ("proto", "utils", "replay_buffer")
     path = [str(directory.resolve()), *sys.path]
     with mock.patch.dict(sys.modules, stand_ins), mock.patch.object(sys, "path", path):
         for name in names:
             sys.modules.pop(name, None)
         try:
             modules = {name: importlib.import_module(name) for name in names}
+            if not hasattr(modules["proto"], "ProtoAgent"):
+                raise ImportError("its proto.py defines no ProtoAgent")
         except Exception as reason:
-            raise CRPTproError(f"{directory} cannot be imported: {type(reason).__name__}: {reason}.") from reason
-    if not hasattr(modules["proto"], "ProtoAgent"):
-        raise CRPTproError(f"{directory / 'proto.py'} defines no ProtoAgent: this is another repository.")
+            raise CRPTproError(
+                f"{directory} cannot be used ({type(reason).__name__}: {reason}): --peer wants a checkout of "
+                "liuxin0824/CRPTpro or denisyarats/proto."
+            ) from reason
     return modules
 
 

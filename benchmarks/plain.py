@@ -1,13 +1,15 @@
-"""The method written straight from its equations: float32, eager, nothing done for speed.
+"""The method as its equations have it: float32, eager, nothing done for speed.
 
 The yardstick of ``benchmarks.updates``. Tests hold its losses and gradients against the library's. The encoder is
-``nn.Conv2d`` on contiguous NCHW images, Adam is torch's default, and every observation is encoded anew at every update;
-the small networks are float32 copies of ours. Sources: CRPTpro (arXiv 2302.05614), Eq. 1-9, and SAC whose twin critic
-shares one trunk. As in the released agents of CRPTpro and Proto-RL, the actor's loss runs backward through the whole
-critic; unlike there, ``next_obs`` is encoded once, not again for the bonus.
+``nn.Conv2d`` on contiguous NCHW images, Adam is torch's default, and every observation is encoded anew at every update.
+The small networks are float32 copies of ours, and the terms of the pre-training loss are our pure functions.
+
+Sources: CRPTpro (arXiv 2302.05614), Eq. 1-9, and SAC whose twin critic shares one trunk. As in the released agents of
+CRPTpro and Proto-RL, the actor's loss runs backward through the whole critic. Unlike there, ``next_obs`` is encoded
+once, not again for the bonus.
 
 Transitions are stored as in the released agents (``replay_buffer.py``): both stacks of nine channels, 127 KB. The shift
-is an integer crop per sample, on uint8: interpolating in float32, as DrQ-v2 does, takes several times as long and is
+is an integer crop per sample, on uint8. To interpolate in float32, as DrQ-v2 does, takes several times as long and is
 not exact; comparing with it would flatter us.
 """
 
@@ -15,15 +17,17 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Any, NamedTuple, cast
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
-from crptpro.modules import PixelEncoder, SquashedGaussianActor, TwinCritic
+from crptpro.modules import SquashedGaussianActor, TwinCritic
 from crptpro.objectives import ProtoLoss
+from crptpro.objectives.functional import comparative_loss, prototype_dispersion, sinkhorn_knopp
 from crptpro.pretrained import Pretrained
 
 LEARNING_RATE = 1e-4
@@ -31,9 +35,6 @@ PAD = 4
 # Pre-training.
 ENCODER_TAU = 0.05
 ALPHA = 5e-3
-OFFSET = 1.5
-TEMPERATURE = 0.1
-SINKHORN_ITERATIONS = 3
 # Downstream.
 DISCOUNT = 0.99
 INITIAL_TEMPERATURE = 0.1
@@ -70,17 +71,14 @@ class Batch(NamedTuple):
 
 
 class PlainEncoder(nn.Module):
-    """3x3 convolutions with ReLU, flattened: the weights of one of ours, of the same strides."""
+    """3x3 convolutions with ReLU, flattened: the weights of one of ours."""
 
-    def __init__(self, ours: PixelEncoder) -> None:
+    def __init__(self, ours: Any) -> None:
         super().__init__()
-        c_in, layers = ours.in_channels, []
-        for c_out, stride in zip(ours.config["channels"], ours.strides):
-            layers += [nn.Conv2d(c_in, c_out, 3, stride), nn.ReLU()]
-            c_in = c_out
+        layers = [layer for conv in copy.deepcopy(ours.convs) for layer in (conv, nn.ReLU())]
         self.convs = nn.Sequential(*layers)
-        for plain, parameter in zip(self.parameters(), ours.parameters(), strict=True):
-            plain.data = parameter.detach().clone(memory_format=torch.contiguous_format)
+        for parameter in self.parameters():
+            parameter.data = parameter.data.contiguous()
 
     def forward(self, images: Tensor) -> Tensor:
         """Map uint8 ``[B, C, H, W]`` to features ``[B, D]``."""
@@ -91,7 +89,7 @@ class PlainPretraining:
     """Networks, targets, loss and optimiser of the pre-training stage, from the weights of one of ours."""
 
     def __init__(self, ours: ProtoLoss) -> None:
-        self.encoder = PlainEncoder(cast(PixelEncoder, ours.encoder))
+        self.encoder = PlainEncoder(ours.encoder)
         heads = (ours.projector, ours.predictor, ours.prototypes.weight)
         self.projector, self.predictor, self.prototypes = copy.deepcopy(heads)
         self.target_encoder, self.target_projector = copy.deepcopy((self.encoder, self.projector))
@@ -104,10 +102,9 @@ class PlainPretraining:
         predictions = F.normalize(self.predictor(self.projector(self.encoder(obs))), dim=1)
         with torch.no_grad():
             targets = F.normalize(self.target_projector(self.target_encoder(next_obs)), dim=1)
-            assignments = sinkhorn(targets @ self.prototypes.T)
-        log_p = F.log_softmax(predictions @ self.prototypes.T / TEMPERATURE, dim=1)
-        comparative = -(assignments * log_p).sum(dim=1).mean()
-        return comparative + ALPHA * dispersion(self.prototypes)
+            assignments = sinkhorn_knopp(targets @ self.prototypes.T)
+        comparative = comparative_loss(predictions @ self.prototypes.T, assignments)
+        return comparative + ALPHA * prototype_dispersion(self.prototypes)
 
     def update(self, batch: Batch) -> Tensor:
         """Do one Adam step and move the targets; returns the loss."""
@@ -118,24 +115,6 @@ class PlainPretraining:
         move_towards(self.target_encoder, self.encoder, ENCODER_TAU)
         move_towards(self.target_projector, self.projector, ENCODER_TAU)
         return loss.detach()
-
-
-@torch.no_grad()
-def sinkhorn(scores: Tensor) -> Tensor:
-    """Return assignments ``[B, M]`` of cosines ``[B, M]``, prototypes evenly loaded (Eq. 4-6)."""
-    q = torch.exp((scores - scores.max()) / TEMPERATURE).T
-    q = q / q.sum()
-    for _ in range(SINKHORN_ITERATIONS):
-        q = q / q.sum(dim=1, keepdim=True) / q.shape[0]
-        q = q / q.sum(dim=0, keepdim=True) / q.shape[1]
-    return (q / q.sum(dim=0, keepdim=True)).T
-
-
-def dispersion(prototypes: Tensor) -> Tensor:
-    """Return the intrinsic loss of unit prototypes ``[M, D]``, mean over all M x M entries (Eq. 9)."""
-    cosines = prototypes.detach() @ prototypes.T
-    ratio = cosines / (cosines.detach() + OFFSET)
-    return (ratio * (1 - torch.eye(len(prototypes), dtype=ratio.dtype))).mean()
 
 
 class PlainDownstream:
@@ -216,13 +195,13 @@ def move_towards(target: nn.Module, source: nn.Module, tau: float) -> None:
 
 
 def random_crop(images: Tensor) -> Tensor:
-    """Shift every image by its own random integer offset."""
-    return crop(images, torch.randint(0, 2 * PAD + 1, (len(images), 2)))
+    """Shift every image by its own random integer offset, border replicated."""
+    return crop(F.pad(images, (PAD, PAD, PAD, PAD), mode="replicate"), images.shape[-2:])
 
 
-def crop(images: Tensor, offsets: Tensor) -> Tensor:
-    """Crop images ``[B, C, H, W]`` at offsets ``[B, 2]``, ``{0, ..., 8}``, from themselves, border replicated."""
-    height, width = images.shape[-2:]
-    padded = F.pad(images, (PAD, PAD, PAD, PAD), mode="replicate")
-    windows = padded.unfold(2, height, 1).unfold(3, width, 1)  # (B, C, 9, 9, H, W), a view
+def crop(images: Tensor, size: Sequence[int], offsets: Tensor | None = None) -> Tensor:
+    """Crop images ``[B, C, H, W]`` to ``size`` at integer offsets ``[B, 2]``, random ones by default."""
+    windows = images.unfold(2, size[0], 1).unfold(3, size[1], 1)  # (B, C, rows, columns, *size), a view
+    if offsets is None:
+        offsets = torch.stack([torch.randint(count, (len(images),)) for count in windows.shape[2:4]], dim=1)
     return windows[torch.arange(len(images)), :, offsets[:, 0], offsets[:, 1]]

@@ -8,94 +8,80 @@ left is the library.
 
 from __future__ import annotations
 
+import functools
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import tyro
 
-from benchmarks.measure import ROOT, Loop, save, side_by_side, table
+from benchmarks.measure import ROOT, Loop, UpdateSettings, compare, run_sections
 from crptpro.console import run_main
 from crptpro.errors import CRPTproError
 
+Item = Literal["pretrain", "downstream", "decision", "sample", "open", "collect"]
 
-@dataclass(frozen=True)
-class Settings:
+
+@dataclass(frozen=True, kw_only=True)
+class Settings(UpdateSettings):
     """What to compare, at which size and how often."""
 
     old: Path
     """checkout of the other revision"""
-    only: tuple[str, ...] = ("pretrain", "downstream", "decision", "sample", "open", "collect")
+    only: tuple[Item, ...] = ("pretrain", "downstream", "decision", "sample", "open", "collect")
     """items"""
     rounds: int = 7
     """timed rounds of each item in each revision, taken in turns"""
     threads: int = torch.get_num_threads()
     """of torch, in both"""
-    batch_size: int = 512
-    """transitions per update and per sample"""
-    prototypes: int = 512
-    """of loss and bonus"""
-    image_size: int = 84
-    """height and width in pixels"""
     transitions: int = 2_000
     """of each dataset and replay; dense features take 0.4 MB each in bf16, 0.8 in fp32, in both processes"""
     warmup: int = 8
     """rounds before the first timed one: today's replay encodes what it has not seen when it is drawn"""
-    out: Path | None = None
-    """directory of the JSON; benchmarks/results by default"""
 
 
-def main(settings: Settings) -> dict[str, Any]:
-    """Measure, print the tables, write the JSON, and return what it holds.
-
-    Raises:
-        CRPTproError: for an item nobody knows, or a directory that is no checkout.
-    """
+def main(settings: Settings) -> None:
     old = settings.old.resolve()
     if not (old / "src" / "crptpro").is_dir():
         raise CRPTproError(f"{settings.old} has no src/crptpro: --old wants a checkout of another revision.")
     python = old / ".venv" / "bin" / "python"
     revisions = {"old": (old, python if python.exists() else sys.executable), "new": (ROOT, sys.executable)}
     images: dict[str, Any] = {"image_size": settings.image_size, "transitions": settings.transitions}
-    learned = {"prototypes": settings.prototypes, "batch_size": settings.batch_size}
+    learned: dict[str, Any] = {**settings.sizes, "batch_size": settings.batch_size}
     # Learned from a replay that the loop itself has filled at random.
-    downstream = {**images, **learned, "features": "dense", "is_filled": False}
-    items: dict[str, tuple[str, tuple[str, ...], dict[str, Any]]] = {
-        "pretrain": ("pretraining", (), {**learned, "image_size": settings.image_size}),
-        "downstream": ("downstream", ("update",), downstream),
-        "decision": ("downstream", (), downstream),
-        "sample": ("sampling", (), {"batch_size": settings.batch_size}),
-        "open": ("opening", (), {}),
-        "collect": ("collecting", (), images),
-    }
-    if unknown := [name for name in settings.only if name not in items]:
-        raise CRPTproError(f"No items {', '.join(unknown)}; there are {', '.join(items)}.")
-    results: dict[str, Any] = {which: describe(root) for which, (root, _) in revisions.items()}
-    with tempfile.TemporaryDirectory(prefix="crptpro-revisions-") as scratch:
-        own: dict[str, dict[str, Any]] = {}  # each revision reads what it has collected
-        for which, (root, interpreter) in revisions.items():
-            place = Path(scratch) / which
-            common: dict[str, Any] = {"source": root, "python": interpreter, "threads": settings.threads}
-            with Loop("datasets", root=place, **images, **common):
-                paths = sorted(place.iterdir())
-            more = {"pretraining": {"datasets": paths}, "sampling": {"path": paths[0]}, "opening": {"path": paths[0]}}
-            own[which] = {**more, "collecting": {"root": place / "collected"}, "common": common}
-        for name in settings.only:
-            item, laps, sizes = items[name]
+    downstream: dict[str, Any] = {**images, **learned, "features": "dense", "is_filled": False}
+    items: dict[str, dict[Item, Callable[[], Loop]]] = {}
+    with tempfile.TemporaryDirectory(prefix="crptpro-revisions-", dir=settings.scratch) as scratch:
+        for revision, (root, interpreter) in revisions.items():
+            start = functools.partial(Loop, source=root, python=interpreter, threads=settings.threads)
+            place = Path(scratch) / revision
+            with start("collecting", root=place, **images) as collect:  # each revision reads what it has collected
+                collect()
+                collect()
+            paths = sorted(place.iterdir())
+            items[revision] = {
+                "pretrain": functools.partial(start, "pretraining", datasets=paths, **learned),
+                "downstream": functools.partial(start, "downstream", of=("update",), **downstream),
+                "decision": functools.partial(start, "downstream", **downstream),
+                "sample": functools.partial(start, "sampling", path=paths[0], batch_size=settings.batch_size),
+                "open": functools.partial(start, "opening", path=paths[0]),
+                "collect": functools.partial(start, "collecting", root=place / "collected", **images),
+            }
+
+        def measure(name: Item) -> dict[str, Any]:
             with ExitStack() as stack:
-                loops = {
-                    which: stack.enter_context(Loop(item, of=laps, **sizes, **mine.get(item, {}), **mine["common"]))
-                    for which, mine in own.items()
-                }
-                timings = side_by_side(loops, rounds=settings.rounds, warmup=settings.warmup)
-            results[name] = table(timings, unit=name)
-    save("revisions", settings, results, settings.out)
-    return results
+                loops = {revision: stack.enter_context(starts[name]()) for revision, starts in items.items()}
+                return compare(loops, unit=name, rounds=settings.rounds, warmup=settings.warmup)
+
+        sections = {name: functools.partial(measure, name) for name in settings.only}
+        described = {revision: describe(root) for revision, (root, _) in revisions.items()}
+        run_sections("revisions", settings, sections, **described)
 
 
 def describe(root: Path) -> str:

@@ -16,7 +16,6 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 import tyro
@@ -25,7 +24,7 @@ from torch import Tensor
 from torchrl.data import LazyMemmapStorage, ReplayBuffer, Sequence
 from torchrl.envs.transforms import CatFrames
 
-from benchmarks.measure import save, side_by_side, table
+from benchmarks import measure
 from benchmarks.synthetic import drifting_dataset
 from crptpro.console import run_main
 from crptpro.data import FrameDataset
@@ -37,8 +36,8 @@ MORE = ("number", ("next", "number"), "index")
 Sample = Callable[[], TensorDictBase]
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(measure.Settings):
     """What to compare and how often."""
 
     transitions: int = 20_000
@@ -47,12 +46,6 @@ class Settings:
     """transitions per sample"""
     rounds: int = 15
     """timed samples of each way, taken in turns"""
-    image_size: int = 84
-    """height and width in pixels"""
-    scratch: Path | None = None
-    """where the frames are written for the time being; the system's temporary directory by default"""
-    out: Path | None = None
-    """directory of the JSON file; benchmarks/results by default"""
 
 
 def stacked(dataset: FrameDataset, batch_size: int, storage: LazyMemmapStorage) -> Sample:
@@ -112,8 +105,7 @@ WAYS = {
 """TorchRL's, as they are called in the table."""
 
 
-def main(settings: Settings) -> dict[str, Any]:
-    """Measure, print the tables, write the JSON, and return what it holds."""
+def main(settings: Settings) -> None:
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it announces storages on standard output
     with tempfile.TemporaryDirectory(prefix="crptpro-sampling-", dir=settings.scratch) as directory:
         path = drifting_dataset(directory, transitions=settings.transitions, image_size=settings.image_size)
@@ -124,16 +116,13 @@ def main(settings: Settings) -> dict[str, Any]:
             storage = LazyMemmapStorage(len(dataset.frames), scratch_dir=Path(directory) / str(number))
             calls[name] = way(dataset, settings.batch_size, storage)
             stored[name] = stored_bytes(storage[: len(storage)])
-        timings = side_by_side(calls, rounds=settings.rounds)
         unit = f"batch of {settings.batch_size} out of {settings.transitions:,} transitions"
-        results = table(timings, unit=unit, to=OURS)
-        per_transition = {name: size / settings.transitions for name, size in stored.items()}
+        results = measure.compare(calls, unit=unit, rounds=settings.rounds, to=OURS)
+        results["stored_bytes_per_transition"] = {name: size / settings.transitions for name, size in stored.items()}
         print("\n| way | bytes per transition |\n|---|---|")
-        for name, size in per_transition.items():
+        for name, size in results["stored_bytes_per_transition"].items():
             print(f"| {name} | {size:,.0f} |")
-        results["stored_bytes_per_transition"] = per_transition
-        save("sampling", settings, results, settings.out)
-    return results
+        measure.save("sampling", settings, results)
 
 
 def episodes(dataset: FrameDataset) -> Iterator[tuple[TensorDict, Tensor]]:

@@ -15,7 +15,6 @@ With ``--peer DIR`` a released agent is timed in the same turns (:mod:`benchmark
 
 from __future__ import annotations
 
-import itertools
 import statistics
 import tempfile
 from collections.abc import Callable
@@ -28,7 +27,7 @@ import torch
 import tyro
 
 from benchmarks.loops import fresh_loss, fresh_pretrained
-from benchmarks.measure import PAPER_ENV_STEPS, PAPER_UPDATES, Loop, save, side_by_side, table
+from benchmarks.measure import Loop, UpdateSettings, compare, run_sections
 from benchmarks.peer import peer_update
 from benchmarks.plain import Batch, PlainDownstream, PlainPretraining
 from benchmarks.synthetic import ACTION_DIM, drifting_dataset
@@ -39,11 +38,11 @@ from crptpro.provenance import cpu_cores
 from crptpro.training import pretrain
 
 Section = Literal["pretrain", "downstream", "decision", "sustained", "parity"]
-CURVES = ("loss_comp", "embedding_cosine")
+PAPER_UPDATES, PAPER_ENV_STEPS = 50_000, 500_000
 
 
-@dataclass(frozen=True)
-class Settings:
+@dataclass(frozen=True, kw_only=True)
+class Settings(UpdateSettings):
     """What to time, at which size and how often."""
 
     only: tuple[Section, ...] = ("pretrain", "downstream", "decision", "sustained")
@@ -52,18 +51,11 @@ class Settings:
     """timed calls of each candidate, taken in turns; a call is one pre-training update or two downstream updates"""
     threads: int = field(default_factory=cpu_cores)
     """of torch; all cores this process may use by default"""
-    batch_size: int = 512
-    """transitions per update"""
-    prototypes: int = 512
-    """of the pre-training loss and of the bonus"""
-    image_size: int = 84
-    """height and width in pixels"""
     dataset: tuple[Path, ...] = ()
     """datasets to pre-train on, directories; three synthetic ones by default"""
-    dataset_transitions: int = 10_000
-    """of each synthetic dataset; also the most that the plain store holds in memory (127 KB each), from the first"""
-    update_transitions: int = 2_000
-    """replay of the section `downstream`: 0.4 MB each for dense features in bf16, 0.8 in fp32"""
+    transitions: int = 2_000
+    """of each synthetic dataset, of the plain store (127 KB each), and of the replay of the section `downstream`; dense
+    features take 0.4 MB each in bf16, 0.8 in fp32"""
     replay_transitions: int = 40_000
     """replay of the section `decision`"""
     task: str = "cheetah_run"
@@ -76,22 +68,18 @@ class Settings:
     """updates of each pre-training of the section `parity`"""
     peer: Path | None = None
     """checkout of liuxin0824/CRPTpro or denisyarats/proto to time too, in the first two sections"""
-    out: Path | None = None
-    """directory of the JSON; benchmarks/results by default"""
 
     @property
-    def sizes(self) -> dict[str, Any]:
-        """What every network and image is sized by."""
-        return {"image_size": self.image_size, "prototypes": self.prototypes}
+    def common(self) -> dict[str, Any]:
+        """What every loop in a process of its own is given."""
+        return {**self.sizes, "batch_size": self.batch_size, "threads": self.threads}
 
 
-def main(settings: Settings) -> dict[str, Any]:
-    """Run the chosen sections, print a table for each and write the JSON; returns what it holds."""
+def main(settings: Settings) -> None:
     torch.set_num_threads(settings.threads)
-    results: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory(prefix="crptpro-updates-") as directory:
+    with tempfile.TemporaryDirectory(prefix="crptpro-updates-", dir=settings.scratch) as directory:
         scratch = Path(directory)
-        sizes: dict[str, Any] = {"transitions": settings.dataset_transitions, "image_size": settings.image_size}
+        sizes: dict[str, Any] = {"transitions": settings.transitions, "image_size": settings.image_size}
         datasets = [path.resolve() for path in settings.dataset] or [
             drifting_dataset(scratch, seed=seed, **sizes) for seed in range(3)
         ]
@@ -102,60 +90,55 @@ def main(settings: Settings) -> dict[str, Any]:
             "sustained": lambda: time_sustained(settings, datasets, scratch),
             "parity": lambda: compare_curves(settings, datasets),
         }
-        for name in settings.only:
-            print(f"\n## {name}\n", flush=True)
-            results[name] = sections[name]()
-            # At once: what has been measured must not be lost with a section for which memory is too small.
-            save("updates", settings, results, settings.out)
-    return results
+        run_sections("updates", settings, sections)
 
 
 def time_pretraining(settings: Settings, datasets: list[Path]) -> dict[str, Any]:
-    """Time one pre-training update of every implementation."""
-    batch_size, common = settings.batch_size, common_of(settings)
-    store = Batch.of(FrameDataset.open(datasets[0]), settings.dataset_transitions)
+    store = Batch.of(FrameDataset.open(datasets[0]), settings.transitions)
     plain = PlainPretraining(fresh_loss(**settings.sizes))
-    candidates: dict[str, Callable[[], Any]] = {"plain fp32": lambda: plain.update(store.sample(batch_size))}
+    candidates: dict[str, Callable[[], Any]] = {"plain fp32": lambda: plain.update(store.sample(settings.batch_size))}
     if settings.peer is not None:
-        theirs = released(settings, store, task_agnostic=True)
+        theirs = peer_update(
+            settings.peer, store, batch_size=settings.batch_size, prototypes=settings.prototypes, task_agnostic=True
+        )
         candidates["released agent"] = lambda: theirs(2)  # an even number: every gate of the schedules is open
     with ExitStack() as stack:
         for precision in precisions():
             candidates[f"ours {precision}"] = stack.enter_context(
-                Loop("pretraining", datasets=datasets, precision=precision, **common)
+                Loop("pretraining", datasets=datasets, precision=precision, **settings.common)
             )
-        return table(side_by_side(candidates, rounds=settings.rounds), unit="pre-training update")
+        return compare(candidates, unit="pre-training update", rounds=settings.rounds)
 
 
 def time_downstream(settings: Settings, dataset: Path) -> dict[str, Any]:
-    """Time one downstream update, the mean of two, of every implementation."""
-    batch_size, common = settings.batch_size, common_of(settings)
     pretrained = fresh_pretrained(**settings.sizes)
-    store = Batch.of(FrameDataset.open(dataset), settings.update_transitions)
+    store = Batch.of(FrameDataset.open(dataset), settings.transitions)
     sizes = pretrained.encoder.feature_dim, ACTION_DIM
     plain = PlainDownstream(pretrained, SquashedGaussianActor(*sizes), TwinCritic(*sizes))
-    ways: dict[str, Callable[[int], Any]] = {"plain fp32": lambda step: plain.update(store.sample(batch_size), step)}
+    candidates: dict[str, Callable[[], Any]] = {
+        "plain fp32": twice(lambda step: plain.update(store.sample(settings.batch_size), step))
+    }
     if settings.peer is not None:
-        ways["released agent"] = released(settings, store, task_agnostic=False)
-    candidates: dict[str, Callable[[], Any]] = {name: twice(update) for name, update in ways.items()}
+        theirs = peer_update(
+            settings.peer, store, batch_size=settings.batch_size, prototypes=settings.prototypes, task_agnostic=False
+        )
+        candidates["released agent"] = twice(theirs)
     with ExitStack() as stack:
         for features, words in (("reencode", "encoding anew"), ("dense", "dense features")):
             for precision in precisions():
                 candidates[f"ours {precision}, {words}"] = stack.enter_context(
                     Loop(
-                        "downstream", of=("update",), transitions=settings.update_transitions, features=features,
-                        precision=precision, **common,
+                        "downstream", of=("update",), transitions=settings.transitions, features=features,
+                        precision=precision, **settings.common,
                     )
                 )  # fmt: skip
-        timings = side_by_side(candidates, rounds=settings.rounds, per_call=2)
-    return table(timings, unit="downstream update")
+        return compare(candidates, unit="downstream update", rounds=settings.rounds, per_call=2)
 
 
 def time_decisions(settings: Settings, scratch: Path) -> dict[str, Any]:
-    """Time decisions on the real simulator, stage by stage: medians over pairs of decisions."""
     with Loop(
-        "downstream", transitions=settings.replay_transitions, task=settings.task, has_stages=True, features="dense",
-        run_dir=scratch / "decision", **common_of(settings),
+        "downstream", transitions=settings.replay_transitions, task=settings.task, features="dense",
+        run_dir=scratch / "decision", **settings.common,
     ) as loop:  # fmt: skip
         pairs = [(loop(), loop.laps) for _ in range(10 + settings.decisions // 2)][10:]
     stages = {stage: statistics.median(laps[stage] for _, laps in pairs) for stage in pairs[0][1]}
@@ -169,7 +152,6 @@ def time_decisions(settings: Settings, scratch: Path) -> dict[str, Any]:
 
 
 def time_sustained(settings: Any, datasets: list[Path], scratch: Path, **options: Any) -> dict[str, Any]:
-    """Pre-train for a while as a user does and project the paper's number of updates."""
     result = pretrain(
         fresh_loss(**settings.sizes), datasets, updates=settings.sustained_updates, batch_size=settings.batch_size,
         run_dir=scratch / "sustained", log_interval=max(1, settings.sustained_updates // 10), **options,
@@ -185,24 +167,18 @@ def time_sustained(settings: Any, datasets: list[Path], scratch: Path, **options
 
 
 def compare_curves(settings: Settings, datasets: list[Path]) -> dict[str, Any]:
-    """Pre-train in float32, in bfloat16 from the same seed, and in float32 from another; compare the curves."""
     curves: dict[str, dict[str, list[float]]] = {}
     for name, precision, seed in (("fp32", "fp32", 0), ("bf16", "bf16", 0), ("other seed", "fp32", 1)):
         result = pretrain(
             fresh_loss(seed=seed, **settings.sizes), datasets, updates=settings.parity_updates, seed=seed,
             batch_size=settings.batch_size, precision=precision, log_interval=max(1, settings.parity_updates // 20),
         )  # fmt: skip
-        curves[name] = {curve: [row[curve] for row in result.history] for curve in CURVES}
+        curves[name] = {curve: [row[curve] for row in result.history] for curve in ("loss_comp", "embedding_cosine")}
     print("| mean absolute difference | bf16 against fp32, same seed | fp32, two seeds |\n|---|---|---|")
-    for curve in CURVES:
+    for curve in curves["fp32"]:
         fp32, bf16, other = (torch.tensor(found[curve]) for found in curves.values())
         print(f"| {curve} | {(bf16 - fp32).abs().mean():.5f} | {(other - fp32).abs().mean():.5f} |")
     return curves
-
-
-def common_of(settings: Settings) -> dict[str, Any]:
-    """Return what every loop in a process of its own is given."""
-    return {**settings.sizes, "batch_size": settings.batch_size, "threads": settings.threads}
 
 
 def precisions() -> list[str]:
@@ -210,18 +186,12 @@ def precisions() -> list[str]:
     return ["fp32"] if resolve_precision("auto", "cpu") == torch.float32 else ["fp32", "bf16"]
 
 
-def released(settings: Settings, store: Batch, *, task_agnostic: bool) -> Callable[[int], Any]:
-    assert settings.peer is not None
-    sizes = {"batch_size": settings.batch_size, "prototypes": settings.prototypes}
-    return peer_update(settings.peer, store, task_agnostic=task_agnostic, **sizes)
-
-
 def twice(update: Callable[[int], Any]) -> Callable[[], None]:
-    steps = itertools.count()
+    """Return a call that does an update with the actor's and one without."""
 
     def both() -> None:
-        update(next(steps))
-        update(next(steps))
+        update(2)
+        update(3)
 
     return both
 
