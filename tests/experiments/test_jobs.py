@@ -52,7 +52,7 @@ def test_a_job_is_a_command_whose_key_names_its_directory() -> None:
 def test_a_changed_command_makes_another_job_and_so_do_its_dependents() -> None:
     others = [
         trained(replace(SCALE, updates=101)), trained(replace(SCALE, training={"batch_size": 65})),
-        trained(transitions=51), trained(loss={"num_prototypes": 17}),
+        trained(replace(SCALE, transitions=51)), trained(loss={"num_prototypes": 17}),
         encoder(SCALE, "crptpro", ("walker", "cheetah"), 1), trained(),
     ]  # fmt: skip
     assert len({job.key for job in others}) == 6

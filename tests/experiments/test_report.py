@@ -262,6 +262,11 @@ def test_a_partial_reproduction_says_what_is_missing(made: Reproduction) -> None
     assert final == "500 (n = 1) · paper 513 ± 33"
 
 
+def test_a_reproduction_without_any_job_is_reported(made: Reproduction) -> None:
+    made.ask("seen", [("atc", "run-none", {"group": "A", "task": "walker_run"})], scale="small")
+    assert "Nothing is finished yet: 1 number requested." in made.report().text
+
+
 def test_methods_are_compared_on_the_tasks_that_all_have(made: Reproduction) -> None:
     cells = made.runs("crptpro", "walker_run", [500.0, 510.0]) + made.runs("crptpro", "cheetah_run", [600.0])
     made.ask("seen", [*cells, *made.runs("atc", "walker_run", [200.0])])

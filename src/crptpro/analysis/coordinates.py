@@ -25,10 +25,8 @@ class Joint(NamedTuple):
 def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
     """Return the joints behind a domain's ``qpos`` and ``qvel``, in order.
 
-    ``None`` where they are not known: a custom environment, or one without a MuJoCo model.
-
-    Raises:
-        RenderingError: dm_control cannot be loaded because no backend renders.
+    ``None`` where they are not known: a custom environment, or one without a MuJoCo model. A ``RenderingError`` if
+    dm_control cannot be loaded because no backend renders.
     """
     try:
         domain = get_domain(domain)
@@ -49,15 +47,12 @@ def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
         model = getattr(env.unwrapped, "model", None)
     else:
         return None
-    import mujoco  # after the backend is selected: the import fixes it
-
     joints = []
     for index in range(model.njnt if model is not None else 0):
         kind = list(_SIZES)[model.jnt_type[index]]
         if kind == "hinge" and not model.jnt_limited[index]:
             kind = "turning"
-        name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_JOINT, index)
-        joints.append(Joint(name or f"joint{index}", kind))
+        joints.append(Joint(model.joint(index).name or f"joint{index}", kind))
     env.close()
     return None if model is None else tuple(joints)
 
@@ -70,11 +65,12 @@ def position_coordinates(qpos: Tensor, joints: Sequence[Joint] | None) -> tuple[
     ``qpos`` (``[N, nq]``: metres, radians, quaternions w, x, y, z) is returned unchanged.
     """
     qpos = qpos.double()
-    if joints is None or sum(_SIZES[joint.kind][0] for joint in joints) != qpos.shape[1]:
+    sizes = [_SIZES[joint.kind][0] for joint in joints or ()]
+    if joints is None or sum(sizes) != qpos.shape[1]:
         return [f"qpos[{index}]" for index in range(qpos.shape[1])], qpos
     names: list[str] = []
     columns: list[Tensor] = []
-    for joint, values in zip(joints, qpos.split([_SIZES[joint.kind][0] for joint in joints], dim=1)):
+    for joint, values in zip(joints, qpos.split(sizes, dim=1)):
         if joint.kind in ("slide", "hinge"):
             names.append(joint.name)
         elif joint.kind == "turning":
@@ -101,10 +97,6 @@ def velocity_coordinates(qvel: Tensor, joints: Sequence[Joint] | None) -> tuple[
 def _two_columns(quaternions: Tensor) -> Tensor:
     """Return the first two columns, ``[N, 6]``, of the rotation matrices of quaternions ``[N, 4]``."""
     w, x, y, z = torch.nn.functional.normalize(quaternions, dim=1).unbind(1)
-    return torch.stack(
-        [
-            1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y),
-            2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
-        ],
-        1,
-    )  # fmt: skip
+    first = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+    second = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]
+    return torch.stack([*first, *second], 1)

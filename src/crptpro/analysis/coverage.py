@@ -7,8 +7,6 @@ from torch import Tensor
 
 from crptpro.objectives.functional import knn_distances, particle_entropy
 
-_BATCH = 64
-
 
 @torch.no_grad()
 def coverage(embeddings: Tensor, *, k: int = 12) -> float:
@@ -17,19 +15,13 @@ def coverage(embeddings: Tensor, *, k: int = 12) -> float:
     :math:`z_i^{(j)}` is the j-th nearest other embedding, as in the rewards of APT (arXiv 2103.04551) and Proto-RL
     (arXiv 2102.11271). The paper plots "a particle-based estimator" and states neither k, nor the number of
     observations, nor the encoder: these are this project's choice. The value falls with the number of observations:
-    compare equal numbers. It is 0 if all embeddings are equal, and at most log 3 for unit vectors.
-
-    Args:
-        embeddings: ``[N, D]``, N above ``k``.
-        k: neighbours, the observation itself not counted.
-
-    Raises:
-        ValueError: too few observations.
+    compare equal numbers. It is 0 if all embeddings are equal, and at most log 3 for unit vectors. Embeddings are
+    ``[N, D]``; N up to ``k``, the number of neighbours, is a ``ValueError``.
     """
     if len(embeddings) <= k:
         raise ValueError(f"{k} neighbours need more than {k} observations, got {len(embeddings)}.")
     total = 0.0
-    for part in embeddings.split(_BATCH):  # the differences to all neighbours of all would not fit
+    for part in embeddings.split(64):  # the differences to all neighbours of all would not fit
         distances = knn_distances(part, embeddings, k=k + 1)[:, 1:]  # the nearest is the observation itself
         total += float(particle_entropy(distances).double().sum())
     return total / len(embeddings)

@@ -9,8 +9,6 @@ from torchrl.data import ReplayBuffer
 
 from crptpro.modules.precision import device_of
 
-_BATCH = 64
-
 
 def sample_pixels(dataset: ReplayBuffer, samples: int, *, seed: int) -> Tensor:
     """Draw observations ``[samples, C, H, W]``, which depend on the seed alone, not on earlier samples."""
@@ -22,14 +20,12 @@ def sample_pixels(dataset: ReplayBuffer, samples: int, *, seed: int) -> Tensor:
 def embed_pixels(encoder: nn.Module, pixels: Tensor, *, projector: nn.Module | None = None) -> Tensor:
     """Encode observations without augmentation, in batches: float32 ``[N, D]`` on the encoder's device.
 
-    Args:
-        encoder: maps uint8 ``[B, C, H, W]`` to features ``[B, D]``.
-        pixels: ``[N, C, H, W]``, on any device.
-        projector: if given, embeddings are its outputs, else the features themselves.
+    The encoder maps uint8 ``[B, C, H, W]`` to features. ``pixels`` are ``[N, C, H, W]`` on any device. With a projector
+    its outputs are the embeddings.
     """
     device = device_of(encoder) or pixels.device
     parts = []
-    for batch in pixels.split(_BATCH):
+    for batch in pixels.split(64):
         features = encoder(batch.to(device))
         parts.append((features if projector is None else projector(features)).float())
     return torch.cat(parts)
@@ -38,9 +34,7 @@ def embed_pixels(encoder: nn.Module, pixels: Tensor, *, projector: nn.Module | N
 def principal_components(points: Tensor, *, components: int = 3) -> tuple[Tensor, Tensor]:
     """Project centred points ``[N, D]`` on their leading principal directions (scikit-learn's ``PCA``).
 
-    Returns:
-        Coordinates ``[N, components]`` and the fraction of the total variance that each explains ``[components]``, in
-        decreasing order.
+    Returns coordinates ``[N, components]``, and the fraction of the variance that each explains, in decreasing order.
     """
     from sklearn.decomposition import PCA
 
@@ -60,10 +54,6 @@ def effective_rank(features: Tensor) -> float:
 
     Between 1 (all on a line) and min(N - 1, D) of features ``[N, D]``; 0 if all samples coincide. Source: Roy and
     Vetterli, "The effective rank: a measure of effective dimensionality", 2007.
-
-    Examples:
-        >>> round(effective_rank(torch.tensor([[1.0, 0], [-1, 0], [0, 1], [0, -1]])), 6)
-        2.0
     """
     mean = features.mean(0, dtype=torch.float64)
     gram = gram_matrix(features, mean, torch.ones_like(mean))

@@ -46,8 +46,7 @@ Or `crptpro reproduce` a whole experiment of the paper.
 With `--plugin FILE.py` (or a module) any command runs a file of yours first: methods and domains that it registers
 then have names here."""
 
-_NAMED = arg(metavar="[NAME=VALUE ...]", help_behavior_hint="(default: the method's)")
-NamedValues = Annotated[tuple[str, ...], _NAMED]
+NamedValues = Annotated[tuple[str, ...], arg(metavar="[NAME=VALUE ...]", help_behavior_hint="(default: the method's)")]
 
 
 @dataclass(frozen=True)
@@ -164,22 +163,20 @@ class Pretraining(EncoderRun):
 
     def run(self) -> None:
         method = get_method(self.method)
-        train: Any = training.pretrain
+        train: Any = training.pretrain if method.exploration is None else training.pretrain_active
+        images: dict[str, int] = {}
         if method.exploration is not None:
-            train = training.pretrain_active
             sources: list[Any] = expand_groups(self.sources)
-            image_size, frame_stack = 84, 3
         else:
             sources = [as_path(source, "sources") for source in self.sources]
-            needs_data = sources or method.loss_class is not None
-            image_size, frame_stack = image_format(sources) if needs_data else (84, 3)
-        images = {"image_size": image_size, "in_channels": 3 * frame_stack}
+            if sources or method.loss_class is not None:
+                image_size, frame_stack = image_format(sources)
+                images = {"image_size": image_size, "in_channels": 3 * frame_stack}
         if method.loss_class is None:
             untrained = random_pretrained(self.config.seed, method=self.method, datasets=sources, **images)
             logger.info("untrained encoder: %s", save_pretrained(untrained, self.out / "encoder"))
             return
-        loss_options = named_values("--loss", self.loss)
-        encoder_options = named_values("--encoder", self.encoder)
+        loss_options, encoder_options = named_values("--loss", self.loss), named_values("--encoder", self.encoder)
         seed_everything(self.config.seed)
         loss = method.build(method.build_encoder(**images, **encoder_options), **loss_options)
         with self.logging.records(self.out, self) as records:
@@ -280,18 +277,14 @@ class Evaluate:
         require_writable(self.video, "--video")
         agent, card = (None, {}) if is_random else training.load_agent(self.agent)
         task = self.task or card["task"]
-        trained_with = card.get("config", {})
-        settings: dict[str, Any] = {
-            "quality": self.quality or trained_with.get("quality", "exact"),
-            "colors": self.colors or trained_with.get("colors", "normal"),
-            "action_repeat": self.action_repeat or trained_with.get("action_repeat"),
-            "render": not is_random or self.video is not None,  # the random policy needs no pixels
-        }
+        usual = {"quality": "exact", "colors": "normal", "action_repeat": None} | card.get("config", {})
+        names = ("quality", "colors", "action_repeat")
+        settings: dict[str, Any] = {name: getattr(self, name) or usual[name] for name in names}
+        settings["render"] = not is_random or self.video is not None  # the random policy needs no pixels
         if agent is not None:
             encoder: Any = agent.encoder
             settings |= {"image_size": encoder.image_size, "frame_stack": encoder.in_channels // 3}
-        env = make_env(task, seed=self.seed, **settings)
-        try:
+        with contextlib.closing(make_env(task, seed=self.seed, **settings)) as env:
             action_dim = env.action_spec.shape[-1]
             if agent is not None and agent.actor.config["action_dim"] != action_dim:
                 raise CRPTproError(
@@ -310,8 +303,6 @@ class Evaluate:
                 policy = agent or training.uniform_policy(env, seed=self.seed)
                 run_episode(policy, env, episode=0, seed=episode_seed(self.seed, 0), on_frame=frames.append)
                 write_video(frames, self.video)
-        finally:
-            env.close()
         scores = training.summarize(episodes)
         print(
             f"{task}: {scores['mean']:.1f} ± {scores['std']:.1f} "
@@ -359,7 +350,7 @@ class Probe:
                 table += rows
                 numbers += measures
                 if self.csv is not None:
-                    measure.write_rows(self.csv, numbers, measure.PROBE_COLUMNS)
+                    measure.write_rows(self.csv, numbers)
         finally:  # a later dataset may be refused, and writing may fail
             if table:
                 lines = [list(table[0]), ["---"] * len(table[0]), *(list(row.values()) for row in table)]
@@ -423,14 +414,15 @@ def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
     """Open every dataset and return the image size and frames per stack, which all must share."""
     if not datasets:
         raise DatasetError("Name at least one dataset directory, e.g. data/walker (made by `crptpro collect`).")
+    formats = {}
     for path in datasets:
         if not path.exists() and str(path) in (*GROUPS, *PAPER_DOMAINS, *TASKS):
             raise DatasetError(
                 f"{path} is no directory. This method learns from datasets: `crptpro collect {path}` makes them, "
                 "data/... by default."
             )
-    opened = {path: FrameDataset.open(path) for path in datasets}
-    formats = {path: (dataset.image_size, dataset.frame_stack) for path, dataset in opened.items()}
+        dataset = FrameDataset.open(path)
+        formats[path] = (dataset.image_size, dataset.frame_stack)
     if len(set(formats.values())) > 1:
         listed = ", ".join(f"{path} has {size} px, {stack} frames" for path, (size, stack) in formats.items())
         raise DatasetError(f"One encoder needs images of one size and stack: {listed}.")
@@ -471,7 +463,8 @@ def main() -> None:
             "downstream": Downstream, "evaluate": Evaluate, "probe": Probe, "reproduce": Reproduce, "report": Report,
         }  # fmt: skip
         stages: Any = Union[tuple(Annotated[stage, subcommand(name)] for name, stage in commands.items())]  # noqa: UP007
-        config = (OmitSubcommandPrefixes,)
-        tyro.cli(stages, prog="crptpro", description=DESCRIPTION, args=arguments, config=config).run()
+        tyro.cli(
+            stages, prog="crptpro", description=DESCRIPTION, args=arguments, config=(OmitSubcommandPrefixes,)
+        ).run()
 
     run_main(run)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,6 @@ from crptpro.experiments import launch
 from crptpro.experiments.jobs import DONE, JOBS, KINDS, Plan, bytes_of, make_plan, write_cells
 from crptpro.experiments.matrix import EXPERIMENTS, SCALES, Cell, Request
 from crptpro.modules import usable_device
-from crptpro.plugins import loaded_plugins
 from crptpro.values import as_path
 
 ALL = "all"
@@ -112,15 +110,13 @@ class Reproduce:
             return
         require_disk(root, disk, "What this plan has yet to make")
         launcher = self._launcher(slurm, gpus) if plan.missing else None  # it may fail, and nothing is written yet
-        request_record = {**dataclasses.asdict(request), "scale": self.scale}
+        asked = {**dataclasses.asdict(request), "scale": self.scale}
         for name, cells in wanted.items():
-            rows = [(cell.label, cell.job.key, cell.place) for cell in cells]
-            write_cells(root, name, self.scale, request_record, rows)
+            write_cells(root, name, self.scale, asked, [(cell.label, cell.job.key, cell.place) for cell in cells])
         if launcher is not None:
             failures = launch.run_jobs(
-                plan, root, launcher, jobs=jobs, cores=cores, device=self.device, plugins=loaded_plugins(),
-                attempts=self.attempts,
-            )  # fmt: skip
+                plan, root, launcher, jobs=jobs, cores=cores, device=self.device, attempts=self.attempts
+            )
             if failures:
                 print(failures_text(failures), flush=True)
                 raise SystemExit(1)
@@ -171,8 +167,7 @@ class Reproduce:
         if self.launcher == "slurm":
             return launch.SlurmLauncher(slurm)
         if self.launcher == "ray":
-            share = 1 / self.jobs_per_gpu if self.device.startswith("cuda") else 0
-            return launch.RayLauncher(self.ray_address, gpus=share)
+            return launch.RayLauncher(self.ray_address, gpus=self.device.startswith("cuda") / self.jobs_per_gpu)
         return launch.LocalLauncher(gpus)
 
 
@@ -180,38 +175,35 @@ def plan_text(plan: Plan, root: Path, disk: int, jobs: int) -> str:
     """Return a table of needed, finished and missing jobs by kind, with their env steps and times."""
     import pandas as pd
 
-    spent: dict[str, list[float]] = {}
-    for path in root.glob(f"{JOBS}/*/{DONE}"):
-        spent.setdefault(path.parent.name.split("-")[0], []).append(float(read_json(path)["seconds"]))
+    done = list(root.glob(f"{JOBS}/*/{DONE}"))
+    kinds = [path.parent.name.split("-")[0] for path in done]
+    spent = pd.Series([read_json(path)["seconds"] for path in done], kinds, float).groupby(level=0).median()
     rows = []
     for kind, name in KINDS.items():
         needed = sum(job.kind == kind for job in plan.jobs)
         missing = [job for job in plan.missing if job.kind == kind]
         if needed:
             env_steps = sum(job.facts.get("env_steps", 0) for job in missing)
-            rows.append({
-                "jobs": name, "needed": f"{needed:,}", "done": f"{needed - len(missing):,}",
-                "to do": f"{len(missing):,}", "env steps": f"{env_steps:,}",
-                "took each": launch.duration(statistics.median(spent[kind])) if kind in spent else "",
-            })  # fmt: skip
+            counts = {"needed": needed, "done": needed - len(missing), "to do": len(missing), "env steps": env_steps}
+            took = launch.duration(spent[kind]) if kind in spent else ""
+            rows.append({"jobs": name, **{what: f"{n:,}" for what, n in counts.items()}, "took each": took})
     text = pd.DataFrame(rows).to_string(index=False)
     if plan.missing:
         text += f"\n\n{jobs} at a time; the disk needs {max(disk, 10**6) / 1e9:,.2f} GB."
-        if spent:
+        if done:
             text += "\nThe last column is the median of what finished jobs in this directory took."
     return text
 
 
 def failures_text(failures: Sequence[launch.Failure]) -> str:
     """Return the list of unfinished jobs with their logs."""
-    failed = [failure for failure in failures if failure.log is not None]
-    skipped = [failure for failure in failures if failure.log is None]
-    lines = [f"{len(failed)} failed:"]
-    for failure in failed:
-        times = "once" if failure.attempts == 1 else f"{failure.attempts} times"
-        lines += [f"  {failure.key} (tried {times})", f"    {failure.reason}", f"    log: {failure.log}"]
+    skipped = [f"  {failure.key}" for failure in failures if failure.log is None]
+    lines = [f"{len(failures) - len(skipped)} failed:"]
+    for failure in failures:
+        if failure.log is not None:
+            times = "once" if failure.attempts == 1 else f"{failure.attempts} times"
+            lines += [f"  {failure.key} (tried {times})", f"    {failure.reason}", f"    log: {failure.log}"]
     if skipped:
-        lines.append(f"{len(skipped)} not started, because they need one that failed:")
-        lines += [f"  {failure.key}" for failure in skipped]
+        lines += [f"{len(skipped)} not started, because they need one that failed:", *skipped]
     lines.append("The same command tries them again; everything else is kept.")
     return "\n".join(lines)

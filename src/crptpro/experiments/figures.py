@@ -52,35 +52,23 @@ def styles(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
 
 
 def draw(
-    points: pd.DataFrame,
-    x: str = "",
-    y: str = "",
-    *,
-    kind: str = "line",
-    columns: int = 3,
-    marks: Mapping[str, float] | None = None,
+    points: pd.DataFrame, x: str = "", y: str = "", *, kind: str = "line", marks: Mapping[str, float] | None = None
 ) -> Any:
     """Draw panels with one legend below.
 
-    Args:
-        points: columns ``label``, ``x`` (numbers, or names of places in order) and ``y``; optionally ``panel`` (its
-            title), ``line`` (one of a label's curves), ``n`` (runs, for the legend), ``low`` and ``high`` (an
-            interval), ``thin``.
-        x: name and unit of the horizontal axis; empty if the titles say it.
-        y: of the vertical axis.
-        kind: ``"line"``, or ``"cloud"`` of points.
-        columns: panels side by side.
-        marks: heights of dashed lines in the first panel, by their names.
+    ``points`` has columns ``label``, ``x`` (numbers, or names of places in order) and ``y``; optionally ``panel`` (its
+    title), ``line`` (one of a label's curves), ``n`` (runs, for the legend), ``low`` and ``high`` (an interval), and
+    ``thin``. ``x`` and ``y`` name the axes and their units. ``kind`` is ``"line"``, or ``"cloud"`` of points. ``marks``
+    are heights of dashed lines in the first panel, by their names.
     """
     import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     optional = {"panel": "", "line": "", "n": "", "low": math.nan, "high": math.nan, "thin": False}
     points = points.assign(**{name: value for name, value in optional.items() if name not in points})
-    panels = list(dict.fromkeys(points["panel"]))
-    columns = min(len(panels), columns)
-    rows = math.ceil(len(panels) / columns)
+    panels = points["panel"].nunique()
+    columns = 2 if panels == 4 else min(panels, 3)
+    rows = math.ceil(panels / columns)
     height = 2.9
     width = {1: 7.4, 2: 5.2}.get(columns, 3.9)
     look = styles(points["label"])
@@ -88,10 +76,8 @@ def draw(
     counts = {label: " or ".join(map(str, sorted(set(own)))) for label, own in points.groupby("label")["n"]}
     with mpl.rc_context({"text.parse_math": False}):  # a user's name in dollars is a name
         figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
-        FigureCanvasAgg(figure)
         axes = list(figure.subplots(rows, columns, squeeze=False).flat)
-        for axis, panel in zip(axes, panels):
-            here = points[points["panel"] == panel]
+        for axis, (panel, here) in zip(axes, points.groupby("panel", sort=False)):
             for (label, _), own in here.groupby(["label", "line"], sort=False):
                 style = look[label]
                 if own["thin"].all():
@@ -112,7 +98,7 @@ def draw(
             axis.spines[["top", "right"]].set_visible(False)
         for name, at in (marks or {}).items():
             handles[name] = axes[0].axhline(at, color=GREY, linestyle=(0, (4, 3)), linewidth=0.9)
-        for axis in axes[len(panels) :]:
+        for axis in axes[panels:]:
             axis.set_axis_off()
         across = max(1, min(len(handles), int(width * columns / (0.6 + 0.062 * max(map(len, handles))))))
         figure.set_figheight(height * rows + 0.17 * math.ceil(len(handles) / across) + 0.1)

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock
 
-from crptpro.artifact import WEIGHTS_FILE, read_json, write_json
+from crptpro.artifact import CARD_FILE, WEIGHTS_FILE, read_json, write_json
 from crptpro.data.storage import PIXELS_FILE
 from crptpro.errors import RecordError
 from crptpro.plugins import loaded_plugins
@@ -45,8 +45,7 @@ KINDS = {
     "embeddings": "embeddings",
 }
 """Kinds of jobs in the order of tables, and their names there."""
-OWN = "{out}"
-"""Stands for the job's own directory in a command; ``{KEY}`` for that of a job it needs."""
+OWN = "{out}"  # stands for the job's own directory in a command, ``{KEY}`` for that of a job it needs
 
 
 @dataclass(frozen=True)
@@ -100,9 +99,6 @@ def options(**values: Any) -> list[str]:
     return words
 
 
-# --- plans ----------------------------------------------------------------------------------------------------------
-
-
 def directory_of(root: Path, key: str) -> Path:
     """Return the directory of a job."""
     return root / JOBS / key
@@ -117,9 +113,8 @@ def _has_inputs(root: Path, job: Job, reader: Job) -> bool:
     """Whether the directories of a job that another job reads exist, with weights or pixels if they have a card."""
     names = re.findall(rf"\{{{re.escape(job.key)}\}}/([^\s'\"]*)", " ".join(reader.command))
     for path in (directory_of(root, job.key) / name for name in names):
-        is_artifact = (path / "card.json").exists()
         has_content = (path / WEIGHTS_FILE).exists() or (path / PIXELS_FILE).exists()
-        if not path.exists() or (is_artifact and not has_content):
+        if not (has_content if (path / CARD_FILE).exists() else path.exists()):
             return False
     return True
 
@@ -170,8 +165,7 @@ def describe(root: Path, plan: Plan) -> None:
         path = directory_of(root, job.key) / DESCRIPTION
         if not path.exists():
             needs = [needed.key for needed in job.needs]
-            about = {"kind": job.kind, "command": list(job.command), "needs": needs, "facts": dict(job.facts)}
-            write_json(path, about)
+            write_json(path, {"kind": job.kind, "command": job.command, "needs": needs, "facts": job.facts})
 
 
 FRAME_BYTES = 3 * 84 * 84
@@ -195,63 +189,51 @@ def bytes_of(job: Job) -> tuple[int, int]:
     return 1_000_000, 0
 
 
-# --- records --------------------------------------------------------------------------------------------------------
-
-
 def write_cells(
     root: Path,
     experiment: str,
     scale: str,
-    request: Mapping[str, Any],
+    request: dict[str, Any],
     cells: Iterable[tuple[str, str, Mapping[str, Any]]],
 ) -> None:
     """Record the cells of an experiment: label, key of the job and place of each number.
 
-    They are added to earlier cells, and replace those with the same label and place.
-
-    Raises:
-        RecordError: the file is there and cannot be read.
+    They are added to earlier cells, and replace those with the same label and place. An earlier file that cannot be
+    read is a ``RecordError``.
     """
     path = root / EXPERIMENTS / f"{experiment}-{scale}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    new = [{"label": label, "job": key, "place": dict(place)} for label, key, place in cells]
+    new = [{"label": label, "job": key, "place": place} for label, key, place in cells]
     with FileLock(path.parent / ".lock"):
         before = read_json(path, error=RecordError).get("cells", []) if path.exists() else []
         taken = [(cell["label"], cell["place"]) for cell in new]
         kept = [cell for cell in before if (cell["label"], cell["place"]) not in taken]
-        content = {"experiment": experiment, "scale": scale, "request": dict(request), "cells": [*new, *kept]}
-        write_json(path, content)
+        about = {"experiment": experiment, "scale": scale, "request": request}
+        write_json(path, {**about, "cells": [*new, *kept]})
 
 
 @dataclass(frozen=True)
 class Results:
     """The state of a reproduction.
 
-    Args:
-        cells: a row per number of an experiment: ``experiment``, ``scale``, ``label``, ``job`` (a key),
-            ``done``, and a column per name of a place, such as ``group``, ``task``, ``encoder_seed``, ``seed``.
-        jobs: by key: ``kind``, ``path``, ``done``, ``seconds``, ``attempts``, ``threads``, ``device``, ``machine``,
-            ``git_revision``, ``versions``, ``facts``, ``needs``.
+    ``cells`` has a row per number of an experiment: ``experiment``, ``scale``, ``label``, ``job`` (a key), ``done``,
+    and a column per name of a place, such as ``group``, ``task``, ``encoder_seed``, ``seed``. ``jobs`` has by key
+    ``kind``, ``command``, ``facts``, ``needs``, ``seconds``, ``attempts``, ``threads``, ``device``, ``git_revision``,
+    ``versions``, ``path``, ``done`` and ``machine``.
     """
 
     cells: pandas.DataFrame
     jobs: pandas.DataFrame
 
 
-DESCRIBED = ("kind", "command", "facts", "needs")
-"""Keys of ``job.json`` that tables read."""
-MADE = ("seconds", "attempts", "threads", "device", "git_revision", "versions")
-"""Keys of ``done.json`` that tables read, besides the hardware."""
+DESCRIBED = ("kind", "command", "facts", "needs")  # keys of ``job.json`` that tables read
+MADE = ("seconds", "attempts", "threads", "device", "git_revision", "versions")  # of ``done.json``, with ``hardware``
 
 
 def load_results(root: str | Path) -> Results:
-    """Read the cells of experiments, and their jobs.
+    """Read the cells of experiments, and their jobs, from the directory of a reproduction.
 
-    Args:
-        root: directory of a reproduction.
-
-    Raises:
-        RecordError: a record is damaged.
+    A damaged record is a ``RecordError``.
     """
     import pandas as pd
 
@@ -261,16 +243,16 @@ def load_results(root: str | Path) -> Results:
     for path in sorted((root / EXPERIMENTS).glob("*.json")):
         content = read_json(path, error=RecordError)
         try:
-            about = {name: content[name] for name in ("experiment", "scale")}
             for cell in content["cells"]:
-                done = rows.get(cell["job"], {}).get("done", False)
-                cells.append({**about, "label": cell["label"], "job": cell["job"], "done": done} | cell["place"])
+                row = {name: content[name] for name in ("experiment", "scale")}
+                row |= {name: cell[name] for name in ("label", "job")}
+                cells.append({**row, "done": rows.get(row["job"], {}).get("done", False), **cell["place"]})
         except (KeyError, TypeError) as reason:
             raise RecordError(f"{path} does not say what was requested ({reason!r}); remove it.") from None
     columns = None if cells else ["experiment", "scale", "label", "job", "done"]
     table = pd.DataFrame(cells, columns=columns, dtype=object).astype({"done": bool})
     jobs = pd.DataFrame.from_dict(rows, orient="index", columns=[*DESCRIBED, *MADE, "path", "done", "machine"])
-    return Results(table, jobs.rename_axis("key"))
+    return Results(table, jobs.astype({"done": bool}).rename_axis("key"))
 
 
 def _job_row(path: Path) -> dict[str, Any]:
@@ -280,10 +262,10 @@ def _job_row(path: Path) -> dict[str, Any]:
         row = {name: content[name] for name in DESCRIBED} | {name: done.get(name) for name in MADE}
     except KeyError as reason:
         raise RecordError(f"{path} does not describe a job: it has no {reason}.") from None
-    return row | {"path": path.parent, "done": done_path.exists(), "machine": machine(done.get("hardware") or {})}
+    return row | {"path": path.parent, "done": done_path.exists(), "machine": machine(done.get("hardware"))}
 
 
-def machine(hardware: Mapping[str, Any]) -> str:
+def machine(hardware: Mapping[str, Any] | None) -> str:
     """Describe the hardware of a record; empty if none is recorded."""
     if not hardware:
         return ""

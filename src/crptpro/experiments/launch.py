@@ -34,17 +34,14 @@ from filelock import FileLock
 from crptpro.artifact import read_json, write_json
 from crptpro.errors import CRPTproError, RecordError, SubmissionError
 from crptpro.experiments.jobs import CLOCK, DESCRIPTION, DONE, LOCK, LOG, OWN, Job, Plan, describe, directory_of
+from crptpro.plugins import loaded_plugins
 from crptpro.provenance import cpu_cores, provenance
 
 logger = logging.getLogger(__name__)
 
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-"""Variables that numpy and torch read at import."""
-LEFTOVERS = {"run": ("checkpoints", "replay")}
-"""Directories to remove from a finished job, other than ``checkpoints`` alone: an explorer's replay is kept."""
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")  # numpy and torch read them at import
 WITH_DEVICE = ("encoder", "explored", "finetuned", "run", "probe", "coverage", "embeddings")
 """Kinds of jobs whose command has a ``--device``."""
-CLUSTER_JOBS, CLUSTER_GPU_CORES = 16, 4
 MAX_REQUEUES = 1_000  # of a Slurm job at its time limit; it makes progress each time
 POLL_S = 0.2
 REFUSED_S = 60.0  # pause after a queue refused a job
@@ -73,11 +70,9 @@ class Work:
     def arguments(self) -> list[str]:
         """Return the whole command line of the job after ``crptpro``."""
         content = read_json(self.directory / DESCRIPTION, error=RecordError)
-        directories = {f"{{{key}}}": str(directory_of(Path(self.root), key)) for key in content["needs"]}
-        directories[OWN] = str(self.directory)
-        words = content["command"]
-        for mark, path in directories.items():
-            words = [word.replace(mark, path) for word in words]
+        words = [word.replace(OWN, str(self.directory)) for word in content["command"]]
+        for key in content["needs"]:
+            words = [word.replace(f"{{{key}}}", str(directory_of(Path(self.root), key))) for word in words]
         for plugin in self.plugins:
             words += ["--plugin", plugin]
         if content["kind"] == "dataset":
@@ -106,16 +101,25 @@ class Work:
             if (self.directory / DONE).exists():
                 return ""
             torch.set_num_threads(self.threads)
-            clock = _clock(self.directory)
+            clock, reason = _clock(self.directory), ""
             sys.argv = ["crptpro", *self.arguments()]
-            reason = _failure_of(crptpro, self.directory / LOG)
+            try:
+                crptpro()
+            except SystemExit as end:
+                if end.code in (130, 143):  # stopped by a signal
+                    raise
+                reason = _last_line(self.directory / LOG) if end.code else ""
+            except Exception as error:  # a defect: the log needs its traceback
+                traceback.print_exc()
+                reason = f"{type(error).__name__}: {error}"
             if not reason:
                 seconds = clock["seconds"] + time.time() - clock["began"]
                 how = {"device": self.device, "threads": self.threads, "attempts": clock["attempts"]}
                 write_json(self.directory / DONE, {"seconds": seconds, **how, **provenance()})
                 (self.directory / CLOCK).unlink(missing_ok=True)
-                for name in LEFTOVERS.get(self.key.split("-")[0], ("checkpoints",)):
-                    shutil.rmtree(self.directory / name, ignore_errors=True)
+                shutil.rmtree(self.directory / "checkpoints", ignore_errors=True)
+                if self.key.startswith("run-"):  # an explorer's replay is measured later
+                    shutil.rmtree(self.directory / "replay", ignore_errors=True)
         print(f"error: {reason}" if reason else "finished", flush=True)
         return reason
 
@@ -131,20 +135,6 @@ def _clock(directory: Path) -> dict[str, float]:
     clock["began"] = time.time()
     write_json(directory / CLOCK, clock)
     return clock
-
-
-def _failure_of(command: Callable[[], None], log: Path) -> str:
-    """Call a command; returns why it failed, or an empty string."""
-    try:
-        command()
-    except SystemExit as end:
-        if end.code in (130, 143):  # stopped by a signal
-            raise
-        return _last_line(log) if end.code else ""
-    except Exception as error:  # a defect: the log needs its traceback
-        traceback.print_exc()
-        return f"{type(error).__name__}: {error}"
-    return ""
 
 
 def _last_line(path: Path) -> str:
@@ -206,7 +196,7 @@ class _Process:
 class SlurmLauncher:
     """A Slurm cluster, whose nodes share ROOT and the environment of this process.
 
-    The parameters are those of submitit's executor; its ``cluster`` is ``"local"`` in tests.
+    The parameters are those of submitit's executor, empty ones left out; its ``cluster`` is ``"local"`` in tests.
     """
 
     is_one_machine = False
@@ -226,38 +216,24 @@ class SlurmLauncher:
         """Queue a job; an exclusive job requests a whole node."""
         from submitit import AutoExecutor
         from submitit.core.utils import FailedJobError
+        from submitit.helpers import FunctionSequence
 
         parent = Path(work.root) / "submitted"
         parent.mkdir(exist_ok=True)
         folder = Path(tempfile.mkdtemp(prefix=f"{work.key}-", dir=parent))
         # Since Slurm 22.05 srun does not inherit the cores of sbatch, and would run the job on one.
         setup = [f"export {name}={work.threads}" for name in (*THREAD_VARIABLES, "SRUN_CPUS_PER_TASK")]
-        parameters = {"job_name": work.key, "cpus_per_task": work.threads, "setup": setup, "exclusive": is_exclusive}
-        parameters |= self.parameters
+        own = {"job_name": work.key, "cpus_per_task": work.threads, "setup": setup, "exclusive": is_exclusive}
         executor = AutoExecutor(folder, cluster=self.cluster, slurm_max_num_timeout=MAX_REQUEUES)
-        executor.update_parameters(**{f"slurm_{name}": value for name, value in parameters.items() if value})
+        executor.update_parameters(**{f"slurm_{k}": v for k, v in {**own, **self.parameters}.items() if v})
+        task = FunctionSequence()  # queued again at its time limit; the job continues from its own checkpoint
+        task.add(_run_here, work)
         try:
-            return _SlurmJob(executor.submit(_Submitted(work)), folder, work.directory / LOG)
+            return _SlurmJob(executor.submit(task), folder, work.directory / LOG)
         except FailedJobError as reason:
             shutil.rmtree(folder, ignore_errors=True)
-            last_line = (str(reason).strip().splitlines() or ["it gave no reason"])[-1]
-            raise SubmissionError(
-                f"sbatch refused a job: {last_line} Change --partition, --hours or --sbatch."
-            ) from reason
-
-
-@dataclass(frozen=True)
-class _Submitted:
-    work: Work
-
-    def __call__(self) -> None:
-        _run_here(self.work)
-
-    def checkpoint(self) -> Any:
-        """Let Slurm queue the job again at its time limit; it continues from its own checkpoint."""
-        from submitit.helpers import DelayedSubmission
-
-        return DelayedSubmission(self)
+            why = (str(reason).strip().splitlines() or ["it gave no reason"])[-1]
+            raise SubmissionError(f"sbatch refused a job: {why} Change --partition, --hours or --sbatch.") from reason
 
 
 @dataclass
@@ -355,27 +331,17 @@ class Failure:
 
 
 def run_jobs(
-    plan: Plan,
-    root: Path,
-    launcher: Any,
-    *,
-    jobs: int = 1,
-    cores: int = 1,
-    device: str = "cpu",
-    plugins: Sequence[str] = (),
-    attempts: int = 3,
+    plan: Plan, root: Path, launcher: Any, *, jobs: int = 1, cores: int = 1, device: str = "cpu", attempts: int = 3
 ) -> list[Failure]:
     """Run every missing job of a plan as soon as all jobs that it needs are finished; returns what is not finished.
 
     At most ``jobs`` run at a time, with ``cores`` each; an exclusive job starts when no other can. Each of the
     ``attempts`` at a job continues the one before. Ctrl-C, SIGTERM and SIGHUP stop all jobs at their next checkpoint, a
-    second one at once; KeyboardInterrupt or SystemExit is raised when all jobs have ended.
-
-    Raises:
-        SubmissionError: a queue refuses the first job.
+    second one at once; KeyboardInterrupt or SystemExit is raised when all jobs have ended. A queue that refuses the
+    first job is a ``SubmissionError``.
     """
     describe(root, plan)
-    usual = Work(str(root.resolve()), "", device, threads=cores, workers=cores, plugins=plugins)
+    usual = Work(str(root.resolve()), "", device, threads=cores, workers=cores, plugins=loaded_plugins())
     queue = _Queue(plan, usual, launcher, jobs, attempts)
     with _signals_end_it():
         try:
@@ -412,13 +378,10 @@ def _signals_end_it() -> Iterator[None]:
 
 class _Queue:
     def __init__(self, plan: Plan, usual: Work, launcher: Any, jobs: int, attempts: int) -> None:
-        self.usual = usual
-        self.launcher = launcher
-        self.jobs = jobs
-        self.attempts = attempts
+        self.count = len(plan.jobs)
+        self.usual, self.launcher, self.jobs, self.attempts = usual, launcher, jobs, attempts
         self.waiting = list(plan.missing)
         self.finished = {job.key for job in plan.jobs} - {job.key for job in plan.missing}
-        self.count = len(plan.jobs)
         self.running: dict[Job, tuple[Any, float]] = {}
         self.failures: list[Failure] = []
         self.tried: Counter[str] = Counter()
@@ -468,14 +431,13 @@ class _Queue:
             del self.running[job]
             directory = directory_of(Path(self.usual.root), job.key)
             took = duration(time.monotonic() - began)
+            log, tried = directory / LOG, self.tried[job.key]
+            reason = lost or _last_line(log) or "it ended unfinished"
             # The job's own record decides: the job may have been lost after its work was done.
             if (directory / DONE).exists():
                 self.finished.add(job.key)
                 logger.info("%s: finished in %s (%d of %d)", job.key, took, len(self.finished), self.count)
-                continue
-            log, tried = directory / LOG, self.tried[job.key]
-            reason = lost or _last_line(log) or "it ended unfinished"
-            if self.is_stopping:
+            elif self.is_stopping:
                 logger.info("%s: stopped after %s", job.key, took)
             elif tried < self.attempts:
                 self.waiting.insert(0, job)
@@ -501,12 +463,7 @@ class _Queue:
 
 
 def duration(seconds: float) -> str:
-    """Return a readable duration.
-
-    Examples:
-        >>> duration(42.4), duration(4000), duration(100_000)
-        ('42 s', '67 min', '27.8 h')
-    """
+    """Return a readable duration, such as 42 s, 67 min or 27.8 h."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7_200 else f"{seconds / 3_600:.1f} h"
@@ -527,13 +484,13 @@ def divide(
         if value is not None and value < 1:
             raise CRPTproError(f"--{name} must be at least 1, got {value}.")
     if launcher != "local":
-        return jobs or CLUSTER_JOBS, cores or (CLUSTER_GPU_CORES if device.startswith("cuda") else 1), ()
+        return jobs or 16, cores or (4 if device.startswith("cuda") else 1), ()
     gpus: tuple[str, ...] = ()
     if device == "cuda":
-        listed = os.environ.get("CUDA_VISIBLE_DEVICES")
-        names = map(str, range(torch.cuda.device_count())) if listed is None else listed.split(",")
-        gpus = tuple(filter(None, (name.strip() for name in names)))
-        if not gpus or not torch.cuda.device_count():
+        count = torch.cuda.device_count()
+        listed = os.environ.get("CUDA_VISIBLE_DEVICES", ",".join(map(str, range(count))))
+        gpus = tuple(filter(None, map(str.strip, listed.split(","))))
+        if not gpus or not count:
             raise CRPTproError("--device cuda: this machine has no GPU that torch can use; --device cpu always works.")
     if device.startswith("cuda"):
         room = jobs_per_gpu * max(1, len(gpus))
@@ -545,22 +502,14 @@ def divide(
 def slurm_parameters(
     *, partition: str | None, hours: float, memory_gb: float, sbatch: Sequence[str], has_gpu: bool
 ) -> dict[str, Any]:
-    """Return the parameters of submitit's Slurm executor that all jobs share.
-
-    Examples:
-        >>> slurm_parameters(partition="short", hours=2, memory_gb=8, sbatch=("qos=high",), has_gpu=False)
-        {'time': 120, 'mem': '8192M', 'partition': 'short', 'additional_parameters': {'qos': 'high'}}
-    """
+    """Return the parameters of submitit's Slurm executor that all jobs share; the launcher leaves out empty ones."""
     if not (hours * 60 >= 1 and memory_gb >= 1):
         raise CRPTproError(f"--hours {hours:g} --memory-gb {memory_gb:g}: a job needs a minute and 1 GB at least.")
-    parameters: dict[str, Any] = {"time": round(hours * 60), "mem": f"{round(memory_gb * 1024)}M"}
-    if partition is not None:
-        parameters["partition"] = partition
-    if has_gpu:
-        parameters["gpus_per_node"] = 1
+    further = {}
     for option in sbatch:
         key, equals, value = option.partition("=")
         if not key or not equals:
             raise CRPTproError(f"--sbatch {option}: write key=value, e.g. qos=high or account=robots.")
-        parameters.setdefault("additional_parameters", {})[key.lstrip("-")] = value
-    return parameters
+        further[key.lstrip("-")] = value
+    limits = {"time": round(hours * 60), "mem": f"{round(memory_gb * 1024)}M", "gpus_per_node": int(has_gpu)}
+    return {**limits, "partition": partition, "additional_parameters": further}

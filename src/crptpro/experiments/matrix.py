@@ -1,19 +1,16 @@
-"""The experiments of the paper at each scale: the cells of its tables, and the job behind each cell.
-
-From top to bottom: systems and scales, a user's request, the jobs of each kind, and the experiments.
-"""
+"""The experiments of the paper at each scale: the cells of its tables, and the job behind each cell."""
 
 from __future__ import annotations
 
 import inspect
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any, NamedTuple
 
 from crptpro.data.collect import dataset_path
-from crptpro.domains import GROUPS, get_domain
+from crptpro.domains import GROUPS, TASKS, get_domain
 from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.experiments.jobs import OWN, Job, options, plugins_digest
@@ -55,8 +52,7 @@ PROBED_UNSEEN = {
 }  # fmt: skip
 """Domains outside a group on which its encoders are probed."""
 
-SEEDS = 1_000
-"""Seeds of each level are below this number: DrQ combines both levels in one seed, and all of them differ."""
+SEEDS = 1_000  # seeds of each level are below it: DrQ combines both levels in one seed, and all of them differ
 
 
 @dataclass(frozen=True)
@@ -71,8 +67,8 @@ class Scale:
     loss: Mapping[str, Settings] = field(default_factory=dict)  # options of losses, by name of their class
     # settings of exploring, with the encoder update interval of a method that makes one update each time
     explore: Settings = field(default_factory=dict)
-    explore_single: Settings = field(default_factory=dict)  # the same for the (S) methods
-    single_ablation: Settings = field(default_factory=dict)  # further settings of the (S) methods in ``ablation``
+    explore_single: Settings = field(default_factory=dict)  # further ones of the (S) methods
+    single_ablation: Settings = field(default_factory=dict)  # further ones of the (S) methods in ``ablation``
     run: Settings = field(default_factory=dict)  # settings of every downstream run
     seeds: int = 3  # downstream runs on each encoder by default
     alphas: tuple[float, ...] = (5e-4, 5e-2, 5e-1)  # of ``sensitivity``, besides none and the method's own
@@ -85,13 +81,6 @@ class Scale:
     embedded_samples: int = 125  # observations of each source in ``visualize``
 
 
-# 20,000 decisions and, after the random ones, as many encoder updates as the methods on random data have.
-_SMALL_EXPLORER = {"env_steps": 40_000, "checkpoint_interval_env_steps": 2_000, "encoder_update_interval": 6}
-_TINY_EXPLORER = {
-    "env_steps": 120, "random_agent_steps": 8, "hidden_dim": 16, "queue_size": 32,
-    "checkpoint_interval_env_steps": 60, "encoder_update_interval": 2, "quality": "fast",
-}  # fmt: skip
-
 PAPER = Scale("paper", single_ablation={"env_steps": 200_000})
 SMALL = Scale(
     "small",
@@ -101,8 +90,12 @@ SMALL = Scale(
     # As many prototypes as rows, as in the paper (512 of both): with more, most rows are their own nearest candidates
     # and the prototype reward is 0.
     loss={"ProtoLoss": {"num_prototypes": 128}},
-    explore={**_SMALL_EXPLORER, "random_agent_steps": 667},
-    explore_single={**_SMALL_EXPLORER, "random_agent_steps": 2_000},
+    # 20,000 decisions and, after the random ones, as many encoder updates as the methods on random data have.
+    explore={
+        "env_steps": 40_000, "checkpoint_interval_env_steps": 2_000, "encoder_update_interval": 6,
+        "random_agent_steps": 667,
+    },
+    explore_single={"random_agent_steps": 2_000},
     run={
         "env_steps": 20_000, "batch_size": 128, "learning_rate": 1e-3, "replay_capacity": 12_000,
         "checkpoint_interval_env_steps": 2_000,
@@ -125,8 +118,10 @@ TINY = Scale(
         "ProtoLoss": {"num_prototypes": 16, "latent_dim": 8, "hidden_dim": 16}, "ATCLoss": {"latent_dim": 8},
         "SimCLRLoss": {"latent_dim": 8}, "BeCLLoss": {"hidden_dim": 16},
     },
-    explore=_TINY_EXPLORER,
-    explore_single=_TINY_EXPLORER,
+    explore={
+        "env_steps": 120, "random_agent_steps": 8, "hidden_dim": 16, "queue_size": 32,
+        "checkpoint_interval_env_steps": 60, "encoder_update_interval": 2, "quality": "fast",
+    },
     run={
         "env_steps": 60, "random_agent_steps": 12, "batch_size": 4, "replay_capacity": 40, "hidden_dim": 16,
         "queue_size": 32, "eval_interval_env_steps": 60, "eval_episodes": 1, "checkpoint_interval_env_steps": 30,
@@ -146,14 +141,11 @@ SCALES: dict[str, Scale] = {scale.name: scale for scale in (TINY, SMALL, PAPER)}
 
 
 class Cell(NamedTuple):
-    """One number of an experiment: the job that gives it, and its place, such as ``{"group": "A", ...}``.
+    """One number of an experiment."""
 
-    The label is the system or variant, a row of the tables: ``"crptpro"``, ``"proto-rl-c with dispersion"``.
-    """
-
-    label: str
-    job: Job
-    place: Settings
+    label: str  # the system or variant, a row of the tables: "crptpro", "proto-rl-c with dispersion"
+    job: Job  # that gives it
+    place: Settings  # such as {"group": "A", "task": "walker_run", "encoder_seed": 0, "seed": 0}
 
 
 @dataclass(frozen=True)
@@ -161,11 +153,8 @@ class Request:
     """The requested part of an experiment, and its scale; an empty field is the experiment's own choice.
 
     Encoder seeds are the first level (collection, exploration, pre-training), seeds the second: downstream runs on each
-    encoder. Device and threads matter only to timings, whose jobs are alone on their machine.
-
-    Raises:
-        UnknownNameError: for a method, a group or a task.
-        CRPTproError: for a repeated or missing seed, or one outside [0, :data:`SEEDS`).
+    encoder. Device and threads matter only to timings, whose jobs are alone on their machine. An unknown name is an
+    ``UnknownNameError``; a repeated or missing seed, or one outside [0, :data:`SEEDS`), a ``CRPTproError``.
     """
 
     scale: Scale
@@ -193,9 +182,8 @@ class Request:
                 raise CRPTproError(f"`{name}` must be different numbers from 0 to {SEEDS - 1}, got {seeds}.")
             object.__setattr__(self, name, seeds)
 
-    def tasks_in(self, domains: Iterable[str]) -> list[str]:
+    def tasks_in(self, domains: Collection[str]) -> list[str]:
         """Return the requested tasks of these domains; without requested tasks, one task of each domain."""
-        domains = list(domains)
         tasks = self.tasks or [get_domain(domain).task for domain in domains]
         return [task for task in tasks if get_domain(task).name in domains]
 
@@ -205,20 +193,18 @@ class Request:
 
     def encoders(
         self, systems: Iterable[str], groups: Iterable[str] = "A"
-    ) -> Iterator[tuple[str, int, str, tuple[str, ...]]]:
-        """Yield group, encoder seed, system and domains of each encoder.
+    ) -> Iterator[tuple[str, tuple[str, ...], dict[str, Any]]]:
+        """Yield system, domains and place of each encoder.
 
         An (S) method has one encoder per requested domain of the group, or that of :data:`SINGLE_DOMAIN`.
         """
-        requested = [get_domain(task).name for task in self.tasks]
-        for group, seed in product(self.groups or groups, self.encoder_seeds):
-            for system in self.methods or systems:
-                if is_single_domain(system):
-                    single = [domain for domain in dict.fromkeys(requested) if domain in GROUPS[group]]
-                    for domain in single or [SINGLE_DOMAIN[group]]:
-                        yield group, seed, system, (domain,)
-                else:
-                    yield group, seed, system, GROUPS[group]
+        requested = dict.fromkeys(get_domain(task).name for task in self.tasks)
+        for group, seed, system in product(self.groups or groups, self.encoder_seeds, self.methods or systems):
+            sets = [GROUPS[group]]
+            if is_single_domain(system):
+                sets = [(domain,) for domain in requested if domain in GROUPS[group]] or [(SINGLE_DOMAIN[group],)]
+            for domains in sets:
+                yield system, domains, {"group": group, "domains": "+".join(domains), "encoder_seed": seed}
 
 
 # --- jobs at a scale ------------------------------------------------------------------------------------------------
@@ -258,49 +244,35 @@ def _dataset_of(job: Job) -> str:
 def dataset(scale: Scale, domain: str, seed: int, transitions: int | None = None) -> Job:
     """Return the collection of a domain's random transitions, in ``<job>/<domain>``."""
     name, transitions = get_domain(domain).name, transitions or scale.transitions
-    command = ["collect", name, "--out", OWN]
-    command += options(transitions=transitions, seed=seed, quality=scale.quality)
+    command = ["collect", name, "--out", OWN, *options(transitions=transitions, seed=seed, quality=scale.quality)]
     facts = {"domain": name, "transitions": transitions, "seed": seed, "quality": scale.quality or "exact"}
     facts["env_steps"] = transitions * resolve_action_repeat(name, None)
     return Job("dataset", f"{name} seed {seed}", tuple(command), facts, definition=_definition(name))
 
 
-def encoder(
-    scale: Scale,
-    system: str,
-    domains: Iterable[str],
-    seed: int,
-    *,
-    transitions: int | None = None,
-    loss: Settings = NONE,
-    explore: Settings = NONE,
-    data: Sequence[Job] = (),
-) -> Job:
-    """Return a system's encoder for domains, in ``<job>/encoder``.
-
-    `transitions`, `loss` and `explore` replace settings of the scale, and `data` its datasets.
-    """
+def encoder(scale: Scale, system: str, domains: Iterable[str], seed: int, *, loss: Settings = NONE) -> Job:
+    """Return a system's encoder for domains, in ``<job>/encoder``; ``loss`` replaces options of the scale."""
     method = pretraining_of(system)
     names = [get_domain(domain).name for domain in domains]
     title = f"{method.name} {'+'.join(names)} seed {seed}"
     where = ["--method", method.name, "--out", OWN]
     facts: dict[str, Any] = {"method": method.name, "seed": seed}
+    needs_data = method.exploration is None if method.loss_class else system == STANDARDISED
+    data = tuple(dataset(scale, name, seed) for name in names if needs_data)
     if method.loss_class is None:
-        data = [dataset(scale, name, seed, transitions) for name in names] if system == STANDARDISED else []
         command = ["pretrain", *map(_dataset_of, data), *where, *options(seed=seed)]
-        return Job("untrained", title if data else f"seed {seed}", tuple(command), facts, tuple(data))
+        return Job("untrained", title if data else f"seed {seed}", tuple(command), facts, data)
     # A default of the method's loss is no option: it would make the same encoder another job.
     defaults = {**_loss_defaults(method), **method.loss_options}
     chosen = {**scale.loss.get(method.loss_class.__name__, {}), **loss}
     settings = {"loss": {k: v for k, v in chosen.items() if k not in defaults or defaults[k] != v}, **scale.training}
     facts |= {"domains": names, **settings}
     if method.exploration is None:
-        data = data or [dataset(scale, name, seed, transitions) for name in names]
-        facts |= {"updates": scale.updates, "transitions": data[0].facts["transitions"]}
+        facts |= {"updates": scale.updates, "transitions": scale.transitions}
         command = ["pretrain", *map(_dataset_of, data), *where]
         command += options(seed=seed, updates=scale.updates, **settings)
-        return Job("encoder", title, tuple(command), facts, tuple(data), _definition(method=method))
-    exploring = {**(scale.explore_single if method.exploration.is_single_domain else scale.explore), **explore}
+        return Job("encoder", title, tuple(command), facts, data, _definition(method=method))
+    exploring = {**scale.explore, **(scale.explore_single if method.exploration.is_single_domain else {})}
     if "encoder_update_interval" in exploring:
         exploring["encoder_update_interval"] *= method.exploration.encoder_updates_each
     plan = plan_exploration(method, names, ExploreConfig(**exploring))
@@ -361,20 +333,15 @@ def probe(scale: Scale, base: Job, data: Job) -> Job:
     """Return the state probe of an encoder on a domain, ``<job>/probe.csv``."""
     command = ["probe", _encoder_of(base), _dataset_of(data), "--csv", f"{OWN}/probe.csv"]
     command += options(samples=scale.probe_samples, seed=0)
-    method, seed, domain = base.facts["method"], base.facts["seed"], data.facts["domain"]
-    facts = {"method": method, "encoder_seed": seed, "domain": domain}
-    return Job("probe", f"{method} seed {seed} on {domain}", tuple(command), facts, (base, data))
+    facts = {"method": base.facts["method"], "encoder_seed": base.facts["seed"], "domain": data.facts["domain"]}
+    title = "{method} seed {encoder_seed} on {domain}".format(**facts)
+    return Job("probe", title, tuple(command), facts, (base, data))
 
 
 def _measurement(kind: str, trained: Job, command: Sequence[str], needs: Iterable[Job], **more: Any) -> Job:
     facts = {name: trained.facts[name] for name in ("method", "domains", "seed")}
     title = f"{facts['method']} {'+'.join(facts['domains'])} seed {facts['seed']}"
     return Job(kind, title, tuple(command), facts | more, tuple(dict.fromkeys(needs)))
-
-
-def spread(base: Job) -> Job:
-    """Return how far an encoder's prototypes have spread, along its training and at its end."""
-    return _measurement("prototypes", base, ["measure", "prototypes", _encoder_of(base), "--out", OWN], [base])
 
 
 def comparison(kind: str, base: Job, explorer: Job, datasets: Sequence[Job], *, samples: int, seed: int) -> Job:
@@ -392,11 +359,11 @@ def timing(request: Request, system: str, domain_sets: Sequence[Sequence[str]], 
     where = {"device": request.device, "threads": request.threads}
     command = ["measure", "timing", "--out", OWN]
     command += options(updates=scale.timing_updates, paper_updates=scale.paper_timing_updates, **where)
+    # The content of the data does not change the time: the paper's training is timed on this scale's.
+    paper = replace(PAPER, transitions=scale.transitions, quality=scale.quality)
     trainings = [encoder(scale, system, domains, seed) for domains in domain_sets]
     for training, domains in zip(trainings, domain_sets):
-        # The content of the data does not change the time: the paper's training is timed on this scale's.
-        paper_training = encoder(PAPER, system, domains, seed, data=training.needs)
-        for option, job in {"--training": training, "--paper-training": paper_training}.items():
+        for option, job in {"--training": training, "--paper-training": encoder(paper, system, domains, seed)}.items():
             at = job.command.index("--out")
             command += [option, shlex.join(job.command[:at] + job.command[at + 2 :])]
     names = [domain for domains in domain_sets for domain in domains]
@@ -417,8 +384,7 @@ class Experiment(NamedTuple):
     cells: Callable[[Request], list[Cell]]
 
 
-EXPERIMENTS: dict[str, Experiment] = {}
-"""In the order of the paper; further ones come last."""
+EXPERIMENTS: dict[str, Experiment] = {}  # in the order of the paper; further ones come last
 
 
 def _experiment(title: str) -> Callable[[Callable[[Request], Iterator[Cell]]], None]:
@@ -432,48 +398,33 @@ def _experiment(title: str) -> Callable[[Callable[[Request], Iterator[Cell]]], N
 
 
 def _scores(
-    request: Request,
-    group: str,
-    task: str,
-    system: str,
-    *,
-    label: str = "",
-    colors: str = "normal",
-    place: Settings = NONE,
-    **how: Any,
+    request: Request, group: str, task: str, system: str, *, label: str = "", place: Settings = NONE, **how: Any
 ) -> Iterator[Cell]:
     """Yield the runs of a system on a task of, or after, a group: every downstream seed on every encoder.
 
     Where there is no encoder to share (DrQ), the encoder seeds count as further seeds of the run, so that every
     system has as many runs.
     """
-    where = {"group": group, "task": task, **({} if colors == "normal" else {"colors": colors}), **place}
     for encoder_seed in request.encoder_seeds:
         base = encoder_for_task(request.scale, system, GROUPS[group], task, encoder_seed, **how)
         for seed in request.seeds:
             own = seed if base is not None else seed + SEEDS * encoder_seed
-            job = run(request.scale, system, task, base, own, colors=colors)
-            yield Cell(label or system, job, {**where, "encoder_seed": encoder_seed, "seed": seed})
+            job = run(request.scale, system, task, base, own, colors=place.get("colors", "normal"))
+            where = {"group": group, "task": task, **place, "encoder_seed": encoder_seed, "seed": seed}
+            yield Cell(label or system, job, where)
 
 
-def _table(
-    request: Request, tasks: Iterable[tuple[str, str]], systems: Iterable[str], colors: str = "normal"
-) -> Iterator[Cell]:
+def _table(request: Request, tasks: Iterable[tuple[str, str]], systems: Iterable[str], **how: Any) -> Iterator[Cell]:
     """Yield the runs of all systems on tasks, each with its group."""
     for (group, task), system in product(tasks, systems):
-        yield from _scores(request, group, task, system, colors=colors)
+        yield from _scores(request, group, task, system, **how)
 
 
-def _elsewhere(
-    request: Request, rows: Iterable[ScoreRow], systems: Iterable[str], colors: str = "normal"
-) -> Iterator[Cell]:
+def _elsewhere(request: Request, rows: Iterable[ScoreRow], systems: Iterable[str], **how: Any) -> Iterator[Cell]:
     """Yield the runs on the requested rows of a table of the paper; no encoder is fine-tuned on them."""
-    tasks = [
-        (row.group, row.task)
-        for row in rows
-        if (not request.groups or row.group in request.groups) and (not request.tasks or row.task in request.tasks)
-    ]
-    return _table(request, tasks, [system for system in systems if system != FINETUNE], colors)
+    groups, tasks = request.groups or GROUPS, request.tasks or TASKS
+    wanted = [(row.group, row.task) for row in rows if row.group in groups and row.task in tasks]
+    return _table(request, wanted, [system for system in systems if system != FINETUNE], **how)
 
 
 @_experiment("Tasks of seen domains")
@@ -495,7 +446,7 @@ def _colors(request: Request) -> Iterator[Cell]:
 
     The paper does not say how it reverses them; whole images are the option.
     """
-    return _elsewhere(request, COLORS, request.methods or CROSS_DOMAIN, request.colors)
+    return _elsewhere(request, COLORS, request.methods or CROSS_DOMAIN, place={"colors": request.colors})
 
 
 @_experiment("Fine-tuning on one domain")
@@ -509,17 +460,18 @@ def _finetune(request: Request) -> Iterator[Cell]:
 def _ablation(request: Request) -> Iterator[Cell]:
     """With and without the dispersion loss, with and without decoupled collection (section IV.F)."""
     # Proto-RL(C) with the dispersion loss is CRPTpro without its decoupled collection.
+    scale = request.scale
+    request = replace(request, scale=replace(scale, explore_single={**scale.explore_single, **scale.single_ablation}))
     for (group, task), system in product(request.seen_tasks("AC"), request.methods or VARIANTS):
-        explore, weight = NONE, DISPERSION["intr_loss_coef"]
+        weight = DISPERSION["intr_loss_coef"]
         if is_single_domain(system):
             domain = get_domain(task).name
             if domain not in SINGLE_DISPERSION and not request.tasks:
                 continue  # the paper has two domains
-            explore = request.scale.single_ablation
             weight = SINGLE_DISPERSION.get(domain, weight)
         for label, loss in VARIANTS.get(system, ((system, NONE),)):
             own = {"intr_loss_coef": weight} if loss == DISPERSION else loss
-            yield from _scores(request, group, task, system, label=label, loss=own, explore=explore)
+            yield from _scores(request, group, task, system, label=label, loss=own)
 
 
 @_experiment("Sensitivity: weight of the dispersion loss, amount of data")
@@ -532,15 +484,12 @@ def _sensitivity(request: Request) -> Iterator[Cell]:
             if "intr_loss_coef" not in _loss_defaults(pretraining_of(system)):
                 continue
             for alpha in sorted({0.0, 5e-3, *scale.alphas}):
-                yield from _scores(
-                    request, group, task, system, label=f"{system}, alpha {alpha:g}", loss={"intr_loss_coef": alpha},
-                    place={"varied": "alpha", "value": f"{alpha:g}"},
-                )  # fmt: skip
+                loss, place = {"intr_loss_coef": alpha}, {"varied": "alpha", "value": f"{alpha:g}"}
+                label = f"{system}, alpha {alpha:g}"
+                yield from _scores(request, group, task, system, label=label, loss=loss, place=place)
         for size in sorted({*scale.capacities, scale.transitions}) if "crptpro" in methods else ():
-            yield from _scores(
-                request, group, task, "crptpro", label=f"crptpro, b {size:,}", transitions=size,
-                place={"varied": "b", "value": str(size)},
-            )  # fmt: skip
+            other, place = replace(request, scale=replace(scale, transitions=size)), {"varied": "b", "value": str(size)}
+            yield from _scores(other, group, task, "crptpro", label=f"crptpro, b {size:,}", place=place)
 
 
 @_experiment("Cost of pre-training")
@@ -556,37 +505,36 @@ def _efficiency(request: Request) -> Iterator[Cell]:
                 yield Cell(system, timing(request, system, sets, seed), place)
 
 
-def _measured(label: str, job: Job, group: str, seed: int, domains: Sequence[str]) -> Cell:
-    return Cell(label, job, {"group": group, "domains": "+".join(domains), "encoder_seed": seed})
-
-
 def _trained(
     request: Request, variants: Mapping[str, Sequence[tuple[str, Settings]]], measure: Callable[[Job], Job]
 ) -> Iterator[Cell]:
     """Yield a measurement of each encoder of methods with prototypes."""
-    for group, seed, system, domains in request.encoders(variants):
+    for system, domains, place in request.encoders(variants):
         for label, loss in variants.get(system, ()):
-            trained = encoder(request.scale, system, domains, seed, loss=loss)
-            yield _measured(label, measure(trained), group, seed, domains)
+            trained = encoder(request.scale, system, domains, place["encoder_seed"], loss=loss)
+            yield Cell(label, measure(trained), place)
 
 
 @_experiment("Spread of the prototypes")
 def _prototypes(request: Request) -> Iterator[Cell]:
     """How far prototypes spread, along pre-training and at its end, with and without the dispersion loss (IV.G)."""
+
+    def spread(base: Job) -> Job:
+        return _measurement("prototypes", base, ["measure", "prototypes", _encoder_of(base), "--out", OWN], [base])
+
     return _trained(request, VARIANTS, spread)
 
 
 def _compared(request: Request, kind: str, groups: str, system: str, samples: int) -> Iterator[Cell]:
     """Yield comparisons of random data with an explorer's, as CRPTpro's encoder of all domains sees both."""
     scale = request.scale
-    for group, seed, explorer, domains in request.encoders([system], groups):
+    for explorer, domains, place in request.encoders([system], groups):
         if pretraining_of(explorer).exploration is None:
             continue
-        base = encoder(scale, "crptpro", GROUPS[group], seed)
-        data = [dataset(scale, domain, seed) for domain in (domains if kind == "coverage" else GROUPS[group])]
-        exploring = encoder(scale, explorer, domains, seed)
-        job = comparison(kind, base, exploring, data, samples=samples, seed=seed)
-        yield _measured(explorer, job, group, seed, domains)
+        together, seed = GROUPS[place["group"]], place["encoder_seed"]
+        base, exploring = encoder(scale, "crptpro", together, seed), encoder(scale, explorer, domains, seed)
+        data = [dataset(scale, domain, seed) for domain in (domains if kind == "coverage" else together)]
+        yield Cell(explorer, comparison(kind, base, exploring, data, samples=samples, seed=seed), place)
 
 
 @_experiment("Coverage of the data")

@@ -33,34 +33,20 @@ from crptpro.pretrained import Pretrained, load_pretrained
 from crptpro.seeding import derive_seed
 from crptpro.training.explore import plan_exploration
 
-PROTOTYPE_METRICS = {
-    "prototype_kne_3": "kne_3", "prototype_kne_half": "kne_half", "prototype_ane": "ane",
+PROTOTYPE_COLUMNS = {
+    "updates": "updates", "prototype_kne_3": "kne_3", "prototype_kne_half": "kne_half", "prototype_ane": "ane",
     "prototype_dispersion": "intr",
 }  # fmt: skip
 """Names in the training's record to columns of ``prototypes.csv``."""
-StageOf = Callable[[Sequence[str]], type]
-"""Returns the dataclass of the stage that a command line names."""
-WINDOWS = 5
-"""Parts of a timing; their median is robust against one hiccup of the machine."""
-RANDOM_AGENT_STEPS = 24
-"""Random decisions per domain before a timed exploration, instead of the method's own."""
-COVERAGE_WINDOWS = 10
-"""Windows of the training; fewer if a window would have fewer decisions of a domain than samples."""
+StageOf = Callable[[Sequence[str]], type]  # returns the dataclass of the stage that a command line names
+WINDOWS = 5  # parts of a timing; their median is robust against one hiccup of the machine
+RANDOM_AGENT_STEPS = 24  # random decisions per domain before a timed exploration, instead of the method's own
+COVERAGE_WINDOWS = 10  # of the training; fewer if a window would have fewer decisions of a domain than samples
 
 
-def write_rows(path: Path, rows: pd.DataFrame | Sequence[Mapping[str, Any]], columns: Any = None) -> None:
+def write_rows(path: Path, rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> None:
     """Write rows as a CSV file, whole or not at all, in place of an earlier one."""
-    table = pd.DataFrame(rows, columns=columns, dtype=object)
-    write_whole(path, table.to_csv(index=False, lineterminator="\n"))
-
-
-# --- state probes ---------------------------------------------------------------------------------------------------
-
-PROBE_COLUMNS = (
-    "encoder", "method", "domain", "seen", "colors", "embedding", "measure", "coordinate", "value", "samples",
-    "held_out_episodes", "seed",
-)  # fmt: skip
-"""Of ``probe.csv``: one row per measure, and per coordinate of each R2."""
+    write_whole(path, pd.DataFrame(rows, dtype=object).to_csv(index=False, lineterminator="\n"))
 
 
 def probe_rows(
@@ -69,7 +55,8 @@ def probe_rows(
     """Probe an encoder, called ``encoder`` in the rows, on a draw from a dataset with physical state.
 
     Its features are probed, and its projections if it has a projector. The untrained control gets an untrained
-    projector, so that it has z, too. Returns a formatted row per embedding, and every number by :data:`PROBE_COLUMNS`.
+    projector, so that it has z, too. Returns a formatted row per embedding, and the rows of ``probe.csv``: one per
+    measure, and per coordinate of each R2.
 
     Raises:
         DatasetError: there is no physical state, or too little data to split.
@@ -122,9 +109,6 @@ def domains_seen(card: Mapping[str, Any]) -> set[str]:
     return seen
 
 
-# --- prototypes and data --------------------------------------------------------------------------------------------
-
-
 def prototypes(encoder: Positional[Path], *, out: Path) -> None:
     """Write how far prototypes have spread, along their training and at its end: OUT/prototypes.csv."""
     pretrained: Any = load_pretrained(encoder)
@@ -133,13 +117,11 @@ def prototypes(encoder: Positional[Path], *, out: Path) -> None:
     config, updates = pretrained.card["loss"]["config"], pretrained.card["training"]["updates"]
     # The record's row of the last update is of weights before their normalisation: it is computed anew.
     record = pd.read_csv(encoder.parent / "pretrain.csv", dtype=str, keep_default_na=False)
-    rows = record.loc[record["updates"].astype(int) < updates, ["updates", *PROTOTYPE_METRICS]]
+    rows = record[record["updates"].astype(int) < updates].to_dict("records")
     metrics = prototype_metrics(pretrained.prototypes.weight, offset=config["offset"])
-    end = {"updates": updates, **{name: float(value) for name, value in metrics.items()}}
-    rows = pd.concat([rows, pd.DataFrame([end], columns=rows.columns, dtype=object)])
-    rows = rows.rename(columns=PROTOTYPE_METRICS)
-    rows.insert(0, "method", pretrained.method)
-    rows.insert(1, "has_dispersion", config["intr_loss_coef"] > 0)
+    rows.append({"updates": updates, **{name: float(value) for name, value in metrics.items()}})
+    about = {"method": pretrained.method, "has_dispersion": config["intr_loss_coef"] > 0}
+    rows = [about | {column: row[name] for name, column in PROTOTYPE_COLUMNS.items()} for row in rows]
     write_rows(out / "prototypes.csv", rows)
 
 
@@ -202,8 +184,7 @@ def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
                 "env_steps": training["env_steps"] * end // total,
                 "coverage": particle_estimate(F.normalize(points, dim=-1)), "samples": samples,
             })  # fmt: skip
-    columns = ("source", "method", "domain", "env_steps", "coverage", "samples")
-    write_rows(of.out / "coverage.csv", rows, columns)
+    write_rows(of.out / "coverage.csv", rows)
 
 
 def embeddings(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
@@ -226,9 +207,6 @@ def embeddings(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
     write_rows(of.out / "embeddings.csv", table)
 
 
-# --- cost of pre-training -------------------------------------------------------------------------------------------
-
-
 def timing(
     stage_of: StageOf,
     *,
@@ -248,25 +226,15 @@ def timing(
     """
     torch.set_num_threads(threads)
     rows = []
-    for command, paper_command in zip(training, paper_training, strict=True):
-        here = _Timed(stage_of, command, out / "timed", device)
-        paper = _Timed(stage_of, paper_command, out / "timed", device)
-        timed, seconds, each = here.time(updates)
-        paper_each = each if command == paper_command else math.nan
-        if command != paper_command and paper_updates:
-            paper_each = paper.time(paper_updates)[-1]
-        sources = [Path(source).parent / "done.json" for source in here.stage.sources]
-        collected = [read_json(path, error=RecordError)["seconds"] for path in sources if path.exists()]
-        plan = here.plan
+    for command, papers in zip(training, paper_training, strict=True):
+        cost = _cost(stage_of, command, updates, out / "timed", device)
+        paper = cost if command == papers else _cost(stage_of, papers, paper_updates, out / "timed", device)
         rows.append({
-            "domains": len(sources), "encoder_updates": timed,
-            "decisions": timed * plan.encoder_update_interval // plan.encoder_updates_each if plan else 0,
-            "seconds": seconds, "budget_updates": here.updates, "budget_decisions": here.decisions,
-            "projected_hours": each * here.updates / 3600, "paper_updates": paper.updates,
-            "paper_decisions": paper.decisions, "paper_projected_hours": paper_each * paper.updates / 3600,
-            "collection_seconds": sum(collected) if collected else math.nan,
+            **cost, "paper_updates": paper["budget_updates"], "paper_decisions": paper["budget_decisions"],
+            "paper_projected_hours": paper["projected_hours"],
         })  # fmt: skip
-    total: dict[str, Any] = {"method": here.stage.method, **pd.DataFrame(rows, dtype=object).sum(skipna=False)}
+    costs = pd.DataFrame(rows, dtype=object).set_index("method")
+    total: dict[str, Any] = {"method": costs.index[0], **costs.sum(skipna=False)}
     total["seconds_per_update"] = 3600 * total["projected_hours"] / total["budget_updates"]
     total["paper_seconds_per_update"] = 3600 * total["paper_projected_hours"] / total["paper_updates"]
     per_decision = total["seconds_per_update"] * total["encoder_updates"]
@@ -274,43 +242,42 @@ def timing(
     write_rows(out / "timing.csv", [{**total, "threads": threads, "device": device}])
 
 
-class _Timed:
-    """A training's command, read as the command line does, with the plan of an exploring method."""
-
-    def __init__(self, stage_of: StageOf, text: str, out: Path, device: str) -> None:
-        words = shlex.split(text)
-        arguments = [*words[1:], "--out", str(out), "--device", device]
-        self.stage: Any = tyro.cli(stage_of(words), args=arguments)
-        method = get_method(self.stage.method)
-        config: Any = self.stage.config
-        self.plan = plan_exploration(method, self.stage.sources, config) if method.exploration else None
-        self.updates: int = self.plan.encoder_updates if self.plan else config.updates
-        self.decisions = self.plan.decisions if self.plan else 0
-
-    def time(self, updates: int) -> tuple[int, float, float]:
-        """Return timed updates, their seconds, and seconds per update by the median over windows."""
-        stage, plan = self.stage, self.plan
-        # Updates of one round over all domains.
-        period = len(stage.sources) * (plan.encoder_updates_each if plan else 1)
-        window = period * math.ceil(updates / (WINDOWS * period))
-        needed = 2 * WINDOWS * window
-        settings = {"updates": needed, "log_interval": window}
-        if plan is not None:
-            first, interval = min(plan.first_update, RANDOM_AGENT_STEPS), plan.encoder_update_interval
-            # The first update comes with the first multiple of the interval that is not random.
-            rounds = interval * (math.ceil(first / interval) + math.ceil(needed / period) - 1) + 1
-            env_steps = rounds * sum(plan.repeats)
-            settings = {"env_steps": env_steps, "random_agent_steps": first, "log_interval": window}
-            settings |= {"checkpoint_interval_env_steps": env_steps}
-        shutil.rmtree(stage.out, ignore_errors=True)
+def _cost(stage_of: StageOf, command: str, updates: int, out: Path, device: str) -> dict[str, Any]:
+    """Return the budget of a training, and what some updates of it take; without any, its hours are NaN."""
+    words = shlex.split(command)
+    stage: Any = tyro.cli(stage_of(words), args=[*words[1:], "--out", str(out), "--device", device])
+    method, sources = get_method(stage.method), stage.sources
+    plan = plan_exploration(method, sources, stage.config) if method.exploration else None
+    budget = plan.encoder_updates if plan else stage.config.updates
+    period = len(sources) * (plan.encoder_updates_each if plan else 1)  # updates of one round over all domains
+    window = period * math.ceil(updates / (WINDOWS * period))
+    timed = WINDOWS * window
+    settings = {"updates": 2 * timed, "log_interval": window}
+    if plan:
+        first, interval = min(plan.first_update, RANDOM_AGENT_STEPS), plan.encoder_update_interval
+        # The first update comes with the first multiple of the interval that is not random.
+        env_steps = interval * (math.ceil(first / interval) + 2 * timed // period) * sum(plan.repeats)
+        settings = {"env_steps": env_steps, "random_agent_steps": first, "log_interval": window}
+        settings["checkpoint_interval_env_steps"] = env_steps
+    times = np.full(WINDOWS + 1, np.nan)
+    if updates:
+        shutil.rmtree(out, ignore_errors=True)
         try:
             replace(stage, config=replace(stage.config, **settings)).run()
-            record = pd.read_csv(stage.out / "pretrain.csv").set_index("updates")["unix_time_s"]
+            record = pd.read_csv(out / "pretrain.csv").set_index("updates")["unix_time_s"]
+            times = record[[count * window for count in range(WINDOWS, 2 * WINDOWS + 1)]].to_numpy()
         finally:
-            shutil.rmtree(stage.out, ignore_errors=True)
-        times = record[[count * window for count in range(WINDOWS, 2 * WINDOWS + 1)]].to_numpy()
-        each = float(np.median(np.diff(times))) / window
-        return WINDOWS * window, float(times[-1] - times[0]), each
+            shutil.rmtree(out, ignore_errors=True)
+    done = [Path(source).parent / "done.json" for source in sources]
+    collected = [read_json(path, error=RecordError)["seconds"] for path in done if path.exists()]
+    return {
+        "method": method.name, "domains": len(sources), "encoder_updates": timed,
+        "decisions": timed * plan.encoder_update_interval // plan.encoder_updates_each if plan else 0,
+        "seconds": float(times[-1] - times[0]), "budget_updates": budget,
+        "budget_decisions": plan.decisions if plan else 0,
+        "projected_hours": float(np.median(np.diff(times))) / max(window, 1) * budget / 3600,
+        "collection_seconds": sum(collected) if collected else math.nan,
+    }  # fmt: skip
 
 
 def main(arguments: Sequence[str], stage_of: StageOf) -> None:

@@ -103,10 +103,6 @@ def published_score(method: str, group: str, task: str, colors: str = "normal") 
     """Return what the paper printed for a method at a place; ``None`` where it printed nothing.
 
     DrQ trains its own encoder, so that its score belongs to a task whatever the group.
-
-    Examples:
-        >>> print(published_score("crptpro", "A", "walker_run"))
-        513 ± 33
     """
     rows = {"normal": (*SEEN, *UNSEEN), "reversed_background": COLORS}.get(colors, ())
     for row in rows:

@@ -33,27 +33,16 @@ from crptpro.values import as_path
 
 logger = logging.getLogger(__name__)
 
-ENCODERS = ("encoder", "explored", "finetuned", "untrained")
-"""Kinds of jobs that make an encoder."""
-PLACES = ("group", "task", "colors", "encoder_seed", "varied", "value")
-"""Columns of cells that tables read."""
-EPISODES = ("env_steps", "episode_return")
-"""Columns of ``eval.csv`` that tables read."""
+PLACES = ("group", "task", "colors", "encoder_seed", "varied", "value")  # columns of cells that tables read
+EPISODES = ("env_steps", "episode_return")  # columns of ``eval.csv`` that tables read
 
 
 def build_report(root: str | Path, *, out: str | Path | None = None) -> Path:
     """Write a report on a reproduction, or on any directory with downstream runs.
 
-    Args:
-        root: directory of ``crptpro reproduce``, finished or not, or one with downstream runs in or below it.
-        out: directory of the report; ``root/report`` if not given.
-
-    Returns:
-        The HTML page; ``report.md`` and ``figures/*.png`` lie beside it.
-
-    Raises:
-        RecordError: there is no such directory, or nothing in it to report on.
-        OSError: the report cannot be written.
+    ``root`` is a directory of ``crptpro reproduce``, finished or not, or one with downstream runs in or below it. One
+    that is missing, or has nothing to report on, is a ``RecordError``. Returns the HTML page in ``out``, or else in
+    ``root/report``; ``report.md`` and ``figures/*.png`` lie beside it.
     """
     root = as_path(root, "directory")
     if not root.is_dir():
@@ -178,13 +167,9 @@ def _records(
 
 def _needed(keys: Iterable[str], jobs: pd.DataFrame, *kinds: str) -> list[str]:
     """Return jobs and everything that they need, each once; of some kinds only, if any are named."""
-    found: list[str] = []
-    waiting = list(keys)
-    while waiting:
-        key = waiting.pop(0)
-        if key in jobs.index and key not in found:
-            found.append(key)
-            waiting += jobs.loc[key, "needs"]
+    found = [key for key in dict.fromkeys(keys) if key in jobs.index]
+    for key in found:  # which grows
+        found += [needed for needed in jobs.loc[key, "needs"] if needed in jobs.index and needed not in found]
     return [key for key in found if not kinds or jobs.loc[key, "kind"] in kinds]
 
 
@@ -217,11 +202,9 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
         key = str(path.relative_to(root))
         place = {"task": facts["task"], "colors": facts.get("colors", "")}
         cells.append({"experiment": "runs", "scale": "", "label": label, "job": key, "done": is_done, **place})
-        jobs[key] = {
-            **{name: content.get(name) for name in records.MADE}, "device": facts.get("device"),
-            "machine": records.machine(content.get("hardware") or {}), "path": path, "kind": "run", "facts": facts,
-            "needs": [], "command": None, "done": is_done,
-        }  # fmt: skip
+        made = {name: content.get(name) for name in records.MADE} | {"device": facts.get("device")}
+        made["machine"] = records.machine(content.get("hardware"))
+        jobs[key] = {"kind": "run", "command": None, "facts": facts, "needs": [], "path": path, "done": is_done, **made}
     table = pd.DataFrame(cells)
     if not len(table) or not table["done"].any():
         raise RecordError(
@@ -241,10 +224,9 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 def _where(job: dict[str, Any]) -> str:
     """Describe the machine and the device of a finished job; empty if the machine is not known."""
-    if not job["done"] or not job["machine"]:
-        return ""
     has_threads = job["device"] == "cpu" and not pd.isna(job["threads"])
-    return f"{job['machine']}, {_count(int(job['threads']), 'thread') if has_threads else job['device']}"
+    device = _count(int(job["threads"]), "thread") if has_threads else job["device"]
+    return f"{job['machine']}, {device}" if job["done"] and job["machine"] else ""
 
 
 def _count(number: int, noun: str) -> str:
@@ -274,11 +256,8 @@ def _spread(values: pd.Series, digits: int, n: bool = True) -> str:
 
 def _contents(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     page.section("What is here", "contents")
-    numbers = cells.groupby(["experiment", "scale"], sort=False)["done"].agg(["size", "sum"])
-    page.table(
-        "Experiments: requested and finished numbers.",
-        numbers.set_axis(["requested", "finished"], axis=1).reset_index(),
-    )
+    numbers = cells.groupby(["experiment", "scale"], sort=False)["done"].agg(requested="size", finished="sum")
+    page.table("Experiments: requested and finished numbers.", numbers.reset_index())
     counts = jobs.groupby("kind")["done"].agg(["sum", "size"])
     finished = ", ".join(f"{done} of {count} {kind}" for kind, done, count in counts.itertuples())
     seconds = jobs.loc[jobs["done"], "seconds"].dropna()
@@ -286,39 +265,37 @@ def _contents(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     page.text(f"Jobs finished: {finished}{work}. Machines, revisions and versions are at the end.")
 
 
-BUDGETS = {
-    "random transitions per domain": (("transitions", ["dataset"], ""), "100,000"),
-    "encoder updates on datasets": (("updates", ["encoder"], ""), "50,000"),
-    "pre-training batch": (("batch_size", ["encoder", "explored"], ""), "512, or the method's own"),
-    "prototypes": (("loss.num_prototypes", ["encoder", "explored"], "crptpro|proto-rl"), "512"),
-    "env steps of exploration (C)": (("explore.env_steps", ["explored"], "proto-rl-c"), "200,000"),
-    "decisions per encoder update (C)": (("explore.encoder_update_interval", ["explored"], "proto-rl-c"), "2"),
-    "downstream env steps": (("env_steps", ["run"], "(?!drq)"), "500,000"),
-    "DrQ's env steps": (("env_steps", ["run"], "drq"), "1,000,000"),
-    "downstream batch": (("batch_size", ["run"], ""), "512"),
-    "downstream learning rate": (("learning_rate", ["run"], ""), "0.0001"),
-    "downstream replay": (("replay_capacity", ["run"], ""), "40,000 (Proto-RL 100,000)"),
-    "render quality": (("quality", ["dataset"], ""), "exact"),
-}
-"""Budget to where it is found (fact, kinds of jobs, pattern of their methods), and the paper's."""
+BUDGETS = (
+    ("random transitions per domain", "100,000", "transitions", "dataset", ""),
+    ("encoder updates on datasets", "50,000", "updates", "encoder", ""),
+    ("pre-training batch", "512, or the method's own", "batch_size", "encoder|explored", ""),
+    ("prototypes", "512", "loss.num_prototypes", "encoder|explored", "crptpro|proto-rl"),
+    ("env steps of exploration (C)", "200,000", "explore.env_steps", "explored", "proto-rl-c"),
+    ("decisions per encoder update (C)", "2", "explore.encoder_update_interval", "explored", "proto-rl-c"),
+    ("downstream env steps", "500,000", "env_steps", "run", "(?!drq)"),
+    ("DrQ's env steps", "1,000,000", "env_steps", "run", "drq"),
+    ("downstream batch", "512", "batch_size", "run", ""),
+    ("downstream learning rate", "0.0001", "learning_rate", "run", ""),
+    ("downstream replay", "40,000 (Proto-RL 100,000)", "replay_capacity", "run", ""),
+    ("render quality", "exact", "quality", "dataset", ""),
+)
+"""Budget, the paper's, and where it is found: fact, and patterns of the jobs' kinds and methods."""
 
 
 def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     """Show the budgets of every scale beside the paper's, and what such budgets cannot show."""
     page.section("What this scale cannot show", "limits")
-    scales = {}
+    names = [*(name for name, *_ in BUDGETS), "downstream runs per encoder"]
+    table = pd.DataFrame(index=pd.Index(names, name="budget"))
     for scale, own in cells[cells["scale"] != "paper"].groupby("scale", sort=False):
-        here = jobs.loc[_needed(own["job"].unique(), jobs)]
-        budgets = {name: _budget(here, *where) for name, (where, _) in BUDGETS.items()}
+        here = jobs.loc[_needed(own["job"], jobs)]
         runs = own[own["job"].map(jobs["kind"]) == "run"].drop_duplicates("job")
-        budgets["downstream runs per encoder"] = _or(runs.groupby(["label", *PLACES]).size())
-        scales[scale or "here"] = budgets
-    table = pd.DataFrame(scales)
-    table = table[(table != "").any(axis=1)]
-    if len(table):
-        paper = {name: printed for name, (_, printed) in BUDGETS.items()}
-        table["the paper's"] = [paper.get(name, "not printed, at least 6 evaluations") for name in table.index]
-        page.table("Budgets beside the paper's.", table.reset_index(names="budget"))
+        of_runs = _or(runs.groupby(["label", *PLACES]).size())
+        table[scale or "here"] = [*(_budget(here, *where) for _, _, *where in BUDGETS), of_runs]
+    is_known = (table != "").any(axis=1)
+    if is_known.any():
+        table["the paper's"] = [*(printed for _, printed, *_ in BUDGETS), "not printed, at least 6 evaluations"]
+        page.table("Budgets beside the paper's.", table[is_known].reset_index())
         page.text(
             "This scale does not show which method is ahead after the full budget: methods that learn late look worse "
             "here. It does not show what an encoder learns after the plateau near ln M, which lasts for over a "
@@ -328,9 +305,10 @@ def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
         )
 
 
-def _budget(jobs: pd.DataFrame, fact: str, kinds: Sequence[str], methods: str) -> str:
+def _budget(jobs: pd.DataFrame, fact: str, kinds: str, methods: str) -> str:
     """Return the values of a fact in jobs of these kinds and methods; a job without it has the paper's."""
-    facts = pd.json_normalize(jobs.loc[jobs["kind"].isin(kinds), "facts"].tolist()).reindex(columns=["method", fact])
+    facts = jobs.loc[jobs["kind"].str.fullmatch(kinds), "facts"]
+    facts = pd.json_normalize(facts.tolist()).reindex(columns=["method", fact])
     values = facts.loc[facts["method"].astype(object).fillna("").str.match(methods), fact]
     words = [v if isinstance(v, str) else f"{v:,}".removesuffix(".0") for v in sorted(values.dropna().unique())]
     return " or ".join(words + ["the paper's"] * bool(values.isna().any()))
@@ -341,8 +319,7 @@ def _provenance(page: Page, jobs: pd.DataFrame) -> None:
     done = jobs[jobs["done"]]
     made = done[["machine", "where", "git_revision"]].value_counts(sort=False)
     page.table("Machines, as tables number them, and source revisions", made.reset_index(name="jobs"))
-    facts = pd.DataFrame(done["facts"].tolist(), done.index)
-    facts = facts.reindex(columns=["method", "domain", "updates", "env_steps"])
+    facts = pd.DataFrame(done["facts"].tolist(), done.index, ["method", "domain", "updates", "env_steps"])
     spent = done[["kind", "machine", "seconds"]].join(facts).dropna(subset="seconds")
     spent["of"] = spent["method"].fillna(spent["domain"])
     groups = spent.groupby(["kind", "of", "machine"], sort=False)
@@ -357,7 +334,7 @@ def _provenance(page: Page, jobs: pd.DataFrame) -> None:
     versions = pd.DataFrame({f"version ({_count(count, 'job')})": dict(each) for each, count in sets.items()})
     page.table("Versions", versions.rename_axis("package").reset_index())
     page.section("Jobs", "jobs")
-    has_begun = [(path / records.LOG).exists() for path in jobs["path"]]
+    has_begun = np.array([(path / records.LOG).exists() for path in jobs["path"]], bool)
     table = pd.DataFrame({
         "job": jobs.index, "state": np.select([jobs["done"], has_begun], ["finished", "begun"], "not begun"),
         "wall clock": jobs["seconds"].map(duration, na_action="ignore"), "attempts": jobs["attempts"],
@@ -440,7 +417,7 @@ def _encoder(run: str, jobs: pd.DataFrame) -> str:
 
     Encoders that were fine-tuned from one base share it: it is their one draw of a pre-training.
     """
-    if encoders := _needed([run], jobs, *ENCODERS):
+    if encoders := _needed([run], jobs, "encoder", "explored", "finetuned", "untrained"):
         return encoders[-1]
     card = jobs.loc[run, "path"] / "agent" / "card.json"
     return read_json(card, error=RecordError).get("pretrained") or run if card.exists() else run
@@ -454,11 +431,9 @@ def _score_table(page: Page, runs: pd.DataFrame, caption: str) -> None:
         text = _spread(own, 0 if abs(own.mean()) >= 10 else 1)
         cells[label, task] = _beside(text, published.published_score(label, *place))
     labels, tasks = in_order(runs["label"]), runs["task"].unique()
-    table = pd.Series(cells).unstack().loc[labels, tasks]
-    if len(tasks) <= 3 < len(labels):
-        page.table(caption, table.reset_index(names="method"))
-    else:
-        page.table(caption, table.T.reset_index(names="task"))
+    table = pd.Series(cells).unstack().loc[labels, tasks].rename_axis("method")
+    has_rows_of_methods = len(tasks) <= 3 < len(labels)
+    page.table(caption, (table if has_rows_of_methods else table.T.rename_axis("task")).reset_index())
 
 
 NORMALIZED = {
@@ -543,19 +518,16 @@ def _paper_mean(label: str, places: Sequence[Sequence[str]], normalized: bool = 
         return f"{means[label]:.{digits}f}"
     values = []
     for group, task, colors in places:
-        expert = published.EXPERT_SCORES.get(task) if normalized else 1.0
-        score = published.published_score(label, group, task, colors)
-        if expert and not score:
-            return ""
-        if expert and score:
-            values.append(score.mean / expert)
-    return f"{np.mean(values):.{digits}f}" if values else ""
+        if expert := published.EXPERT_SCORES.get(task) if normalized else 1.0:
+            score = published.published_score(label, group, task, colors)
+            values.append(score.mean / expert if score else math.nan)
+    return _number(float(np.mean(values)) if values else math.nan, f".{digits}f")
 
 
 def _estimated(found: stats.Estimate, **columns: Any) -> pd.DataFrame:
     """Return an estimate and its interval as points of a figure."""
-    ends = {"low": found.low, "high": found.high}
-    return pd.DataFrame({"y": found.value, **ends}).assign(**columns).astype({"low": float, "high": float})
+    points = pd.DataFrame({"y": found.value, "low": found.low, "high": found.high})
+    return points.assign(**columns).astype({"low": float, "high": float})
 
 
 def _learning_curves(page: Page, name: str, evaluations: pd.DataFrame) -> None:
@@ -569,7 +541,7 @@ def _learning_curves(page: Page, name: str, evaluations: pd.DataFrame) -> None:
         drawn.append(_estimated(found, x=runs.columns, **about, line="mean", thin=False))
         if found.low is None and len(runs) > 1:  # too few for an interval: the runs themselves
             curves = own[["env_steps", "score", "run"]].set_axis(["x", "y", "line"], axis=1)
-            drawn.append(curves.assign(**about, low=math.nan, high=math.nan, thin=True))
+            drawn.append(curves.assign(**about, thin=True))
     page.figure(
         f"{name}-curves",
         f"Episode return along training: mean over runs, with {stats.CONFIDENCE:.0%} bootstrap intervals from "
@@ -619,8 +591,8 @@ def _efficiency(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) 
     table = []
     for (device, threads, method, count), own in rows.groupby(["device", "threads", "method", "domains"], sort=False):
         average = own.mean(numeric_only=True)
-        line: dict[str, Any] = {"method": method, "domains": count}
-        line["on"] = device if device != "cpu" else _count(int(threads), "thread")
+        where = device if device != "cpu" else _count(int(threads), "thread")
+        line: dict[str, Any] = {"method": method, "domains": count, "on": where}
         line |= {title: _number(average[column], spec) for title, (column, spec) in COSTS.items()}
         line["s per encoder update"] += f" (n = {len(own)})"
         if method in published.EFFICIENCY and count in (1, 2, 3):
@@ -656,8 +628,7 @@ def _measurements(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame
         _probes(page, rows)
 
 
-SPREAD = {"kne_3": "KNE, k = 3", "kne_half": "KNE, k = M/2", "ane": "ANE", "intr": "L_intr"}
-"""Column of ``prototypes.csv`` to its heading."""
+SPREAD = {"kne_3": "KNE, k = 3", "kne_half": "KNE, k = M/2", "ane": "ANE", "intr": "L_intr"}  # columns, headings
 
 
 def _last(rows: pd.DataFrame, keys: list[str], numbers: list[str], window: int = 1) -> pd.DataFrame:
@@ -668,8 +639,7 @@ def _last(rows: pd.DataFrame, keys: list[str], numbers: list[str], window: int =
 
 
 def _prototypes(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> None:
-    variants = {True: " with L_intr", False: " without L_intr"}
-    rows["label"] = rows["method"] + rows["has_dispersion"].map(variants)
+    rows["label"] = rows["method"] + rows["has_dispersion"].map({True: " with L_intr", False: " without L_intr"})
     table = []
     for end in _last(rows, ["label", "method", "has_dispersion"], [*SPREAD, "updates"]).to_dict("records"):
         paper = published.PROTOTYPE_METRICS.get((end["method"], end["has_dispersion"]))
@@ -686,20 +656,18 @@ def _prototypes(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -
     points = rows.rename(columns={"updates": "x", "job": "line", **SPREAD})
     points = points.melt(["label", "line", "x"], list(SPREAD.values()), "panel", "y")
     caption = "Spread of the prototypes along training, a line per encoder."
-    page.figure(f"{name}-spread", caption, draw(points, "encoder updates", columns=2))
+    page.figure(f"{name}-spread", caption, draw(points, "encoder updates"))
 
 
 def _coverage(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> None:
     """Show how much of a domain the data covers along pre-training: random policy against explorers."""
-    explorers = rows["method"].astype(str) + " explorer"
-    rows["label"] = explorers.mask(rows["source"] == "random", "random policy")
+    rows["label"] = (rows["method"].astype(str) + " explorer").mask(rows["source"] == "random", "random policy")
     # Several explorers share one random dataset: equal rows are one curve.
     rows = rows.drop_duplicates(["domain", "label", "env_steps", "coverage", "samples"])
     ends = _last(rows, ["domain", "label"], ["env_steps", "samples", "coverage"])
     ends["all windows"] = _last(rows, ["domain", "label"], ["coverage"], window=10)["coverage"]
-    formats = {"env_steps": "{:,.0f}", "samples": "{:,.0f}", "coverage": "{:.4f}", "all windows": "{:.4f}"}
-    for column, form in formats.items():
-        ends[column] = ends[column].map(form.format)
+    for column, form in {"env_steps": ",.0f", "samples": ",.0f", "coverage": ".4f", "all windows": ".4f"}.items():
+        ends[column] = ends[column].map(f"{{:{form}}}".format)
     page.table(
         "Coverage at the end: particle estimate over observations from the last of up to ten equal windows of the "
         "training, and from as many decisions of the random policy; mean over n runs; higher is wider. Env steps are "
@@ -731,17 +699,15 @@ DIAGNOSTICS = {
     "prototype_ane": "ANE of prototypes",
 }
 """Column of ``pretrain.csv`` to its heading; the first three are drawn."""
-WINDOW = 5
-"""A final value is the mean over this many rows at the end of a record."""
-PLATEAU = 0.99
-"""Share of ln M: a comparative loss that stays below has left the plateau, where all prototypes look alike."""
+WINDOW = 5  # a final value is the mean over this many rows at the end of a record
+PLATEAU = 0.99  # of ln M: a comparative loss that stays below has left the plateau, where all prototypes look alike
 
 
 def left_plateau(record: pd.DataFrame) -> float:
     """Return after how many encoder updates a comparative loss has left its plateau for good.
 
-    This is the first row of ``pretrain.csv`` from which the loss stays below :data:`PLATEAU` of ln M; infinity if the
-    record ends on the plateau, and NaN if there is no such loss.
+    This is the first row of ``pretrain.csv`` from which the loss stays below 99 % of ln M; infinity if the record ends
+    on the plateau, and NaN if there is no such loss.
     """
     known = record.reindex(columns=["updates", "comp", "ln_num_prototypes"]).dropna()
     if known.empty:
@@ -758,8 +724,7 @@ def _diagnostics(page: Page, name: str, title: str, rows: pd.DataFrame) -> None:
     points["n"] = points.groupby("label")["line"].transform("nunique").astype(str)
     points = points.melt(["label", "line", "x", "n"], headings[:3], "panel", "y").dropna(subset="y")
     if len(points):
-        has_loss = points["panel"].iloc[0] == DIAGNOSTICS["comp"]
-        logs = rows["ln_num_prototypes"].dropna().unique() if has_loss else ()
+        logs = rows["ln_num_prototypes"].dropna().unique() if points["panel"].iloc[0] == DIAGNOSTICS["comp"] else ()
         marks = {f"ln M = {value:.3f}": value for value in logs}
         caption = f"{title} along pre-training, a line per encoder (n in the legend)."
         page.figure(name, caption, draw(points, "encoder updates", marks=marks))
@@ -769,8 +734,7 @@ def _diagnostics(page: Page, name: str, title: str, rows: pd.DataFrame) -> None:
     left = pd.Series({run: left_plateau(record) for run, record in by_run})
     summary = pd.DataFrame({"updates": by_run["updates"].max(), "left the plateau at": left})
     summary = summary.groupby(level=0).agg(_or).replace("inf", "not left", regex=True)
-    for place, column in enumerate(summary, 1):
-        ends.insert(place, column, ends["label"].map(summary[column]))
+    ends = ends[["label"]].join(summary, on="label").join(ends.drop(columns="label"))
     page.table(
         f"{title} at the end of pre-training. Mean of the last {WINDOW} rows of a record, then over encoders. The "
         f"plateau is left where the comparative loss stays below {PLATEAU:.0%} of ln M from then on: at ln M, or with "
@@ -798,12 +762,11 @@ def _probes(page: Page, rows: pd.DataFrame) -> None:
         "those of unseen domains.",
         "note",
     )
-    means = rows[rows["coordinate"].isna()].dropna(subset="value")
-    means = means.sort_values(["domain", "colors"], kind="stable")
+    means = rows[rows["coordinate"].isna()].dropna(subset="value").sort_values(["domain", "colors"], kind="stable")
     colors = (", " + means["colors"].str.replace("_", " ")).mask(means["colors"] == "normal", "")
     groups = ", " + means["group"] if means["group"].nunique() > 1 else ""
-    means = means.assign(at=means["domain"] + colors, encoder=means["label"] + groups)
-    means["seen"] = means["seen"].map({"yes": "seen", "no": "unseen"})
+    seen = means["seen"].map({"yes": "seen", "no": "unseen"})
+    means = means.assign(at=means["domain"] + colors, encoder=means["label"] + groups, seen=seen)
     for embedding, (measure, (title, digits)) in product(means["embedding"].unique(), MEASURES.items()):
         own = means[(means["embedding"] == embedding) & (means["measure"] == measure)]
         places = own.groupby(["encoder", "group", "at"], sort=False)

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.stats import mannwhitneyu, trim_mean
 
@@ -23,8 +22,7 @@ MIN_RUNS = 5
 """A task with fewer runs has no interval: percentile intervals of fewer draws are far too narrow."""
 COVERAGE = {5: 0.84, 6: 0.86, 8: 0.89, 10: 0.90}
 """Number of normal draws to the coverage of a 95 % percentile interval of their mean."""
-CONFIDENCE, REPLICATES, SEED = 0.95, 2_000, 0
-"""Of every interval; the same runs give the same interval in any order."""
+CONFIDENCE, REPLICATES, SEED = 0.95, 2_000, 0  # of every interval; the order of the runs does not matter
 
 
 def mean(scores: Sequence[Array]) -> Array:
@@ -38,12 +36,7 @@ def median(scores: Sequence[Array]) -> Array:
 
 
 def iqm(scores: Sequence[Array]) -> Array:
-    """Return the interquartile mean: that of the middle half of all runs of all tasks, sorted together.
-
-    Examples:
-        >>> float(iqm([np.array([0.0, 1.0]), np.array([3.0, 100.0])]))
-        2.0
-    """
+    """Return the interquartile mean: that of the middle half of all runs of all tasks, sorted together."""
     return np.asarray(trim_mean(np.concatenate(scores, axis=-1), 0.25, axis=-1))
 
 
@@ -101,20 +94,13 @@ def estimate(
     Args:
         statistic: an aggregate of this module; for two methods one that takes both.
         *methods: a row per run, with columns ``task``, ``encoder`` and ``run`` (names; a run without a pre-trained
-            encoder is its own), and the numbers. A run under several tasks is redrawn alike in all of them. Two methods
-            need the same tasks.
+            encoder is its own), and the numbers. A run under several tasks is redrawn alike in all of them.
         columns: numbers to aggregate: one score, or the points of a curve.
         replicates: of the bootstrap.
         seed: of the bootstrap.
 
     Raises:
         ValueError: no run, a number that is not finite, or a task that only one method has.
-
-    Examples:
-        >>> runs = pd.DataFrame({"task": "walker_run", "run": list("abcde"), "score": [1.0, 2.0, 3.0, 4.0, 5.0]})
-        >>> runs["encoder"] = runs["run"]
-        >>> print(f"{estimate(mean, runs):.1f}")
-        3.0 [1.8, 4.2]
     """
     samples = [_by_task(method, columns) for method in methods]
     if len({tuple(sample) for sample in samples}) > 1:
@@ -140,27 +126,23 @@ def _resample(tasks: Sequence[pd.DataFrame], replicates: int, rng: np.random.Gen
     """Draw encoders with replacement, jointly for the tasks that share them, and then runs of the drawn encoders.
 
     The first encoder's ``n`` runs become ``n`` runs of the first encoder drawn, redrawn with replacement, and so on.
-    Tasks with the same runs are redrawn alike. Returns indices ``[B, R_t]`` per task.
+    Tasks with the same runs are redrawn alike. The rows of a task are sorted by encoder. Returns indices ``[B, R_t]``
+    per task.
     """
-    encoders = [task["encoder"].tolist() for task in tasks]
-    names = [np.unique(labels) for labels in encoders]
-    strata = _strata(names)
-    ranks = {
-        stratum: rng.random((replicates, max(len(n) for n, s in zip(names, strata) if s == stratum)))
-        for stratum in dict.fromkeys(strata)
-    }
+    encoders = [set(task["encoder"]) for task in tasks]
+    is_shared = np.array([[not own.isdisjoint(other) for other in encoders] for own in encoders])
+    strata = connected_components(is_shared, directed=False)[1]  # tasks that share encoders, directly or not
+    sizes = pd.Series(map(len, encoders)).groupby(strata).max()
+    ranks = {stratum: rng.random((replicates, size)) for stratum, size in sizes.items()}
     drawn: dict[tuple, NDArray[np.int64]] = {}
     found = []
-    for task, labels, own, stratum in zip(tasks, encoders, names, strata):
-        same = (tuple(labels), tuple(task["run"]))
+    for task, stratum in zip(tasks, strata):
+        same = (*task["encoder"], *task["run"])
         if same not in drawn:
-            place = np.searchsorted(own, labels)  # [R] number of each run's encoder
-            counts = np.bincount(place)
-            by_encoder = np.argsort(place, kind="stable")
-            first = np.cumsum(counts) - counts
-            chosen = (ranks[stratum][:, : len(own)] * len(own)).astype(np.int64)[:, place]  # [B, R]
+            _, place, counts = np.unique(task["encoder"].tolist(), return_inverse=True, return_counts=True)
+            chosen = (ranks[stratum][:, : len(counts)] * len(counts)).astype(np.int64)[:, place]  # [B, R]
             nth = (rng.random(chosen.shape) * counts[chosen]).astype(np.int64)
-            drawn[same] = by_encoder[first[chosen] + nth]
+            drawn[same] = (np.cumsum(counts) - counts)[chosen] + nth
         found.append(drawn[same])
     return found
 
@@ -175,12 +157,3 @@ def _by_task(method: pd.DataFrame, columns: Sequence[str]) -> dict[str, pd.DataF
             "diverged has no score: leave it out and say so."
         )
     return dict(iter(method.sort_values(["task", "encoder", "run"]).groupby("task")))
-
-
-def _strata(names: Sequence[NDArray]) -> list[int]:
-    """Return, for each task, the number of its set: tasks that share encoders, directly or through others."""
-    codes, unique = pd.factorize(np.concatenate(names))
-    tasks = np.repeat(np.arange(len(names)), [len(own) for own in names])
-    size = len(names) + len(unique)
-    links = coo_array((np.ones(len(codes)), (tasks, len(names) + codes)), shape=(size, size))
-    return connected_components(links, directed=False)[1][: len(names)].tolist()
