@@ -111,14 +111,15 @@ def test_paths_mean_what_a_shell_means_and_empty_ones_are_refused(home: Path) ->
             write_artifact(bad, {}, card={}, format_name="test", version=1)
 
 
-def test_files_and_directories_have_the_rights_that_the_umask_leaves(tmp_path: Path) -> None:
-    before = os.umask(0o027)
+@pytest.mark.parametrize("mask", [0o027, 0o077, 0o002])
+def test_files_and_directories_have_the_rights_that_the_umask_leaves(tmp_path: Path, mask: int) -> None:
+    before = os.umask(mask)
     try:
         path = write(tmp_path / "new" / "a")
     finally:
         os.umask(before)
-    assert {folder.stat().st_mode & 0o777 for folder in (path.parent, path)} == {0o750}
-    assert {file.stat().st_mode & 0o777 for file in path.iterdir()} == {0o640}
+    assert {folder.stat().st_mode & 0o777 for folder in (path.parent, path)} == {0o777 & ~mask}
+    assert {file.stat().st_mode & 0o777 for file in path.iterdir()} == {0o666 & ~mask}
 
 
 # --- artifacts ----------------------------------------------------------------------------------------------------

@@ -8,12 +8,16 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 from command import SIZE, SMALL, TASK, Call, refused, rows, toy_dataset
+from toy_world import ToyEnv, fixed_length
 
 from crptpro.cli import main
 from crptpro.data import FrameDataset
+from crptpro.domains import Domain, register_domain
 from crptpro.pretrained import load_pretrained
 from crptpro.training import load_agent
 
@@ -136,6 +140,27 @@ def test_results_are_written_before_they_are_printed(
     assert [row["episode"] for row in rows(file)] == ["0", "1"]
 
 
+class Poisoned(ToyEnv):
+    """Rewards NaN in its second episode."""
+
+    def _step(self, tensordict: Any) -> Any:
+        found = super()._step(tensordict)
+        return found.set("reward", torch.full((1,), torch.nan)) if self.steps == 15 else found
+
+
+def test_a_reward_that_is_not_finite_ends_an_evaluation_and_keeps_its_finished_episodes(
+    call: Call, tmp_path: Path
+) -> None:
+    def make(*, seed: int, image_size: int) -> Poisoned:
+        return Poisoned(fixed_length, seed=seed, image_size=image_size)
+
+    register_domain(Domain("poisoned", "poisoned_go", make=make))
+    file = tmp_path / "a.csv"
+    line = refused(call("evaluate", "random-policy", "--task", "poisoned_go", "--episodes", 4, "--csv", file))
+    assert "'poisoned_go' answered with reward" in line
+    assert [row["episode"] for row in rows(file)] == ["0"]
+
+
 @pytest.mark.parametrize("pretrained", ["drq", "random-encoder"])
 def test_the_controls_leave_agents_that_evaluate(call: Call, tmp_path: Path, pretrained: str) -> None:
     run = tmp_path / "run"
@@ -210,6 +235,25 @@ def test_an_impossible_request_leaves_nothing_behind(
     line = refused(call(*arguments, "--out", tmp_path / "out"))
     assert re.search(message, line), line
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("out", [("--out", ""), ("--out=",)])
+@pytest.mark.parametrize("command", [("collect", TASK), ("downstream", TASK, "--pretrained", "drq")])
+def test_an_empty_path_is_refused(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...], out: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert "empty: --out" in refused(call(*command, *out))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_home_directory_is_expanded_also_where_the_shell_leaves_it(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.chdir(tmp_path)
+    assert call("collect", TASK, "--out=~/data", "--transitions", 10, "--workers", 1)[0] == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["home"]
 
 
 @pytest.mark.parametrize(("arguments", "message"), [

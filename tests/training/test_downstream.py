@@ -9,14 +9,17 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 from toy_world import ToyEnv, fixed_length
 from worlds import EPISODE, SIZE, make_encoder, make_pretrained, make_smooth, python, record, signalling, world
 
 from crptpro.errors import CheckpointError, NonFiniteError, PretrainedError
 from crptpro.modules import SquashedGaussianActor
-from crptpro.pretrained import Pretrained, random_pretrained
-from crptpro.training import DownstreamConfig, DownstreamResult, load_agent, train_downstream
+from crptpro.objectives import ProtoLoss
+from crptpro.pretrained import load_pretrained, random_pretrained, save_pretrained
+from crptpro.training import DownstreamConfig, DownstreamResult, load_agent, pretrain, train_downstream
 
 SMALL = DownstreamConfig(
     env_steps=120, batch_size=8, replay_capacity=40, random_agent_steps=12, queue_size=16, hidden_dim=16,
@@ -153,17 +156,24 @@ class OwnEncoder(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.feature_dim, self.image_size, self.in_channels = 12, SIZE, 9
+        self.config: dict[str, Any] = {}
         self.layers = nn.Sequential(nn.Conv2d(9, 3, 8, 8), nn.Flatten())
 
     def forward(self, pixels: Tensor) -> Tensor:
         return self.layers(pixels.float() / 255)
 
 
-def test_any_module_serves_as_a_frozen_encoder_and_is_encoded_anew(
+def test_any_module_is_trained_saved_loaded_and_serves_as_a_frozen_encoder_that_is_encoded_anew(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    data = ReplayBuffer(storage=LazyTensorStorage(20))
+    pixels = torch.randint(0, 256, (20, 9, SIZE, SIZE), dtype=torch.uint8)
+    data.extend(TensorDict({"pixels": pixels, "next": {"pixels": pixels.roll(1, -1)}}, [20]))
+    loss = ProtoLoss(OwnEncoder(), num_prototypes=8, latent_dim=4, hidden_dim=8)
+    path = save_pretrained(pretrain(loss, data, updates=2, batch_size=4, progress=False), tmp_path / "encoder")
+    own = load_pretrained(path, classes={"OwnEncoder": OwnEncoder})
     with caplog.at_level("INFO", logger="crptpro"):
-        result = train(tmp_path, Pretrained(OwnEncoder(), card={"method": "mine"}), env_steps=40)
+        result = train(tmp_path, own, env_steps=40)
     assert result.evaluations[-1]["updates"] == 8
     assert "re-encoding" in caplog.text
     agent, _ = load_agent(tmp_path / "agent", encoder=OwnEncoder())

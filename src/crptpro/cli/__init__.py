@@ -10,6 +10,7 @@ import contextlib
 import itertools
 import logging
 import os
+import re
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -292,12 +293,15 @@ class Evaluate:
                     f"has {action_dim}; choose a task of the agent's own domain."
                 )
             policy = agent or training.uniform_policy(env, seed=self.seed)
-            episodes = training.evaluate(policy, env, episodes=self.episodes, seed=self.seed)
-            if self.csv is not None:
-                from crptpro.experiments import measure
+            episodes: list[Any] = []
+            try:
+                training.evaluate(policy, env, episodes=self.episodes, seed=self.seed, on_episode=episodes.append)
+            finally:  # a later episode may have failed
+                if self.csv is not None and episodes:
+                    from crptpro.experiments import measure
 
-                rows = [{"task": task, "agent": self.agent, **vars(episode)} for episode in episodes]
-                measure.write_rows(self.csv, rows)
+                    rows = [{"task": task, "agent": self.agent, **vars(episode)} for episode in episodes]
+                    measure.write_rows(self.csv, rows)
             if self.video is not None:
                 frames: list[Any] = []
                 policy = agent or training.uniform_policy(env, seed=self.seed)
@@ -453,6 +457,9 @@ def main() -> None:
 
     def run() -> None:
         arguments = load_plugins(sys.argv[1:])
+        for before, word in itertools.pairwise(["crptpro", *arguments]):
+            if not word or re.fullmatch("--[^=]*=", word):
+                raise CRPTproError(f"An argument is empty: {word or before}. A path is at least a dot.")
         if arguments[:1] == ["measure"]:  # for jobs of `reproduce`
             from crptpro.experiments import measure
 

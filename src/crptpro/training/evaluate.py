@@ -47,12 +47,19 @@ class Episode:
 
 
 def evaluate(
-    policy: Policy, env: EnvBase, *, episodes: int = 10, seed: int = 0, progress: bool = True
+    policy: Policy,
+    env: EnvBase,
+    *,
+    episodes: int = 10,
+    seed: int = 0,
+    progress: bool = True,
+    on_episode: Callable[[Episode], Any] = lambda episode: None,
 ) -> list[Episode]:
     """Run a policy for whole episodes and return every episode's own return.
 
     Every episode has its own seed, so that neither earlier evaluations nor the number of processes change a result.
-    The environment is unbatched, with ``pixels`` uint8 ``[C, H, W]`` and without an intrinsic reward.
+    The environment is unbatched, with ``pixels`` uint8 ``[C, H, W]`` and without an intrinsic reward. ``on_episode`` is
+    called with each episode as it ends.
 
     Raises:
         ValueError: fewer than one episode.
@@ -65,6 +72,7 @@ def evaluate(
     )  # fmt: skip
     for index in bar:
         results.append(run_episode(policy, env, episode=index, seed=episode_seed(seed, index)))
+        on_episode(results[-1])
         bar.set_postfix(mean_return=f"{statistics.fmean(e.episode_return for e in results):.1f}")
     return results
 
