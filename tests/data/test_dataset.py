@@ -283,6 +283,18 @@ def test_killed_anywhere_the_same_request_continues_to_the_same_bytes(tmp_path: 
     assert len(FrameDataset.open(path)) == 40
 
 
+def test_what_was_written_is_read_back_before_a_dataset_is_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lose_a_byte(descriptor: int) -> None:
+        if os.readlink(f"/proc/self/fd/{descriptor}").endswith("pixels.memmap"):
+            os.ftruncate(descriptor, os.fstat(descriptor).st_size - 1)
+
+    monkeypatch.setattr(os, "fsync", lose_a_byte)
+    with pytest.raises(DatasetError, match=r"pixels\.memmap is truncated"):
+        collect_toy(tmp_path / "toy")
+
+
 def test_files_that_lack_finished_episodes_are_named_and_left_alone(tmp_path: Path) -> None:
     path = collect_toy(tmp_path, episodes=2)
     pixels = path / "frames/pixels.memmap"

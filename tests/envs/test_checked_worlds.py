@@ -51,8 +51,11 @@ both = pytest.mark.parametrize("library", ["gymnasium", "own"])
 
 @both
 @pytest.mark.parametrize("frame_stack", [1, 3])
-def test_frames_outlive_the_buffer_that_a_world_uses_again(library: str, frame_stack: int) -> None:
+@pytest.mark.parametrize("is_view", [False, True])
+def test_frames_outlive_the_buffer_that_a_world_uses_again(library: str, frame_stack: int, is_view: bool) -> None:
     buffer = grey(0)
+    if is_view:  # of a buffer that is laid out as frames are stored
+        buffer = np.zeros((3, SIZE, SIZE), np.uint8).transpose(1, 2, 0)
 
     def reuse(clock: int) -> np.ndarray:
         buffer[:] = clock
@@ -63,12 +66,15 @@ def test_frames_outlive_the_buffer_that_a_world_uses_again(library: str, frame_s
     assert shown[:, -1, 0, 0].tolist() == [1, 2, 3]
 
 
-@both
+@pytest.mark.parametrize(("library", "size"), [("gymnasium", SIZE), ("gymnasium", 3 * SIZE), ("own", SIZE)])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_floats_between_0_and_1_are_scaled_once_and_said(
-    library: str, dtype: Any, caplog: pytest.LogCaptureFixture
+    library: str, size: int, dtype: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    with caplog.at_level(logging.WARNING), shows(lambda clock: grey(clock / 5, dtype), library=library) as env:
+    def image(clock: int) -> np.ndarray:  # Gymnasium's are resized
+        return np.full((size, size, 3), clock / 5, dtype)
+
+    with caplog.at_level(logging.WARNING), shows(image, library=library) as env:
         shown = env.rollout(3)["next", "pixels"]
     assert shown.dtype == torch.uint8
     assert shown[:, -1, 0, 0].tolist() == [51, 102, 153]
