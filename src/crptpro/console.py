@@ -36,9 +36,8 @@ def configure_logging(level: int = logging.INFO) -> None:
 def run_main(main: Callable[[], object]) -> None:
     """Run a program: expected errors become one line and exit status 1, Ctrl-C exits with 130.
 
-    Expected are this library's own errors, a setting it refuses, and a file that cannot be read or written. Any other
-    error is a defect and keeps its traceback. Characters that the terminal cannot show are printed as escapes. A closed
-    pipe (``| head``) ends the program silently, with the status of SIGPIPE.
+    Expected are this library's own errors, a setting it refuses, and a file that cannot be read or written. A defect
+    keeps its traceback. A closed pipe (``| head``) ends the program silently, with the status of SIGPIPE.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

@@ -18,10 +18,8 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 class DirectoryLock:
     """Locks ``directory`` for this process, so that no two processes write one record; a kill frees it too.
 
-    It is taken at construction. Use it as a context manager, or call :meth:`release`. Re-entrant holders in one
-    process, a run's record and its training loop, share the lock. The file ``.lock`` stays in the directory.
-
-    Raises ``error`` if another process holds the directory, or it cannot be written.
+    It is taken at construction, which raises ``error`` if another process holds the directory, or it cannot be written.
+    Re-entrant holders in one process, a run's record and its training loop, share the lock.
     """
 
     def __init__(self, directory: str | Path, *, error: type[CRPTproError] = CRPTproError, is_reentrant: bool = False):
@@ -42,7 +40,6 @@ class DirectoryLock:
             _LOG.warning("%s cannot be locked (%s): make sure that no two processes write to it.", path, reason)
 
     def release(self) -> None:
-        """Free the directory once its last holder does; a second call does nothing."""
         if self._lock is not None:
             self._lock.release()
             self._lock = None

@@ -12,8 +12,11 @@ import shutil
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any, Literal
 
 import psutil
@@ -29,7 +32,7 @@ _BREAKING = ("mujoco", "dm-control", "torchrl", "tensordict")
 """Packages that are known to break outside their declared range; others are merely untested."""
 _LEFTOVERS = ("mujoco-core", "mujoco-studio")
 _GB = 1e9
-_WARM_UP_AGENT_STEPS, _TIMED_AGENT_STEPS = 2, 6
+_TIMED_AGENT_STEPS = 8
 _OTHER_BACKEND = "Try another backend: MUJOCO_GL=osmesa or MUJOCO_GL=egl."
 _DOMAIN_S = 60.0
 """Seconds for a domain besides its first frame: imports, building, stepping."""
@@ -48,18 +51,16 @@ class Finding:
 
 @dataclass(frozen=True)
 class DoctorReport:
-    """What :func:`run_doctor` found: lines of facts, and problems, the gravest first."""
+    """What :func:`run_doctor` found; the gravest problems come first."""
 
     facts: tuple[str, ...]
     findings: tuple[Finding, ...]
 
     @property
     def ok(self) -> bool:
-        """True only if a run would work."""
         return not any(finding.severity == "error" for finding in self.findings)
 
     def text(self) -> str:
-        """Return the report as plain text: facts, then problems with their remedies."""
         lines = [*self.facts, ""]
         for finding in self.findings:
             lines.append(f"{finding.severity}: {finding.what}")
@@ -71,18 +72,12 @@ class DoctorReport:
 def run_doctor(domains: Iterable[str] | None = None) -> DoctorReport:
     """Check versions, memory and disk, and render every domain with the backend that a run would use.
 
-    Args:
-        domains: as for :func:`crptpro.domains.expand_groups`; by default the paper's eight.
-
-    Raises:
-        UnknownNameError: for an unknown domain.
+    ``domains`` are as for :func:`crptpro.domains.expand_groups`, by default the paper's eight.
     """
     names = expand_groups(PAPER_DOMAINS if domains is None else domains)
     machine = provenance.hardware()
     gpus = machine["gpus"]
-    here = Path.cwd()
-    free_disk = shutil.disk_usage(here).free
-    free_ram = psutil.virtual_memory().available
+    free_disk, free_ram = shutil.disk_usage(Path.cwd()).free, psutil.virtual_memory().available
     facts = [
         "versions",
         *(f"  {name:<12}{version}" for name, version in provenance.versions().items()),
@@ -91,7 +86,7 @@ def run_doctor(domains: Iterable[str] | None = None) -> DoctorReport:
         f"  CPU   {machine['cpu']} ({machine['cpu_instructions']}), {machine['cpu_cores']} cores",
         f"  GPU   {', '.join(gpus) or 'none'}",
         f"  RAM   {free_ram / _GB:.1f} GB free of {machine['ram_bytes'] / _GB:.1f} GB",
-        f"  disk  {free_disk / _GB:.1f} GB free at {here}",
+        f"  disk  {free_disk / _GB:.1f} GB free at {Path.cwd()}",
         "",
     ]
     installed = {canonicalize_name(each.name): each.version for each in importlib.metadata.distributions()}
@@ -120,11 +115,9 @@ def check_versions(installed: Mapping[Any, str], requirements: Iterable[str]) ->
         if version is None:
             findings.append(Finding("error", f"{name} is not installed.", remedy))
         elif not requirement.specifier.contains(version, prereleases=True):
-            what = f"{name} {version} is outside {requirement.specifier}, which is "
-            if name in _BREAKING:
-                findings.append(Finding("error", f"{what}known to break.", remedy))
-            else:
-                findings.append(Finding("warning", f"{what}untested.", remedy))
+            severity, effect = ("error", "known to break") if name in _BREAKING else ("warning", "untested")
+            what = f"{name} {version} is outside {requirement.specifier}, which is {effect}."
+            findings.append(Finding(severity, what, remedy))
     if leftovers := [name for name in _LEFTOVERS if name in installed]:
         what = f"{' and '.join(leftovers)} belong to MuJoCo 4 and break the import of MuJoCo 3."
         remedy = f'pip uninstall -y {" ".join(leftovers)}; pip install --force-reinstall "mujoco>=3.17,<4"'
@@ -135,10 +128,7 @@ def check_versions(installed: Mapping[Any, str], requirements: Iterable[str]) ->
 def _check_machine(free_ram: int, free_disk: int, gpus: Sequence[str]) -> list[Finding]:
     findings = []
     if free_ram < 4 * _GB:
-        what = (
-            f"{free_ram / _GB:.1f} GB of RAM are free; pre-training at batch 512 and a replay of 40,000 "
-            "transitions want about 4 GB."
-        )
+        what = f"{free_ram / _GB:.1f} GB of RAM are free; batches of 512 and a replay of 40,000 transitions want 4."
         remedy = "End other programs, or use smaller batches and a smaller replay."
         findings.append(Finding("error" if free_ram < 1.5 * _GB else "warning", what, remedy))
     if free_disk < 7 * _GB:
@@ -146,9 +136,8 @@ def _check_machine(free_ram: int, free_disk: int, gpus: Sequence[str]) -> list[F
         remedy = "Free space, write to another disk, or collect fewer transitions."
         findings.append(Finding("error" if free_disk < 0.5 * _GB else "warning", what, remedy))
     remedy = "Repair its driver (nvidia-smi), or hide it with CUDA_VISIBLE_DEVICES; --device cpu always works."
-    for gpu in gpus:
-        if gpu.startswith(provenance.UNUSABLE):
-            findings.append(Finding("warning", f"torch cannot use a GPU: {gpu}.", remedy))
+    unusable = [gpu for gpu in gpus if gpu.startswith(provenance.UNUSABLE)]
+    findings += [Finding("warning", f"torch cannot use a GPU: {gpu}.", remedy) for gpu in unusable]
     if not gpus:
         findings.append(Finding("note", "torch sees no GPU; training runs on the CPU."))
     return findings
@@ -167,11 +156,9 @@ def _check_rendering(names: Sequence[str], *, has_gpu: bool) -> tuple[list[str],
     facts, findings = [f"{title}, milliseconds per agent step (physics and one image)"], []
     if has_gpu and gl["gl_kind"] == "software":
         what = f"There is a GPU, but {backend} renders in software, about twenty times slower."
-        remedy = (
-            "Install the GL parts of the GPU's driver; in a container start it with NVIDIA_DRIVER_CAPABILITIES=all."
-        )
+        remedy = "Install the GL parts of the GPU's driver; in a container set NVIDIA_DRIVER_CAPABILITIES=all."
         findings.append(Finding("warning", what, remedy))
-    for entry in render_domains(names, backend, rendering.default_timeout_s() + _DOMAIN_S):
+    for entry in render_domains(names, backend, rendering.first_frame_timeout_s() + _DOMAIN_S):
         name, error = entry["domain"], entry["error"]
         times = "   failed" if error else f"{entry['agent_step_ms']:>8.1f}   reset {entry['reset_ms']:.0f}"
         facts.append(f"  {name:<24}{times}")
@@ -181,7 +168,7 @@ def _check_rendering(names: Sequence[str], *, has_gpu: bool) -> tuple[list[str],
 
 
 def render_domains(names: Sequence[str], backend: str, timeout_s: float) -> list[dict[str, Any]]:
-    """Return :func:`check_domain` of each name, one after the other, each in its own process with a time limit."""
+    """Return :func:`check_domain` of each name, one by one in processes with a time limit."""
     from crptpro.envs.rendering import run_isolated
 
     plugins = [part for name in loaded_plugins() for part in (FLAG, name)]
@@ -203,28 +190,22 @@ def render_domains(names: Sequence[str], backend: str, timeout_s: float) -> list
 def check_domain(name: str) -> dict[str, Any]:
     """Step a domain at random and look at its pixels.
 
-    Returns:
-        ``domain`` and ``error``: why it failed, or what is wrong with its images, otherwise empty. With an error,
-        ``remedy``. Without one, wall-clock milliseconds: ``reset_ms`` of the first reset, which makes the render
-        context, and ``agent_step_ms`` of physics and one image.
+    Returns ``domain`` and ``error``: why it failed, or what is wrong with its images, otherwise empty. With an error,
+    ``remedy``. Without one, wall-clock milliseconds: ``reset_ms`` of the first reset, which makes the render context,
+    and ``agent_step_ms``, the median of physics and one image.
     """
     import gymnasium
 
     from crptpro.envs import make_env
 
     try:
-        env = make_env(name, seed=0, frame_stack=1)
-        try:
-            start = time.perf_counter()
+        with closing(make_env(name, seed=0, frame_stack=1)) as env:
+            times = [time.perf_counter()]
             first = last = env.reset()
-            reset_s = time.perf_counter() - start
-            for agent_step in range(_WARM_UP_AGENT_STEPS + _TIMED_AGENT_STEPS):
-                if agent_step == _WARM_UP_AGENT_STEPS:
-                    start = time.perf_counter()
+            times.append(time.perf_counter())
+            for _ in range(_TIMED_AGENT_STEPS):
                 last = env.step(env.rand_action(last))["next"]
-            agent_step_s = (time.perf_counter() - start) / _TIMED_AGENT_STEPS
-        finally:
-            env.close()
+                times.append(time.perf_counter())
     except Exception as reason:
         lacks_package = (ModuleNotFoundError, gymnasium.error.DependencyNotInstalled)
         has_remedy = isinstance(reason, CRPTproError) and not isinstance(reason, RenderingError)
@@ -233,7 +214,8 @@ def check_domain(name: str) -> dict[str, Any]:
         return _failed(name, str(reason) if has_name else f"{type(reason).__name__}: {reason}", remedy)
     if first["pixels"].unique().numel() == 1 or first["pixels"].equal(last["pixels"]):
         return _failed(name, "its pixels are constant or do not change")
-    return {"domain": name, "error": "", "reset_ms": reset_s * 1e3, "agent_step_ms": agent_step_s * 1e3}
+    reset_ms, *step_ms = (1e3 * (end - start) for start, end in pairwise(times))
+    return {"domain": name, "error": "", "reset_ms": reset_ms, "agent_step_ms": median(step_ms)}
 
 
 def _failed(name: str, error: str, remedy: str = _OTHER_BACKEND) -> dict[str, Any]:

@@ -42,9 +42,7 @@ class Domain:
     camera: int | str | None = 0  #: index or name of the default camera; ``None`` leaves it to the environment
     make: Callable[..., EnvBase] | None = None
     episode_env_steps: int | None = None  #: of a full episode; if ``None``, the time limit is 1000 agent steps
-    source: Literal["suite", "manipulation", "gymnasium", "own"] = (
-        "own"  #: library of ``task``; ``"own"`` with ``make``
-    )
+    source: Literal["suite", "manipulation", "gymnasium", "own"] = "own"  #: library of ``task``
 
     def __post_init__(self) -> None:
         for name in ("action_repeat", "episode_env_steps"):
@@ -135,10 +133,9 @@ _registered: dict[str, Domain] = {}
 def register_domain(domain: Domain) -> Domain:
     """Register a domain under its name and its task's name, in this process, and return it.
 
-    Several tasks may share the name of a domain, which then means the one registered last. A worker process starts
-    without registered domains: pass the ``Domain`` itself, or call ``register_domain`` at the top level of the module
-    that defines ``make``, which unpickling imports. A domain without ``make``, or with a name of the paper's, is a
-    ``CRPTproError``.
+    A name that several domains share means the one registered last. A worker process starts without registered
+    domains: pass the ``Domain`` itself, or call ``register_domain`` at the top level of the module that defines
+    ``make``. A domain without ``make``, or with a name of the paper's, is a ``CRPTproError``.
     """
     if domain.make is None and domain.source == "own":
         raise CRPTproError(f"Domain {domain.name!r} has no make; pass make=<function that builds the environment>.")
@@ -202,7 +199,7 @@ def expand_groups(names: Iterable[Named]) -> list[Named]:
 def _gymnasium_domain(name: str) -> Domain:
     import gymnasium
 
-    env_id = name[len(GYMNASIUM_PREFIX) :]
+    env_id = name.removeprefix(GYMNASIUM_PREFIX)
     try:
         spec = gymnasium.spec(env_id)
     except gymnasium.error.Error:

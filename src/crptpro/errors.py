@@ -23,10 +23,7 @@ class WorldError(CRPTproError):
 
 
 class WorldFailedError(RuntimeError):
-    """The code of an environment raised an exception; the message adds the environment's name and the call.
-
-    It is a defect of the environment, not a wrong setting, and keeps its traceback on the command line.
-    """
+    """The code of an environment raised an exception: a defect, so the command line shows its traceback."""
 
 
 class WorkerLostError(CRPTproError):

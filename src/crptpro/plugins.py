@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from crptpro.errors import CRPTproError
@@ -15,13 +15,9 @@ _loaded: list[str] = []
 
 
 def load_plugin(name: str) -> None:
-    """Import a module, or a Python file.
+    """Import a module, installed or of the working directory, or a Python file, a path that ends in ``.py``.
 
-    Args:
-        name: of an installed module or one in the working directory, or a path that ends in ``.py``.
-
-    Raises:
-        CRPTproError: it does not exist, cannot be imported, or the file has another module's name.
+    What does not exist or cannot be imported, or a file with another module's name, is a ``CRPTproError``.
     """
     path = Path(name)
     is_file = path.suffix == ".py"
@@ -34,11 +30,10 @@ def load_plugin(name: str) -> None:
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as reason:
-        if reason.name is None or reason.name != module_name.split(".")[0]:
-            raise CRPTproError(f"{FLAG} {name}: it cannot be imported ({reason}).") from reason
-        raise CRPTproError(
-            f"{FLAG} {name}: there is no such module; name an installed one, one of this directory, or a .py file."
-        ) from None
+        remedy = (
+            "A plugin is a module, installed or of this directory, or a .py file, and imports only what is installed."
+        )
+        raise CRPTproError(f"{FLAG} {name}: it cannot be imported ({reason}). {remedy}") from reason
     if is_file and Path(getattr(module, "__file__", None) or "").resolve() != path.resolve():
         raise CRPTproError(f"{FLAG} {name}: {module_name!r} is the name of another module; rename the file.")
     full_name = str(path.resolve()) if is_file else name
@@ -47,11 +42,7 @@ def load_plugin(name: str) -> None:
 
 
 def load_plugins(arguments: Sequence[str]) -> list[str]:
-    """Import every module that ``--plugin`` names, anywhere on a command line, and return the other arguments.
-
-    Raises:
-        CRPTproError: no name follows, or as :func:`load_plugin`.
-    """
+    """Import every module that ``--plugin`` names, anywhere on a command line, and return the other arguments."""
     rest: list[str] = []
     words = iter(arguments)
     for word in words:
@@ -64,12 +55,6 @@ def load_plugins(arguments: Sequence[str]) -> list[str]:
             raise CRPTproError(f"{FLAG} needs a module or a Python file, e.g. {FLAG} my_method.py.")
         load_plugin(name)
     return rest
-
-
-def load_again(names: Iterable[str]) -> None:
-    """Load the plugins (:func:`loaded_plugins`) of the parent process in its worker."""
-    for name in names:
-        load_plugin(name)
 
 
 def loaded_plugins() -> tuple[str, ...]:

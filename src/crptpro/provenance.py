@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import platform
+import re
 import subprocess
 from functools import cache
 from pathlib import Path
@@ -12,8 +13,6 @@ from typing import Any
 
 import psutil
 import torch
-
-PACKAGES = ("crptpro", "torch", "torchrl", "tensordict", "dm-control", "mujoco", "gymnasium", "numpy", "wandb")
 
 UNUSABLE = "unusable"
 """Prefix of the name of a GPU that torch sees and cannot use."""
@@ -23,7 +22,8 @@ UNUSABLE = "unusable"
 def versions() -> dict[str, str]:
     """Return the installed version of every package that can change a number, and Python's."""
     found = {"python": platform.python_version()}
-    for package in PACKAGES:
+    packages = ("crptpro", "torch", "torchrl", "tensordict", "dm-control", "mujoco", "gymnasium", "numpy", "wandb")
+    for package in packages:
         try:
             found[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
@@ -35,18 +35,15 @@ def versions() -> dict[str, str]:
 def hardware() -> dict[str, Any]:
     """Return what decides how long work takes here.
 
-    ``cpu_instructions`` are those that torch uses: in virtual machines two processors of one model may differ threefold
-    in speed. ``cpu_cores`` are those that this process may use, ``gpus`` names, or why torch cannot use one.
+    ``cpu_instructions`` are those that torch uses: virtual processors of one model may differ threefold in speed.
+    ``gpus`` are names, or why torch cannot use one.
     """
-    cpu = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        names = [line for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
-        cpu = names[0].split(":", 1)[1].strip() if names else cpu
+    model = re.search(r"^model name\s*: (.*)", cpuinfo.read_text() if cpuinfo.exists() else "", re.MULTILINE)
     probes = {"_is_avx512_bf16_supported": "AVX512-BF16", "_is_amx_tile_supported": "AMX"}
     present = [name for probe, name in probes.items() if getattr(torch.cpu, probe, lambda: False)()]
     return {
-        "cpu": cpu,
+        "cpu": model[1].strip() if model else platform.processor() or platform.machine(),
         "cpu_instructions": ", ".join([torch.backends.cpu.get_cpu_capability(), *present]),
         "cpu_cores": cpu_cores(),
         "ram_bytes": psutil.virtual_memory().total,

@@ -15,10 +15,9 @@ from crptpro.values import MAX_SEED, as_int
 
 
 def derive_seed(seed: int, *path: str | int) -> int:
-    """Derive a seed in ``[0, 2**31)`` from ``seed`` and a path of names, stable across processes.
+    """Derive a seed in ``[0, 2**31)`` from ``seed`` and a path of names, the same in every process.
 
-    Streams with different paths are independent, so neither the number of workers nor the order in which episodes are
-    collected changes an episode.
+    Streams of different paths are independent.
 
     Examples:
         >>> derive_seed(0, "collect", "walker", 3) == derive_seed(0, "collect", "walker", 3)
@@ -31,11 +30,7 @@ def derive_seed(seed: int, *path: str | int) -> int:
 
 
 def seed_everything(seed: int) -> None:
-    """Seed Python's, NumPy's and torch's global generators (all devices).
-
-    Raises:
-        ValueError: a seed outside [0, 2**32), NumPy's range.
-    """
+    """Seed Python's, NumPy's and torch's global generators (all devices) with a seed from 0 to 2**32 - 1."""
     seed = as_int(seed, "seed", minimum=0, maximum=MAX_SEED)
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002 - dm_control and gymnasium read the legacy global generator

@@ -16,15 +16,8 @@ import numpy as np
 import torch
 
 Quality = Literal["exact", "fast"]
-"""How frames are rendered. ``"fast"`` uses smaller shadow maps: up to twice as fast on software GL, with fewer than 1 %
-of the pixels changed (8 % on the terrain of quadruped_escape)."""
-
 Colors = Literal["normal", "reversed_background", "reversed_image"]
-"""Colours of an environment. The reversed ones swap the order of red, green and blue: of skybox and floor (the paper's
-unseen colours), or of whole images."""
-
-QUALITIES: tuple[str, ...] = get_args(Quality)
-COLORS: tuple[str, ...] = get_args(Colors)
+"""Both are explained by :func:`crptpro.envs.make_env`."""
 
 MAX_SEED = 2**32 - 1
 """NumPy's largest."""
@@ -33,8 +26,7 @@ MAX_SEED = 2**32 - 1
 def as_int(value: Any, name: str, *, minimum: int | None = None, maximum: int | None = None) -> int:
     """Return a count, size or seed as a plain ``int``: of an int, a NumPy or torch scalar, or a float such as ``1e5``.
 
-    Raises:
-        ValueError: naming the setting, its value and what is allowed.
+    Anything else is a ``ValueError``, which names the setting, its value and what is allowed.
     """
     number: Any = value
     if hasattr(number, "item") and getattr(number, "ndim", 0) == 0:
@@ -66,11 +58,7 @@ def as_float(value: Any, name: str, *, minimum: float | None = None, maximum: fl
 
 
 def as_path(value: str | os.PathLike[str], name: str = "path") -> Path:
-    """Return a path with ``~`` expanded.
-
-    Raises:
-        ValueError: an empty path, or one whose bytes are not UTF-8 and could not be written into a record.
-    """
+    """Return a path with ``~`` expanded; one that is empty or not UTF-8, as records are, is a ``ValueError``."""
     text = os.fspath(value)
     if not text:
         raise ValueError(f"`{name}` is empty; name a directory, or `.` for the working directory.")
@@ -84,10 +72,8 @@ def as_path(value: str | os.PathLike[str], name: str = "path") -> Path:
 def as_plain(value: Any, name: str) -> Any:
     """Return a setting, or a whole card of them, as what JSON holds: numbers, texts, lists, dicts with text keys.
 
-    NumPy and torch scalars become numbers, arrays and tensors lists, dataclasses dicts, paths and dtypes texts.
-
-    Raises:
-        ValueError: naming an entry that has no such form.
+    NumPy and torch scalars become numbers, arrays and tensors lists, dataclasses dicts, paths and dtypes texts. An
+    entry that has no such form is a ``ValueError`` with its name.
     """
     if isinstance(value, Enum):
         value = value.value
@@ -114,10 +100,8 @@ def check_numbers(config: Any, *, minima: Mapping[str, int], maxima: Mapping[str
     """Convert the fields of a frozen dataclass that are an ``int`` or ``float`` to plain numbers in their range.
 
     A whole number is at least 1 unless ``minima`` says otherwise, a ``float`` at least 0 and at most what ``maxima``
-    says. ``seed`` is from 0 to 2**32 - 1. ``None`` stays where the annotation allows it.
-
-    Raises:
-        ValueError: naming the setting, its value and what is allowed.
+    says. ``seed`` is from 0 to 2**32 - 1. ``None`` stays where the annotation allows it. Errors are those of
+    :func:`as_int`.
     """
     for name, hint in get_type_hints(type(config)).items():
         value = getattr(config, name)

@@ -16,14 +16,14 @@ from typing import Any
 
 import torch
 
-from crptpro.plugins import load_again, loaded_plugins
+from crptpro.plugins import load_plugin, loaded_plugins
 
 SPAWN = multiprocessing.get_context("spawn")
 """Forked processes would share a GL context."""
 
 
 def can_be_sent(function: Callable[..., Any]) -> bool:
-    """Whether another process can import a function; none can import one of a notebook's cell."""
+    """Whether another process can import a function; it cannot import one of a notebook's cell."""
     main_file = getattr(sys.modules.get("__main__"), "__file__", None)
     try:
         return b"__main__" not in pickle.dumps(function) or bool(main_file and Path(main_file).exists())
@@ -35,7 +35,6 @@ class Inline(Executor):
     """An executor that does the work at once, in the thread that submits it."""
 
     def submit(self, function: Any, /, *arguments: Any, **options: Any) -> Future[Any]:
-        """Call the function; the future holds its result or exception."""
         future: Future[Any] = Future()
         try:
             future.set_result(function(*arguments, **options))
@@ -55,7 +54,7 @@ class WorkerPool(ProcessPoolExecutor):
         self.processes: dict[int, Any] = {}
 
     def submit(self, function: Any, /, *arguments: Any, **options: Any) -> Future[Any]:
-        """Schedule a call; a process that is started for it ignores Ctrl-C from its first moment."""
+        # A process that is started for the call ignores Ctrl-C from its first moment.
         is_main = threading.current_thread() is threading.main_thread()
         before = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
         try:
@@ -66,7 +65,6 @@ class WorkerPool(ProcessPoolExecutor):
                 signal.signal(signal.SIGINT, before)
 
     def end(self) -> None:
-        """End the processes, whatever they do."""
         for process in self.processes.values():
             process.terminate()
         for process in self.processes.values():
@@ -82,12 +80,12 @@ def _begin(plugins: tuple[str, ...], prepare: Callable[..., None], arguments: tu
     os.environ.setdefault("LP_NUM_THREADS", "1")
     torch.set_num_threads(1)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
-    load_again(plugins)
+    for name in plugins:
+        load_plugin(name)
     prepare(*arguments)
 
 
 def _exit_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        wait([parent.sentinel])
-        os._exit(1)
+    parent: Any = multiprocessing.parent_process()
+    wait([parent.sentinel])
+    os._exit(1)

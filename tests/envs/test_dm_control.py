@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import torch
 from fake_worlds import FakeDmEnv
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import CatFrames, DMControlWrapper, EnvBase, check_env_specs
 
 from crptpro.domains import PAPER_DOMAINS, SUITE_TASKS, Domain, get_domain
 from crptpro.envs import make_env
-from crptpro.envs.dm_control import AgentSteps, load_dm_env, reverse_background
+from crptpro.envs.dm_control import DMControlPixelEnv, load_dm_env, reverse_background
 from crptpro.envs.rendering import select_backend
 from crptpro.errors import CRPTproError, UnknownNameError
 
@@ -209,18 +209,22 @@ def test_every_task_of_the_suite_is_known_to_dm_control_also_under_another_domai
         load_dm_env(Domain("own", "acrobot_dance", source="suite"))
 
 
-def steps_of(env: FakeDmEnv, action_repeat: int = 1) -> AgentSteps:
-    steps = AgentSteps(env, world="fake", image_size=8, action_repeat=action_repeat, render=False)
-    steps.reset()
-    return steps
+def env_of(fake: FakeDmEnv, action_repeat: int = 1) -> DMControlPixelEnv:
+    env = DMControlPixelEnv(fake, world="fake", image_size=8, action_repeat=action_repeat, render=False)
+    env.reset()
+    return env
+
+
+def step(env: EnvBase, *action: float) -> TensorDictBase:
+    return env.step(TensorDict({"action": torch.tensor(action)}))["next"]
 
 
 def test_rewards_of_repeated_env_steps_are_summed_up_to_the_episodes_end() -> None:
-    env = FakeDmEnv(length=5)
-    steps = steps_of(env, action_repeat=3)
-    first, last = (steps.step(np.zeros(2, np.float32)) for _ in range(2))
-    assert (first.reward, first.last()) == (1.0 + 2.0 + 3.0, False)
-    assert (last.reward, last.last(), env.env_steps) == (4.0 + 5.0, True, 5)
+    fake = FakeDmEnv(length=5)
+    env = env_of(fake, action_repeat=3)
+    first, last = step(env, 0.0, 0.0), step(env, 0.0, 0.0)
+    assert (first["reward"].item(), first["done"].item()) == (1.0 + 2.0 + 3.0, False)
+    assert (last["reward"].item(), last["done"].item(), fake.env_steps) == (4.0 + 5.0, True, 5)
 
 
 @pytest.mark.parametrize(
@@ -232,23 +236,23 @@ def test_rewards_of_repeated_env_steps_are_summed_up_to_the_episodes_end() -> No
     ],
 )
 def test_actions_are_mapped_to_the_actuators_ranges(bounds: Any, commands: list) -> None:
-    env = FakeDmEnv(bounds=bounds)
-    steps = steps_of(env)
-    for action in ([-1, -1], [1, 1], [0, 0.5]):
-        steps.step(np.array(action, np.float32))
-    np.testing.assert_allclose(env.actions, commands, atol=1e-12)
+    fake = FakeDmEnv(bounds=bounds)
+    env = env_of(fake)
+    for action in ((-1.0, -1.0), (1.0, 1.0), (0.0, 0.5)):
+        step(env, *action)
+    np.testing.assert_allclose(fake.actions, commands, atol=1e-12)
 
 
 def test_bounds_on_one_side_only_are_refused() -> None:
     with pytest.raises(CRPTproError, match="one side only"):
-        steps_of(FakeDmEnv(bounds=([-1.0, 0.0], [np.inf, 4.0])))
+        env_of(FakeDmEnv(bounds=([-1.0, 0.0], [np.inf, 4.0])))
 
 
 def test_seeding_reaches_the_generator_of_either_kind_of_environment() -> None:
     suite_like, composer_like = FakeDmEnv(), FakeDmEnv()
     composer_like.random_state = np.random.RandomState(0)  # type: ignore[attr-defined]
-    steps_of(suite_like).seed(3)
-    steps_of(composer_like).seed(3)
+    env_of(suite_like).set_seed(3)
+    env_of(composer_like).set_seed(3)
     expected = np.random.RandomState(3).rand()
     assert suite_like.task.random.rand() == composer_like.random_state.rand() == expected  # type: ignore[attr-defined]
 

@@ -13,7 +13,7 @@ from torchrl.envs import GymWrapper, check_env_specs
 
 from crptpro.domains import Domain
 from crptpro.envs import factory, make_env, needs_gl
-from crptpro.envs.gymnasium_worlds import resize
+from crptpro.envs.worlds import resize
 from crptpro.errors import CRPTproError, RenderingError
 
 

@@ -14,7 +14,7 @@ import pytest
 
 import crptpro.envs
 from crptpro.envs import rendering
-from crptpro.envs.rendering import PROOF_VARIABLE, backend_card, first_frame_watchdog, select_backend
+from crptpro.envs.rendering import PROOF_VARIABLE, TIMEOUT_VARIABLE, backend_card, first_frame_watchdog, select_backend
 from crptpro.errors import RenderingError
 
 LLVMPIPE = {"gl_vendor": "Mesa", "gl_renderer": "llvmpipe", "gl_version": "4.5", "gl_kind": "software", "alive": True}
@@ -120,8 +120,9 @@ def test_a_hung_first_frame_is_ended_and_named_with_its_cause_and_the_alternativ
     os.environ["MUJOCO_GL"] = "egl"
     probe(f"open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(600)")
     start = time.monotonic()
+    os.environ[TIMEOUT_VARIABLE] = "3"
     with pytest.raises(RenderingError) as caught:
-        select_backend(timeout_s=3.0)
+        select_backend()
     assert time.monotonic() - start < 30
     for part in ("did not arrive within 3 s", "several processes hold EGL contexts", "MUJOCO_GL=osmesa"):
         assert part in str(caught.value)
@@ -139,10 +140,12 @@ def test_a_backend_that_hangs_or_fails_gives_way_to_one_that_renders_and_is_not_
     probe: Probe, caplog: pytest.LogCaptureFixture, code: str, said: list[str]
 ) -> None:
     started = probe(f"if b == 'egl': {code}\n{ANSWER}")
+    os.environ[TIMEOUT_VARIABLE] = "4"
     with caplog.at_level(logging.WARNING):
-        assert select_backend(timeout_s=4.0) == "osmesa"
+        assert select_backend() == "osmesa"
     assert all(part in caplog.text for part in said)
-    assert select_backend(timeout_s=10.0, processes=2) == "osmesa"
+    os.environ[TIMEOUT_VARIABLE] = "10"
+    assert select_backend(processes=2) == "osmesa"
     assert started() == ["egl", "osmesa", "osmesa", "osmesa"]
 
 
@@ -150,7 +153,8 @@ def test_several_processes_are_proven_at_the_same_time(probe: Probe, tmp_path: P
     # Each waits until all three have started, so only simultaneous processes can answer.
     record = str(tmp_path / "started")
     started = probe(f"while len(open({record!r}).read().split()) < 3: time.sleep(0.01)\n{ANSWER}")
-    assert select_backend(processes=3, timeout_s=20) == "egl"
+    os.environ[TIMEOUT_VARIABLE] = "20"
+    assert select_backend(processes=3) == "egl"
     assert select_backend(processes=2) == "egl"
     assert len(started()) == 3
 
@@ -181,10 +185,11 @@ def test_the_watchdog_names_a_slow_first_frame_and_is_silent_about_a_quick_one(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     with caplog.at_level(logging.ERROR):
-        with first_frame_watchdog(timeout_s=30):
+        with first_frame_watchdog():
             pass
         assert not caplog.records
-        with first_frame_watchdog(timeout_s=0.05):
+        os.environ[TIMEOUT_VARIABLE] = "0.05"
+        with first_frame_watchdog():
             time.sleep(0.3)
     assert "first frame" in caplog.text
     assert "MUJOCO_GL=osmesa" in caplog.text

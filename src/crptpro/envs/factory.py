@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import functools
 import inspect
 import logging
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -17,7 +16,7 @@ from crptpro.domains import GYMNASIUM_PREFIX, LONGEST_EPISODE_AGENT_STEPS, Domai
 from crptpro.envs.rendering import backend_card, select_backend
 from crptpro.envs.worlds import CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError
-from crptpro.values import COLORS, MAX_SEED, QUALITIES, Colors, Quality, as_int
+from crptpro.values import MAX_SEED, Colors, Quality, as_int
 
 logger = logging.getLogger(__name__)
 
@@ -40,11 +39,11 @@ def make_env(
     It is TorchRL's ``DMControlWrapper`` or ``GymWrapper``, or what your ``make`` returns, with ``CatFrames`` and the
     checks of :class:`~crptpro.envs.worlds.CheckedWorld`.
 
-    Output keys: ``pixels`` uint8 ``[3 * frame_stack, H, W]``, oldest to newest (a reset repeats its first
-    frame); ``action`` float32 ``[A]`` in [-1, 1]; ``("next", "reward")`` float32 ``[1]``, summed over the
-    repeated env steps; ``done``, ``terminated``, ``truncated`` (by the time limit, or without one after 1000 agent
-    steps). ``env.set_seed(s)`` seeds the next ``reset`` without resetting. ``env.card()`` returns the settings that
-    determine the pixels (only the task for your own environments).
+    Keys: ``pixels`` uint8 ``[3 * frame_stack, H, W]``, oldest to newest (a reset repeats its first frame); ``action``
+    float32 ``[A]`` in [-1, 1]; ``("next", "reward")`` float32 ``[1]``, summed over the repeated env steps; ``done``,
+    ``terminated``, ``truncated`` (by the time limit, or without one after 1000 agent steps). ``env.set_seed(s)`` seeds
+    the next ``reset`` without resetting. ``env.card()`` returns the settings that determine the pixels (only the task
+    for your own environments).
 
     Args:
         task: a name that :func:`crptpro.domains.get_domain` knows, or a :class:`~crptpro.domains.Domain`.
@@ -58,8 +57,8 @@ def make_env(
         colors: ``"reversed_background"`` reverses the order of the RGB values of skybox and floor, the paper's unseen
             colours (dm_control only); ``"reversed_image"`` that of whole images.
         physics_state: also emit ``qpos`` and ``qvel``, float64, of a MuJoCo environment.
-        render: ``False`` leaves every image black, for policies that ignore images: ten times faster, with the same
-            rewards. It does not affect your own environments.
+        render: ``False`` leaves images black, for policies that ignore them: ten times faster, with the same rewards.
+            Your own environments ignore it.
 
     Raises:
         ValueError: a number is invalid or out of range.
@@ -75,11 +74,12 @@ def make_env(
         "image_size": as_int(image_size, "image_size", minimum=1), "camera": camera, "quality": quality,
         "action_repeat": resolve_action_repeat(domain, action_repeat),
     }  # fmt: skip
-    is_dm_control = domain.source in ("suite", "manipulation")
-    for name, value, allowed in (("quality", quality, QUALITIES), ("colors", colors, COLORS)):
+    for name, value, allowed in (("quality", quality, get_args(Quality)), ("colors", colors, get_args(Colors))):
         if value not in allowed:
             raise CRPTproError(f"{name} must be {' or '.join(map(repr, allowed))}, got {value!r}.")
-    if colors == "reversed_background" and not is_dm_control:
+    is_dm_control = domain.source in ("suite", "manipulation")
+    reverses_background = colors == "reversed_background"
+    if reverses_background and not is_dm_control:
         raise CRPTproError(
             f"The background of {domain.name!r} is not known: only dm_control's environments can have it reversed. "
             "colors='reversed_image' reverses the colours of whole images in any environment."
@@ -94,10 +94,8 @@ def make_env(
         world = _own(domain, seed=seed, **settings)
         card = {"task": domain.task}
     elif is_dm_control:
-        # Imported late: dm_control keeps the GL backend that it is imported with.
-        from crptpro.envs.dm_control import make_dm_control
+        from crptpro.envs.dm_control import make_dm_control  # late: dm_control keeps the GL backend of its import
 
-        reverses_background = colors == "reversed_background"
         world = make_dm_control(domain, render=render, reverses_background=reverses_background, **settings)
     else:
         from crptpro.envs.gymnasium_worlds import make_gymnasium
@@ -107,8 +105,7 @@ def make_env(
     world.watch(card, agent_step_limit=limit, checks_frames=render or domain.source == "own")
     transforms: list[Transform] = []
     if colors == "reversed_image":
-        # Imported late: the package of transforms imports the networks.
-        from crptpro.transforms.color_swap import ColorSwap
+        from crptpro.transforms.color_swap import ColorSwap  # late: its package imports the networks
 
         transforms.append(ColorSwap(in_keys=["pixels"]))
     if frame_stack > 1:
@@ -121,8 +118,7 @@ def make_env(
 def resolve_action_repeat(task: str | Domain, action_repeat: int | None = None) -> int:
     """Return the env steps of one agent step: ``action_repeat``, or the domain's if None.
 
-    If ``make`` of your own environment does not take it, it is 1, or what a ``partial`` binds, and another value is
-    warned about.
+    If your own ``make`` does not take it, it is 1, or what a ``partial`` binds; another value is warned about.
     """
     if action_repeat is not None:
         action_repeat = as_int(action_repeat, "action_repeat", minimum=1)
@@ -130,7 +126,7 @@ def resolve_action_repeat(task: str | Domain, action_repeat: int | None = None) 
     make = domain.make if domain.source == "own" else None
     if make is None or _named_by(make, {"action_repeat": None}):
         return action_repeat or domain.action_repeat
-    fixed = as_int(_bound(make).get("action_repeat", 1), "action_repeat", minimum=1)
+    fixed = as_int(getattr(make, "keywords", {}).get("action_repeat", 1), "action_repeat", minimum=1)
     if action_repeat not in (None, fixed):
         logger.warning(
             "The make of domain %r takes no action_repeat: a decision is %d env step(s), not %d.",
@@ -153,7 +149,7 @@ def needs_gl(task: str | Domain) -> bool:
         return domain.source != "own"
     import gymnasium
 
-    made_by = str(gymnasium.spec(domain.task[len(GYMNASIUM_PREFIX) :]).entry_point).lower()
+    made_by = str(gymnasium.spec(domain.task.removeprefix(GYMNASIUM_PREFIX)).entry_point).lower()
     return any(name in made_by for name in ("mujoco", "dm_control", "gymnasium_robotics"))
 
 
@@ -177,7 +173,6 @@ class FrameTransform(Transform):
         return observation_spec
 
     def transform_done_spec(self, done_spec: Composite) -> Composite:
-        """Add ``truncated``, a copy of ``done``."""
         done_spec = done_spec.clone()
         if "truncated" not in done_spec.keys():  # noqa: SIM118
             done_spec["truncated"] = done_spec["done"].clone()
@@ -206,12 +201,14 @@ def _own(domain: Domain, **settings: Any) -> EnvBase:
         env = make(**named)
     if broken := _broken_contract(env, settings["image_size"]):
         raise CRPTproError(f"The environment of domain {domain.name!r} {broken} (see crptpro.domains.Domain).")
-    state = ("qpos", "qvel") if settings["physics_state"] else ()
-    present = set(env.observation_spec.keys(True, True))
-    kept = [key for key in ("pixels", *state, *_read_back(env)) if key in present]
-    transforms: list[Transform] = [FrameTransform(domain.task, settings["image_size"])]
-    if present - set(kept):
-        transforms.insert(0, SelectTransform(*kept))
+    base = env
+    while isinstance(base, TransformedEnv):
+        base = base.base_env
+    # What the next step reads stays: states, and entries of transforms such as StepCounter.
+    wanted = {"pixels", *(("qpos", "qvel") if settings["physics_state"] else ()), *env.full_state_spec.keys(True, True)}
+    dropped = set(base.observation_spec.keys(True, True)) - wanted
+    kept = [key for key in env.observation_spec.keys(True, True) if key not in dropped]
+    transforms: list[Transform] = [SelectTransform(*kept), FrameTransform(domain.task, settings["image_size"])]
     rewards = ["reward"] if env.reward_spec.dtype == torch.float64 else []
     actions = ["action"] if env.action_spec.dtype == torch.float64 else []
     if rewards or actions:
@@ -219,26 +216,12 @@ def _own(domain: Domain, **settings: Any) -> EnvBase:
     return OwnEnv(env, Compose(*transforms), auto_unwrap=False)
 
 
-def _read_back(env: EnvBase) -> list[Any]:
-    """Return the entries that the next step reads: those of transforms such as ``StepCounter``, and states."""
-    base = env
-    while isinstance(base, TransformedEnv):
-        base = base.base_env
-    own = set(base.observation_spec.keys(True, True))
-    added = [key for key in env.observation_spec.keys(True, True) if key not in own]
-    return [*added, *env.full_state_spec.keys(True, True)]
-
-
-def _bound(make: Any) -> dict[str, Any]:
-    return make.keywords if isinstance(make, functools.partial) else {}
-
-
 def _named_by(make: Any, settings: dict[str, Any]) -> dict[str, Any]:
     """Return the settings that ``make`` names and that no ``partial`` has bound."""
     # TorchRL's metaclass hides the signature of an environment's constructor.
     parameters = inspect.signature(make.__init__ if inspect.isclass(make) else make).parameters
     takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
-    wanted = {name for name in settings if takes_all or name in parameters} - set(_bound(make))
+    wanted = {name for name in settings if takes_all or name in parameters} - set(getattr(make, "keywords", ()))
     return {name: value for name, value in settings.items() if name in wanted}
 
 

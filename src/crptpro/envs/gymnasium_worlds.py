@@ -1,112 +1,85 @@
-"""Gymnasium environments that render RGB: TorchRL's ``GymWrapper`` around one step per agent step."""
+"""Gymnasium environments that render RGB: TorchRL's ``GymWrapper``."""
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from typing import Any
 
 import gymnasium
 import numpy as np
-import torch
-import torch.nn.functional as F
 from gymnasium import spaces
-from torch import Tensor
+from tensordict import TensorDictBase
 from torchrl.envs.libs.gym import GymWrapper
 
 from crptpro.domains import GYMNASIUM_PREFIX
 from crptpro.envs.dm_control import FAST_SHADOW_SIZE, route_mujoco_warnings
-from crptpro.envs.rendering import first_frame_watchdog, render_context
-from crptpro.envs.worlds import ActionRange, CheckedWorld, FrameReader, passed_on
-from crptpro.errors import CRPTproError, RenderingError, WorldError
+from crptpro.envs.rendering import render_context
+from crptpro.envs.worlds import NO_BOUND, SimulatorEnv, passed_on
+from crptpro.errors import CRPTproError, RenderingError, WorldError, WorldFailedError
 from crptpro.values import Quality
 
 
-class AgentSteps(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """A Gymnasium environment in agent steps: actions repeated and scaled, rewards summed, one frame rendered.
+class GymnasiumPixelEnv(SimulatorEnv, GymWrapper):
+    """TorchRL's ``GymWrapper``; ``set_seed`` takes effect at the next reset, because Gymnasium seeds only there.
 
-    Gymnasium's wrappers need OpenCV (``ResizeObservation``) or render every env step (``AddRenderObservation``), and
-    none repeats actions. The settings are those of :func:`crptpro.envs.make_env`; ``world`` is the name in messages.
+    Gymnasium's wrappers need OpenCV (``ResizeObservation``) or render every env step (``AddRenderObservation``).
     """
 
-    def __init__(self, env: Any, *, world: str, image_size: int, action_repeat: int, physics_state: bool, render: bool):
-        super().__init__(env)
-        self.episode_seed: int | None = None
-        self._world, self._image_size, self._action_repeat = world, image_size, action_repeat
-        self._renders, self._has_drawn = render, False
-        self._read_frame = FrameReader(world)
-        action = env.action_space
-        if not isinstance(action, spaces.Box):
+    _episode_seed: int | None = None
+    _has_drawn = False
+
+    def __init__(self, env: Any, *, world: str, **settings: Any):
+        space = env.action_space
+        if not isinstance(space, spaces.Box):
             raise CRPTproError(
-                f"{world} has {type(action).__name__} actions. Only continuous actions (a Box) are supported; wrap it, "
+                f"{world} has {type(space).__name__} actions. Only continuous actions (a Box) are supported; wrap it, "
                 "and register it with register_domain."
             )
-        self._to_actuators = ActionRange(action.low, action.high, action.dtype, world)
-        if self._to_actuators.unbounded:
+        if (np.minimum(np.abs(space.low), np.abs(space.high)) >= NO_BOUND).any():
             raise CRPTproError(
-                f"{world} has actions without bounds ({action}), which cannot be mapped from [-1, 1]; wrap it with "
+                f"{world} has actions without bounds ({space}), which cannot be mapped from [-1, 1]; wrap it with "
                 "gymnasium.wrappers.RescaleAction or ClipAction, and register it with register_domain."
             )
-        self.action_space = spaces.Box(-1.0, 1.0, (int(np.prod(action.shape)),), np.float32)
-        self._data: Any = getattr(env.unwrapped, "data", None)
-        self._state_names = [name for name in ("qpos", "qvel") if physics_state and hasattr(self._data, name)]
-        observed: dict[str, spaces.Space[Any]] = {"pixels": spaces.Box(0, 255, (3, image_size, image_size), np.uint8)}
-        for name in self._state_names:
-            observed[name] = spaces.Box(-np.inf, np.inf, getattr(self._data, name).shape, np.float64)
-        self.observation_space = spaces.Dict(observed)
-
-    def reset(self, **_: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode, with ``episode_seed`` if one was set."""
-        self.env.reset(seed=self.episode_seed)
-        self.episode_seed = None
-        return self._observe(), {}
-
-    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Repeat an action in [-1, 1]; the reward is the sum."""
-        command = self._to_actuators(action)
-        total = 0.0
-        for _ in range(self._action_repeat):
-            try:
-                _, reward, terminated, truncated, _ = self.env.step(command)
-            except ValueError as reason:
-                if "expected 5" not in str(reason):
-                    raise
-                raise WorldError(
-                    f"step() of the environment {self._world!r} does not return Gymnasium's five values (observation, "
-                    f"reward, terminated, truncated, info): {reason}. The old API ends with `done, info`."
-                ) from reason
-            total += float(reward)
-            if terminated or truncated:
-                break
-        # A time limit that coincides with a real end is a real end.
-        return self._observe(), total, bool(terminated), bool(truncated and not terminated), {}
-
-    def _observe(self) -> dict[str, Any]:
-        state = {name: torch.tensor(getattr(self._data, name)) for name in self._state_names}
-        return {"pixels": self._draw(), **state}
-
-    def _draw(self) -> Tensor:
-        if not self._renders:
-            return torch.zeros(3, self._image_size, self._image_size, dtype=torch.uint8)
-        viewer = getattr(getattr(self.env.unwrapped, "mujoco_renderer", None), "viewer", None)
-        with (
-            passed_on(self._world, "render"),
-            nullcontext() if self._has_drawn else first_frame_watchdog(),
-            render_context(getattr(viewer, "make_context_current", None)),
-        ):
-            try:
-                image = self.env.render()
-            except (ImportError, gymnasium.error.Error) as reason:
-                raise RenderingError(f"{self._world} does not render: {reason}") from reason
-        self._has_drawn = True
-        return resize(self._read_frame(image), self._image_size)
-
-
-class GymnasiumPixelEnv(CheckedWorld, GymWrapper):
-    """TorchRL's ``GymWrapper``; ``set_seed`` takes effect at the next reset, because Gymnasium seeds only there."""
+        super().__init__(env, world=world, low=space.low, high=space.high, dtype=space.dtype, **settings)
 
     def _set_seed(self, seed: int | None) -> None:
-        if seed is not None:
-            self._env.episode_seed = seed
+        self._episode_seed = seed
+
+    def _simulation(self) -> Any:
+        return getattr(self._env.unwrapped, "data", None)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        seed, self._episode_seed = self._episode_seed, None
+        return super()._reset(tensordict, seed=seed)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        try:
+            return super()._step(tensordict)
+        except WorldFailedError as reason:
+            if "expected 5" not in str(reason):
+                raise
+            raise WorldError(
+                f"step() of the environment {self.world!r} does not return Gymnasium's five values (observation, "
+                f"reward, terminated, truncated, info): {reason.__cause__}. The old API ends with `done, info`."
+            ) from reason
+
+    def _reset_output_transform(self, reset_data: Any) -> tuple[Any, dict[str, Any]]:
+        return reset_data, {}
+
+    def _output_transform(self, step_outputs_tuple: Any) -> tuple[Any, ...]:
+        observation, reward, terminated, truncated, _ = step_outputs_tuple
+        # A time limit that coincides with a real end is a real end.
+        ends = bool(terminated), bool(truncated and not terminated), bool(terminated or truncated)
+        return (observation, float(reward), *ends, {})
+
+    def _render(self) -> Any:
+        viewer = getattr(getattr(self._env.unwrapped, "mujoco_renderer", None), "viewer", None)
+        with render_context(getattr(viewer, "make_context_current", None), is_first=not self._has_drawn):
+            try:
+                image = self._env.render()
+            except (ImportError, gymnasium.error.Error) as reason:
+                raise RenderingError(f"{self.world} does not render: {reason}") from reason
+        self._has_drawn = True
+        return image
 
 
 def make_gymnasium(
@@ -116,7 +89,7 @@ def make_gymnasium(
 
     Gymnasium's MuJoCo environments render at twice ``image_size``, others at their own size; images are resized.
     """
-    env_id = task[len(GYMNASIUM_PREFIX) :]
+    env_id = task.removeprefix(GYMNASIUM_PREFIX)
     options: dict[str, Any] = {}
     if camera is not None:
         options["camera_name" if isinstance(camera, str) else "camera_id"] = camera
@@ -141,15 +114,7 @@ def make_gymnasium(
     _fix_free_camera(env)
     if quality == "fast" and hasattr(model, "vis"):
         model.vis.quality.shadowsize = min(FAST_SHADOW_SIZE["suite"], model.vis.quality.shadowsize)
-    return GymnasiumPixelEnv(env=AgentSteps(env, world=task, image_size=image_size, **settings))
-
-
-def resize(frame: Tensor, size: int) -> Tensor:
-    """Resize a uint8 frame ``[3, H, W]`` to ``[3, size, size]``, bilinear and antialiased, without cropping."""
-    if frame.shape[1:] == (size, size):
-        return frame
-    small = F.interpolate(frame[None].float(), (size, size), mode="bilinear", antialias=True, align_corners=False)
-    return small[0].round_().clamp_(0, 255).to(torch.uint8)
+    return GymnasiumPixelEnv(env, world=task, image_size=image_size, **settings)
 
 
 def _fix_free_camera(env: Any) -> None:

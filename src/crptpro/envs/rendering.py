@@ -16,7 +16,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
 
 from crptpro.errors import RenderingError
@@ -89,18 +88,19 @@ def canonical_backend(text: str) -> str:
     return backend
 
 
-def select_backend(timeout_s: float | None = None, *, processes: int = 1) -> str:
+def select_backend(*, processes: int = 1) -> str:
     """Choose the GL backend, test that it renders, and set ``MUJOCO_GL``; call it before importing dm_control.
 
     A ``MUJOCO_GL`` of the user is tested and kept. Otherwise EGL, OSMesa and (with a display) GLFW are tried in this
     order. The test is a frame with content from each of ``processes`` simultaneous processes (parallel collection needs
-    several) within ``timeout_s``, by default 60 or ``CRPTPRO_GL_TIMEOUT_S``. It counts for this process and its
-    children, on this machine and for one ``MUJOCO_EGL_DEVICE_ID``. With software GL, ``LP_NUM_THREADS=1`` is set unless
-    the user has set it: more threads cost a third more CPU time per frame and save hardly any time. If no backend
-    renders, a ``RenderingError`` names cause and remedy for each.
+    several), by default within 60 s. It counts for this process and its children, on this machine and for one
+    ``MUJOCO_EGL_DEVICE_ID``. With software GL, ``LP_NUM_THREADS=1`` is set unless the user has set it: more threads
+    cost a third more CPU time per frame and save hardly any time. If no backend renders, a ``RenderingError`` names
+    cause and remedy for each.
     """
-    timeout_s = default_timeout_s() if timeout_s is None else timeout_s
-    proof, requested, imported = _proof(), _requested_backend(), _imported_backend()
+    timeout_s = first_frame_timeout_s()
+    proof = _proof()
+    requested, imported = _requested_backend(proof), _imported_backend()
     if imported is not None and requested not in (None, imported):
         raise RenderingError(
             f"dm_control was already imported with the backend {imported!r}, so {requested!r} cannot be used in this "
@@ -108,7 +108,8 @@ def select_backend(timeout_s: float | None = None, *, processes: int = 1) -> str
         )
     only = requested or imported
     candidates = (only,) if only else _platform_candidates()
-    if proof.get("backend") in candidates:
+    place = {"host": socket.gethostname(), "egl_device": os.environ.get("MUJOCO_EGL_DEVICE_ID")}
+    if proof.get("backend") in candidates and proof.items() >= place.items():
         if proof["processes"] >= processes:
             os.environ["MUJOCO_GL"] = proof["backend"]
             return proof["backend"]
@@ -116,7 +117,7 @@ def select_backend(timeout_s: float | None = None, *, processes: int = 1) -> str
     failures: list[str] = []
     for backend in candidates:
         try:
-            gl = _prove(backend, timeout_s=timeout_s, processes=processes)
+            gl = _prove(backend, timeout_s, processes)
         except RenderingError as reason:
             failures.append(str(reason))
             continue
@@ -126,7 +127,7 @@ def select_backend(timeout_s: float | None = None, *, processes: int = 1) -> str
         if gl["gl_kind"] == "software":
             os.environ.setdefault("LP_NUM_THREADS", "1")
         gl |= {"backend": backend, "processes": processes, "chosen_by": "user" if requested else "crptpro"}
-        os.environ[PROOF_VARIABLE] = json.dumps(gl | _place())
+        os.environ[PROOF_VARIABLE] = json.dumps(gl | place)
         logger.info("GL backend %s: %s", backend, gl["gl_renderer"])
         return backend
     what = "No GL backend renders a frame."
@@ -146,13 +147,13 @@ def backend_card() -> dict[str, Any]:
     return {key: _proof().get(key, "unknown") for key in keys}
 
 
-@contextmanager
-def first_frame_watchdog(timeout_s: float | None = None) -> Iterator[None]:
+@contextlib.contextmanager
+def first_frame_watchdog() -> Iterator[None]:
     """Log an error with the likely cause if the body, which renders a first frame, does not return in time.
 
     Python cannot interrupt a call that hangs in the driver: the process stays, and its parent should end it.
     """
-    timeout_s = default_timeout_s() if timeout_s is None else timeout_s
+    timeout_s = first_frame_timeout_s()
     message = f"Process {os.getpid()} has waited {timeout_s:g} s for its first frame. {HANG}"
     timer = threading.Timer(timeout_s, logger.error, args=(message,))
     timer.daemon = True
@@ -163,20 +164,21 @@ def first_frame_watchdog(timeout_s: float | None = None) -> Iterator[None]:
         timer.cancel()
 
 
-@contextmanager
-def render_context(make_current: Callable[[], Any] | None) -> Iterator[None]:
+@contextlib.contextmanager
+def render_context(make_current: Callable[[], Any] | None, *, is_first: bool = False) -> Iterator[None]:
     """Make a render context current in the body and none after it, because the contexts of a thread interfere.
 
     Freeing an environment frees its textures in whichever context is current, and then detaches that from the thread:
     later frames of another environment would be black. The garbage collector, which may free one at any moment, is off
-    in the body. ``make_current`` is ``None`` before the context exists.
+    in the body. ``make_current`` is ``None`` before the context exists. The watchdog runs if the body ``is_first``.
     """
     collects = gc.isenabled()
     gc.disable()
     try:
-        if make_current is not None:
-            make_current()
-        yield
+        with first_frame_watchdog() if is_first else contextlib.nullcontext():
+            if make_current is not None:
+                make_current()
+            yield
     finally:
         _leave_none_current()
         if collects:
@@ -193,8 +195,8 @@ def _leave_none_current() -> None:
         osmesa.OSMesaMakeCurrent(None, None, 0x1406, 0, 0)  # GL_FLOAT
 
 
-def default_timeout_s() -> float:
-    """Return the time limit of a first frame in seconds."""
+def first_frame_timeout_s() -> float:
+    """Return ``CRPTPRO_GL_TIMEOUT_S``, by default 60."""
     text = os.environ.get(TIMEOUT_VARIABLE, "60")
     try:
         return float(text)
@@ -217,20 +219,19 @@ def run_isolated(
     with contextlib.ExitStack() as stack:
         jobs = []
         for command in commands:
-            out, err = (stack.enter_context(tempfile.TemporaryFile()) for _ in range(2))
+            out, err = (stack.enter_context(tempfile.TemporaryFile("w+", errors="replace")) for _ in range(2))
             process = subprocess.Popen(
                 command, env=environment, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True
             )
             stack.callback(_kill, process)
             jobs.append((process, out, err))
         deadline = time.monotonic() + timeout_s
-        for process, *files in jobs:
+        for process, out, err in jobs:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(max(0.0, deadline - time.monotonic()))
-            for file in files:
-                file.seek(0)
-            output, errors = (file.read().decode(errors="replace") for file in files)
-            results.append((process.returncode, output, errors))
+            out.seek(0)
+            err.seek(0)
+            results.append((process.returncode, out.read(), err.read()))
     return results
 
 
@@ -242,7 +243,7 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
             process.wait(2.0)
 
 
-def _prove(backend: str, *, timeout_s: float, processes: int) -> dict[str, Any]:
+def _prove(backend: str, timeout_s: float, processes: int) -> dict[str, Any]:
     """Render in ``processes`` simultaneous processes, and return the answer of the last probe."""
     gl: dict[str, Any] = {}
     for status, stdout, stderr in run_isolated([PROBE_COMMAND] * processes, backend, timeout_s=timeout_s):
@@ -274,9 +275,9 @@ def _platform_candidates() -> tuple[str, ...]:
     return BACKENDS if has_display else ("egl", "osmesa")
 
 
-def _requested_backend() -> str | None:
+def _requested_backend(proof: dict[str, Any]) -> str | None:
     """Return the backend of a MUJOCO_GL that the user set, and not an earlier call, perhaps on another machine."""
-    text, proof = os.environ.get("MUJOCO_GL"), _proof(anywhere=True)
+    text = os.environ.get("MUJOCO_GL")
     if text is None or (proof.get("chosen_by") == "crptpro" and text == proof["backend"]):
         return None
     backend = canonical_backend(text)
@@ -290,11 +291,6 @@ def _imported_backend() -> str | None:
     return name if name in BACKENDS else None
 
 
-def _proof(*, anywhere: bool = False) -> dict[str, Any]:
-    """Return the passed test; an empty one if it was passed elsewhere, unless ``anywhere``."""
-    proof: dict[str, Any] = json.loads(os.environ.get(PROOF_VARIABLE) or "{}")
-    return proof if anywhere or proof.items() >= _place().items() else {}
-
-
-def _place() -> dict[str, Any]:
-    return {"host": socket.gethostname(), "egl_device": os.environ.get("MUJOCO_EGL_DEVICE_ID")}
+def _proof() -> dict[str, Any]:
+    """Return the passed test, perhaps one of another machine."""
+    return json.loads(os.environ.get(PROOF_VARIABLE) or "{}")

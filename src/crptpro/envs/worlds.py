@@ -6,15 +6,18 @@ import atexit
 import logging
 import traceback
 import weakref
+from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any, cast
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase, GymLikeEnv
 
 from crptpro.errors import CRPTproError, NonFiniteError, WorldError, WorldFailedError
 
@@ -32,20 +35,17 @@ class CheckedWorld:
     """Mixin of the class that steps an environment.
 
     - An exception of the environment's code is raised as :class:`~crptpro.errors.WorldFailedError`.
-    - An action, a reward or a physical state that is not finite raises :class:`~crptpro.errors.NonFiniteError` with
-      the episode and the agent step.
+    - An action, reward or physical state that is not finite raises :class:`~crptpro.errors.NonFiniteError`.
     - An episode of identical frames is reported by one warning per environment.
-    - After ``agent_step_limit`` agent steps an episode is truncated. (TorchRL's ``StepCounter`` would add
-      ``step_count`` to every observation.)
+    - After ``agent_step_limit`` agent steps an episode is truncated. (``StepCounter`` would add ``step_count``.)
     - The environment is closed at the interpreter's exit: a render context that is freed later prints errors.
     """
 
-    world: str = ""
     agent_step_limit: int | None = None
     checks_frames = True
     _episode = -1
     _agent_step = 0
-    _first_frame: Tensor | None = None
+    _first_frame: Any = None
     _is_still = False
     _was_closed = False
 
@@ -56,7 +56,6 @@ class CheckedWorld:
         _open.add(cast(EnvBase, self))
 
     def card(self) -> dict[str, Any]:
-        """Return the settings that determine the pixels: task, camera, GL backend, quality, colours, action repeat."""
         return dict(self._card)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
@@ -79,7 +78,7 @@ class CheckedWorld:
         if self._agent_step == self.agent_step_limit:
             for flag in ("truncated", "done"):
                 found.set(flag, torch.ones_like(found.get(flag)))
-        self._is_still = self._is_still and torch.equal(found.get("pixels"), cast(Tensor, self._first_frame))
+        self._is_still = self._is_still and torch.equal(found.get("pixels"), self._first_frame)
         if self._is_still and found.get("done").any():
             self._report_still_frames()
         return found
@@ -90,15 +89,15 @@ class CheckedWorld:
             if value is not None and not value.isfinite().all():
                 raise NonFiniteError(
                     f"The environment {self.world!r} {verb} {key} {value.tolist()} in agent step {self._agent_step} of "
-                    f"episode {self._episode} (this environment's first is 0). Nothing of this step is stored; fix "
-                    "what computes it, or keep the actions where the environment is stable."
+                    f"episode {self._episode} (its first is 0). The step is not stored; fix what computes it, or keep "
+                    "the actions where the environment is stable."
                 )
 
     def _report_still_frames(self) -> None:
         if not self._is_still or self._agent_step < 2:
             return
         self.checks_frames = self._is_still = False
-        shade = cast(Tensor, self._first_frame).unique()
+        shade = self._first_frame.unique()
         what = f" ({'black' if not shade.any() else 'of one shade'})" if shade.numel() == 1 else ""
         logger.warning(
             "All frames of a whole episode of the environment %r are identical%s, over %d agent steps. Look at what it "
@@ -106,12 +105,7 @@ class CheckedWorld:
             self.world, what, self._agent_step,
         )  # fmt: skip
 
-    def read_obs(self, observations: dict[str, Any]) -> dict[str, Any]:
-        """Return the observations; TorchRL's method would compare every byte with the spec's bounds."""
-        return dict(observations)
-
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Free the environment and its render context; a second call does nothing."""
         _open.discard(cast(EnvBase, self))
         if not self._was_closed:
             self._was_closed = True
@@ -143,6 +137,78 @@ def passed_on(world: str, call: str) -> Iterator[None]:
         ) from reason
 
 
+class SimulatorEnv(CheckedWorld, GymLikeEnv):
+    """Mixin of TorchRL's wrappers of simulators: scales the action, and draws one frame per agent step.
+
+    TorchRL's ``from_pixels`` draws every env step of a repeated action. A subclass writes ``_render``, which returns an
+    image, and ``_simulation``, which may have ``qpos`` and ``qvel``. The settings are those of
+    :func:`crptpro.envs.make_env`; ``world`` is the name in messages, ``low`` to ``high`` its actions.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        *,
+        world: str,
+        low: np.ndarray,
+        high: np.ndarray,
+        dtype: Any,
+        image_size: int,
+        action_repeat: int,
+        render: bool = True,
+        physics_state: bool = False,
+        **options: Any,
+    ):
+        self.world, self._image_size, self._renders, self._has_state = world, image_size, render, physics_state
+        self._low, self._half = action_range(low, high, dtype, world)
+        self._action_dtype = dtype
+        self._read_frame = FrameReader(world)
+        super().__init__(env=env, frame_skip=action_repeat, **options)
+
+    def _make_specs(self, env: Any) -> None:
+        shape = (3, self._image_size, self._image_size)
+        state = {name: Unbounded(value.shape, dtype=value.dtype) for name, value in self._read_state().items()}
+        self.observation_spec = Composite(pixels=Bounded(0, 255, shape=shape, dtype=torch.uint8), **state)
+        self.action_spec = Bounded(-1.0, 1.0, shape=(self._low.size,), dtype=torch.float32)
+        self.reward_spec = Unbounded((1,))
+        flag = Categorical(2, shape=(1,), dtype=torch.bool)
+        self.done_spec = Composite({name: flag.clone() for name in ("done", "terminated", "truncated")})
+
+    def read_action(self, action: Tensor) -> np.ndarray:
+        centred = action.detach().cpu().double().numpy().reshape(self._low.shape) + 1.0
+        return (self._low + self._half * centred).astype(self._action_dtype, copy=False)
+
+    def read_obs(self, observations: Any) -> dict[str, Any]:
+        return {"pixels": self._draw(), **self._read_state()}
+
+    def _read_state(self) -> dict[str, Tensor]:
+        if not self._has_state:
+            return {}
+        data = self._simulation()
+        return {name: torch.tensor(getattr(data, name)) for name in ("qpos", "qvel") if hasattr(data, name)}
+
+    def _draw(self) -> Tensor:
+        if not self._renders:
+            return torch.zeros(3, self._image_size, self._image_size, dtype=torch.uint8)
+        with passed_on(self.world, "render"):
+            image = self._render()
+        return resize(self._read_frame(image), self._image_size)
+
+    @abstractmethod
+    def _render(self) -> Any: ...
+
+    @abstractmethod
+    def _simulation(self) -> Any: ...
+
+
+def resize(frame: Tensor, size: int) -> Tensor:
+    """Resize a uint8 frame ``[3, H, W]`` to ``[3, size, size]``, bilinear and antialiased, without cropping."""
+    if frame.shape[1:] == (size, size):
+        return frame
+    small = F.interpolate(frame[None].float(), (size, size), mode="bilinear", antialias=True, align_corners=False)
+    return small[0].round_().clamp_(0, 255).to(torch.uint8)
+
+
 class FrameReader:
     """Copies an image to a frame, uint8 ``[3, H, W]``; floats in [0, 1] are multiplied by 255, which is logged once."""
 
@@ -153,12 +219,12 @@ class FrameReader:
     def __call__(self, image: Any) -> Tensor:
         """Return the frame of an array or tensor ``[H, W, 3]`` or ``[3, H, W]``; others are a ``WorldError``."""
         if not isinstance(image, (np.ndarray, Tensor)):
-            raise self._refusal(f"is {type(image).__name__}", "an RGB array [H, W, 3]")
+            raise self._refusal(f"is {type(image).__name__}")
         if image.ndim != 3 or 3 not in (image.shape[0], image.shape[2]):
-            raise self._refusal(f"has shape {tuple(image.shape)}", "an RGB array [H, W, 3]")
+            raise self._refusal(f"has shape {tuple(image.shape)}")
         dtype = str(image.dtype).removeprefix("torch.")
         if dtype not in ("uint8", "float16", "float32", "float64"):
-            raise self._refusal(f"has dtype {dtype}", "uint8, or floats in [0, 1]")
+            raise self._refusal(f"has dtype {dtype}")
         # The copy is for arrays that are read-only or have negative strides.
         pixels = image if isinstance(image, Tensor) else torch.from_numpy(image.copy())
         if pixels.shape[2] == 3:
@@ -167,43 +233,36 @@ class FrameReader:
             return pixels.clone(memory_format=torch.contiguous_format)
         low, high = float(pixels.min()), float(pixels.max())
         if not (low >= 0.0 and high <= 1.0):  # NaN is neither
-            raise self._refusal(f"holds {dtype} from {low:g} to {high:g}", "uint8, or floats in [0, 1]")
+            raise self._refusal(f"holds {dtype} from {low:g} to {high:g}")
         if not self._has_scaled:
             self._has_scaled = True
             logger.warning("Frames of the environment %r are %s in [0, 1], multiplied by 255.", self.world, dtype)
         return (pixels * 255).round().to(torch.uint8).contiguous()
 
-    def _refusal(self, what: str, expected: str) -> WorldError:
+    def _refusal(self, what: str) -> WorldError:
+        expected = "an RGB array [H, W, 3], uint8 or floats in [0, 1]"
         return WorldError(f"The image that the environment {self.world!r} renders {what}; it must be {expected}.")
 
 
-class ActionRange:
-    """The affine map from [-1, 1] to an environment's action bounds; an unbounded action stays as it is.
+def action_range(low: np.ndarray, high: np.ndarray, dtype: Any, world: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower end and half the width of an environment's action bounds; without bounds they are -1 and 1.
 
     Integer or empty actions, and bounds in the wrong order or on one side only, raise ``CRPTproError``.
     """
-
-    def __init__(self, low: np.ndarray, high: np.ndarray, dtype: Any, world: str):
-        low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
-        no_low, no_high = ~(np.abs(low) < NO_BOUND), ~(np.abs(high) < NO_BOUND)
-        self.unbounded = bool(no_low.any())
-        self._low = np.where(no_low, -1.0, low)
-        self._half = (np.where(no_high, 1.0, high) - self._low) / 2.0
-        self._dtype = dtype
-        bounds = f"low {low.tolist()}, high {high.tolist()}"
-        wrong = ""
-        if not np.issubdtype(dtype, np.floating):
-            wrong = f"has actions of {np.dtype(dtype)}; wrap it in one that takes floats and rounds as it should"
-        elif not low.size:
-            wrong = f"has an empty action, shape {low.shape}: nothing to learn"
-        elif (no_low != no_high).any():
-            wrong = f"bounds an action on one side only ({bounds}), so [-1, 1] cannot be mapped to it"
-        elif not (self._half > 0).all():
-            wrong = f"has action bounds that hold nothing: {bounds}"
-        if wrong:
-            raise CRPTproError(f"The environment {world!r} {wrong}.")
-
-    def __call__(self, action: np.ndarray) -> np.ndarray:
-        """Map ``action``, float ``[A]`` in [-1, 1]."""
-        centred = action.astype(np.float64).reshape(self._low.shape) + 1.0
-        return (self._low + self._half * centred).astype(self._dtype, copy=False)
+    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    no_low, no_high = ~(np.abs(low) < NO_BOUND), ~(np.abs(high) < NO_BOUND)
+    start = np.where(no_low, -1.0, low)
+    half = (np.where(no_high, 1.0, high) - start) / 2.0
+    bounds = f"low {low.tolist()}, high {high.tolist()}"
+    wrong = ""
+    if not np.issubdtype(dtype, np.floating):
+        wrong = f"has actions of {np.dtype(dtype)}; wrap it in one that takes floats and rounds as it should"
+    elif not low.size:
+        wrong = f"has an empty action, shape {low.shape}: nothing to learn"
+    elif (no_low != no_high).any():
+        wrong = f"bounds an action on one side only ({bounds}), so [-1, 1] cannot be mapped to it"
+    elif not (half > 0).all():
+        wrong = f"has action bounds that hold nothing: {bounds}"
+    if wrong:
+        raise CRPTproError(f"The environment {world!r} {wrong}.")
+    return start, half
