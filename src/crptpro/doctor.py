@@ -115,9 +115,10 @@ def check_versions(installed: Mapping[Any, str], requirements: Iterable[str]) ->
         if version is None:
             findings.append(Finding("error", f"{name} is not installed.", remedy))
         elif not requirement.specifier.contains(version, prereleases=True):
-            severity, effect = ("error", "known to break") if name in _BREAKING else ("warning", "untested")
+            breaks = name in _BREAKING
+            effect = "known to break" if breaks else "untested"
             what = f"{name} {version} is outside {requirement.specifier}, which is {effect}."
-            findings.append(Finding(severity, what, remedy))
+            findings.append(Finding("error" if breaks else "warning", what, remedy))
     if leftovers := [name for name in _LEFTOVERS if name in installed]:
         what = f"{' and '.join(leftovers)} belong to MuJoCo 4 and break the import of MuJoCo 3."
         remedy = f'pip uninstall -y {" ".join(leftovers)}; pip install --force-reinstall "mujoco>=3.17,<4"'
