@@ -126,6 +126,8 @@ class DMControlPixelEnv(SimulatorEnv, DMControlWrapper):
             self._prepare()  # quadruped_escape makes the render context in its reset
 
     def _set_seed(self, seed: int | None) -> None:
+        if seed is None:
+            return
         generator = getattr(self._env, "random_state", None)
         (self._env.task.random if generator is None else generator).seed(seed)
 

@@ -42,7 +42,8 @@ class GymnasiumPixelEnv(SimulatorEnv, GymWrapper):
         super().__init__(env, world=world, low=space.low, high=space.high, dtype=space.dtype, **settings)
 
     def _set_seed(self, seed: int | None) -> None:
-        self._episode_seed = seed
+        if seed is not None:
+            self._episode_seed = seed
 
     def _simulation(self) -> Any:
         return getattr(self._env.unwrapped, "data", None)
