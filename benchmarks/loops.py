@@ -10,10 +10,13 @@ from __future__ import annotations
 import functools
 import itertools
 import json
+import math
+import statistics
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from timeit import timeit
 from typing import Any
 from unittest import mock
@@ -154,16 +157,25 @@ def opening(hold: Hold, *, path: str) -> None:
         hold({"open": timeit(lambda: FrameDataset.open(path), number=5) / 5})
 
 
-def collecting(hold: Hold, *, root: str, image_size: int, transitions: int, task: str = "") -> None:
-    """Time collecting in one process, its start included: a task once, or one dataset of the drifting world a pass."""
-    sizes: dict[str, Any] = {"transitions": transitions, "image_size": image_size}
+def collecting(hold: Hold, *, root: str, image_size: int, transitions: int) -> None:
+    """Collect a dataset of the drifting world in one process, once a pass, and time its episodes.
+
+    The median time from one reset to the next leaves out what a start costs. It is NaN below two whole episodes.
+    """
+    Path(root).mkdir(parents=True, exist_ok=True)
     for number in itertools.count():
-        start = time.perf_counter()
-        if task:
-            collect_random(task, root, progress=False, **sizes)
-        else:
-            drifting_dataset(root, seed=number, **sizes)
-        hold({"collect": (time.perf_counter() - start) / transitions})
+        clock = Path(root) / f"clock_{number}"
+        drifting_dataset(root, seed=number, clock=clock, transitions=transitions, image_size=image_size)
+        resets = [tuple(map(float, line.split())) for line in clock.read_text().splitlines()]
+        pairs = itertools.pairwise(resets)
+        episodes = [end - start for (start, _), (end, length) in pairs if length == synthetic.LENGTH]
+        hold({"collect": statistics.median(episodes or [math.nan]) / synthetic.LENGTH})
+
+
+def rendering(hold: Hold, *, root: str, task: str, image_size: int, transitions: int) -> None:
+    """Collect a task once."""
+    collect_random(task, root, transitions=transitions, image_size=image_size, progress=False)
+    hold({})
 
 
 def nothing(hold: Hold) -> None:
@@ -172,7 +184,7 @@ def nothing(hold: Hold) -> None:
 
 
 ITEMS: dict[str, Callable[..., None]] = {
-    item.__name__: item for item in (pretraining, downstream, sampling, opening, collecting, nothing)
+    item.__name__: item for item in (pretraining, downstream, sampling, opening, collecting, rendering, nothing)
 }
 
 

@@ -50,7 +50,7 @@ def main(settings: Settings) -> None:
     with tempfile.TemporaryDirectory(prefix="crptpro-memory-", dir=settings.scratch) as directory:
         work = Path(directory)
         collected: dict[str, Any] = {"task": settings.task, "transitions": settings.collect_transitions, **image}
-        peaks["collection"] = peak_bytes("collecting", root=work / "collected", **collected)
+        peaks["collection"] = peak_bytes("rendering", root=work / "collected", **collected)
         disk["dataset"] = disk_bytes(work / "collected") / settings.collect_transitions
         sizes: dict[str, Any] = {**image, "transitions": settings.dataset_transitions}
         paths = [drifting_dataset(work, seed=seed, **sizes) for seed in range(3)]

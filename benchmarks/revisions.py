@@ -64,7 +64,7 @@ def main(settings: Settings) -> None:
             with start("collecting", root=place, **images) as collect:  # each revision reads what it has collected
                 collect()
                 collect()
-            paths = sorted(place.iterdir())
+            paths = sorted(place.glob("drifting_*"))
             items[revision] = {
                 "pretrain": functools.partial(start, "pretraining", datasets=paths, **learned),
                 "downstream": functools.partial(start, "downstream", of=("update",), **downstream),

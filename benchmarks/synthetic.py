@@ -5,6 +5,8 @@ Public names of the library only: ``benchmarks.revisions`` runs this with other 
 
 from __future__ import annotations
 
+import functools
+import time
 from pathlib import Path
 
 import torch
@@ -26,11 +28,14 @@ _PATCHES = 12
 
 
 class DriftingWorld(EnvBase):
-    """Single frames of a drifting picture. No two frames of an episode are equal (below ``image_size ** 2``)."""
+    """Single frames of a drifting picture. No two frames of an episode are equal (below ``image_size ** 2``).
 
-    def __init__(self, *, seed: int, image_size: int, action_dim: int) -> None:
+    Every reset appends the time and how many transitions came before it to the file ``clock``.
+    """
+
+    def __init__(self, *, seed: int, image_size: int, action_dim: int, clock: Path | None) -> None:
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
-        self.image_size, self.count = image_size, 0
+        self.image_size, self.clock, self.count = image_size, clock, 0
         self._set_seed(seed)
         shape = (3, image_size, image_size)
         self.observation_spec = Composite(pixels=Bounded(0, 255, shape=shape, dtype=torch.uint8))
@@ -46,6 +51,9 @@ class DriftingWorld(EnvBase):
         return {"pixels": frame, **flags}
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
+        if self.clock is not None:
+            with self.clock.open("a") as file:
+                file.write(f"{time.time()} {self.count}\n")
         self.count = 0
         return TensorDict(self._look(), [])
 
@@ -63,16 +71,19 @@ class DriftingWorld(EnvBase):
 
 
 def make_drifting(
-    action_dim: int = ACTION_DIM, *, seed: int = 0, image_size: int = 84, action_repeat: int = 2
+    action_dim: int = ACTION_DIM, *, seed: int, image_size: int = 84, action_repeat: int = 2, clock: Path | None = None
 ) -> EnvBase:
     """Build the world of a :class:`crptpro.domains.Domain`, whose decisions count as ``action_repeat`` env steps."""
-    return DriftingWorld(seed=seed, image_size=image_size, action_dim=action_dim)
+    return DriftingWorld(seed=seed, image_size=image_size, action_dim=action_dim, clock=clock)
 
 
 register_domain(Domain("drifting", "drifting_task", make=make_drifting, episode_env_steps=2 * LENGTH))
 
 
-def drifting_dataset(root: Path | str, *, transitions: int, image_size: int = 84, seed: int = 0) -> Path:
+def drifting_dataset(
+    root: Path | str, *, transitions: int, image_size: int = 84, seed: int = 0, clock: Path | None = None
+) -> Path:
     """Collect a dataset of the world in one process, or return it at once where it is complete."""
-    domain = Domain(f"drifting_{seed}", "drifting_go", make=make_drifting, episode_env_steps=2 * LENGTH)
+    make = functools.partial(make_drifting, clock=clock)
+    domain = Domain(f"drifting_{seed}", "drifting_go", make=make, episode_env_steps=2 * LENGTH)
     return collect_random(domain, root, seed=seed, progress=False, transitions=transitions, image_size=image_size)
