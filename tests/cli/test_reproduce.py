@@ -73,7 +73,7 @@ def test_all_means_the_experiments_with_requested_cells(call: Call, tmp_path: Pa
     (("seen", "--launcher", "slurm", "--hours", "0"), "a job needs a minute and 1 GB at least"),
     (("seen", "--launcher", "slurm", "--memory-gb", "0.1"), "a job needs a minute and 1 GB at least"),
     (("seen", "--launcher", "slurm", "--sbatch", "qos"), "--sbatch qos: write key=value"),
-    (("seen", "--out", ""), "`out` is empty"),
+    (("seen", "--out", ""), "An argument is empty: --out"),
 ])  # fmt: skip
 def test_an_impossible_request_leaves_nothing_behind(
     call: Call, tmp_path: Path, arguments: tuple[str, ...], message: str

@@ -259,7 +259,7 @@ def test_the_pieces_of_the_quickstart_run_in_the_cells_of_a_notebook(tmp_path: P
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
     # Only a world whose factory a cell defines is out of the worker processes' reach.
-    assert re.findall("(.*) is collected in this process", ended.stderr) == ["warning: mine"]
+    assert re.findall("(.*) is collected in this process", ended.stderr) == ["mine"]
     assert ended.stdout.endswith("4 episodes evaluated\n")
 
 
