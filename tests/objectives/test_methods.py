@@ -111,7 +111,7 @@ def test_downstream_settings_differ_from_crptpros_where_the_paper_says_so() -> N
     for name in ("atc", "apt-c", "becl", "random-encoder", "crptpro-no-bonus"):
         assert get_method(name).downstream == {"intrinsic_reward_coef": 0.0}
     drq = get_method("drq").downstream
-    assert (drq["algorithm"], drq["replay_capacity"], drq["learning_rate"]) == ("drq", 100_000, 1e-3)
+    assert (drq["replay_capacity"], drq["learning_rate"]) == (100_000, 1e-3)
     assert get_method("random-encoder-standardised").build_encoder().config["standardised"]
 
 

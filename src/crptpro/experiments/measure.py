@@ -268,7 +268,7 @@ def _cost(stage_of: StageOf, command: str, updates: int, out: Path, device: str)
             times = record[[count * window for count in range(WINDOWS, 2 * WINDOWS + 1)]].to_numpy()
         finally:
             shutil.rmtree(out, ignore_errors=True)
-    done = [Path(source).parent / "done.json" for source in sources]
+    done = [] if plan else [Path(source).parent / "done.json" for source in sources]
     collected = [read_json(path, error=RecordError)["seconds"] for path in done if path.exists()]
     return {
         "method": method.name, "domains": len(sources), "encoder_updates": timed,

@@ -96,7 +96,7 @@ class Method:
 
 
 _NO_BONUS = {"intrinsic_reward_coef": 0.0}
-_DRQ = {"algorithm": "drq", "env_steps": 1_000_000, "replay_capacity": 100_000, "learning_rate": 1e-3}
+_DRQ = {"env_steps": 1_000_000, "replay_capacity": 100_000, "learning_rate": 1e-3}
 _CRPTPRO = Method("crptpro", ProtoLoss)
 
 # ATC's loss, head and schedule on the encoder (orthogonal weights), batch and budget that all methods share.
