@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from crptpro.errors import CheckpointError, NonFiniteError
 from crptpro.modules import PixelEncoder, SquashedGaussianActor, resolve_precision, set_compute_dtype
 from crptpro.objectives import RADSACLoss, SkillDDPGLoss
 from crptpro.provenance import provenance
-from crptpro.training.compile import accelerate
+from crptpro.training.compile import Update, accelerate
 
 AGENT_FORMAT, AGENT_VERSION = "crptpro-agent", 2
 
@@ -117,29 +118,39 @@ class SACLearner:
         actor_interval: int = 2,
         target_interval: int = 2,
         compile: bool = False,
+        cuda_graph: bool = False,
     ) -> None:
         self.loss, self.targets = loss, SoftUpdate(loss, tau=critic_tau)
         self.actor_interval, self.target_interval = actor_interval, target_interval
+        self.cuda_graph = cuda_graph
         groups = {"critic": [*loss.critic.parameters()], "actor": [*loss.actor.parameters()]}
         if isinstance(loss, RADSACLoss):
             groups["temperature"] = [loss.log_alpha]
         self.optimizers = {
-            name: torch.optim.Adam(group, lr=learning_rate, fused=True) for name, group in groups.items()
+            name: torch.optim.Adam(group, lr=learning_rate, fused=True, capturable=cuda_graph)
+            for name, group in groups.items()
         }
         self._critic_loss = accelerate(loss.critic_loss, compile=compile)
         self._actor_loss = accelerate(loss.actor_and_temperature_loss, compile=compile)
+        self._updates: dict[tuple[bool, bool], Update] = {}  # by what they do beside the critic's step
 
     def update(self, batch: TensorDictBase, *, agent_step: int) -> TensorDictBase:
         """Do one update on a batch with features and rewards; returns detached scalars."""
+        also = agent_step % self.actor_interval == 0, agent_step % self.target_interval == 0
+        if also not in self._updates:
+            self._updates[also] = accelerate(functools.partial(self._update, *also), cuda_graph=self.cuda_graph)
+        return self._updates[also](batch)
+
+    def _update(self, moves_actor: bool, moves_target: bool, batch: TensorDictBase) -> TensorDictBase:
         critic, *others = self.optimizers.values()
         losses = self._critic_loss(batch)
         _step(losses["loss_qvalue"], critic)
-        if agent_step % self.actor_interval == 0:
+        if moves_actor:
             actor_losses = self._actor_loss(batch)
             terms = [value for name, value in actor_losses.items() if name.startswith("loss")]
             _step(torch.stack(terms).sum(), *others)
             losses = losses.update(actor_losses)
-        if agent_step % self.target_interval == 0:
+        if moves_target:
             self.targets.step()
         return losses.detach()
 

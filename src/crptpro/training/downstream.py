@@ -98,6 +98,8 @@ class DownstreamConfig:
     """arithmetic of big products; auto is bf16 where that is faster. Deviation: the released code is fp32 throughout"""
     compile: bool = False
     """compile the losses with torch.compile; changes rounding only"""
+    cuda_graph: bool = False
+    """on a GPU, record the update as CUDA graphs and replay them"""
     device: str = "cpu"
     """where networks and features are"""
 
@@ -179,7 +181,7 @@ def train_downstream(
                                       progress=progress))  # fmt: skip
         dtype = resolve_precision(run.saved_setting("precision", settings.precision), device)
         # The budget may grow, and machines differ; everything else decides the numbers of the run.
-        free = ("env_steps", "eval_workers", "compile", "device")
+        free = ("env_steps", "eval_workers", "compile", "cuda_graph", "device")
         run.require_same({
             "task": name, "pretrained": pretrained.identity(),
             **{key: value for key, value in dataclasses.asdict(settings).items() if key not in free},
@@ -283,9 +285,11 @@ def _make_agent(
     networks = actor.to(device), TwinCritic(encoder.feature_dim, action_dim, **widths).to(device)
     options: dict[str, Any] = {"gamma": config.discount, "alpha_init": config.initial_temperature}
     make_loss = functools.partial(DrQLoss, encoder.requires_grad_(True)) if is_drq else RADSACLoss
-    loss = make_loss(*networks, **options, generator=generator)
+    # A CUDA graph draws from the generator of its device.
+    loss = make_loss(*networks, **options, generator=generator if device.type == "cpu" else None)
     rates = {"learning_rate": config.learning_rate, "critic_tau": config.critic_tau}
-    return SACLearner(loss, compile=config.compile, **rates), PixelAgent(encoder, loss.actor)
+    learner = SACLearner(loss, compile=config.compile, cuda_graph=config.cuda_graph, **rates)
+    return learner, PixelAgent(encoder, loss.actor)
 
 
 def _make_replay(run: Run, env: EnvBase, config: Any, generator: torch.Generator, *, is_complete: bool) -> FrameReplay:

@@ -46,7 +46,7 @@ class EnvThread:
             frame_stack=getattr(encoder, "in_channels", 9) // 3,
         )
         # A torch limited to one thread leaves the cores to others.
-        has_cores = config.device == "cpu" and cpu_cores() > 1 and torch.get_num_threads() > 1
+        has_cores = cpu_cores() > 1 and torch.get_num_threads() > 1
         runs_ahead = has_cores and not (needs_gl(domain) and select_backend() == "glfw")
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="environment") if runs_ahead else Inline()
         self.env: EnvBase = self._thread.submit(self.make_env).result()
