@@ -90,7 +90,8 @@ def main(settings: Settings) -> None:
         raise CRPTproError("No CUDA device here. `--tiny` runs through on the CPU.")
     with tempfile.TemporaryDirectory(prefix="crptpro-gpu-", dir=settings.scratch) as directory:
         sizes: dict[str, Any] = {"transitions": settings.transitions, "image_size": settings.image_size}
-        paths = [drifting_dataset(directory, seed=seed, **sizes) for seed in range(3)]
+        # Domains have actions of their own, which must not keep an update from being recorded.
+        paths = [drifting_dataset(directory, seed=seed, action_dim=6 + seed, **sizes) for seed in range(3)]
         bf16 = {f"bf16, {name}": {**BF16, **switches} for name, switches in settings.ways.items()}
         sections: dict[Section, Callable[[], Any]] = {
             "parity": lambda: check_parity(settings, paths),

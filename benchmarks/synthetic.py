@@ -81,9 +81,10 @@ register_domain(Domain("drifting", "drifting_task", make=make_drifting, episode_
 
 
 def drifting_dataset(
-    root: Path | str, *, transitions: int, image_size: int = 84, seed: int = 0, clock: Path | None = None
-) -> Path:
+    root: Path | str, *, transitions: int, image_size: int = 84, seed: int = 0, clock: Path | None = None,
+    action_dim: int = ACTION_DIM,
+) -> Path:  # fmt: skip
     """Collect a dataset of the world in one process, or return it at once where it is complete."""
-    make = functools.partial(make_drifting, clock=clock)
+    make = functools.partial(make_drifting, action_dim, clock=clock)
     domain = Domain(f"drifting_{seed}", "drifting_go", make=make, episode_env_steps=2 * LENGTH)
     return collect_random(domain, root, seed=seed, progress=False, transitions=transitions, image_size=image_size)

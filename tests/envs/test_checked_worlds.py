@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import gc
+import importlib
 import logging
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -325,3 +327,19 @@ def test_worlds_that_come_and_go_in_a_thread_change_no_frame_of_another(task: st
     expected = frames_alone(task)
     assert expected.float().std() > 1
     assert torch.equal(frames(task, come_and_go), expected)
+
+
+@pytest.mark.gl
+def test_a_frame_leaves_no_context_current_and_the_driver_set_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With eglReleaseThread after every frame, 12 processes on an NVIDIA driver drew 2 frames/s each, not 114."""
+    env = make_env("cartpole_balance", seed=0, image_size=32)
+    td = env.reset()
+    if os.environ["MUJOCO_GL"] != "egl":
+        pytest.skip("this machine does not render with EGL")
+    egl = importlib.import_module("OpenGL.EGL")
+    monkeypatch.setattr(egl, "eglReleaseThread", lambda: pytest.fail("the driver's thread was taken down"))
+    td["action"] = torch.zeros(env.action_spec.shape)
+    env.step(td)
+    assert not egl.eglGetCurrentContext()
+    monkeypatch.undo()
+    env.close()

@@ -228,6 +228,15 @@ def test_an_impossible_setting_is_refused_by_name(setting: str, value: Any, mess
         DownstreamConfig(**{setting: value})
 
 
+def test_a_cuda_graph_without_a_gpu_is_refused_before_the_first_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match="`cuda_graph` is on, but this machine has no GPU"):
+        train(tmp_path / "run", cuda_graph=True)
+    assert not (tmp_path / "run" / "episodes.csv").exists()
+
+
 def test_what_is_left_open_is_the_methods_own() -> None:
     own = DownstreamConfig().resolved("walker_run", make_pretrained("crptpro"))
     assert (own.env_steps, own.replay_capacity, own.learning_rate) == (500_000, 40_000, 1e-4)

@@ -64,6 +64,25 @@ def test_domains_take_turns_one_update_each() -> None:
     assert is_bright == [False, True] * 3
 
 
+def test_a_loss_is_given_what_it_reads_and_nothing_else() -> None:
+    """A recorded update needs batches of one shape, and domains have actions of their own."""
+    seen: list[dict[str, torch.Size]] = []
+
+    class Watching(Brightness):
+        def forward(self, tensordict: TensorDictBase) -> TensorDict:
+            seen.append({str(key): value.shape for key, value in tensordict.items(True, True)})
+            return super().forward(tensordict)
+
+    run(Watching(), 2, datasets=[make_dataset(domain, action_dim=6 * (domain + 1)) for domain in range(2)])
+    assert seen == [{"pixels": torch.Size([8, 3, SIZE, SIZE])}] * 2
+
+
+def test_a_cuda_graph_without_a_gpu_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match="`cuda_graph` is on, but this machine has no GPU"):
+        run(make_loss(), 1, cuda_graph=True)
+
+
 def test_an_update_is_one_adam_step_and_one_ema_step_of_the_targets() -> None:
     loss = make_loss()
     before = {name: value.clone() for name, value in loss.state_dict().items()}

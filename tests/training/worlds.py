@@ -26,13 +26,14 @@ SIZE, EPISODE = 16, 10
 HERE = Path(__file__).parent
 
 
-def make_dataset(domain: int, *, transitions: int = 60) -> ReplayBuffer:
+def make_dataset(domain: int, *, transitions: int = 60, action_dim: int = 2) -> ReplayBuffer:
     """Smooth noise that drifts by one pixel per transition; the mean brightness tells the domain."""
     generator = torch.Generator().manual_seed(domain)
     base = torch.rand(transitions, 3, SIZE, SIZE, generator=generator) * 120 + 60 * domain
     pixels = base.to(torch.uint8)
     buffer = ReplayBuffer(storage=LazyTensorStorage(transitions))
-    buffer.extend(TensorDict({"pixels": pixels, "next": {"pixels": pixels.roll(1, -1)}}, [transitions]))
+    rows = {"pixels": pixels, "action": torch.zeros(transitions, action_dim), "next": {"pixels": pixels.roll(1, -1)}}
+    buffer.extend(TensorDict(rows, [transitions]))
     return buffer
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -122,7 +123,6 @@ class SACLearner:
     ) -> None:
         self.loss, self.targets = loss, SoftUpdate(loss, tau=critic_tau)
         self.actor_interval, self.target_interval = actor_interval, target_interval
-        self.cuda_graph = cuda_graph
         groups = {"critic": [*loss.critic.parameters()], "actor": [*loss.actor.parameters()]}
         if isinstance(loss, RADSACLoss):
             groups["temperature"] = [loss.log_alpha]
@@ -132,13 +132,15 @@ class SACLearner:
         }
         self._critic_loss = accelerate(loss.critic_loss, compile=compile)
         self._actor_loss = accelerate(loss.actor_and_temperature_loss, compile=compile)
-        self._updates: dict[tuple[bool, bool], Update] = {}  # by what they do beside the critic's step
+        # By what they do beside the critic's step.
+        self._updates: dict[tuple[bool, bool], Update] = {
+            also: accelerate(functools.partial(self._update, *also), cuda_graph=cuda_graph)
+            for also in itertools.product((False, True), repeat=2)
+        }
 
     def update(self, batch: TensorDictBase, *, agent_step: int) -> TensorDictBase:
         """Do one update on a batch with features and rewards; returns detached scalars."""
         also = agent_step % self.actor_interval == 0, agent_step % self.target_interval == 0
-        if also not in self._updates:
-            self._updates[also] = accelerate(functools.partial(self._update, *also), cuda_graph=self.cuda_graph)
         return self._updates[also](batch)
 
     def _update(self, moves_actor: bool, moves_target: bool, batch: TensorDictBase) -> TensorDictBase:

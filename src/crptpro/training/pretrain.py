@@ -166,8 +166,9 @@ def pretrain(
         domains = list(buffers)
         for done in run.until(settings.updates, checkpoint_interval=settings.checkpoint_interval):
             domain = domains[done % len(domains)]
-            # The buffer's transform is the random shift.
-            batch = buffers[domain].sample(settings.batch_size).to(device)
+            # The buffer's transform is the random shift. Only what the loss reads is kept: a recorded or compiled
+            # update needs batches of one shape, and actions differ from domain to domain.
+            batch = buffers[domain].sample(settings.batch_size).select(*loss.in_keys).to(device)
             losses = update(batch)
             schedule.step()
             run.log(scalars(losses, domain))
