@@ -134,8 +134,8 @@ class SACLearner:
         self._actor_loss = accelerate(loss.actor_and_temperature_loss, compile=compile)
         # By what they do beside the critic's step.
         self._updates: dict[tuple[bool, bool], Update] = {
-            also: accelerate(functools.partial(self._update, *also), cuda_graph=cuda_graph)
-            for also in itertools.product((False, True), repeat=2)
+            (actor, target): accelerate(functools.partial(self._update, actor, target), cuda_graph=cuda_graph)
+            for actor, target in itertools.product((False, True), repeat=2)
         }
 
     def update(self, batch: TensorDictBase, *, agent_step: int) -> TensorDictBase:
