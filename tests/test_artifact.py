@@ -77,11 +77,12 @@ def test_a_damaged_or_missing_card_is_named(tmp_path: Path, text: str | None, me
 
 def test_every_number_in_a_card_is_the_plain_number_it_means_or_refused_by_name(tmp_path: Path) -> None:
     given = {"size": np.int64(84), "rate": torch.tensor(0.5), "shape": (np.uint8(3), 2), "out": Path("a"), "no": None}
+    given["scale"] = np.longdouble(0.5)
     write_json(tmp_path / "card.json", {"config": given, "ok": np.bool_(True)})
     assert read_json(tmp_path / "card.json") == {
-        "config": {"size": 84, "rate": 0.5, "shape": [3, 2], "out": "a", "no": None}, "ok": True,
+        "config": {"size": 84, "rate": 0.5, "shape": [3, 2], "out": "a", "no": None, "scale": 0.5}, "ok": True,
     }  # fmt: skip
-    for entry in (object(), nn.Linear(1, 1), 1j, {3: 4}):
+    for entry in (object(), nn.Linear(1, 1), 1j, {3: 4}, np.datetime64("2026-01-01")):
         with pytest.raises(ValueError, match=r"card\.json\.config\.what"):
             write_json(tmp_path / "card.json", {"config": {"what": entry}})
     assert read_json(tmp_path / "card.json")["ok"] is True

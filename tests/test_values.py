@@ -12,7 +12,9 @@ import torch
 from crptpro.values import as_float, as_int, as_path, check_numbers
 
 
-@pytest.mark.parametrize("value", [3, 3.0, np.int64(3), np.float32(3), np.array(3), torch.tensor(3), torch.tensor(3.0)])
+@pytest.mark.parametrize(
+    "value", [3, 3.0, np.int64(3), np.float32(3), np.array(3), torch.tensor(3), torch.tensor(3.0), np.longdouble(3)]
+)
 def test_a_number_of_any_library_is_taken_as_the_plain_number_it_means(value: Any) -> None:
     whole, real = as_int(value, "count"), as_float(value, "rate")
     assert (type(whole), whole, type(real), real) == (int, 3, float, 3.0)

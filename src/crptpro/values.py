@@ -31,7 +31,7 @@ def as_int(value: Any, name: str, *, minimum: int | None = None, maximum: int | 
     number: Any = value
     if hasattr(number, "item") and getattr(number, "ndim", 0) == 0:
         number = number.item()
-    if isinstance(number, float) and number.is_integer():
+    if isinstance(number, (float, np.floating)) and number.is_integer():
         number = int(number)
     try:
         if isinstance(number, bool):
@@ -88,9 +88,12 @@ def as_plain(value: Any, name: str) -> Any:
         return [as_plain(item, f"{name}[{index}]") for index, item in enumerate(value)]
     if isinstance(value, (str, os.PathLike, torch.dtype, torch.device)):
         return str(value)
-    if isinstance(value, (np.ndarray, np.generic, torch.Tensor)):
+    if isinstance(value, np.floating):  # the `tolist` of a long double is itself
+        value = float(value)
+    elif isinstance(value, (np.ndarray, np.generic, torch.Tensor)):
         value = value.tolist()
-        return as_plain(value, name) if isinstance(value, (list, complex)) else value
+        if isinstance(value, list):
+            return as_plain(value, name)
     if value is None or isinstance(value, (bool, int, float)):
         return value
     raise ValueError(f"`{name}` is no plain value: {value!r} is a {type(value).__name__}.")

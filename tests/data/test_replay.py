@@ -146,6 +146,7 @@ def test_what_does_not_continue_begins_an_episode() -> None:
     late["pixels"] = torch.cat([frame(5), frame(6), frame(7)]).unsqueeze(0)  # joins an episode under way
     late["next", "pixels"] = torch.cat([frame(6), frame(7), frame(8)]).unsqueeze(0)
     assert replay.extend(late).tolist() == [6]
+    assert replay.extend(late[:0]).tolist() == []
     shown = replay[:]
     assert shown["pixels"][:, ::3, 0, 0].tolist() == [[1, 1, 1], [100, 100, 100], [5, 6, 7]]
     assert shown["next", "pixels"][:, ::3, 0, 0].tolist() == [[1, 1, 2], [100, 100, 101], [6, 7, 8]]

@@ -248,7 +248,7 @@ class RingStorage(StackStorage):
 
     def write(self, rows: Rows) -> Tensor:
         """Store transitions in temporal order; returns their observations' numbers, int64 ``[T]``."""
-        numbers = []
+        numbers = [torch.empty(0, dtype=torch.int64, device="cpu")]
         for begin in range(0, len(rows.following), self.max_size):
             part = rows.part(begin, begin + self.max_size)
             last = self.pixels[(self.frames - 1) % self.rows] if self.is_open else None
