@@ -331,7 +331,7 @@ def test_worlds_that_come_and_go_in_a_thread_change_no_frame_of_another(task: st
 
 @pytest.mark.gl
 def test_a_frame_leaves_no_context_current_and_the_driver_set_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With eglReleaseThread after every frame, 12 processes on an NVIDIA driver drew 2 frames/s each, not 114."""
+    """With eglReleaseThread after every image, 12 processes on an NVIDIA driver made 2 agent steps/s each, not 114."""
     env = make_env("cartpole_balance", seed=0, image_size=32)
     td = env.reset()
     if os.environ["MUJOCO_GL"] != "egl":

@@ -188,8 +188,8 @@ def render_context(make_current: Callable[[], Any] | None, *, is_first: bool = F
 def _leave_none_current() -> None:
     backend = os.environ.get("MUJOCO_GL")
     if backend == "egl" and (egl := sys.modules.get("OpenGL.EGL")) is not None:
-        # Not eglReleaseThread: on an NVIDIA driver 12 processes that called it after every frame drew 2 frames/s each,
-        # and 114 this way.
+        # Not eglReleaseThread: on an NVIDIA driver 12 processes that called it after every image made 2 agent steps/s
+        # each, and 114 this way.
         egl.eglBindAPI(egl.EGL_OPENGL_API)  # the API of a thread decides which context it loses
         if display := egl.eglGetCurrentDisplay():
             egl.eglMakeCurrent(display, egl.EGL_NO_SURFACE, egl.EGL_NO_SURFACE, egl.EGL_NO_CONTEXT)

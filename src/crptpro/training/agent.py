@@ -132,9 +132,10 @@ class SACLearner:
         }
         self._critic_loss = accelerate(loss.critic_loss, compile=compile)
         self._actor_loss = accelerate(loss.actor_and_temperature_loss, compile=compile)
+        recording: dict[str, Any] = {"cuda_graph": cuda_graph, "device": groups["critic"][0].device}
         # By what they do beside the critic's step.
         self._updates: dict[tuple[bool, bool], Update] = {
-            (actor, target): accelerate(functools.partial(self._update, actor, target), cuda_graph=cuda_graph)
+            (actor, target): accelerate(functools.partial(self._update, actor, target), **recording)
             for actor, target in itertools.product((False, True), repeat=2)
         }
 

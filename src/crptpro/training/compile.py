@@ -15,7 +15,9 @@ from crptpro.errors import CompileError
 Update = Callable[[TensorDictBase], TensorDictBase]
 
 
-def accelerate(update: Update, *, compile: bool = False, cuda_graph: bool = False) -> Update:
+def accelerate(
+    update: Update, *, compile: bool = False, cuda_graph: bool = False, device: torch.device | str = "cpu"
+) -> Update:
     """Return an update that is compiled, recorded as a CUDA graph, or unchanged.
 
     The update maps a batch of fixed shapes to detached scalars and must not read a value back to the host. On a CPU
@@ -23,11 +25,13 @@ def accelerate(update: Update, *, compile: bool = False, cuda_graph: bool = Fals
     half a minute and gains nothing beyond noise. On a GPU recording was checked for parity; neither switch was timed.
 
     Raises:
-        ValueError: ``cuda_graph`` without a GPU.
+        ValueError: ``cuda_graph`` on a ``device`` that is no GPU.
         CompileError: a call of the update fails, most likely the first, while it is compiled or recorded.
     """
-    if cuda_graph and not torch.cuda.is_available():
-        raise ValueError("`cuda_graph` is on, but this machine has no GPU that torch can use; leave it off.")
+    if cuda_graph and torch.device(device).type != "cuda":
+        raise ValueError(
+            f"`cuda_graph` needs a GPU, but `device` is {str(device)!r}; set device='cuda' or leave it off."
+        )
     if not (compile or cuda_graph):
         return update
     fast: Update = torch.compile(update, dynamic=False) if compile else update

@@ -162,7 +162,7 @@ def pretrain(
                  generators=generators, **samplers)  # fmt: skip
 
         update = make_update(loss, optimizer, targets, grad_clip=recipe.grad_clip)
-        update = accelerate(update, compile=settings.compile, cuda_graph=settings.cuda_graph)
+        update = accelerate(update, compile=settings.compile, cuda_graph=settings.cuda_graph, device=device)
         domains = list(buffers)
         for done in run.until(settings.updates, checkpoint_interval=settings.checkpoint_interval):
             domain = domains[done % len(domains)]
