@@ -23,7 +23,7 @@ from crptpro.errors import CRPTproError, PretrainedError
 from crptpro.modules import PixelEncoder, SquashedGaussianActor
 from crptpro.objectives import BeCLLoss, ProtoLoss, SimCLRLoss
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained, save_pretrained, shipped_encoders
-from crptpro.training import PretrainResult, finetune, pretrain
+from crptpro.training import PretrainResult, finetune, pretrain, train_downstream
 from crptpro.training.agent import PixelAgent, save_agent
 
 TINY: dict[str, Any] = {"channels": (4, 4), "strides": (2, 1), "image_size": 16}
@@ -222,6 +222,19 @@ def test_an_encoder_that_ships_is_loaded_by_name_and_an_unknown_name_lists_them(
         load_pretrained("runs/group-a")  # a path
     save_pretrained(make_loss(1), "group-a")  # a directory of this name comes first
     assert load_pretrained("group-a").identity() != load_pretrained(kept).identity()
+
+
+@pytest.mark.gl
+def test_a_task_is_learned_on_every_encoder_that_ships() -> None:
+    for name in shipped_encoders():
+        learned = train_downstream(
+            "finger_spin", name, env_steps=20, random_agent_steps=4, batch_size=4, replay_capacity=20,
+            features="reencode", eval_episodes=1, eval_workers=0, progress=False,
+        )  # fmt: skip
+        before, after = (row["episode_return"] for row in learned.evaluations)
+        assert 0 <= min(before, after) <= max(before, after) <= 1_000
+        assert torch.equal(learned.agent.encoder.convs[0].weight, load_pretrained(name).encoder.convs[0].weight)
+    assert shipped_encoders()
 
 
 # --- refusals ---------------------------------------------------------------------------------------------------------

@@ -1,0 +1,171 @@
+"""Compute the tables of docs/results.md and of the README from the records in results/.
+
+``python docs/results.py`` writes each table between its markers, ``<!-- table: name -->`` and ``<!-- end -->``, and
+draws the figure. :func:`filled` is what a test compares the pages with.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pandas as pd
+
+ROOT = Path(__file__).resolve().parent.parent
+RECORDS = ROOT / "results"
+PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
+FIGURE = ROOT / "docs" / "results.png"
+METHODS = ("crptpro", "crptpro-fast", "crptpro-finetune", "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-s", "becl",
+           "drq", "crptpro-no-bonus", "random-encoder", "random-encoder-standardised")  # fmt: skip
+DOMAINS = ("cheetah", "walker", "quadruped", "finger", "pendulum")
+PROBES = {
+    **{n: RECORDS / "paper_scale" / f"probe_{n}_updates.csv" for n in (0, 1_000, 3_000)},
+    10_000: ROOT / "src" / "crptpro" / "encoders" / "group-a-10k" / "probe.csv",
+}
+"""Updates of the probed encoders to their records."""
+
+
+def downstream_runs(record: str, file: str = "eval") -> pd.DataFrame:
+    """Return every episode of a record's finished downstream runs, with the method and the number of the seed."""
+    found = []
+    for done in sorted((RECORDS / record).glob("jobs/run-*/done.json")):
+        facts = json.loads(done.with_name("job.json").read_text())["facts"]
+        found.append(pd.read_csv(done.with_name(f"{file}.csv")).assign(method=facts["method"], run=facts["seed"]))
+    table = pd.concat(found, ignore_index=True)
+    table["method"] = pd.Categorical(table["method"], METHODS)  # whose order is that of the tables
+    return table.sort_values(["method", "run"], kind="stable")
+
+
+def small_scale() -> pd.DataFrame:
+    """Return of each run of each method at the end of the small-scale comparison."""
+    runs = downstream_runs("seen_small")
+    last = runs[runs["env_steps"] == runs["env_steps"].max()]
+    means = last.groupby(["method", "run"], observed=True)["episode_return"].mean()
+    chance = pd.read_csv(RECORDS / "group_a_20k" / "uniform_walker_run.csv")["episode_return"]
+    rows = [(f"`{method}`", len(own), _list(own)) for method, own in means.groupby("method", observed=True)]
+    rows.append(("control: uniform random policy", f"{len(chance)} episodes", f"{chance.mean():.0f}"))
+    return pd.DataFrame(rows, columns=["", "runs", "returns"])
+
+
+def controls() -> pd.DataFrame:
+    """Mean return over the finished runs of each control, and each run's at the end."""
+    runs = downstream_runs("controls")
+    means = runs.groupby(["method", "run", "env_steps"], observed=True)["episode_return"].mean().unstack()
+    trained = downstream_runs("controls", "episodes").groupby(["method", "run"], observed=True)["episode_return"]
+    last = trained.apply(lambda returns: returns.tail(5).mean())
+    return pd.DataFrame(
+        {
+            "": f"`{method}`",
+            "runs": len(own),
+            "before learning": f"{own[0].mean():.0f}",
+            "10,000 env steps": f"{own[10_000].mean():.0f}",
+            "20,000 env steps": f"{own[20_000].mean():.0f}",
+            "each run": _list(own[20_000]),
+            "last five training episodes of each run": _list(last[method]),
+        }
+        for method, own in means.groupby("method", observed=True)
+    )
+
+
+def two_tasks() -> pd.DataFrame:
+    """Mean and standard deviation over ten episodes of the runs on an encoder of 3,000 updates of batch 512."""
+    rows = []
+    for task in ("walker_run", "cheetah_run"):
+        for name, encoder in (("crptpro", "crptpro"), ("random", "random-encoder")):
+            episodes = pd.read_csv(RECORDS / "group_a_20k" / f"eval_{task}_{name}.csv").groupby("env_steps")
+            shown = {f"{n:,} env steps": _spread(own["episode_return"]) for n, own in episodes if n}
+            rows.append({"task": task, "": f"`{encoder}`", **shown})
+        chance = pd.read_csv(RECORDS / "group_a_20k" / f"uniform_{task}.csv")["episode_return"]
+        rows.append({"task": task, "": "uniform random policy", "30,000 env steps": _spread(chance)})
+    return pd.DataFrame(rows).fillna("")
+
+
+def pretraining() -> pd.DataFrame:
+    """The record of pre-training with the paper's settings."""
+    record = pd.read_csv(RECORDS / "paper_scale" / "pretrain.csv").set_index("updates")
+    rows = record.loc[[500, 1_000, 3_000, 5_000, 10_000, 15_000, 20_000, record.index[-1]]]
+    columns = {"updates": rows.index.map("{:,}".format), "loss": rows["loss_comp"].map("{:.3f}".format)}
+    columns |= {f"cosine: {name}": rows[f"cosine/{name}"].map("{:.3f}".format) for name in DOMAINS[:3]}
+    columns["prototypes in use"] = rows["prototypes_in_use"].map("{:.0f}".format)
+    columns["prototypes: cosine to the third nearest"] = rows["prototype_kne_3"].map("{:.3f}".format)
+    return pd.DataFrame(columns)
+
+
+def probes() -> pd.DataFrame:
+    """R² of positions and velocities along pre-training; a negative one counts as 0."""
+    rows = []
+    for updates, scores in _probe_scores().items():
+        cells = {name: f"{scores[name, 'r2_position']:.3f} / {scores[name, 'r2_velocity']:.3f}" for name in DOMAINS}
+        rows.append({"updates": f"{updates:,}" if updates else "0 (`random-encoder`)", **cells})
+    return pd.DataFrame(rows)
+
+
+def _probe_scores() -> dict[int, pd.Series]:
+    found = {}
+    for updates, path in PROBES.items():
+        table = pd.read_csv(path)
+        table = table[table["embedding"] == "features"].assign(value=table["value"].clip(lower=0))
+        found[updates] = table.groupby(["domain", "measure"])["value"].mean()
+    return found
+
+
+TABLES = {"small scale": small_scale, "controls": controls, "two tasks": two_tasks, "pre-training": pretraining,
+          "probes": probes}  # fmt: skip
+
+
+def draw() -> None:
+    """Draw the loss and the probes along pre-training, and the training returns of the controls."""
+    figure, (loss, gain, learning) = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")
+    record = pd.read_csv(RECORDS / "paper_scale" / "pretrain.csv")
+    loss.plot(record["updates"], record["loss_comp"], label="paper's settings, group A")
+    loss.axhline(math.log(512), color="grey", linestyle=":", label="ln 512: uniform predictions")
+    loss.set(title="Pre-training (1 run)", xlabel="updates", ylabel="comparative loss")
+    scores = _probe_scores()
+    for name in DOMAINS:
+        gains = [scores[n][name, "r2_velocity"] - scores[0][name, "r2_velocity"] for n in PROBES]
+        unseen = name not in DOMAINS[:3]
+        gain.plot(range(len(PROBES)), gains, "o--" if unseen else "o-", label=name + " (unseen)" * unseen)
+    gain.set(title="State probe of its encoders (1 run)", xlabel="updates", ylabel="R² of velocities, beyond untrained")
+    gain.set_xticks(range(len(PROBES)), [f"{n:,}" for n in PROBES])
+    episodes = downstream_runs("controls", "episodes")
+    for method, own in episodes.groupby("method", observed=True):
+        curve = own.groupby("env_steps")["episode_return"].mean().rolling(5).mean()
+        learning.plot(curve.index, curve, label=f"{method} (n = {own['run'].nunique()})")
+    learning.set(
+        title="Controls at small scale: walker_run", xlabel="env steps", ylabel="return, last 5 training episodes"
+    )
+    for axes in (loss, gain, learning):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(frameon=False, fontsize=8)
+    figure.savefig(FIGURE, dpi=110, metadata={"Software": None})
+
+
+def filled(page: str) -> str:
+    """Return the text of a page with every table computed from the records."""
+
+    def fill(match: re.Match[str]) -> str:
+        return f"<!-- table: {match[1]} -->\n{_markdown(TABLES[match[1]]())}\n<!-- end -->"
+
+    return re.sub(r"<!-- table: (.+?) -->\n.*?<!-- end -->", fill, page, flags=re.DOTALL)
+
+
+def _markdown(table: pd.DataFrame) -> str:
+    lines = [list(table), ["---"] * len(table.columns), *table.astype(str).to_numpy().tolist()]
+    return "\n".join(re.sub(r"  +", " ", f"| {' | '.join(line)} |") for line in lines)
+
+
+def _list(returns: pd.Series) -> str:
+    return ", ".join(f"{value:.0f}" for value in returns)
+
+
+def _spread(returns: pd.Series) -> str:
+    return f"{returns.mean():.0f} ± {returns.std():.0f}"
+
+
+if __name__ == "__main__":
+    for path in PAGES:
+        path.write_text(filled(path.read_text()))
+    draw()
