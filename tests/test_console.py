@@ -47,7 +47,7 @@ def stopped_by(main: Callable[[], object]) -> Any:
     (fails(DatasetError("no such thing")), 1, "error: no such thing"),
     (lambda: DownstreamConfig(batch_size=0), 1, "error: `batch_size` must be at least 1, got 0."),
     (Path("/absent/file").read_text, 1, "error: [Errno 2] No such file or directory: '/absent/file'"),
-    (fails(KeyboardInterrupt()), 130, "interrupted; the same command continues from the last checkpoint."),
+    (fails(KeyboardInterrupt()), 130, "interrupted; where there is a checkpoint, the same command continues from it."),
 ])  # fmt: skip
 def test_an_expected_error_is_one_line_and_an_exit_status(
     main: Callable[[], object], status: int, line: str, capsys: pytest.CaptureFixture[str]

@@ -62,7 +62,7 @@ def run_main(main: Callable[[], object]) -> None:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from None
     except KeyboardInterrupt:
-        print("interrupted; the same command continues from the last checkpoint.", file=sys.stderr)
+        print("interrupted; where there is a checkpoint, the same command continues from it.", file=sys.stderr)
         raise SystemExit(130) from None
 
 

@@ -89,6 +89,10 @@ class RunLogger:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
+    def describe(self, config: Any) -> None:
+        """Add settings to those of the run, a mapping or a dataclass, before its first row."""
+        self._config.update(as_plain(config, "config"))
+
     def log(self, metrics: Mapping[str, Any], *, stream: str, **counters: int) -> None:
         """Write one row.
 

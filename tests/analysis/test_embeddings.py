@@ -8,15 +8,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from crptpro.analysis.embeddings import (
-    effective_rank,
-    embed_pixels,
-    gram_matrix,
-    mean_cosine,
-    principal_components,
-    sample_pixels,
-)
-from crptpro.objectives.functional import mean_pairwise_cosine
+from crptpro.analysis.embeddings import effective_rank, embed_pixels, gram_matrix, sample_pixels
 
 
 class Brightness(nn.Module):
@@ -49,31 +41,13 @@ def test_the_seed_chooses_the_observations_whatever_was_sampled_before() -> None
     assert not torch.equal(first, other)
 
 
-def test_components_explain_variance_in_decreasing_order_and_reconstruct_the_points() -> None:
-    generator = torch.Generator().manual_seed(0)
-    points = torch.randn(40, 5, generator=generator, dtype=torch.float64) * torch.tensor([5.0, 3, 2, 1, 0.1])
-    coordinates, explained = principal_components(points, components=5)
-    assert (explained.diff() <= 0).all()
-    eigenvalues = torch.linalg.eigvalsh(torch.cov(points.T)).flip(0)
-    torch.testing.assert_close(coordinates.var(0), eigenvalues)
-    torch.testing.assert_close(explained, eigenvalues / eigenvalues.sum())
-    centred = points - points.mean(0)
-    torch.testing.assert_close(coordinates @ coordinates.T, centred @ centred.T)
-    with pytest.raises(ValueError, match="n_components=6"):
-        principal_components(points, components=6)
-
-
-def test_inner_products_and_mean_cosine_are_those_of_all_pairs_and_change_nothing() -> None:
+def test_inner_products_are_those_of_all_pairs_and_change_nothing() -> None:
     features = 0.3 + torch.randn(60, 5_000, generator=torch.Generator().manual_seed(0))
     features[7] = 0
     before = features.clone()
     mean, scale = features.double().mean(0), 1 + features.double().std(0)
     x = (features.double() - mean) / scale
     torch.testing.assert_close(torch.from_numpy(gram_matrix(features, mean, scale)), x @ x.T)
-    unit = torch.nn.functional.normalize(features.double(), dim=-1)
-    assert mean_cosine(features) == pytest.approx(float(mean_pairwise_cosine(unit)), abs=1e-7)
-    assert mean_cosine(features[:1]) == 0
-    assert mean_cosine(torch.ones(3, 2)) == pytest.approx(1, abs=1e-6)
     effective_rank(features)
     assert features.equal(before)
 

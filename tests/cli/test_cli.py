@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 import os
 import re
 import subprocess
@@ -177,6 +178,10 @@ def test_an_untrained_encoder_is_written_like_any_other(call: Call, dataset: Pat
         assert call("pretrain", dataset, "--method", method, "--out", tmp_path / method)[0] == 0
         loaded = load_pretrained(tmp_path / method / "encoder")
         assert (loaded.method, loaded.encoder.image_size) == (method, SIZE)
+    other = ("pretrain", dataset, "--method", "random-encoder", "--out", tmp_path / "other")
+    assert call(*other, "--encoder", "strides=(2,2,2,1)")[0] == 0
+    assert load_pretrained(tmp_path / "other" / "encoder").encoder.config["strides"] == [2, 2, 2, 1]
+    assert "is not trained and has no loss" in refused(call(*other, "--loss", "num_prototypes=8"))
 
 
 def test_a_real_process_ends_with_the_same_line(tmp_path: Path) -> None:
@@ -304,3 +309,9 @@ def test_mirrors_begin_with_the_run_and_get_its_record(
     assert call("pretrain", dataset, "--out", tmp_path / "out", *few, "--logging.tensorboard")[0] == 0
     assert list((tmp_path / "out" / "tensorboard").iterdir())
     assert len(rows(tmp_path / "out" / "pretrain.csv")) == 2
+    run = tmp_path / "run"  # one with a mirror is reported like any other
+    common = ("downstream", TASK, "--pretrained", "random-encoder", "--out", run, *SMALL)
+    assert call(*common, "--logging.tensorboard")[0] == 0
+    settings = json.loads((run / "config.json").read_text())["config"]
+    assert (settings["task"], settings["learning_rate"]) == (TASK, 1e-4)
+    assert call("report", run)[0] == 0

@@ -344,7 +344,7 @@ def test_a_command_that_is_killed_continues(
 
     monkeypatch.setattr(sys, "argv", ["crptpro", *arguments])
     main()
-    assert "All of it is there" in capsys.readouterr().out
+    assert "Everything requested is finished" in capsys.readouterr().out
     [done] = root.glob("jobs/*/done.json")
     assert read_json(done)["attempts"] == 2
     [card] = root.glob("jobs/dataset-*/*/card.json")

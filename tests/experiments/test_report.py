@@ -275,6 +275,12 @@ def test_methods_are_compared_on_the_tasks_that_all_have(made: Reproduction) -> 
     assert report.cell("Over the 1 task", "mean score", "crptpro").startswith("505")
 
 
+def test_runs_are_compared_on_tasks_too_that_the_paper_has_no_score_of(made: Reproduction) -> None:
+    cells = made.runs("crptpro", "walker_walk", [500.0, 510.0])
+    made.ask("seen", [*cells, *made.runs("atc", "walker_walk", [505.0])])
+    assert made.report().cell("Probability that a run of crptpro", "P(crptpro &gt; other)", "atc") == "0.50"
+
+
 def test_unreadable_records_are_left_out_by_name(made: Reproduction) -> None:
     cells = made.runs("crptpro", "walker_run", [500.0, 510.0, 520.0])
     paths = [made.root / "jobs" / job / "eval.csv" for _, job, _ in cells]

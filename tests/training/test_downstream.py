@@ -20,6 +20,7 @@ from crptpro.modules import SquashedGaussianActor
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import load_pretrained, random_pretrained, save_pretrained
 from crptpro.training import DownstreamConfig, DownstreamResult, load_agent, pretrain, train_downstream
+from crptpro.training.agent import save_agent
 
 SMALL = DownstreamConfig(
     env_steps=120, batch_size=8, replay_capacity=40, random_agent_steps=12, queue_size=16, hidden_dim=16,
@@ -96,6 +97,29 @@ def test_a_killed_run_continues_with_the_same_command(tmp_path: Path) -> None:
         assert record(tmp_path / "parts" / name) == record(tmp_path / "whole" / name)
 
 
+def test_a_kill_during_the_last_evaluation_repeats_that_evaluation_alone(tmp_path: Path) -> None:
+    # Two episodes of ten agent steps evaluate at 0, 40, 80 and 120 env steps; 60 agent steps train.
+    killed = python(
+        "import signal, pathlib, test_downstream, worlds\n"
+        "task = worlds.signalling('toy', 125, signal.SIGKILL)\n"
+        f"test_downstream.train(pathlib.Path({str(tmp_path)!r}), task=task)"
+    )
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    steps = []
+
+    def make(*, seed: int, image_size: int, action_repeat: int) -> ToyEnv:
+        return ToyEnv(fixed_length, seed=seed, image_size=image_size, on_step=steps.append)
+
+    assert train(tmp_path, task=world("toy", make)).evaluations[-1]["env_steps"] == 120
+    assert len(steps) == 2 * EPISODE
+
+
+def test_an_agent_acts_in_the_precision_that_auto_meant_where_it_was_trained(tmp_path: Path) -> None:
+    agent = train(None, env_steps=20).agent
+    save_agent(tmp_path / "agent", agent, card={"precision": "bf16", "config": {"precision": "auto"}})
+    assert load_agent(tmp_path / "agent")[0].encoder.compute_dtype == torch.bfloat16
+
+
 def test_dense_maps_and_encoding_anew_are_the_same_run_up_to_rounding(tmp_path: Path) -> None:
     short: dict[str, Any] = {"task": world("smooth", make_smooth), "env_steps": 80, "eval_episodes": 1}
     for features in ("dense", "reencode", "dense-bf16"):
@@ -141,13 +165,17 @@ def test_drq_trains_its_encoder(tmp_path: Path) -> None:
     assert torch.equal(agent(pixels), result.agent(pixels))
 
 
-def test_an_actor_that_explored_the_task_is_where_learning_begins() -> None:
+def test_an_actor_that_explored_the_task_is_where_learning_begins(tmp_path: Path) -> None:
     torch.manual_seed(1)
     actor = SquashedGaussianActor(make_encoder(9).feature_dim, 2, hidden_dim=16)
     with_actor = dataclasses.replace(make_pretrained(), actor=actor)
-    begun = train(None, with_actor, env_steps=20)
+    begun = train(tmp_path / "explored", with_actor, env_steps=20)
     for key, value in actor.state_dict().items():
         assert torch.equal(weights(begun)[key], value)
+    # It acts from the first decision on, where others act at random until the first update.
+    train(tmp_path / "random", env_steps=20)
+    explored, random = (record(tmp_path / name / "episodes.csv")[0] for name in ("explored", "random"))
+    assert explored["episode_return"] != random["episode_return"]
 
 
 class OwnEncoder(nn.Module):
@@ -187,6 +215,8 @@ def test_what_does_not_fit_a_run_is_refused_by_name(tmp_path: Path) -> None:
     train(tmp_path, env_steps=40)
     with pytest.raises(CheckpointError, match="batch_size was 8, now 4"):
         train(tmp_path, batch_size=4)
+    with pytest.raises(CheckpointError, match="cuda_graph was False, now True"):
+        train(tmp_path, cuda_graph=True)
     with pytest.raises(CheckpointError, match="pretrained was"):
         train(tmp_path, make_pretrained("proto-rl-c"))
     with pytest.raises(PretrainedError, match="cannot be built in another process"):

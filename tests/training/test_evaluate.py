@@ -99,6 +99,7 @@ def test_workers_evaluate_a_snapshot_hand_it_out_when_asked_and_it_is_part_of_a_
     assert results == expected
     again, repeated = evaluator(0, seed=7)
     again.load_state_dict(state)
+    assert repeated == []  # the run has not restored its record yet
     again.finish()
     assert repeated == expected
     assert again.state_dict() == {}

@@ -108,6 +108,7 @@ def test_a_run_of_other_settings_is_refused_by_name(tmp_path: Path) -> None:
     run("apt-s", tmp_path, env_steps=20)
     with pytest.raises(CheckpointError, match="batch_size was 4, now 8"):
         run("apt-s", tmp_path, env_steps=20, batch_size=8)
+    assert run("apt-s", tmp_path, env_steps=20, log_interval=3).env_steps == 20  # it decides no number
 
 
 def test_a_loss_without_the_networks_of_the_reward_is_refused() -> None:

@@ -18,7 +18,7 @@ from toy_world import random_episode, write_dataset
 from worlds import SIZE, make_dataset, make_datasets, make_encoder, make_loss, record, same_state
 
 from crptpro.data import FrameDataset
-from crptpro.errors import CheckpointError, DatasetError, NonFiniteError
+from crptpro.errors import CheckpointError, CRPTproError, DatasetError, NonFiniteError
 from crptpro.objectives import ATCLoss, SimCLRLoss, get_method
 from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training import PretrainConfig, PretrainResult, finetune, pretrain
@@ -114,11 +114,11 @@ def test_a_resumed_run_gives_the_weights_and_the_record_of_an_uninterrupted_one(
         return get_method(method).build(make_encoder(), latent_dim=8, **options)
 
     whole, parts = build(), build()
-    run(whole, 14, tmp_path / "whole", method=method, warmup_updates=3)
+    run(whole, 14, tmp_path / "whole", warmup_updates=3)
     with pytest.raises(KeyboardInterrupt):
-        run(parts, 14, tmp_path / "parts", method=method, warmup_updates=3, datasets=_interrupting(7))
+        run(parts, 14, tmp_path / "parts", warmup_updates=3, datasets=_interrupting(7))
     resumed = build()
-    result = run(resumed, 14, tmp_path / "parts", method=method, warmup_updates=3)
+    result = run(resumed, 14, tmp_path / "parts", warmup_updates=3)
     assert result.resumed_from == 7
     assert same_state(resumed, whole)
     assert record(tmp_path / "parts" / "pretrain.csv") == record(tmp_path / "whole" / "pretrain.csv")
@@ -153,6 +153,36 @@ def test_a_larger_budget_extends_a_finished_run(tmp_path: Path) -> None:
     run(longer, 14, tmp_path / "parts")
     assert same_state(longer, whole)
     assert record(tmp_path / "parts" / "pretrain.csv") == record(tmp_path / "whole" / "pretrain.csv")
+
+
+def test_a_finished_run_that_is_called_again_gives_its_result_and_keeps_its_record(tmp_path: Path) -> None:
+    first = run(make_loss(), 7, tmp_path, log_interval=4)
+    again = run(make_loss(), 7, tmp_path, log_interval=4)
+    assert (again.updates, same_state(again.loss, first.loss)) == (7, True)
+    assert [row["updates"] for row in record(tmp_path / "pretrain.csv")] == ["4", "7"]
+    assert again.metrics["loss"] == first.metrics["loss"]
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        ("proto-rl-c", r"explores its domains .* use pretrain_active"),
+        ("crptpro-finetune", "takes a trained encoder of crptpro"),
+        ("crptpro-no-bonus", "takes a trained encoder of crptpro"),
+    ],
+)
+def test_a_method_that_does_not_begin_with_datasets_is_refused(method: str, message: str) -> None:
+    with pytest.raises(CRPTproError, match=message):
+        pretrain(make_loss(), make_datasets(), method=method, progress=False)
+
+
+def test_finetuning_takes_the_updates_of_the_method_of_that_name(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    before = load_pretrained(save_pretrained(run(make_loss(), 1), tmp_path))
+    with caplog.at_level("WARNING", logger="crptpro"), pytest.raises(KeyboardInterrupt):
+        finetune(before, _interrupting(3), batch_size=8, progress=False)
+    assert "of 2,000 updates" in caplog.text
 
 
 def test_a_schedule_over_the_run_cannot_be_extended(tmp_path: Path) -> None:
@@ -195,7 +225,7 @@ def test_a_second_view_is_the_same_image_under_another_shift() -> None:
             batches.append(tensordict.clone())
             return super().forward(tensordict)
 
-    run(Watched(make_encoder(), latent_dim=8), 2, method="apt-c")
+    run(Watched(make_encoder(), latent_dim=8), 2)
     first, second = (batches[0][key].float() for key in ("pixels", "pixels_view"))
     assert not torch.equal(first, second)
     centre = (slice(None), slice(None), slice(4, 12), slice(4, 12))

@@ -31,18 +31,6 @@ def embed_pixels(encoder: nn.Module, pixels: Tensor, *, projector: nn.Module | N
     return torch.cat(parts)
 
 
-def principal_components(points: Tensor, *, components: int = 3) -> tuple[Tensor, Tensor]:
-    """Project centred points ``[N, D]`` on their leading principal directions (scikit-learn's ``PCA``).
-
-    Returns coordinates ``[N, components]``, and the fraction of the variance that each explains, in decreasing order.
-    """
-    from sklearn.decomposition import PCA
-
-    pca = PCA(components, svd_solver="full")
-    coordinates = pca.fit_transform(points.double().numpy())
-    return torch.from_numpy(coordinates), torch.from_numpy(pca.explained_variance_ratio_)
-
-
 def gram_matrix(features: Tensor, mean: Tensor, scale: Tensor) -> np.ndarray:
     """Return the inner products, float64 ``[N, N]``, of ``(features - mean) / scale``; features on the CPU."""
     standardized = features.to(torch.float64, copy=True).sub_(mean).div_(scale).numpy()
@@ -64,16 +52,3 @@ def effective_rank(features: Tensor) -> float:
         return 0.0
     shares = singular / singular.sum()
     return float(np.exp(-(shares * np.log(shares)).sum()))
-
-
-def mean_cosine(features: Tensor) -> float:
-    """Return the mean cosine between different samples' features ``[N, D]``; 1 if all point the same way.
-
-    A sample whose features are all 0 has the cosine 0 with every other; a single one gives 0.
-    """
-    count = len(features)
-    if count < 2:
-        return 0.0
-    unit = nn.functional.normalize(features, dim=1)
-    of_sum = unit.sum(0, dtype=torch.float64).square().sum()
-    return float(of_sum - unit.square().sum(dtype=torch.float64)) / (count * (count - 1))

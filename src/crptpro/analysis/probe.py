@@ -9,10 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from crptpro.analysis.coordinates import joints_of, position_coordinates, velocity_coordinates
-from crptpro.analysis.embeddings import effective_rank, embed_pixels, gram_matrix, mean_cosine
+from crptpro.analysis.embeddings import effective_rank, embed_pixels, gram_matrix
 from crptpro.data import FrameDataset
 from crptpro.data.storage import gather_stacks, stack_rows
 from crptpro.errors import DatasetError
+from crptpro.objectives.functional import mean_pairwise_cosine
 from crptpro.seeding import derive_seed
 
 HELD_OUT = 0.25
@@ -140,7 +141,7 @@ def probe_embeddings(samples: ProbeSamples, embeddings: Tensor) -> ProbeResult:
         velocities={name: value for (kind, name), value in scores.items() if kind == "velocity"},
         left_out=tuple(name for name in names if name not in scores),
         effective_rank=effective_rank(embeddings),
-        mean_cosine=mean_cosine(embeddings),
+        mean_cosine=mean_pairwise_cosine(nn.functional.normalize(embeddings, dim=1)).item(),
     )
 
 

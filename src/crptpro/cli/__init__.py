@@ -14,7 +14,7 @@ import re
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
@@ -66,7 +66,7 @@ class Logging:
     """also write TensorBoard event files"""
 
     @contextlib.contextmanager
-    def records(self, run_dir: Path, config: Any) -> Iterator[RunLogger | None]:
+    def records(self, run_dir: Path) -> Iterator[RunLogger | None]:
         """Open the record of a run with its mirrors; without mirrors the run makes its own."""
         if self.wandb == "off" and not self.tensorboard:
             yield None
@@ -75,7 +75,7 @@ class Logging:
         if self.wandb != "off":
             wandb = WandbOptions(self.wandb_project, self.wandb_group, tags=self.wandb_tags, mode=self.wandb)
         is_new = not run_dir.exists()
-        with RunLogger(run_dir, config=config, wandb=wandb, tensorboard=self.tensorboard) as logger:
+        with RunLogger(run_dir, wandb=wandb, tensorboard=self.tensorboard) as logger:
             try:
                 yield logger
             except Exception:
@@ -174,13 +174,16 @@ class Pretraining(EncoderRun):
                 image_size, frame_stack = image_format(sources)
                 images = {"image_size": image_size, "in_channels": 3 * frame_stack}
         if method.loss_class is None:
-            untrained = random_pretrained(self.config.seed, method=self.method, datasets=sources, **images)
+            if self.loss:
+                raise CRPTproError(f"{self.method} is not trained and has no loss; leave out --loss.")
+            encoder_options = images | named_values("--encoder", self.encoder)
+            untrained = random_pretrained(self.config.seed, method=self.method, datasets=sources, **encoder_options)
             logger.info("untrained encoder: %s", save_pretrained(untrained, self.out / "encoder"))
             return
         loss_options, encoder_options = named_values("--loss", self.loss), named_values("--encoder", self.encoder)
         seed_everything(self.config.seed)
         loss = method.build(method.build_encoder(**images, **encoder_options), **loss_options)
-        with self.logging.records(self.out, self) as records:
+        with self.logging.records(self.out) as records:
             result = train(loss, sources, method=self.method, run_dir=self.out, config=self.config, records=records)
             self.keep(result, records)
 
@@ -216,9 +219,8 @@ class Finetune(EncoderRun):
     def run(self) -> None:
         image_size, frame_stack = image_format([self.dataset])
         pretrained = load_pretrained(self.pretrained).require(image_size=image_size, frame_stack=frame_stack)
-        config = replace(self.config, updates=self.config.updates or get_method("crptpro-finetune").updates)
-        with self.logging.records(self.out, self) as records:
-            result = training.finetune(pretrained, self.dataset, run_dir=self.out, config=config, records=records)
+        with self.logging.records(self.out) as records:
+            result = training.finetune(pretrained, self.dataset, run_dir=self.out, config=self.config, records=records)
             self.keep(result, records)
 
 
@@ -240,7 +242,7 @@ class Downstream:
 
     def run(self) -> None:
         get_domain(self.task)  # an unknown name is refused before the run directory is made
-        with self.logging.records(self.out, self) as records:
+        with self.logging.records(self.out) as records:
             result = training.train_downstream(
                 self.task, self.pretrained, run_dir=self.out, config=self.config, records=records
             )

@@ -26,7 +26,7 @@ _LAUNCHERS = {
 }  # fmt: skip
 """Options that only some launchers read."""
 PAPER_RUNS = 6
-"""Evaluations behind each of the paper's numbers: three runs on each of two encoders."""
+"""Evaluations that the paper's numbers of CRPTpro are over, at the least; it says no number for the others."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Reproduce:
     Experiments: seen, unseen, colors, finetune, efficiency, ablation, sensitivity, prototypes, coverage, stability,
     visualize, probe, or all. Whatever is finished, by this or another experiment, is used again; interrupted,
     the same command continues. At the end `crptpro report ROOT` makes tables and figures of it. The default of at most
-    three runs on one encoder is below the paper's six evaluations of each number: --encoder-seeds 0 1 has as many.
+    three runs on one encoder is below the paper's six evaluations or more: --encoder-seeds 0 1 has six.
     """
 
     experiments: Annotated[
@@ -56,7 +56,7 @@ class Reproduce:
     encoder_seeds: tuple[int, ...] = (0,)
     """of data and pre-training"""
     colors_by: Literal["background", "image"] = "background"
-    """what other colours are, where an experiment has them: reversed in the background or in the whole image"""
+    """what the experiment `colors` reverses: the background or the whole image"""
     out: Annotated[str, arg(metavar="PATH")] = "runs/reproduce"
     """ROOT, where everything is kept and found again"""
     dry_run: bool = False
@@ -105,7 +105,8 @@ class Reproduce:
         print(plan_text(plan, root, disk, jobs), flush=True)
         runs = len(request.encoder_seeds) * len(request.seeds)
         if any(job.kind == "run" for job in plan.jobs) and runs < PAPER_RUNS:
-            print(f"\nRuns behind each score: {runs}; the paper has {PAPER_RUNS} (--seeds, --encoder-seeds).")
+            paper = f"the paper has at least {PAPER_RUNS} for CRPTpro (--seeds, --encoder-seeds)"
+            print(f"\nRuns behind each score: {runs}; {paper}.")
         if self.dry_run:
             return
         require_disk(root, disk, "What this plan has yet to make")
@@ -120,7 +121,7 @@ class Reproduce:
             if failures:
                 print(failures_text(failures), flush=True)
                 raise SystemExit(1)
-        print(f"\nAll of it is there. Tables and figures: crptpro report {root}", flush=True)
+        print(f"\nEverything requested is finished. Tables and figures: crptpro report {root}", flush=True)
 
     def _checked_options(self) -> dict[str, Any]:
         """Refuse impossible options, and those of another launcher; returns the parameters of Slurm."""

@@ -20,7 +20,7 @@ import tyro
 from tyro.conf import Positional, UseAppendAction
 
 from crptpro.analysis.coverage import coverage as particle_estimate
-from crptpro.analysis.embeddings import embed_pixels, principal_components, sample_pixels
+from crptpro.analysis.embeddings import embed_pixels, sample_pixels
 from crptpro.analysis.probe import probe, probe_samples
 from crptpro.artifact import read_json, write_json, write_whole
 from crptpro.data import FrameDataset, StoredReplay
@@ -189,6 +189,8 @@ def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
 
 def embeddings(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
     """Write principal components of random data and of an explorer's last quarter: OUT/embeddings.csv."""
+    from sklearn.decomposition import PCA
+
     pretrained = of.load()
     frame_stack = pretrained.encoder.in_channels // 3
     pixels = {}
@@ -200,9 +202,9 @@ def embeddings(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
         chosen = of.draw(int(0.75 * len(replay)), len(replay), of.samples, "embeddings", path.name)
         pixels[f"{path.name} explorer"] = replay.observations(chosen)
     points = torch.cat([embed_pixels(pretrained.encoder, images) for images in pixels.values()]).cpu()
-    coordinates, explained = principal_components(points)
-    write_json(of.out / "explained.json", {"explained_variance_ratio": explained.tolist()})
-    table = pd.DataFrame(coordinates.numpy(), columns=["pc1", "pc2", "pc3"])
+    pca = PCA(3, svd_solver="full")
+    table = pd.DataFrame(pca.fit_transform(points.double().numpy()), columns=["pc1", "pc2", "pc3"])
+    write_json(of.out / "explained.json", {"explained_variance_ratio": pca.explained_variance_ratio_.tolist()})
     table.insert(0, "source", [source for source, images in pixels.items() for _ in images])
     write_rows(of.out / "embeddings.csv", table)
 

@@ -191,8 +191,7 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     for path in sorted(path.parent for path in root.rglob("eval.csv")):
         try:
             content = read_json(path / "config.json", error=RecordError)
-            config = content["config"]
-            facts = {"task": config["task"], **config.get("config", config)}
+            facts = content["config"]
             episodes = _read(path / "eval.csv", *EPISODES)
             label = episodes["method"].iloc[0]
             is_done = bool(episodes["env_steps"].max() >= facts["env_steps"])
@@ -493,7 +492,7 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
         )
     if missing := sorted(kept.loc[kept["expert"].isna(), "task_name"].unique()):
         page.text(f"The paper has no DrQ score for {', '.join(missing)}: in the mean score only.", "note")
-    _improvement(page, normal)
+    _improvement(page, kept)
 
 
 def _improvement(page: Page, runs: pd.DataFrame) -> None:

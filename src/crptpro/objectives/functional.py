@@ -178,7 +178,7 @@ def assignment_entropy(assignments: Tensor) -> Tensor:
 
 @torch.no_grad()
 def prototypes_in_use(assignments: Tensor) -> Tensor:
-    """Number of prototypes that are the largest of some row ``[B, M]``, a float scalar; arbitrary after a collapse."""
+    """Number of prototypes with the largest assignment in a row of ``[B, M]`` or more; arbitrary after a collapse."""
     used = assignments.new_zeros(assignments.shape[-1])
     return used.index_fill(0, assignments.argmax(dim=-1), 1.0).sum()
 

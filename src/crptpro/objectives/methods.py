@@ -151,9 +151,7 @@ TABLE = (
     Method("drq", None, updates=0, downstream=_DRQ | _NO_BONUS),
     # Controls: the encoder at initialisation, and with features of mean 0 and deviation 1.
     Method("random-encoder", None, updates=0, downstream=_NO_BONUS),
-    Method(
-        "random-encoder-standardised", None, updates=0, encoder_options={"standardised": True}, downstream=_NO_BONUS
-    ),
+    Method("random-encoder-standardised", None, updates=0, downstream=_NO_BONUS),
 )
 
 _METHODS: dict[str, Method] = {row.name: replace(row, is_builtin=True) for row in TABLE}

@@ -61,8 +61,8 @@ class PixelAgent(nn.Module):
         action = action.squeeze(0).float().cpu().clamp(-1, 1)
         if not torch.isfinite(action).all():
             raise NonFiniteError(
-                f"{where}: the policy acts {action.tolist()}, it has diverged. The last checkpoint is kept; lower the "
-                "learning rate or use precision='fp32'."
+                f"{where}: the policy returned the action {action.tolist()}; training has diverged. The last "
+                "checkpoint is kept; lower the learning rate or use precision='fp32'."
             )
         return action
 
@@ -81,7 +81,7 @@ def save_agent(path: str | Path, agent: PixelAgent, *, card: Mapping[str, Any]) 
 
 
 def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[PixelAgent, dict[str, Any]]:
-    """Rebuild an agent from its directory, to act in the arithmetic that its run learned in; return it and its card.
+    """Rebuild an agent from its directory, to act in the precision it was trained in; return it and its card.
 
     An encoder that is no :class:`~crptpro.modules.PixelEncoder` is needed as ``encoder``, a module of its class, whose
     weights are loaded. A directory that is missing, damaged, or not an agent is a ``CheckpointError``.
@@ -96,7 +96,7 @@ def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[P
             encoder = encoder or PixelEncoder(**card["modules"]["encoder"])
             agent = PixelAgent(encoder, SquashedGaussianActor(**card["modules"]["actor"]))
         agent.load_state_dict(tensors, assign=True)
-        dtype = resolve_precision(card.get("config", {}).get("precision", "fp32"), "cpu")
+        dtype = resolve_precision(card.get("precision", "fp32"), "cpu")
     except (KeyError, TypeError, ValueError, RuntimeError) as reason:
         raise CheckpointError(f"{path} holds no agent that can be rebuilt: {reason!r}") from reason
     return set_compute_dtype(agent.requires_grad_(False).eval(), dtype), card

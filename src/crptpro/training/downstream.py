@@ -56,7 +56,7 @@ class DownstreamConfig:
     replay_capacity: int | None = None
     """transitions kept (default: the method's; 40,000, proto-rl and drq 100,000); the oldest go first"""
     random_agent_steps: int = 1_000
-    """decisions taken uniformly at random before the first update"""
+    """decisions before the first update, uniformly at random unless the actor has explored the domain (proto-rl-s)"""
     intrinsic_reward_coef: float | None = None
     """weight of the prototype-kNN bonus (default: the method's; 0.2 for those with prototypes); 0 switches it off"""
     knn_k: int = 3
@@ -95,13 +95,13 @@ class DownstreamConfig:
     colors: Colors = "normal"
     """colours of the task: reversed_background are the paper's unseen ones, reversed_image works everywhere"""
     precision: Precision = "auto"
-    """arithmetic of big products; auto is bf16 where that is faster. Deviation: the released code is fp32 throughout"""
+    """of convolutions and matrix products; auto is bf16 where faster. Deviation: the released code uses fp32"""
     compile: bool = False
     """compile the losses with torch.compile; changes rounding only"""
     cuda_graph: bool = False
     """on a GPU, record the update as CUDA graphs and replay them"""
     device: str = "cpu"
-    """where networks and features are"""
+    """device of networks and features"""
 
     def __post_init__(self) -> None:
         check_numbers(self, minima={"eval_workers": 0}, maxima={"discount": 1, "critic_tau": 1})
@@ -181,7 +181,7 @@ def train_downstream(
                                       progress=progress))  # fmt: skip
         dtype = resolve_precision(run.saved_setting("precision", settings.precision), device)
         # The budget may grow, and machines differ; everything else decides the numbers of the run.
-        free = ("env_steps", "eval_workers", "compile", "cuda_graph", "device")
+        free = ("env_steps", "eval_workers", "compile", "device")
         run.require_same({
             "task": name, "pretrained": pretrained.identity(),
             **{key: value for key, value in dataclasses.asdict(settings).items() if key not in free},
@@ -193,7 +193,10 @@ def train_downstream(
         stack.callback(env.close)
         pretrained.require(image_size=env.env.observation_spec["pixels"].shape[-1])
         encoder = _frozen_copy(pretrained.encoder, device, dtype)
-        learner, agent = _make_agent(pretrained, encoder, env.env, settings, generators["policy"])
+        actor, action_dim = pretrained.actor, env.env.action_spec.shape[-1]
+        # Proto-RL(S): it begins as the actor that explored the task's own domain.
+        has_explored = isinstance(actor, SquashedGaussianActor) and actor.config["action_dim"] == action_dim
+        learner, agent = _make_agent(pretrained, encoder, action_dim, settings, generators["policy"], has_explored)
         set_compute_dtype(learner.loss, dtype)
         evaluator = Evaluator(env.make_env, agent, episodes=settings.eval_episodes, seed=settings.seed,
                               workers=_eval_workers(name, env.make_env, settings), progress=progress,
@@ -222,7 +225,8 @@ def train_downstream(
             episode_return, done, number = 0.0, False, None
             while not done and run.position < settings.env_steps:
                 agent_step = run.position // repeat
-                if is_random := agent_step < settings.random_agent_steps:
+                learns = agent_step >= settings.random_agent_steps
+                if not (learns or has_explored):
                     td["action"] = env.uniform_action(generators["random_actions"])
                 else:
                     if dense is None or number is None:  # the first observation of an episode is not stored yet
@@ -232,7 +236,7 @@ def train_downstream(
                     where = f"{name}, agent step {agent_step}"
                     td["action"] = agent.explore(features, generators["policy"], where=where)
                 step = env.step(td)  # the next observation is drawn while the update computes
-                if not is_random:
+                if learns:
                     # The sample has features under random shifts, and the bonus is part of its reward.
                     batch = replay.sample(settings.batch_size).to(device)
                     run.log(learner.update(batch, agent_step=agent_step))
@@ -254,6 +258,7 @@ def train_downstream(
             run.write("episodes", ended, episodes=counters["episodes"])
 
         if run.position != counters["last_evaluation"]:  # unless a finished run is called again
+            run.save()  # a kill during the last evaluation costs no env step
             start_evaluation()
         evaluator.finish()
         run.finish()
@@ -271,17 +276,15 @@ def _frozen_copy(network: nn.Module, device: torch.device, dtype: torch.dtype) -
 
 
 def _make_agent(
-    pretrained: Pretrained, encoder: Any, env: EnvBase, config: Any, generator: torch.Generator
+    pretrained: Pretrained, encoder: Any, action_dim: int, config: Any, generator: torch.Generator, has_explored: bool
 ) -> tuple[SACLearner, PixelAgent]:
     """Return SAC on the encoder's features, or DrQ, whose critic trains the encoder, and the agent that acts."""
-    action_dim, device = env.action_spec.shape[-1], torch.device(config.device)
+    device = torch.device(config.device)
     is_drq = pretrained.method == "drq"
     widths: dict[str, Any] = {"hidden_dim": config.hidden_dim, "has_tanh": is_drq}
-    explored = pretrained.actor
-    if isinstance(explored, SquashedGaussianActor) and explored.config["action_dim"] == action_dim:
-        actor = copy.deepcopy(explored).requires_grad_(True).train()  # it explored the task's own domain
-    else:
-        actor = SquashedGaussianActor(encoder.feature_dim, action_dim, **widths)
+    actor: Any = SquashedGaussianActor(encoder.feature_dim, action_dim, **widths)
+    if has_explored:
+        actor = copy.deepcopy(pretrained.actor).requires_grad_(True).train()
     networks = actor.to(device), TwinCritic(encoder.feature_dim, action_dim, **widths).to(device)
     options: dict[str, Any] = {"gamma": config.discount, "alpha_init": config.initial_temperature}
     make_loss = functools.partial(DrQLoss, encoder.requires_grad_(True)) if is_drq else RADSACLoss
@@ -395,7 +398,7 @@ def _record_evaluation(
 ) -> None:
     for e in episodes:
         row = {"episode_return": e.episode_return, "episode_agent_steps": e.agent_steps, "seed": e.seed}
-        run.write("eval", {**row, "method": method}, extra=None, episode=e.episode, **counters)
+        run.write("eval", {**row, "method": method}, episode=e.episode, **counters)
     scores = summarize(episodes)
     logger.info(
         "%s: %s env steps, %s updates, return %.1f ± %.1f over %d episodes",

@@ -149,7 +149,11 @@ class Evaluator:
     def start(self, agent: PixelAgent | None = None, /, **counters: int) -> None:
         """Evaluate an agent, by default the run's as it is now; ``counters``, with ``env_steps``, say where it is."""
         self.finish()
-        agent = agent or self.agent.snapshot()
+        self._begin(agent or self.agent.snapshot(), counters)
+        if not self.workers:
+            self.finish()
+
+    def _begin(self, agent: PixelAgent, counters: dict[str, int]) -> None:
         seed = derive_seed(self.seed, "evaluation", counters["env_steps"])
         futures: list[Future[Episode]] = []
         if self.workers:
@@ -158,8 +162,6 @@ class Evaluator:
             seeds = [episode_seed(seed, episode) for episode in range(self.episodes)]
             futures = [self._pool.submit(_evaluate, sent, *numbered) for numbered in enumerate(seeds)]
         self._pending = (agent, counters, seed, futures)
-        if not self.workers:
-            self.finish()
 
     def finish(self) -> None:
         """Wait for the evaluation that is under way, if any, and deliver its episodes."""
@@ -193,7 +195,7 @@ class Evaluator:
         if state:
             agent = copy.deepcopy(self.agent)
             agent.load_state_dict(state["agent"])
-            self.start(agent, **state["counters"])
+            self._begin(agent, state["counters"])  # delivered by the next start or finish, when the record is restored
 
     def close(self) -> None:
         if self._pool is not None:

@@ -79,9 +79,9 @@ class ExploreConfig:
     quality: Quality = "exact"
     """render quality"""
     precision: Precision = "auto"
-    """arithmetic of big products; auto is bf16 where that is faster. Deviation: the released code is fp32 throughout"""
+    """of convolutions and matrix products; auto is bf16 where faster. Deviation: the released code uses fp32"""
     device: str = "cpu"
-    """where networks are"""
+    """device of all networks"""
     log_interval: int = 50
     """encoder updates between two rows of the record"""
     checkpoint_interval_env_steps: int = 5_000
@@ -205,7 +205,7 @@ def pretrain_active(
         stack.enter_context(computing(loss, dtype))
         reward = getattr(exploration.reward, "__qualname__", exploration.reward)
         run.require_same({
-            **{k: v for k, v in dataclasses.asdict(settings).items() if k != "device"},
+            **{k: v for k, v in dataclasses.asdict(settings).items() if k not in ("device", "log_interval")},
             "domains": list(named), "precision": PRECISION_NAMES[dtype], "loss": describe_loss(loss),
             "exploration": {**dataclasses.asdict(exploration), "reward": reward},
         })  # fmt: skip

@@ -18,7 +18,7 @@ from torchrl.data import RandomSampler, ReplayBuffer
 from torchrl.objectives import LossModule, SoftUpdate
 
 from crptpro.data import FrameDataset
-from crptpro.errors import DatasetError
+from crptpro.errors import CRPTproError, DatasetError
 from crptpro.logging import RunLogger
 from crptpro.modules import computing, resolve_precision, usable_device
 from crptpro.modules.precision import PRECISION_NAMES, Precision
@@ -53,7 +53,7 @@ class PretrainConfig:
     seed: int = 0
     """seeds sampling, shifts, and what the loss draws"""
     precision: Precision = "auto"
-    """arithmetic of big products; auto is bf16 where that is faster. Deviation: the released code is fp32 throughout"""
+    """of convolutions and matrix products; auto is bf16 where faster. Deviation: the released code uses fp32"""
     compile: bool = False
     """compile the loss with torch.compile; changes rounding only"""
     cuda_graph: bool = False
@@ -126,12 +126,17 @@ def pretrain(
         **overrides: single settings of :class:`PretrainConfig`, e.g. ``updates=10_000``.
 
     Raises:
+        CRPTproError: ``method`` explores, or takes the encoder of another method.
         CheckpointError: ``run_dir`` holds a run of other settings (named), or another process is running in it.
         NonFiniteError: a loss or a weight is not finite; the last checkpoint is kept.
         DatasetError: a dataset is unusable, shows other images than the encoder takes, or lacks an entry.
         ValueError: naming an impossible setting.
     """
     recipe = method_of(loss) if method is None else get_method(method)
+    if started_from is None and recipe.starts_from is not None:
+        raise CRPTproError(f"{method} takes a trained encoder of {recipe.starts_from} and does not pre-train its own.")
+    if started_from is None and method is not None and recipe.exploration is not None:
+        raise CRPTproError(f"{method} explores its domains and does not learn from datasets; use pretrain_active().")
     settings = dataclasses.replace(config or PretrainConfig(), **overrides).resolved(recipe)
     device = usable_device(settings.device)
     loss.to(device).train()
@@ -177,6 +182,9 @@ def pretrain(
                 write_row(run, loss, monitor, batch, domain)
         run.finish()
         if run.means("pretrain"):  # after the checkpoint: a longer run takes this shorter row back
+            if run.position == run.resumed_from:  # a finished run that is called again
+                domain = domains[(run.position - 1) % len(domains)]
+                batch = buffers[domain].sample(settings.batch_size).select(*loss.in_keys).to(device)
             write_row(run, loss, monitor, batch, domain)
         facts = {"device": str(device), "datasets": datasets_facts}
         return PretrainResult(**ending(run, loss, recipe, monitor, run.position, facts))
@@ -195,7 +203,9 @@ def finetune(pretrained: Pretrained | str | Path, datasets: Any, **options: Any)
     if not isinstance(pretrained, Pretrained):
         pretrained = load_pretrained(pretrained)
     identity = pretrained.identity()
-    options |= {"method": pretrained.method, "started_from": identity}
+    config = options.get("config") or PretrainConfig()
+    updates = options.get("updates") or config.updates or get_method("crptpro-finetune").updates
+    options |= {"method": pretrained.method, "started_from": identity, "updates": updates}
     result = pretrain(pretrained.build_loss(), datasets, **options)
     before = {"started_from": identity, "previous_training": pretrained.card.get("training")}
     return dataclasses.replace(result, training={**result.training, **before})

@@ -152,7 +152,9 @@ class Run:
                 self._rotation = CheckpointRotation(self.run_dir / "checkpoints", keep_last=2)
                 self._find_checkpoint()
                 if self.records is None:
-                    self.records = stack.enter_context(RunLogger(self.run_dir, config=self.config))
+                    self.records = stack.enter_context(RunLogger(self.run_dir))
+            if self.records is not None and self.config is not None:
+                self.records.describe(self.config)
             self._stack = stack.pop_all()
         return self
 
