@@ -19,7 +19,7 @@ RECORDS = ROOT / "results"
 PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
 FIGURE = ROOT / "docs" / "results.png"
 METHODS = ("crptpro", "crptpro-fast", "crptpro-finetune", "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-s", "becl",
-           "drq", "crptpro-no-bonus", "random-encoder", "random-encoder-standardised")  # fmt: skip
+           "drq", "crptpro-no-bonus", "group-a-10k", "random-encoder", "random-encoder-standardised")  # fmt: skip
 DOMAINS = ("cheetah", "walker", "quadruped", "finger", "pendulum")
 PROBES = {
     **{n: RECORDS / "paper_scale" / f"probe_{n}_updates.csv" for n in (0, 1_000, 3_000)},
@@ -34,6 +34,10 @@ def downstream_runs(record: str, file: str = "eval") -> pd.DataFrame:
     for done in sorted((RECORDS / record).glob("jobs/run-*/done.json")):
         facts = json.loads(done.with_name("job.json").read_text())["facts"]
         found.append(pd.read_csv(done.with_name(f"{file}.csv")).assign(method=facts["method"], run=facts["seed"]))
+    if record == "controls":  # made with the same settings
+        for run in sorted((RECORDS / "paper_scale").glob("walker_run_seed_*")):
+            table = pd.read_csv(run / f"{file}.csv")
+            found.append(table.assign(method="group-a-10k", run=int(run.name.rpartition("_")[2])))
     table = pd.concat(found, ignore_index=True)
     table["method"] = pd.Categorical(table["method"], METHODS)  # whose order is that of the tables
     return table.sort_values(["method", "run"], kind="stable")
