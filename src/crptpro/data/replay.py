@@ -95,9 +95,8 @@ class FrameReplay(ReplayBuffer):
             **dict.fromkeys(("done", "terminated", "truncated"), ((1,), torch.bool)),
         }
         extra = dict(extra_columns or {})
-        if taken := sorted(
-            {*columns, "branch", "discount", "index", "next", "number", "row_of", "step"} & extra.keys()
-        ):
+        own = {"branch", "discount", "index", "next", "number", "row_of", "step"}
+        if taken := sorted({*columns, *own} & extra.keys()):
             raise ValueError(f"extra_columns may not be named {taken}: a sample has those; choose other names.")
         storage = RingStorage(
             capacity, columns | extra, slack=slack, frame_stack=frame_stack, n_step=n_step, discount=discount, path=path
