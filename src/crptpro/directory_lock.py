@@ -29,7 +29,7 @@ class DirectoryLock:
             path.mkdir(parents=True, exist_ok=True)
             lock = FileLock(path.resolve() / ".lock", is_singleton=True, thread_local=False)
             if lock.is_locked and not is_reentrant:
-                raise error(f"This process is already writing to {path}: close that first, such as dataset.writer.")
+                raise error(f"This process is already writing to {path}: close it first, e.g. dataset.writer.close().")
             lock.acquire(blocking=False)
             self._lock = lock
         except Timeout:

@@ -116,8 +116,8 @@ def check_numbers(config: Any, *, minima: Mapping[str, int], maxima: Mapping[str
 
 def _scalar(value: Any) -> Any:
     """Return the Python number of a scalar; what is no number, a bool or an array is a TypeError here or later."""
-    number = value.item() if hasattr(value, "item") and not getattr(value, "ndim", 0) else value
-    if isinstance(number, (bool, str, bytes)) or getattr(number, "ndim", 0):
+    number = value.item() if getattr(value, "ndim", None) == 0 else value
+    if isinstance(number, (bool, str, bytes)) or getattr(number, "ndim", 0) > 0:
         raise TypeError
     return number
 
