@@ -6,6 +6,7 @@ import errno
 import os
 import shutil
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -138,11 +139,11 @@ def test_weights_and_card_round_trip_and_writing_again_replaces_them(tmp_path: P
 def test_what_is_no_artifact_of_this_kind_is_not_replaced(tmp_path: Path) -> None:
     run_dir = tmp_path / "run"
     (run_dir / "checkpoints").mkdir(parents=True)
-    with pytest.raises(CRPTproError, match="is no 'test'; it is not replaced"):
+    with pytest.raises(CRPTproError, match="is not a 'test', so it was left unchanged"):
         write(run_dir)
     assert [path.name for path in run_dir.iterdir()] == ["checkpoints"]
     write_artifact(tmp_path / "a", {}, card={}, format_name="other", version=1)
-    with pytest.raises(CRPTproError, match="is no 'test'"):
+    with pytest.raises(CRPTproError, match="is not a 'test'"):
         write(tmp_path / "a")
     (tmp_path / "empty").mkdir()
     assert read(write(tmp_path / "empty"))[0]["task"] == "walker"
@@ -187,7 +188,7 @@ def test_what_was_written_is_read_back_before_it_replaces_anything(
     assert value_of(tmp_path / "a") == 1
 
 
-def test_the_directory_that_one_is_in_is_read_and_written_like_any_other(
+def test_the_directory_that_one_is_in_is_read_but_never_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(tmp_path / "a", 1.0)
@@ -196,8 +197,10 @@ def test_the_directory_that_one_is_in_is_read_and_written_like_any_other(
     assert value_of(Path("..")) == value_of(Path("../sub/..")) == 1
     monkeypatch.chdir(tmp_path / "a")
     assert value_of(Path(".")) == 1
-    write(Path("."), 2.0)
-    assert value_of(tmp_path / "a") == 2
+    for path in (Path("."), tmp_path / "a"):
+        with pytest.raises(CRPTproError, match="a is the working directory, which is not replaced"):
+            write(path, 2.0)
+    assert value_of(Path(".")) == value_of(tmp_path / "a") == 1
 
 
 def test_a_kill_between_the_two_renames_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,10 +225,25 @@ def test_a_kill_between_the_two_renames_loses_nothing(tmp_path: Path, monkeypatc
 
 
 def test_what_a_killed_writer_left_is_removed_by_the_next(tmp_path: Path) -> None:
-    (tmp_path / ".a.writing").mkdir()
-    (tmp_path / ".a.writing" / "weights.safetensors").write_text("half")
+    living, dead = f".a.writing.{os.getppid()}", f".a.writing.{2**22 + 1}"  # Linux has no process of this number
+    for name in (".a.writing", living, dead):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "weights.safetensors").write_text("half")
     write(tmp_path / "a")
-    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+    assert {p.name for p in tmp_path.iterdir()} == {"a", living}
+
+
+def test_threads_that_write_one_file_leave_a_whole_one(tmp_path: Path) -> None:
+    path, contents = tmp_path / "a.txt", [str(digit) * 100_000 for digit in range(4)]
+
+    def repeat(content: str) -> None:
+        for _ in range(20):
+            write_whole(path, content)
+
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(repeat, contents))
+    assert path.read_text() in contents
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
 def truncate(path: Path) -> None:

@@ -41,7 +41,7 @@ def test_a_second_process_is_refused_and_a_dead_one_is_not_remembered(
 def test_a_released_directory_may_be_taken_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     lock = DirectoryLock("~/new")
-    with pytest.raises(CRPTproError, match="Another process"):
+    with pytest.raises(CRPTproError, match="This process is already writing to"):
         DirectoryLock(tmp_path / "new")
     lock.release()
     lock.release()

@@ -93,6 +93,14 @@ def test_letters_stand_for_the_domains_of_their_group() -> None:
         expand_groups(["E"])
 
 
+def test_a_text_is_one_name_and_not_its_letters() -> None:
+    assert expand_groups("walker") == ["walker"]
+    assert expand_groups("A") == ["cheetah", "walker", "quadruped"]
+    assert expand_groups(PAPER_DOMAINS["walker"]) == [PAPER_DOMAINS["walker"]]
+    with pytest.raises(UnknownNameError, match="'AB'"):
+        expand_groups("AB")
+
+
 def test_numbers_of_a_domain_are_the_plain_numbers_they_mean() -> None:
     domain = Domain("lander", "lander", make=make_nothing, action_repeat=np.int64(4), episode_env_steps=1e3)
     assert repr((domain.action_repeat, domain.episode_env_steps)) == "(4, 1000)"
@@ -106,7 +114,7 @@ def test_a_domain_travels_to_another_process() -> None:
 
 
 @pytest.mark.parametrize(("domain", "complaint"), [
-    *((Domain(name, "own", make=make_nothing), "built-in") for name in ("walker", "reach_duplo", "gymnasium:Own-v0")),
+    *((Domain(name, "own", make=make_nothing), "built-in") for name in ("walker", "A", "reach_duplo", "gymnasium:X")),
     (Domain("lander", "lander"), "no make"),
 ])  # fmt: skip
 def test_a_built_in_name_or_a_domain_without_make_is_refused(domain: Domain, complaint: str) -> None:

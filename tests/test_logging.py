@@ -57,6 +57,19 @@ def test_a_column_that_appears_later_does_not_shift_the_others(tmp_path: Path) -
     ]
 
 
+def test_a_row_is_written_without_reading_those_before_wherever_the_process_has_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with RunLogger("run") as logger:
+        logger.log({"a": 1}, stream="train", updates=1)
+        (tmp_path / "elsewhere").mkdir()
+        monkeypatch.chdir("elsewhere")
+        monkeypatch.setattr(RunLogger, "rows", lambda *_: pytest.fail("the rows so far were read"))
+        logger.log({"a": 2}, stream="train", updates=2)
+    assert table(tmp_path / "run", "train") == [{"updates": "1", "a": "1"}, {"updates": "2", "a": "2"}]
+
+
 def test_floats_keep_every_digit_and_nan_is_a_word(tmp_path: Path) -> None:
     with RunLogger(tmp_path) as logger:
         logger.log({"third": 1 / 3, "bad": math.nan, "huge": -math.inf, "none": None}, stream="x", updates=1)
@@ -72,7 +85,7 @@ def test_floats_keep_every_digit_and_nan_is_a_word(tmp_path: Path) -> None:
     ({"a": 1}, "train", {"updates": 1.5}, "whole number"),
     ({"stream": 1}, "train", {"updates": 1}, "cannot name a metric"),
     ({"updates": 1}, "train", {"updates": 1}, "cannot name a metric"),
-    ({"a": torch.zeros(2)}, "train", {"updates": 1}, "no scalar"),
+    ({"a": torch.zeros(2)}, "train", {"updates": 1}, "not a scalar"),
     ({"a": 1}, "../x", {"updates": 1}, "stream is named"),
 ])  # fmt: skip
 def test_what_cannot_be_a_row_is_refused(

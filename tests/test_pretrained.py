@@ -19,12 +19,14 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import LossModule
 
 from crptpro import pretrained
-from crptpro.errors import CRPTproError, PretrainedError
+from crptpro.data import FrameDataset
+from crptpro.errors import CRPTproError, PretrainedError, UnknownNameError
 from crptpro.modules import PixelEncoder, SquashedGaussianActor
 from crptpro.objectives import BeCLLoss, ProtoLoss, SimCLRLoss
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained, save_pretrained, shipped_encoders
 from crptpro.training import PretrainResult, finetune, pretrain, train_downstream
 from crptpro.training.agent import PixelAgent, save_agent
+from crptpro.transforms import RandomShift
 
 TINY: dict[str, Any] = {"channels": (4, 4), "strides": (2, 1), "image_size": 16}
 PIXELS = torch.randint(0, 256, (5, 9, 16, 16), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
@@ -125,7 +127,7 @@ def test_a_result_is_saved_with_its_facts_queue_and_actor(trained: ProtoLoss, tm
     again = load_pretrained(save_pretrained(loaded, tmp_path / "b"))
     assert again.queue is not None
     assert all_equal(states(again, "actor", "target_encoder"), states(loaded, "actor", "target_encoder"))
-    with pytest.raises(PretrainedError, match="no loss, and no result of one"):
+    with pytest.raises(PretrainedError, match="neither a loss nor a pre-training result"):
         save_pretrained(SimpleNamespace(updates=3), tmp_path / "c")
 
 
@@ -152,7 +154,7 @@ def test_what_cannot_be_rebuilt_is_refused_and_the_old_artifact_kept(saved: Path
 def test_another_directory_is_never_replaced(trained: ProtoLoss, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "pretrain.csv").write_text("precious")
-    with pytest.raises(CRPTproError, match="not replaced"):
+    with pytest.raises(CRPTproError, match="left unchanged"):
         save_pretrained(trained, tmp_path / "run")
     assert (tmp_path / "run" / "pretrain.csv").read_text() == "precious"
 
@@ -222,6 +224,14 @@ def test_an_encoder_that_ships_is_loaded_by_name_and_an_unknown_name_lists_them(
         load_pretrained("runs/group-a")  # a path
     save_pretrained(make_loss(1), "group-a")  # a directory of this name comes first
     assert load_pretrained("group-a").identity() != load_pretrained(kept).identity()
+
+
+def test_an_artifact_of_a_bare_name_is_found_between_the_two_renames_of_its_replacement(
+    kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(kept, ".enc.previous")
+    assert load_pretrained("enc").identity() == load_pretrained(kept).identity()
 
 
 @pytest.mark.gl
@@ -319,6 +329,43 @@ def test_the_random_control_depends_on_its_seed_alone_and_can_be_kept(tmp_path: 
     assert all_equal(states(loaded, "encoder"), states(one, "encoder"))
 
 
+def write_frames(path: Path, frame_stack: int = 3, **options: Any) -> FrameDataset:
+    generator = torch.Generator().manual_seed(1)
+    frames = torch.randint(0, 256, (31, 3, 16, 16), dtype=torch.uint8, generator=generator)
+    flags = {name: torch.zeros(30, 1, dtype=torch.bool) for name in ("done", "terminated", "truncated")}
+    following = TensorDict({"pixels": frames[1:], "reward": torch.zeros(30, 1), **flags}, [30])
+    rollout = TensorDict({"pixels": frames[:-1], "action": torch.zeros(30, 1), "next": following}, [30])
+    FrameDataset.create(path, domain="walker", transitions=30).extend(rollout)
+    return FrameDataset.open(path, frame_stack=frame_stack, **options)
+
+
+@pytest.mark.parametrize("method", ["random-encoder-standardized", "crptpro"])
+def test_a_control_that_does_not_exist_is_refused_with_those_that_do(method: str) -> None:
+    with pytest.raises(UnknownNameError, match=rf"drq, random-encoder, random-encoder-standardised, got '{method}'"):
+        random_pretrained(method=method, **TINY)
+
+
+@pytest.mark.parametrize("frame_stack", [3, 2])
+def test_a_standardised_control_depends_on_stored_frames_alone_and_leaves_the_dataset_as_it_is(
+    tmp_path: Path, frame_stack: int
+) -> None:
+    options: dict[str, Any] = {**TINY, "method": "random-encoder-standardised", "in_channels": 3 * frame_stack}
+    dataset = write_frames(tmp_path / "walker", frame_stack)
+    plain = random_pretrained(datasets=[dataset], **options).identity()
+    for path in (tmp_path / "walker", str(tmp_path / "walker")):
+        assert random_pretrained(datasets=path, **options).identity() == plain
+    dataset.append_transform(RandomShift(pad=4, in_keys=["pixels"]))
+    dataset.set_rng(torch.Generator().manual_seed(3))
+    expected = FrameDataset.open(tmp_path / "walker", generator=torch.Generator().manual_seed(3)).sample(9)["index"]
+    assert random_pretrained(datasets=dataset, **options).identity() == plain
+    assert torch.equal(dataset.sample(9)["index"], expected)
+
+
+def test_weights_in_bfloat16_have_an_identity() -> None:
+    one, other = (Pretrained(PixelEncoder(**TINY).bfloat16()) for _ in range(2))
+    assert one.identity() == one.identity() != other.identity()
+
+
 # --- training further -------------------------------------------------------------------------------------------------
 
 
@@ -355,7 +402,7 @@ def test_finetuning_resumes_only_from_the_same_artifact(kept: Path, tmp_path: Pa
 
 def test_an_unregistered_method_cannot_be_finetuned(saved: Path) -> None:
     edit_card(saved, lambda card: card.update(method="somebody-elses"))
-    with pytest.raises(PretrainedError, match="no registered method"):
+    with pytest.raises(PretrainedError, match="not a registered method"):
         finetune(saved, make_dataset(0), updates=1)
 
 

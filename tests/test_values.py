@@ -21,13 +21,33 @@ def test_a_number_of_any_library_is_taken_as_the_plain_number_it_means(value: An
     assert json.dumps([whole, real]) == "[3, 3.0]"
 
 
-@pytest.mark.parametrize("value", [2.5, "3", None, True, float("nan"), float("inf"), [3], np.array([3]), torch.ones(2)])
+@pytest.mark.parametrize(
+    "value",
+    [
+        2.5,
+        "3",
+        None,
+        True,
+        float("nan"),
+        float("inf"),
+        [3],
+        np.array([3]),
+        torch.ones(2),
+        np.True_,
+        torch.tensor(True),
+        torch.tensor([True]),
+        torch.tensor([3]),
+    ],
+)
 def test_what_is_no_whole_number_is_refused_with_its_name_and_value(value: Any) -> None:
     with pytest.raises(ValueError, match="`transitions` must be a whole number, got"):
         as_int(value, "transitions")
 
 
-@pytest.mark.parametrize("value", ["3", None, True, float("nan"), float("inf"), np.array([1.0, 2.0])])
+@pytest.mark.parametrize("value", [
+    "3", None, True, float("nan"), float("inf"), np.array([1.0, 2.0]), np.True_, torch.tensor(True),
+    pytest.param(10**400, id="huge"),
+])  # fmt: skip
 def test_what_is_no_finite_number_is_refused_with_its_name_and_value(value: Any) -> None:
     with pytest.raises(ValueError, match="`rate` must be"):
         as_float(value, "rate")
@@ -63,6 +83,8 @@ def test_numbers_of_a_stage_are_plain_and_in_their_range_or_left_open() -> None:
 def test_a_path_is_expanded_and_one_that_no_record_can_hold_is_refused() -> None:
     assert as_path("~/runs") == Path.home() / "runs"
     assert as_path(Path("runs")) == Path("runs")
+    assert as_path(b"abc") == Path("abc")  # type: ignore[arg-type]
+    assert as_path("~nosuchuser/x") == Path("~nosuchuser/x")  # as a shell has it
     with pytest.raises(ValueError, match="`out` is empty"):
         as_path("", "out")
     with pytest.raises(ValueError, match="`out` is not UTF-8"):

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 import os
 import shutil
+import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import psutil
 from torch import Tensor, nn
 
 from crptpro.errors import CRPTproError, DiskSpaceError, writing_error
@@ -26,7 +29,7 @@ def write_whole(path: str | Path, content: str | bytes) -> Path:
     """
     path = as_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.partial")
     try:
         with open(partial, "wb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
@@ -41,7 +44,7 @@ def write_whole(path: str | Path, content: str | bytes) -> Path:
 
 
 def write_json(path: str | Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON object as :func:`write_whole` does; a ValueError names an entry that is no plain value."""
+    """Write a JSON object as :func:`write_whole` does; a ValueError names an entry that JSON cannot hold."""
     plain = as_plain(content, Path(path).name)
     write_whole(path, json.dumps(plain, indent=2, sort_keys=True) + "\n")
 
@@ -54,7 +57,7 @@ def read_json(path: str | Path, *, error: type[CRPTproError] = CRPTproError) -> 
     except FileNotFoundError:
         raise error(f"{path} does not exist.") from None
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as reason:
-        raise error(f"{path} cannot be read as JSON ({reason}); it is damaged or foreign.") from None
+        raise error(f"{path} cannot be read as JSON ({reason}); it is damaged or not written by crptpro.") from None
     if not isinstance(content, dict):
         raise error(f"{path} holds a {type(content).__name__}, expected a JSON object.")
     return content
@@ -91,19 +94,21 @@ def write_artifact(
     and ``weights_sha256`` are added to the plain facts of ``card``. Returns ``path``.
 
     Raises:
-        CRPTproError: there is something else at ``path``; it is left alone.
-        ValueError: a fact that is no plain value.
+        CRPTproError: there is something else at ``path``, or it is the working directory; it is left alone.
+        ValueError: a fact that cannot be stored as JSON.
         DiskSpaceError: the disk is full; an artifact there is kept.
     """
     from safetensors.torch import save
 
     given = as_path(path)
     path = given.resolve()
+    if path.exists() and path.samefile("."):
+        raise CRPTproError(f"{path} is the working directory, which is not replaced. Write to {path / 'encoder'}.")
     is_free = not path.exists() or (path.is_dir() and not any(path.iterdir()))
     if not is_free and (not (path / CARD_FILE).exists() or read_json(path / CARD_FILE).get("format") != format_name):
         raise CRPTproError(
-            f"{path} exists and is no {format_name!r}; it is not replaced. Choose another directory, such as "
-            f"{path / 'encoder'}."
+            f"{path} exists and is not a {format_name!r}, so it was left unchanged. Choose another directory, such "
+            f"as {path / 'encoder'}."
         )
     tensors = {}
     for name, module in modules.items():
@@ -112,10 +117,13 @@ def write_artifact(
         tensors.update({f"{name}.{k}": v.detach().cpu().contiguous().clone() for k, v in state.items()})
     content = save(tensors)
     facts = {"format": format_name, "version": version, "weights_sha256": hashlib.sha256(content).hexdigest()}
-    temporary = path.with_name(f".{path.name}.writing")
-    previous = _previous(path)
+    temporary = path.with_name(f".{path.name}.writing.{os.getpid()}")
+    previous = previous_of(path)
     try:
-        shutil.rmtree(temporary, ignore_errors=True)  # of a writer that was killed
+        for stale in path.parent.glob(f".{glob.escape(path.name)}.writing*"):  # of writers that were killed
+            pid = stale.suffix[1:]
+            if stale == temporary or not (pid.isdigit() and psutil.pid_exists(int(pid))):
+                shutil.rmtree(stale, ignore_errors=True)
         write_whole(temporary / WEIGHTS_FILE, content)
         write_json(temporary / CARD_FILE, {**card, **facts})
         found = read_artifact(temporary, format_name=format_name, version=version)
@@ -144,7 +152,7 @@ def read_artifact(
     from safetensors.torch import load
 
     path = as_path(path).resolve()
-    previous = _previous(path)  # where a writer that was killed between its two renames left it
+    previous = previous_of(path)  # where a writer that was killed between its two renames left it
     if previous.is_dir() and not path.exists():
         path = previous
     if not path.is_dir():
@@ -178,5 +186,6 @@ def identity_of(card: Mapping[str, Any]) -> str | None:
     return whole or f"{card.get('method', 'unknown')}:{card['weights_sha256']}"
 
 
-def _previous(path: Path) -> Path:
+def previous_of(path: Path) -> Path:
+    """Return where an artifact is between the two renames of its replacement."""
     return path.parent / f".{path.name}.previous"

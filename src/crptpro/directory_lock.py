@@ -18,7 +18,7 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 class DirectoryLock:
     """Locks ``directory`` for this process, so that no two processes write one record; a kill frees it too.
 
-    It is taken at construction, which raises ``error`` if another process holds the directory, or it cannot be written.
+    It is taken at construction, which raises ``error`` if the directory is held already, or cannot be written.
     Re-entrant holders in one process, a run's record and its training loop, share the lock.
     """
 
@@ -27,7 +27,9 @@ class DirectoryLock:
         self._lock: FileLock | None = None
         try:
             path.mkdir(parents=True, exist_ok=True)
-            lock = FileLock(path.resolve() / ".lock", is_singleton=is_reentrant, thread_local=False)
+            lock = FileLock(path.resolve() / ".lock", is_singleton=True, thread_local=False)
+            if lock.is_locked and not is_reentrant:
+                raise error(f"This process is already writing to {path}: close it first, e.g. dataset.writer.close().")
             lock.acquire(blocking=False)
             self._lock = lock
         except Timeout:

@@ -51,7 +51,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class DoctorReport:
-    """What :func:`run_doctor` found; the gravest problems come first."""
+    """What :func:`run_doctor` found; most severe first."""
 
     facts: tuple[str, ...]
     findings: tuple[Finding, ...]
@@ -129,7 +129,7 @@ def check_versions(installed: Mapping[Any, str], requirements: Iterable[str]) ->
 def _check_machine(free_ram: int, free_disk: int, gpus: Sequence[str]) -> list[Finding]:
     findings = []
     if free_ram < 4 * _GB:
-        what = f"{free_ram / _GB:.1f} GB of RAM are free; batches of 512 and a replay of 40,000 transitions want 4 GB."
+        what = f"{free_ram / _GB:.1f} GB of RAM are free; batches of 512 and a replay of 40,000 transitions need 4 GB."
         remedy = "End other programs, or use smaller batches and a smaller replay."
         findings.append(Finding("error" if free_ram < 1.5 * _GB else "warning", what, remedy))
     if free_disk < 7 * _GB:

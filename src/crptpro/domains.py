@@ -135,12 +135,12 @@ def register_domain(domain: Domain) -> Domain:
 
     A name that several domains share means the one registered last. A worker process starts without registered
     domains: pass the ``Domain`` itself, or call ``register_domain`` at the top level of the module that defines
-    ``make``. A domain without ``make``, or with a name of the paper's, is a ``CRPTproError``.
+    ``make``. A domain without ``make``, or with a name or letter of the paper's, is a ``CRPTproError``.
     """
     if domain.make is None and domain.source == "own":
         raise CRPTproError(f"Domain {domain.name!r} has no make; pass make=<function that builds the environment>.")
     for name in (domain.name, domain.task):
-        if name in PAPER_DOMAINS or name in TASKS or name.startswith(GYMNASIUM_PREFIX):
+        if name in {*PAPER_DOMAINS, *TASKS, *GROUPS} or name.startswith(GYMNASIUM_PREFIX):
             raise CRPTproError(f"{name!r} is one of the built-in names; register the domain under another one.")
     for key in (domain.task, domain.name):
         _registered[key] = domain
@@ -177,17 +177,17 @@ def get_domain(name: str | Domain) -> Domain:
     )
 
 
-def expand_groups(names: Iterable[Named]) -> list[Named]:
+def expand_groups(names: Named | Iterable[Named]) -> list[Named]:
     """Replace group letters by their domains, keeping order and dropping repeats.
 
-    No name, or an unknown one, is an ``UnknownNameError``; a :class:`Domain` stays.
+    No name, or an unknown one, is an ``UnknownNameError``; a :class:`Domain` stays. A text is one name.
 
     Examples:
         >>> expand_groups(["D", "walker", "finger"])
         ['walker', 'pendulum', 'hopper', 'finger']
     """
     expanded: list[Named] = []
-    for name in names:
+    for name in [names] if isinstance(names, (str, Domain)) else names:
         expanded += GROUPS.get(name, (name,)) if isinstance(name, str) else (name,)
     if not expanded:
         raise UnknownNameError(f"Name at least one domain, task or group ({', '.join(GROUPS)}).")

@@ -31,7 +31,7 @@ class WorkerLostError(CRPTproError):
 
 
 class DatasetError(CRPTproError):
-    """A dataset is missing, truncated, foreign or does not fit its use."""
+    """A dataset is missing, truncated, not written by crptpro or does not fit its use."""
 
 
 class DiskSpaceError(CRPTproError):

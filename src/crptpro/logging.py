@@ -69,11 +69,11 @@ class RunLogger:
     def __init__(
         self, run_dir: str | Path, *, config: Any = None, wandb: WandbOptions | None = None, tensorboard: bool = False
     ) -> None:
-        self.run_dir = as_path(run_dir, "run_dir")
+        self.run_dir = as_path(run_dir, "run_dir").absolute()
         self.path = self.run_dir / "metrics.jsonl"
         self._config = as_plain(config or {}, "config")
         self._lock = DirectoryLock(self.run_dir, error=CheckpointError, is_reentrant=True)
-        self._rows = self._read()
+        self._rows, self._columns = self._read(), dict[str, list[str]]()
         for stream in {row["stream"] for row in self._rows}:
             self._write_csv(stream)
         self._has_begun = False
@@ -103,7 +103,7 @@ class RunLogger:
                 given, else the first.
 
         Raises:
-            ValueError: no counter, a name used twice, reserved or not printable, or a value that is no scalar.
+            ValueError: no counter, a name used twice, reserved or not printable, or a value that is not a scalar.
             DiskSpaceError: if the disk is full; no half row stays behind.
         """
         if not re.fullmatch(r"[a-z][a-z0-9_]*", stream):
@@ -121,7 +121,7 @@ class RunLogger:
         if not self._has_begun and self._config:
             write_json(self.run_dir / "config.json", {"config": self._config, **provenance()})
         self._has_begun = True
-        columns, index = self._columns(stream), len(self._rows)
+        columns, index = self._columns.get(stream, []), len(self._rows)
         row = {"stream": stream, **where, "unix_time_s": round(time.time(), 3)}
         # NaN and infinity as words: they are not JSON, and the CSV shows the same.
         for key, value in values.items():
@@ -129,7 +129,7 @@ class RunLogger:
         _append(self.path, json.dumps(row) + "\n")
         self._rows.append(row)
         if row.keys() <= {"stream", *columns}:
-            _append(self._csv(stream), _csv_text([[row.get(name) for name in columns]]))
+            _append(self.run_dir / f"{stream}.csv", _csv_text([[row.get(name) for name in columns]]))
         else:
             self._write_csv(stream)
         self._mirror(lambda mirror: mirror.log(stream, where, values, index))
@@ -164,7 +164,7 @@ class RunLogger:
             if (missing := count - seen[name]) > 0:
                 _LOG.warning("%s: %d rows of %r are missing that the checkpoint counted.", self.path, missing, name)
         if len(kept) < len(self._rows):
-            self._write_rows(kept)
+            write_whole(self.path, "".join(json.dumps(row) + "\n" for row in kept))
         self._rows = kept
         for stream in seen:
             self._write_csv(stream)
@@ -179,14 +179,8 @@ class RunLogger:
         self._mirrors = []
         self._lock.release()
 
-    def _columns(self, stream: str) -> list[str]:
-        return list(dict.fromkeys(name for row in self.rows(stream) for name in row))
-
-    def _csv(self, stream: str) -> Path:
-        return self.run_dir / f"{stream}.csv"
-
     def _read(self) -> list[dict[str, Any]]:
-        """Read all rows; a torn or foreign line is dropped from the file with a warning."""
+        """Read all rows; a torn line, or one not written by crptpro, is dropped from the file with a warning."""
         lines = self.path.read_bytes().splitlines(keepends=True) if self.path.exists() else []
         rows = []
         for line in lines:
@@ -198,19 +192,18 @@ class RunLogger:
                 rows.append(row)
         if len(rows) < len(lines):
             _LOG.warning("%s: dropped %d damaged line(s).", self.path, len(lines) - len(rows))
-            self._write_rows(rows)
+            write_whole(self.path, "".join(json.dumps(row) + "\n" for row in rows))
         return rows
 
-    def _write_rows(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        write_whole(self.path, "".join(json.dumps(row) + "\n" for row in rows))
-
     def _write_csv(self, stream: str) -> None:
-        columns, path = self._columns(stream), self._csv(stream)
-        content = _csv_text([columns, *([row.get(name) for name in columns] for row in self.rows(stream))])
+        rows, path = self.rows(stream), self.run_dir / f"{stream}.csv"
+        columns = list(dict.fromkeys(name for row in rows for name in row))
+        content = _csv_text([columns, *([row.get(name) for name in columns] for row in rows)])
         if not columns:
             path.unlink(missing_ok=True)
         elif not path.exists() or path.read_bytes() != content.encode():
             write_whole(path, content)
+        self._columns[stream] = columns
 
     def _mirror(self, call: Callable[[_Wandb | _TensorBoard], None]) -> None:
         for mirror in list(self._mirrors) if self._has_begun else ():
@@ -340,7 +333,7 @@ def _scalar(key: str, value: Any) -> int | float | str:
         number = value.item() if hasattr(value, "item") else value
         return int(number) if isinstance(number, int) else float(number)
     except (TypeError, ValueError, RuntimeError):
-        raise ValueError(f"The metric {key!r} is no scalar: {value!r}.") from None
+        raise ValueError(f"The metric {key!r} is not a scalar: {value!r}.") from None
 
 
 def _csv_text(rows: Iterable[Iterable[Any]]) -> str:

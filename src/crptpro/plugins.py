@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from crptpro.errors import CRPTproError
+from crptpro.values import as_path
 
 FLAG = "--plugin"
 
@@ -17,12 +18,14 @@ _loaded: list[str] = []
 def load_plugin(name: str) -> None:
     """Import a module, installed or of the working directory, or a Python file, a path that ends in ``.py``.
 
-    What does not exist or cannot be imported, or a file with another module's name, is a ``CRPTproError``.
+    What is missing, imports what is missing, or is a file that no module may be named after, is a ``CRPTproError``.
     """
-    path = Path(name)
+    path = as_path(name, FLAG)
     is_file = path.suffix == ".py"
     if is_file and not path.is_file():
         raise CRPTproError(f"{FLAG} {name}: there is no such file.")
+    if is_file and "." in path.stem:
+        raise CRPTproError(f"{FLAG} {name}: a module has no dot in its name; rename the file.")
     folder = str(path.resolve().parent if is_file else Path.cwd())
     if folder not in sys.path:
         sys.path.append(folder)  # last, so that it hides no installed module
@@ -30,9 +33,7 @@ def load_plugin(name: str) -> None:
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as reason:
-        remedy = (
-            "A plugin is a module, installed or of this directory, or a .py file, and imports only what is installed."
-        )
+        remedy = "A plugin is a .py file or a module, installed or of this directory, and imports what is installed."
         raise CRPTproError(f"{FLAG} {name}: it cannot be imported ({reason}). {remedy}") from reason
     if is_file and Path(getattr(module, "__file__", None) or "").resolve() != path.resolve():
         raise CRPTproError(f"{FLAG} {name}: {module_name!r} is the name of another module; rename the file.")

@@ -19,11 +19,11 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from crptpro import modules
-from crptpro.artifact import CARD_FILE, identity_of, read_artifact, write_artifact
+from crptpro.artifact import CARD_FILE, identity_of, previous_of, read_artifact, write_artifact
 from crptpro.data import FrameDataset
 from crptpro.errors import PretrainedError, UnknownNameError
 from crptpro.modules import PixelEncoder
-from crptpro.objectives import get_method, method_of
+from crptpro.objectives import get_method, method_names, method_of
 from crptpro.provenance import provenance
 from crptpro.seeding import derive_seed
 from crptpro.values import as_int, as_path
@@ -81,7 +81,7 @@ class Pretrained:
         digest = hashlib.sha256()
         for key, value in nn.ModuleDict(self._networks()).state_dict().items():
             digest.update(key.encode())
-            digest.update(value.cpu().contiguous().numpy().tobytes())
+            digest.update(value.cpu().reshape(-1).view(torch.uint8).numpy().tobytes())  # NumPy has no bfloat16
         return f"{self.method}:{digest.hexdigest()}"
 
     def require(self, *, image_size: int, frame_stack: int | None = None) -> Pretrained:
@@ -115,7 +115,7 @@ class Pretrained:
             method: Any = get_method(self.method)
         except UnknownNameError as reason:
             raise PretrainedError(
-                f"The artifact was trained with {self.method!r}, which is no registered method. Call "
+                f"The artifact was trained with {self.method!r}, which is not a registered method. Call "
                 "crptpro.objectives.register_method for its loss first."
             ) from reason
         networks = copy.deepcopy(self._networks())
@@ -145,13 +145,16 @@ def random_pretrained(
         seed: of the initialisation; the global generator is left as it was.
         method: ``"random-encoder"``; ``"random-encoder-standardised"``, whose features have mean 0 and deviation 1 on
             ``datasets``; or ``"drq"``, which trains it.
-        datasets: directories or :class:`~crptpro.data.FrameDataset`; the standardised one needs one.
+        datasets: directories or :class:`~crptpro.data.FrameDataset`, or one of them; the standardised one needs one.
         **encoder_config: arguments of :class:`~crptpro.modules.PixelEncoder`.
 
     Examples:
         >>> random_pretrained(channels=(4,), strides=(2,), image_size=16).method
         'random-encoder'
     """
+    untrained = [name for name in method_names(presets=True) if get_method(name).loss_class is None]
+    if method not in untrained:
+        raise UnknownNameError(f"`method` must be one of {', '.join(untrained)}, got {method!r}.")
     seed = as_int(seed, "seed", minimum=0)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive_seed(seed, "random_pretrained"))
@@ -165,13 +168,16 @@ def random_pretrained(
 @torch.no_grad()
 def _feature_moments(encoder: PixelEncoder, datasets: Iterable[Any], seed: int) -> tuple[Tensor, Tensor]:
     """Return mean and deviation of every feature over 2048 random observations, as many of each dataset."""
-    opened = [FrameDataset.open(d) if isinstance(d, (str, Path)) else d for d in datasets]
+    several = [datasets] if isinstance(datasets, (str, Path, FrameDataset)) else datasets
+    stack = encoder.in_channels // 3
+    opened = [FrameDataset.open(d, frame_stack=stack) if isinstance(d, (str, Path)) else d for d in several]
     if not opened:
         raise PretrainedError("random-encoder-standardised needs datasets to standardise its features on.")
     features = []
     for index, dataset in enumerate(opened):
-        dataset.set_rng(torch.Generator().manual_seed(derive_seed(seed, "standardise", index)))
-        pixels = dataset.sample(-(-2048 // len(opened)))["pixels"]
+        generator = torch.Generator("cpu").manual_seed(derive_seed(seed, "standardise", index))
+        drawn = torch.randint(len(dataset), (-(-2048 // len(opened)),), generator=generator, device="cpu")
+        pixels = dataset.storage.get(drawn)["pixels"]  # without the transforms of samples
         features += [encoder(chunk) for chunk in pixels.split(64)]
     deviation, mean = torch.std_mean(torch.cat(features), dim=0, correction=0)
     # A feature that never changes stays 0 after centring, whatever it is divided by.
@@ -196,7 +202,7 @@ def save_pretrained(
 
     Raises:
         PretrainedError: no encoder that can be rebuilt, or ``path`` is another kind of directory.
-        ValueError: a network was built with something that is no plain value.
+        ValueError: a network was built with something that cannot be stored as JSON.
         DiskSpaceError: the disk is full; an artifact there is kept.
     """
     if dtype not in (None, "bfloat16"):
@@ -249,7 +255,7 @@ def load_pretrained(path: str | Path, classes: Mapping[str, type[nn.Module]] | N
         PretrainedError: something is missing, truncated, tampered with, of another kind, or unknown.
     """
     path = as_path(path)
-    if not path.exists() and path.name == str(path):  # a name, not a path
+    if path.name == str(path) and not path.exists() and not previous_of(path).exists():  # a name, not a path
         if not (SHIPPED / path / CARD_FILE).exists():
             raise PretrainedError(
                 f"{path} does not exist, and no encoder of this name ships with crptpro; those that do: "
@@ -274,7 +280,7 @@ def _as_pretrained(trained: Any) -> Pretrained:
     loss = trained if result is None else getattr(result, "loss", None)
     if not isinstance(loss, nn.Module):
         raise PretrainedError(
-            f"A {type(trained).__name__} cannot be saved as a pretrained encoder: it is no loss, and no result of one."
+            f"A {type(trained).__name__} cannot be saved as an encoder: it is neither a loss nor a pre-training result."
         )
     encoder: Any = _unwrapped(getattr(loss, "encoder", None))
     if encoder is None:

@@ -28,14 +28,10 @@ def as_int(value: Any, name: str, *, minimum: int | None = None, maximum: int | 
 
     Anything else is a ``ValueError``, which names the setting, its value and what is allowed.
     """
-    number: Any = value
-    if hasattr(number, "item") and getattr(number, "ndim", 0) == 0:
-        number = number.item()
-    if isinstance(number, (float, np.floating)) and number.is_integer():
-        number = int(number)
     try:
-        if isinstance(number, bool):
-            raise TypeError
+        number = _scalar(value)
+        if isinstance(number, (float, np.floating)) and number.is_integer():
+            number = int(number)
         number = operator.index(number)
     except TypeError:
         raise ValueError(f"`{name}` must be a whole number, got {value!r}.") from None
@@ -46,10 +42,8 @@ def as_int(value: Any, name: str, *, minimum: int | None = None, maximum: int | 
 def as_float(value: Any, name: str, *, minimum: float | None = None, maximum: float | None = None) -> float:
     """Return a coefficient or rate as a plain finite ``float``; a ValueError as of :func:`as_int`."""
     try:
-        if isinstance(value, (bool, str, bytes)):
-            raise TypeError
-        number = float(value)
-    except (TypeError, ValueError):
+        number = float(_scalar(value))
+    except (TypeError, ValueError, OverflowError):
         raise ValueError(f"`{name}` must be a number, got {value!r}.") from None
     if not math.isfinite(number):
         raise ValueError(f"`{name}` must be finite, got {value!r}.")
@@ -59,18 +53,18 @@ def as_float(value: Any, name: str, *, minimum: float | None = None, maximum: fl
 
 def as_path(value: str | os.PathLike[str], name: str = "path") -> Path:
     """Return a path with ``~`` expanded; one that is empty or not UTF-8, as records are, is a ``ValueError``."""
-    text = os.fspath(value)
+    text = os.fsdecode(value)
     if not text:
         raise ValueError(f"`{name}` is empty; name a directory, or `.` for the working directory.")
     try:
         text.encode()
     except UnicodeEncodeError:
         raise ValueError(f"`{name}` is not UTF-8: {os.fsencode(text)!r}; choose another name.") from None
-    return Path(text).expanduser()
+    return Path(os.path.expanduser(text))  # `Path.expanduser` fails for an unknown user; a shell leaves the text
 
 
 def as_plain(value: Any, name: str) -> Any:
-    """Return a setting, or a whole card of them, as what JSON holds: numbers, texts, lists, dicts with text keys.
+    """Return a setting, or a whole card of them, as what JSON holds: numbers, texts, lists, dicts with string keys.
 
     NumPy and torch scalars become numbers, arrays and tensors lists, dataclasses dicts, paths and dtypes texts. An
     entry that has no such form is a ``ValueError`` with its name.
@@ -82,7 +76,7 @@ def as_plain(value: Any, name: str) -> Any:
     if isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str):
-                raise ValueError(f"`{name}` has the key {key!r}; keys are texts.")
+                raise ValueError(f"`{name}` has the key {key!r}; keys must be strings.")
         return {str(key): as_plain(item, f"{name}.{key}") for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [as_plain(item, f"{name}[{index}]") for index, item in enumerate(value)]
@@ -96,7 +90,7 @@ def as_plain(value: Any, name: str) -> Any:
             return as_plain(value, name)
     if value is None or isinstance(value, (bool, int, float)):
         return value
-    raise ValueError(f"`{name}` is no plain value: {value!r} is a {type(value).__name__}.")
+    raise ValueError(f"`{name}` cannot be stored as JSON: {value!r} is a {type(value).__name__}.")
 
 
 def check_numbers(config: Any, *, minima: Mapping[str, int], maxima: Mapping[str, float]) -> None:
@@ -118,6 +112,14 @@ def check_numbers(config: Any, *, minima: Mapping[str, int], maxima: Mapping[str
         elif float in kinds:
             value = as_float(value, name, minimum=0, maximum=maxima.get(name))
         object.__setattr__(config, name, value)
+
+
+def _scalar(value: Any) -> Any:
+    """Return the Python number of a scalar; what is no number, a bool or an array is a TypeError here or later."""
+    number = value.item() if getattr(value, "ndim", None) == 0 else value
+    if isinstance(number, (bool, str, bytes)) or getattr(number, "ndim", 0) > 0:
+        raise TypeError
+    return number
 
 
 def _require_range(number: float, value: Any, name: str, minimum: float | None, maximum: float | None) -> None:

@@ -158,7 +158,7 @@ def test_a_reward_that_is_not_finite_ends_an_evaluation_and_keeps_its_finished_e
     register_domain(Domain("poisoned", "poisoned_go", make=make))
     file = tmp_path / "a.csv"
     line = refused(call("evaluate", "random-policy", "--task", "poisoned_go", "--episodes", 4, "--csv", file))
-    assert "'poisoned_go' answered with reward" in line
+    assert "'poisoned_go' returned reward" in line
     assert [row["episode"] for row in rows(file)] == ["0"]
 
 

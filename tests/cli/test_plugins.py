@@ -78,7 +78,19 @@ def test_a_plugin_that_cannot_be_imported_says_so(call: Call, tmp_path: Path, mo
     (tmp_path / "json.py").write_text("")
     assert "it cannot be imported" in refused(call("--plugin", tmp_path / "needs_more.py", "doctor"))
     assert "'json' is the name of another module" in refused(call("--plugin", tmp_path / "json.py", "doctor"))
+    (tmp_path / "my.maze.py").write_text("")
+    assert "has no dot in its name; rename the file" in refused(call("--plugin", tmp_path / "my.maze.py", "doctor"))
     assert "needs a module or a Python file" in refused(call("doctor", "--plugin"))
+
+
+def test_a_plugin_may_be_named_from_the_home_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(plugins, "_loaded", [])
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "plugin_at_home.py").write_text("")
+    assert plugins.load_plugins(["--plugin=~/plugin_at_home.py", "doctor"]) == ["doctor"]
+    assert plugins.loaded_plugins() == (str(tmp_path / "plugin_at_home.py"),)
+    del sys.modules["plugin_at_home"]
 
 
 # --- a world of the user's own --------------------------------------------------------------------------------------

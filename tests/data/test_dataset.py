@@ -29,7 +29,7 @@ from toy_world import (
 )
 
 from crptpro.artifact import CARD_FILE
-from crptpro.data import FrameDataset
+from crptpro.data import FrameDataset, FrameReplay
 from crptpro.errors import DatasetError, DiskSpaceError, NonFiniteError
 from crptpro.modules import PixelEncoder
 from crptpro.transforms import FrozenEncoder
@@ -208,7 +208,7 @@ def test_what_is_no_dataset_is_named(duplicate: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="`frame_stack` must be at least 1, got 0"):
         FrameDataset.open(duplicate, frame_stack=0)
     (duplicate / CARD_FILE).write_text("{")
-    with pytest.raises(DatasetError, match="damaged or foreign"):
+    with pytest.raises(DatasetError, match="damaged or not written by crptpro"):
         FrameDataset.open(duplicate)
 
 
@@ -337,10 +337,40 @@ def test_a_directory_with_something_else_or_another_writer_is_left_alone(tmp_pat
         FrameDataset.create(tmp_path / "full", **collection_request())
     assert [file.name for file in (tmp_path / "full").iterdir()] == ["thesis.tex"]
     first = FrameDataset.create(tmp_path / "toy", **collection_request())
-    with pytest.raises(DatasetError, match="Another process is writing"):
+    with pytest.raises(DatasetError, match=r"This process is already writing to .*dataset\.writer"):
         FrameDataset.create(tmp_path / "toy", **collection_request())
     first.writer.close()
     FrameDataset.create(tmp_path / "toy", **collection_request()).writer.close()
+
+
+def test_facts_of_any_kind_are_the_same_request_when_they_are_repeated(tmp_path: Path) -> None:
+    facts: dict[str, Any] = {"tags": ("x", "y"), "script": Path("a.py"), "rate": torch.tensor(0.5)}
+    collect_toy(tmp_path, episodes=1, **facts)
+    assert FrameDataset.open(collect_toy(tmp_path, **facts)).card["tags"] == ["x", "y"]
+    assert FrameDataset.create(tmp_path, **collection_request(**facts)).is_complete
+
+
+def test_frames_of_another_size_than_the_request_are_refused_at_the_first(tmp_path: Path) -> None:
+    dataset = FrameDataset.create(tmp_path, **collection_request(image_size=64))
+    with pytest.raises(DatasetError, match=r"of image_size 64, got frames \[3, 16, 16\]"):
+        dataset.extend(random_episode(5, size=16))
+    assert not list(tmp_path.rglob("*.memmap"))
+
+
+def test_a_relative_path_stays_what_it_was_when_the_process_goes_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, episodes: list[TensorDict]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    dataset = FrameDataset.create("toy", **collection_request(transitions=TOTAL, image_size=6))
+    dataset.extend(episodes[0])
+    replay = FrameReplay(20, frame_shape=(3, 6, 6), action_dim=2, path="ring")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir("elsewhere")
+    for episode in episodes[1:]:
+        dataset.extend(episode)
+    assert len(pickle.loads(pickle.dumps(dataset))) == len(FrameDataset.open(tmp_path / "toy")) == TOTAL
+    replay.load_state_dict(replay.state_dict())
+    assert not list((tmp_path / "elsewhere").iterdir())
 
 
 def test_a_full_disk_is_named_and_what_was_kept_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

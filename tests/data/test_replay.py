@@ -335,6 +335,34 @@ def test_a_state_that_the_files_cannot_give_back_is_refused(tmp_path: Path) -> N
         replay.load_state_dict(state)
 
 
+@pytest.mark.parametrize("others", [10, 20, 40])
+def test_a_state_is_refused_once_another_branch_has_overwritten_it(tmp_path: Path, others: int) -> None:
+    def build() -> FrameReplay:
+        return small(50, path=tmp_path, slack=60)
+
+    replay = build()
+    driver = Driver(replay, 1000).write(20)
+    early, content = replay.state_dict(), replay[:].clone()
+    driver.write(20)
+    late = replay.state_dict()
+    replay.load_state_dict(early)
+    assert (replay[:] == content).all()
+    Driver(replay, 1000).write(others)  # a branch of as many rows, or fewer, or more
+    own, kept = replay.state_dict(), replay[:].clone()
+    with pytest.raises(CheckpointError, match="from an earlier state"):
+        replay.load_state_dict(late)
+    again = build()
+    again.load_state_dict(own)
+    assert (again[:] == kept).all()
+    again.load_state_dict(early)
+    assert (again[:] == content).all()
+    new = Driver(build(), 1000).write(others)  # nothing was loaded: it begins at the first row
+    for state in (early, late, own):
+        with pytest.raises(CheckpointError, match="are gone"):
+            build().load_state_dict(state)
+    assert len(new.replay) == others
+
+
 def test_a_ring_in_ram_carries_its_content_in_the_state(tmp_path: Path) -> None:
     replay = small()
     driver = Driver(replay).write(33)
@@ -415,6 +443,14 @@ def test_a_stored_replay_shows_every_observation_that_was_decided_on_in_order(
     assert shown(stored) == expected
     stored.observations(torch.arange(len(stored))).zero_()
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+def test_a_stored_replay_shows_only_what_the_last_writer_of_its_directory_stored(tmp_path: Path) -> None:
+    Driver(small(200, path=tmp_path), 1000).write(100)
+    assert len(StoredReplay(tmp_path)) == 100
+    Driver(small(200, path=tmp_path), 1).write(10)  # twice as many frames
+    stored = StoredReplay(tmp_path, frame_stack=3.0)  # type: ignore[arg-type]
+    assert shown(stored) == [[2 * episode] * 3 for episode in range(10)]
 
 
 def test_what_is_no_stored_replay_is_refused(tmp_path: Path) -> None:

@@ -233,7 +233,7 @@ HUGE = float(np.finfo(np.float32).max)
     (Discrete(3), "Discrete actions"), (Box(0, 10, (2,), np.int64), "actions of int64"),
     (Box(-1.0, 1.0, (0,)), "empty action"), (Box(-HUGE, HUGE, (2,)), "without bounds"),
     (Box(-np.inf, np.inf, (2,)), "without bounds"), (Box(0.0, HUGE, (2,)), "one side only"),
-    (Box(1.0, 1.0, (2,)), "hold nothing"),
+    (Box(1.0, 1.0, (2,)), r"empty action bounds \(low >= high\)"),
 ])  # fmt: skip
 def test_action_spaces_that_cannot_be_mapped_from_minus_1_to_1_are_refused_by_name(space: Any, complaint: str) -> None:
     with painter(action_space=space) as task, pytest.raises(CRPTproError, match=rf"{task}.*{complaint}"):
@@ -250,6 +250,15 @@ def test_numbers_are_taken_as_what_they_mean() -> None:
         assert torch.equal(plain.reset()["pixels"], other.reset()["pixels"])
         assert plain.card() == other.card()
         assert {type(other.card()[name]) for name in ("image_size", "action_repeat")} == {int}
+
+
+def test_specs_do_not_follow_torchs_default_dtype() -> None:
+    torch.set_default_dtype(torch.float64)
+    try:
+        with painter() as task:
+            assert make_env(task, seed=0, image_size=SIZE).rollout(1)["next", "reward"].dtype == torch.float32
+    finally:
+        torch.set_default_dtype(torch.float32)
 
 
 @pytest.mark.parametrize(("option", "value"), [

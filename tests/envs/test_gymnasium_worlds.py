@@ -132,3 +132,10 @@ def test_a_mujoco_episode_is_drawn_the_same_whatever_was_drawn_before_it(env_id:
 def test_a_camera_that_a_mujoco_model_has_not_is_refused_where_mujoco_would_end_the_process() -> None:
     with pytest.raises(CRPTproError, match=r"Reacher-v5 has no camera 5"):
         make_env("gymnasium:Reacher-v5", seed=0, camera=5)
+
+
+@pytest.mark.gl
+def test_a_camera_name_that_a_mujoco_model_has_not_is_refused_with_those_it_has() -> None:
+    with pytest.raises(CRPTproError, match=r"has no camera 'trakc'; its model has 1, from 0 on: \['track'\]"):
+        make_env("gymnasium:HalfCheetah-v5", seed=0, camera="trakc")
+    make_env("gymnasium:HalfCheetah-v5", seed=0, camera="track").close()

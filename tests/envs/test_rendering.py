@@ -211,3 +211,10 @@ def test_a_backend_that_cannot_be_loaded_is_one_error_that_names_the_remedy_at_t
     monkeypatch.setitem(sys.modules, "torchrl.envs", None)  # makes its import fail, as MuJoCo's failure does
     with pytest.raises(RenderingError, match=r"MUJOCO_GL=osmesa is set, and cannot be loaded.*libosmesa6"):
         importlib.reload(crptpro.envs)
+
+
+@pytest.mark.parametrize("text", ["inf", "nan", "0", "-1", "1e300", "soon"])
+def test_a_time_limit_that_cannot_be_is_refused(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    monkeypatch.setenv(rendering.TIMEOUT_VARIABLE, text)
+    with pytest.raises(RenderingError, match=f"CRPTPRO_GL_TIMEOUT_S must be a positive number .* got '{text}'"):
+        rendering.first_frame_timeout_s()

@@ -239,7 +239,7 @@ def test_a_reward_that_is_not_finite_never_enters_the_replay_and_is_named() -> N
     def make(*, seed: int, image_size: int, action_repeat: int) -> ToyEnv:
         return Poisoned(fixed_length, seed=seed, image_size=image_size)
 
-    with pytest.raises(NonFiniteError, match=r"'toy_go' answered with reward .* agent step 7 of episode 1"):
+    with pytest.raises(NonFiniteError, match=r"'toy_go' returned reward .* agent step 7 of episode 1"):
         train(None, task=world("toy", make), eval_episodes=1, eval_interval_env_steps=10**6)
 
 

@@ -90,7 +90,8 @@ def collect_group(
         UnknownNameError: an unknown domain.
         ValueError: an impossible number or path.
         WorkerLostError: a process died; finished episodes are kept.
-        CRPTproError: an environment failed or hangs; likewise.
+        WorldFailedError: the code of an environment raised an exception; likewise.
+        CRPTproError: an environment returned something unusable, or hangs; likewise.
     """
     # Imported late: nothing that reads datasets needs the simulators.
     from crptpro.envs import episode_length, make_env, needs_gl, resolve_action_repeat
@@ -145,7 +146,7 @@ def dataset_path(root: str | Path, domain_name: str) -> Path:
 def collect_episode(
     env: EnvBase, *, env_seed: int, action_seed: int, limit: int, callback: Callable[..., Any] | None = None
 ) -> TensorDictBase:
-    """Roll one episode of single frames out with a uniform random policy; its two seeds determine it.
+    """Roll out one episode of single frames with a uniform random policy; its two seeds determine it.
 
     The policy draws from torch's global generator. ``limit`` is the number of transitions after which the episode is
     cut, ``callback`` that of TorchRL's ``rollout``.
@@ -285,11 +286,9 @@ class _Worker:
             env: Any = self._env
             with kept_global_rng():
                 rollout = collect_episode(env, callback=count, **plan)
-        except CRPTproError:
-            raise
         except Exception as reason:
-            text = str(reason).strip() or repr(reason)
-            raise CRPTproError(f"Collecting {title} failed: {text}. {_AGAIN} once the cause is removed.") from reason
+            reason.add_note(f"Collecting {title} failed. {_AGAIN} once the cause is removed.")
+            raise
         return pickle.dumps((env.card() if hasattr(env, "card") else {}, rollout))
 
     def close(self) -> None:

@@ -21,7 +21,7 @@ from crptpro.data.storage import Rows, StackStorage, map_rows, read_rows, requir
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import DatasetError, DiskSpaceError, is_disk_full
 from crptpro.provenance import provenance, versions
-from crptpro.values import as_int, as_path
+from crptpro.values import as_int, as_path, as_plain
 
 logger = logging.getLogger(__name__)
 
@@ -74,7 +74,7 @@ class FrameDataset(ReplayBuffer):
             **options: see the class.
 
         Raises:
-            DatasetError: a file is missing, unfinished, truncated or foreign.
+            DatasetError: a file is missing, unfinished, truncated or not written by crptpro.
         """
         return cls(FrameStorage(as_path(path), frame_stack, device), **options)
 
@@ -88,9 +88,9 @@ class FrameDataset(ReplayBuffer):
         card that every attempt must repeat: ``task``, ``seed``, ``action_repeat``, ... Another content or writer of the
         directory is a DatasetError.
         """
-        path = as_path(path)
+        path = as_path(path).absolute()
         usual = {"task": domain, "seed": 0, "action_repeat": 1, "camera": None, "quality": "exact", "colors": "normal"}
-        request = {"domain": domain, **usual, **about, "transitions": transitions}
+        request = as_plain({"domain": domain, **usual, **about, "transitions": transitions}, "about")
         for name in request.keys() & {"transitions", "seed", "action_repeat", "image_size"}:
             request[name] = as_int(request[name], name, minimum=0 if name == "seed" else 1)
         card = _read(path) if (path / CARD_FILE).exists() else None
@@ -154,7 +154,7 @@ class FrameStorage(StackStorage):
     def __init__(self, path: Path, frame_stack: int, device: str | torch.device = "cpu", *, is_complete: bool = True):
         self.frame_stack = as_int(frame_stack, "frame_stack", minimum=1)
         super().__init__(0)
-        self.path, self.device = path, torch.device(device)
+        self.path, self.device = path.absolute(), torch.device(device)
         self.card: dict[str, Any] = {}
         if is_complete:
             self.load()
@@ -260,6 +260,8 @@ class EpisodeWriter(ImmutableDatasetWriter):
         extra += [("next", name) for name in extra]
         frame_stack = self._storage.frame_stack
         rows = read_rows(data, channels=channels, frame_stack=frame_stack, extra=extra, what="A dataset")
+        if (size := self.request.get("image_size")) not in (None, rows.following.shape[-1]):
+            raise DatasetError(f"{self.path} is of image_size {size}, got frames {list(rows.following.shape[1:])}.")
         last = self._pending[-1].following[-1] if self._pending else None
         for begins, part in rows.part(0, self.missing).pieces(last):
             if begins:

@@ -95,7 +95,8 @@ class FrameReplay(ReplayBuffer):
             **dict.fromkeys(("done", "terminated", "truncated"), ((1,), torch.bool)),
         }
         extra = dict(extra_columns or {})
-        if taken := sorted({*columns, "discount", "index", "next", "number", "row_of", "step"} & extra.keys()):
+        own = {"branch", "discount", "index", "next", "number", "row_of", "step"}
+        if taken := sorted({*columns, *own} & extra.keys()):
             raise ValueError(f"extra_columns may not be named {taken}: a sample has those; choose other names.")
         storage = RingStorage(
             capacity, columns | extra, slack=slack, frame_stack=frame_stack, n_step=n_step, discount=discount, path=path
@@ -139,7 +140,7 @@ class StoredReplay(StackStorage):
 
     def __init__(self, path: str | Path, *, frame_stack: int = 3) -> None:
         path = as_path(path)
-        self.frame_stack = frame_stack
+        self.frame_stack = frame_stack = as_int(frame_stack, "frame_stack", minimum=1)
         number, row_of = (map_rows(path / f"{name}.memmap", torch.int64, ()) for name in ("number", "row_of"))
         self.step = map_rows(path / "step.memmap", torch.int32, ())
         rows = len(number)

@@ -223,7 +223,7 @@ class RingStorage(StackStorage):
         self.frame_stack = as_int(frame_stack, "frame_stack", minimum=1)
         self.n_step = as_int(n_step, "n_step", minimum=1)
         self.discount = as_float(discount, "discount", minimum=0, maximum=1)
-        self.path = None if path is None else as_path(path)
+        self.path = None if path is None else as_path(path).absolute()
         # One frame more per episode than transitions, and the frames of the oldest stack.
         self.window = self.max_size + max(16, self.max_size // 50) + self.frame_stack
         self.rows = self.window + self.slack
@@ -231,10 +231,11 @@ class RingStorage(StackStorage):
             row_bytes = sum(math.prod(shape) * dtype.itemsize for shape, dtype in columns.values())
             require_disk(self.path, self.rows * row_bytes, f"A replay of {self.max_size} transitions")
         # Counters only grow; modulo the number of rows they are slots. `oldest` is the first valid transition.
-        self.frames = self.transitions = self.oldest = self.episode_step = 0
-        self.is_open = False
-        # ``number`` is one more than the row's counter, 0 if it was never written; ``row_of`` is by transition.
-        own = {"step": torch.int32, "number": torch.int64, "row_of": torch.int64}
+        self.frames = self.transitions = self.oldest = self.episode_step = self.branch = 0
+        self.is_open = self._is_continued = False
+        # ``number`` is one more than the row's counter, 0 if it was never written; ``row_of`` is by transition. Whoever
+        # opens or loads begins a ``branch`` with its first row: what it overwrites is lost to states of earlier ones.
+        own = {"step": torch.int32, "number": torch.int64, "row_of": torch.int64, "branch": torch.int32}
         specs = {**columns, **{name: ((), dtype) for name, dtype in own.items()}}
         self.content: dict[NestedKey, Tensor] = {
             name: torch.zeros(self.rows, *shape, dtype=dtype, device="cpu")
@@ -262,8 +263,13 @@ class RingStorage(StackStorage):
             frames, lead = torch.cat([first, frames]), len(first)
             self.episode_step = -1
         count, length = len(frames), len(rows.following)
+        if not self._is_continued:
+            self.branch, self._is_continued = int(self.content["branch"].max()) + 1, True
+            self.number[self.number > self.frames] = 0
+            self.row_of[self.row_of >= self.frames] = 0
         # Numbered before the rows are overwritten: a kill in between must not hide the loss.
         number = torch.arange(self.frames, self.frames + count, device="cpu")
+        self._put("branch", self.frames, torch.full_like(number, self.branch))
         self._put("number", self.frames, number + 1)
         self._put("pixels", self.frames, frames)
         self._put("step", self.frames, number - self.frames + self.episode_step + 1)
@@ -335,7 +341,7 @@ class RingStorage(StackStorage):
 
     def state_dict(self) -> dict[str, Any]:
         """Return the counters, and the rows themselves if they are in RAM."""
-        counters = ("frames", "transitions", "oldest", "episode_step", "is_open")
+        counters = ("frames", "transitions", "oldest", "episode_step", "is_open", "branch")
         state: dict[str, Any] = {"counters": {name: getattr(self, name) for name in counters}}
         state |= {"rows": self.rows, "window": self.window}
         if self.path is None:
@@ -358,16 +364,18 @@ class RingStorage(StackStorage):
             for name, column in state_dict["content"].items():
                 self.content[name][: len(column)] = column
         else:
-            self._require_rows(counters["frames"])
+            self._require_rows(counters["frames"], counters.get("branch", 0))
         for name, value in counters.items():
             setattr(self, name, value)
+        self._is_continued = False
 
-    def _require_rows(self, frames: int) -> None:
+    def _require_rows(self, frames: int, branch: int) -> None:
         """Refuse a state if a row of its window was overwritten since."""
         needed = torch.arange(max(0, frames - self.window), frames, device="cpu")
-        lost = int((self.number[needed % self.rows] != needed + 1).sum())
+        rows = needed % self.rows
+        lost = int(((self.number[rows] != needed + 1) | (self.content["branch"][rows] > branch)).sum())
         since = int(self.number.max()) - frames
-        why = "the files were removed or replaced; put them back."
+        why = "the files were removed or replaced, or written to from an earlier state; put them back, or begin again."
         if since > self.slack:
             why = (
                 f"{since} frames were written after it, with a slack of {self.slack}; start again with a larger one "

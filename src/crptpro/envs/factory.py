@@ -37,7 +37,7 @@ def make_env(
     """Build an unbatched CPU environment that renders once per agent step.
 
     It is TorchRL's ``DMControlWrapper`` or ``GymWrapper``, or what your ``make`` returns, with ``CatFrames`` and the
-    checks of :class:`~crptpro.envs.worlds.CheckedWorld`.
+    checks of :class:`~crptpro.envs.worlds.CheckedWorld`. Create, step and close a dm_control environment in one thread.
 
     Keys: ``pixels`` uint8 ``[3 * frame_stack, H, W]``, oldest to newest (a reset repeats its first frame); ``action``
     float32 ``[A]`` in [-1, 1]; ``("next", "reward")`` float32 ``[1]``, summed over the repeated env steps; ``done``,

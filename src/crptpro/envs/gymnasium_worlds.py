@@ -109,9 +109,11 @@ def make_gymnasium(
         except (ImportError, gymnasium.error.Error) as reason:
             raise CRPTproError(f"{task} cannot be made: {reason}") from reason
     model: Any = getattr(env.unwrapped, "model", None)
-    if isinstance(camera, int) and not -1 <= camera < getattr(model, "ncam", camera + 1):
-        env.close()  # rendering would end the process
-        raise CRPTproError(f"{task} has no camera {camera}; its model has {model.ncam}, numbered from 0.")
+    if camera is not None and hasattr(model, "ncam"):
+        names = [model.camera(index).name for index in range(model.ncam)]
+        if not (camera in names if isinstance(camera, str) else -1 <= camera < len(names)):
+            env.close()  # rendering would show the free camera, or end the process
+            raise CRPTproError(f"{task} has no camera {camera!r}; its model has {len(names)}, from 0 on: {names}.")
     _fix_free_camera(env)
     if quality == "fast" and hasattr(model, "vis"):
         model.vis.quality.shadowsize = min(FAST_SHADOW_SIZE["suite"], model.vis.quality.shadowsize)

@@ -202,10 +202,10 @@ def _leave_none_current() -> None:
 def first_frame_timeout_s() -> float:
     """Return ``CRPTPRO_GL_TIMEOUT_S``, by default 60."""
     text = os.environ.get(TIMEOUT_VARIABLE, "60")
-    try:
-        return float(text)
-    except ValueError:
-        raise RenderingError(f"{TIMEOUT_VARIABLE} must be a number of seconds, got {text!r}.") from None
+    with contextlib.suppress(ValueError):
+        if 0 < (seconds := float(text)) <= threading.TIMEOUT_MAX:
+            return seconds
+    raise RenderingError(f"{TIMEOUT_VARIABLE} must be a positive number of seconds, got {text!r}.")
 
 
 def run_isolated(

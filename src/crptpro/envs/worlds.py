@@ -64,17 +64,17 @@ class CheckedWorld:
         self._episode, self._agent_step = self._episode + 1, 0
         with passed_on(self.world, "reset"):
             found: TensorDictBase = super()._reset(tensordict, **kwargs)  # type: ignore[misc]
-        self._require_finite(found, "answered with", "qpos", "qvel")
+        self._require_finite(found, "returned", "qpos", "qvel")
         self._first_frame = found.get("pixels")
         self._is_still = self.checks_frames
         return found
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._agent_step += 1
-        self._require_finite(tensordict, "was given the", "action")
+        self._require_finite(tensordict, "received the", "action")
         with passed_on(self.world, "step"):
             found: TensorDictBase = super()._step(tensordict)  # type: ignore[misc]
-        self._require_finite(found, "answered with", "reward", "qpos", "qvel")
+        self._require_finite(found, "returned", "reward", "qpos", "qvel")
         if self._agent_step == self.agent_step_limit:
             for flag in ("truncated", "done"):
                 found.set(flag, torch.ones_like(found.get(flag)))
@@ -170,7 +170,7 @@ class SimulatorEnv(CheckedWorld, GymLikeEnv):
         state = {name: Unbounded(value.shape, dtype=value.dtype) for name, value in self._read_state().items()}
         self.observation_spec = Composite(pixels=Bounded(0, 255, shape=shape, dtype=torch.uint8), **state)
         self.action_spec = Bounded(-1.0, 1.0, shape=(self._low.size,), dtype=torch.float32)
-        self.reward_spec = Unbounded((1,))
+        self.reward_spec = Unbounded((1,), dtype=torch.float32)
         flag = Categorical(2, shape=(1,), dtype=torch.bool)
         self.done_spec = Composite({name: flag.clone() for name in ("done", "terminated", "truncated")})
 
@@ -262,7 +262,7 @@ def action_range(low: np.ndarray, high: np.ndarray, dtype: Any, world: str) -> t
     elif (no_low != no_high).any():
         wrong = f"bounds an action on one side only ({bounds}), so [-1, 1] cannot be mapped to it"
     elif not (half > 0).all():
-        wrong = f"has action bounds that hold nothing: {bounds}"
+        wrong = f"has empty action bounds (low >= high): {bounds}"
     if wrong:
         raise CRPTproError(f"The environment {world!r} {wrong}.")
     return start, half

@@ -95,7 +95,7 @@ class PixelEncoder(nn.Module):
 
     @torch.no_grad()
     def standardise(self, mean: Tensor, scale: Tensor) -> PixelEncoder:
-        """Encode to ``(features - mean) / scale`` from now on, finite ``[feature_dim]`` and saved; return self."""
+        """Output ``(features - mean) / scale``, finite ``[feature_dim]``, from now on, saved as state; returns self."""
         for name, value in (("mean", mean), ("scale", scale)):
             value = torch.as_tensor(value).to(self.convs[0].weight)
             if value.shape != (self.feature_dim,) or not bool(value.isfinite().all()):
