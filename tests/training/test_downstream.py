@@ -12,13 +12,12 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from toy_world import ToyEnv, fixed_length
 from worlds import EPISODE, SIZE, make_encoder, make_pretrained, make_smooth, python, record, signalling, world
 
-from crptpro.errors import CheckpointError, NonFiniteError, PretrainedError
+from crptpro.errors import CheckpointError, PretrainedError
 from crptpro.modules import SquashedGaussianActor
 from crptpro.objectives import ProtoLoss
-from crptpro.pretrained import load_pretrained, random_pretrained, save_pretrained
+from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training import DownstreamConfig, DownstreamResult, load_agent, pretrain, train_downstream
 
 SMALL = DownstreamConfig(
@@ -123,12 +122,6 @@ def test_the_bonus_is_added_where_there_are_prototypes_and_a_coefficient(caplog:
     assert "no exploration bonus" in caplog.text
 
 
-def test_the_random_encoder_is_the_control_without_bonus() -> None:
-    control = random_pretrained(0, in_channels=9, image_size=SIZE, channels=(4, 4), strides=(2, 1))
-    result = train(None, control, env_steps=20)
-    assert {row["method"] for row in result.evaluations} == {"random-encoder"}
-
-
 def test_drq_trains_its_encoder(tmp_path: Path) -> None:
     pretrained = make_pretrained("drq")
     before = {key: value.clone() for key, value in pretrained.encoder.state_dict().items()}
@@ -195,22 +188,6 @@ def test_what_does_not_fit_a_run_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"to continue it needs its frames, and .* is gone"):
         train(tmp_path)
     train(tmp_path, env_steps=40)  # complete: nothing is needed
-
-
-class Poisoned(ToyEnv):
-    """Rewards NaN once, unwatched: it stands for what no check of ours has seen."""
-
-    def _step(self, tensordict: Any) -> Any:
-        found = super()._step(tensordict)
-        return found.set("reward", torch.full((1,), torch.nan)) if self.steps == 17 else found
-
-
-def test_a_reward_that_is_not_finite_never_enters_the_replay_and_is_named() -> None:
-    def make(*, seed: int, image_size: int, action_repeat: int) -> ToyEnv:
-        return Poisoned(fixed_length, seed=seed, image_size=image_size)
-
-    with pytest.raises(NonFiniteError, match=r"'toy_go' answered with reward .* agent step 7 of episode 1"):
-        train(None, task=world("toy", make), eval_episodes=1, eval_interval_env_steps=10**6)
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,7 @@ from worlds import SIZE, make_dataset, make_datasets, make_encoder, make_loss, r
 from crptpro.data import FrameDataset
 from crptpro.errors import CheckpointError, DatasetError, NonFiniteError
 from crptpro.objectives import ATCLoss, SimCLRLoss, get_method
-from crptpro.pretrained import load_pretrained, save_pretrained
-from crptpro.training import PretrainConfig, PretrainResult, finetune, pretrain
+from crptpro.training import PretrainConfig, PretrainResult, pretrain
 from crptpro.training.pretrain import make_optimizer
 
 SETTINGS = PretrainConfig(
@@ -57,11 +56,12 @@ class Brightness(LossModule):
         return TensorDict({"loss_brightness": loss}, [])
 
 
-def test_domains_take_turns_one_update_each() -> None:
+def test_domains_take_turns_and_their_cosines_are_watched_whatever_the_loss() -> None:
     loss = Brightness()
-    run(loss, 6)
+    result = run(loss, 5)
     is_bright = [mean > 0.4 for mean in loss.seen]
-    assert is_bright == [False, True] * 3
+    assert is_bright == [False, True, False, True, False]
+    assert "cosine/dark" in result.metrics or "cosine/bright" in result.metrics
 
 
 def test_a_loss_is_given_what_it_reads_and_nothing_else() -> None:
@@ -222,25 +222,6 @@ def test_a_dead_run_is_announced_by_name_of_the_plateau(caplog: pytest.LogCaptur
     assert result.collapse["verdict"] == "plateau"
     assert "at ln(M) = 2.0794" in caplog.text
     assert "encoder has not begun to learn" in caplog.text
-
-
-def test_the_artifact_says_how_it_was_trained_and_can_be_trained_further(tmp_path: Path) -> None:
-    before = load_pretrained(save_pretrained(run(make_loss(), 6), tmp_path / "encoder"))
-    training = before.card["training"]
-    assert (before.method, training["updates"]) == ("crptpro", 6)
-    assert [facts["domain"] for facts in training["datasets"]] == ["dark", "bright"]
-    result = finetune(before, {"bright": make_dataset(1)}, config=SETTINGS, updates=3, progress=False)
-    assert result.method == "crptpro"
-    assert result.training["started_from"] == before.identity()
-    assert result.training["previous_training"]["updates"] == 6
-    save_pretrained(result, tmp_path / "tuned")
-    assert load_pretrained(tmp_path / "tuned").label == "crptpro-finetune"
-
-
-def test_any_loss_module_trains_without_targets_or_registration() -> None:
-    result = run(Brightness(), 5)
-    assert result.updates == 5
-    assert "cosine/dark" in result.metrics or "cosine/bright" in result.metrics
 
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
