@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import SerialEnv, TransformedEnv
 
-from crptpro.transforms import FrozenEncoder, choose_feature_mode
+from crptpro.transforms import FrozenEncoder
 
 
 def images(*lead):
@@ -62,14 +62,6 @@ def test_any_module_is_an_encoder_for_any_batch_and_stays_frozen(make, lead):
         assert not part["features"].requires_grad
     assert all(parameter.requires_grad for parameter in encoder.parameters())
     assert all(torch.equal(value, state[name]) for name, value in encoder.state_dict().items())
-
-
-@pytest.mark.parametrize("make", [ResNet, VisionTransformer])
-def test_an_encoder_without_dense_maps_is_encoded_anew_with_a_one_line_reason(make):
-    mode, reason = choose_feature_mode("auto", make(), 100)
-    assert mode == "reencode"
-    assert f"got {make.__name__}; encode shifted images instead" in reason
-    assert "\n" not in reason
 
 
 def test_partial_resets_of_a_batched_environment_renew_only_what_was_reset():
