@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import signal
 from pathlib import Path
@@ -115,34 +116,15 @@ def test_a_resumed_run_gives_the_weights_and_the_record_of_an_uninterrupted_one(
 
     whole, parts = build(), build()
     run(whole, 14, tmp_path / "whole", method=method, warmup_updates=3)
+    updates = itertools.count(1)
+    parts.register_forward_hook(lambda *_: signal.raise_signal(signal.SIGINT) if next(updates) == 7 else None)
     with pytest.raises(KeyboardInterrupt):
-        run(parts, 14, tmp_path / "parts", method=method, warmup_updates=3, datasets=_interrupting(7))
+        run(parts, 14, tmp_path / "parts", method=method, warmup_updates=3)
     resumed = build()
     result = run(resumed, 14, tmp_path / "parts", method=method, warmup_updates=3)
     assert result.resumed_from == 7
     assert same_state(resumed, whole)
     assert record(tmp_path / "parts" / "pretrain.csv") == record(tmp_path / "whole" / "pretrain.csv")
-
-
-def _interrupting(update: int) -> dict[str, ReplayBuffer]:
-    """The usual datasets; the one of update number ``update`` (from 1) brings Ctrl-C with its batch."""
-    datasets, count = make_datasets(), 0
-
-    def watch(buffer: ReplayBuffer) -> None:
-        sample = buffer.sample
-
-        def sample_and_count(*arguments: Any, **options: Any) -> Any:
-            nonlocal count
-            count += 1
-            if count == update + len(datasets):  # each was sampled once to see what it shows
-                signal.raise_signal(signal.SIGINT)
-            return sample(*arguments, **options)
-
-        buffer.sample = sample_and_count  # type: ignore[method-assign]
-
-    for buffer in datasets.values():
-        watch(buffer)
-    return datasets
 
 
 def test_a_larger_budget_extends_a_finished_run(tmp_path: Path) -> None:
