@@ -20,6 +20,7 @@ def _log_is_as_a_library_has_it() -> None:
     """A command that an earlier test ran in this process has given the log a handler of its own."""
     library = logging.getLogger("crptpro")
     library.handlers.clear()
+    library.setLevel(logging.NOTSET)
     library.propagate = True
 
 

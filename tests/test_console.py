@@ -5,7 +5,7 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +16,6 @@ from tqdm import tqdm
 from crptpro.console import configure_logging, run_main
 from crptpro.errors import CRPTproError, DatasetError
 from crptpro.training import DownstreamConfig
-
-
-@pytest.fixture(autouse=True)
-def _logging_as_before() -> Iterator[None]:
-    """The console takes the library's logger over; later tests want it back."""
-    library = logging.getLogger("crptpro")
-    before = library.handlers[:], library.level, library.propagate
-    yield
-    library.handlers[:], library.propagate = before[0], before[2]
-    library.setLevel(before[1])
 
 
 def fails(error: BaseException) -> Callable[[], None]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import errno
 import io
 import json
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -25,8 +25,8 @@ from crptpro.logging import RunLogger, WandbOptions
 
 
 def table(run_dir: Path, stream: str) -> list[dict[str, str]]:
-    with open(run_dir / f"{stream}.csv", newline="") as file:
-        return [{k: v for k, v in row.items() if k != "unix_time_s"} for row in csv.DictReader(file)]
+    rows = pd.read_csv(run_dir / f"{stream}.csv", dtype=str, keep_default_na=False)
+    return rows.drop(columns="unix_time_s").to_dict("records")
 
 
 def lines(run_dir: Path) -> list[dict[str, Any]]:

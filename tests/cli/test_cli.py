@@ -8,12 +8,10 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
-import torch
 from command import SIZE, SMALL, TASK, Call, refused, rows, toy_dataset
-from toy_world import ToyEnv, fixed_length
+from toy_world import PoisonedEnv, fixed_length
 
 from crptpro.cli import main
 from crptpro.data import FrameDataset
@@ -140,19 +138,11 @@ def test_results_are_written_before_they_are_printed(
     assert [row["episode"] for row in rows(file)] == ["0", "1"]
 
 
-class Poisoned(ToyEnv):
-    """Rewards NaN in its second episode."""
-
-    def _step(self, tensordict: Any) -> Any:
-        found = super()._step(tensordict)
-        return found.set("reward", torch.full((1,), torch.nan)) if self.steps == 15 else found
-
-
 def test_a_reward_that_is_not_finite_ends_an_evaluation_and_keeps_its_finished_episodes(
     call: Call, tmp_path: Path
 ) -> None:
-    def make(*, seed: int, image_size: int) -> Poisoned:
-        return Poisoned(fixed_length, seed=seed, image_size=image_size)
+    def make(*, seed: int, image_size: int) -> PoisonedEnv:
+        return PoisonedEnv(fixed_length, seed=seed, image_size=image_size)
 
     register_domain(Domain("poisoned", "poisoned_go", make=make))
     file = tmp_path / "a.csv"
