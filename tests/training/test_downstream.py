@@ -190,21 +190,6 @@ def test_what_does_not_fit_a_run_is_refused_by_name(tmp_path: Path) -> None:
     train(tmp_path, env_steps=40)  # complete: nothing is needed
 
 
-@pytest.mark.parametrize(
-    ("setting", "value", "message"),
-    [
-        ("env_steps", 0, "`env_steps` must be at least 1, got 0"),
-        ("batch_size", "8", "`batch_size` must be a whole number"),
-        ("discount", 1.5, "`discount` must be at most 1"),
-        ("features", "sparse", "`features` must be auto, dense, dense-bf16 or reencode"),
-        ("replay_capacity", 5, "`replay_capacity` .5. must hold the 1000 transitions"),
-    ],
-)
-def test_an_impossible_setting_is_refused_by_name(setting: str, value: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        DownstreamConfig(**{setting: value})
-
-
 def test_a_cuda_graph_without_a_gpu_is_refused_before_the_first_step(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="`cuda_graph` needs a GPU, but `device` is 'cpu'"):
         train(tmp_path / "run", cuda_graph=True)

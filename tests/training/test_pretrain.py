@@ -234,20 +234,6 @@ def test_the_stacks_that_an_open_dataset_samples_must_fit_the_encoder_whatever_i
         run(make_loss(channels=9), 2, datasets=single)
 
 
-@pytest.mark.parametrize(
-    ("setting", "value", "message"),
-    [
-        ("updates", 0, "`updates` must be at least 1, got 0"),
-        ("batch_size", 2.5, "`batch_size` must be a whole number, got 2.5"),
-        ("encoder_tau", 1.5, "`encoder_tau` must be at most 1, got 1.5"),
-        ("learning_rate", float("nan"), "`learning_rate` must be finite"),
-    ],
-)
-def test_an_impossible_setting_is_refused_by_name(setting: str, value: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        PretrainConfig(**{setting: value})
-
-
 def test_bf16_stays_within_the_spread_of_two_fp32_seeds() -> None:
     def curve(precision: str, seed: int) -> torch.Tensor:
         config = PretrainConfig(batch_size=16, learning_rate=1e-3, seed=seed, log_interval=10, precision=precision)  # type: ignore[arg-type]
