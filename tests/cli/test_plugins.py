@@ -2,37 +2,21 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
-import gymnasium
 import pytest
 from command import SIZE, SMALL, TASK, Call, refused, rows
 
-import crptpro.objectives.methods as registry
 from crptpro import doctor, plugins
 from crptpro.data import FrameDataset
-from crptpro.experiments import matrix
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import get_method, method_names
 from crptpro.pretrained import load_pretrained
 from crptpro.training import pretrain
 
+pytestmark = pytest.mark.usefixtures("plugins_are_forgotten")
 METHODS = Path(__file__).with_name("own_method.py")
 WORLD = Path(__file__).parents[1] / "experiments" / "slow_world.py"
-
-
-@pytest.fixture(autouse=True)
-def _plugins_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """What a file registers is as it was afterwards."""
-    monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
-    monkeypatch.setattr(matrix, "EXPERIMENTS", dict(matrix.EXPERIMENTS))
-    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if Path(entry) != METHODS.parent])
-    yield
-    for path in (METHODS, WORLD):
-        sys.modules.pop(path.stem, None)
-    gymnasium.registry.pop("SlowWorld-v0", None)
 
 
 def test_a_plugin_registers_a_method(call: Call, dataset: Path, tmp_path: Path) -> None:
