@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -20,7 +23,25 @@ def _log_is_as_a_library_has_it() -> None:
     """A command that an earlier test ran in this process has given the log a handler of its own."""
     library = logging.getLogger("crptpro")
     library.handlers.clear()
+    library.setLevel(logging.NOTSET)
     library.propagate = True
+
+
+@pytest.fixture
+def plugins_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What a plugin registers is as it was afterwards."""
+    import gymnasium
+
+    from crptpro import plugins
+    from crptpro.experiments import matrix
+    from crptpro.objectives import methods
+
+    monkeypatch.setattr(plugins, "_loaded", [])  # processes of later tests would load what this one has loaded
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if Path(entry) != Path(__file__).parent / "cli"])
+    with patch.dict(matrix.EXPERIMENTS), patch.dict(methods._METHODS), patch.dict(gymnasium.registry):
+        yield
+    for name in ("own_method", "slow_world"):
+        sys.modules.pop(name, None)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

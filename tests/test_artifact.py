@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -246,16 +247,17 @@ def test_threads_that_write_one_file_leave_a_whole_one(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
-def truncate(path: Path) -> None:
+def end_weights_with(end: bytes, path: Path) -> None:
     weights = path / "weights.safetensors"
-    weights.write_bytes(weights.read_bytes()[:-4])
+    weights.write_bytes(weights.read_bytes()[:-4] + end)
 
 
 @pytest.mark.parametrize(("damage", "message"), [
     (shutil.rmtree, "does not exist"),
     (lambda p: (p / "card.json").unlink(), "card.json does not exist"),
     (lambda p: (p / "weights.safetensors").unlink(), "weights.safetensors is missing"),
-    (truncate, "truncated, damaged or replaced"),
+    (partial(end_weights_with, b""), "truncated, damaged or replaced"),
+    (partial(end_weights_with, b"\1\0\0\0"), "truncated, damaged or replaced"),
 ])  # fmt: skip
 def test_each_kind_of_damage_is_named(tmp_path: Path, damage: Callable[[Path], None], message: str) -> None:
     write(tmp_path / "a")

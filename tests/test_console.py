@@ -5,7 +5,7 @@ import logging
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +16,6 @@ from tqdm import tqdm
 from crptpro.console import configure_logging, run_main
 from crptpro.errors import CRPTproError, DatasetError
 from crptpro.training import DownstreamConfig
-
-
-@pytest.fixture(autouse=True)
-def _logging_as_before() -> Iterator[None]:
-    """The console takes the library's logger over; later tests want it back."""
-    library = logging.getLogger("crptpro")
-    before = library.handlers[:], library.level, library.propagate
-    yield
-    library.handlers[:], library.propagate = before[0], before[2]
-    library.setLevel(before[1])
 
 
 def fails(error: BaseException) -> Callable[[], None]:
@@ -63,18 +53,18 @@ def test_a_full_disk_is_no_defect_though_the_system_names_no_file(capsys: pytest
 
     assert stopped_by(main) == 1
     assert capsys.readouterr().err == "error: [Errno 28] No space left on device\n"
-    with pytest.raises(OSError, match="Input/output error"):  # anything else may be one
-        run_main(fails(OSError(errno.EIO, os.strerror(errno.EIO))))
 
 
 @pytest.mark.parametrize("main", [
     fails(KeyError("forgotten")),
     fails(ValueError("raised by a caller")),
+    fails(OSError(errno.EIO, os.strerror(errno.EIO))),
+    fails(BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))),  # a pipe of its own
     lambda: torch.zeros(2).reshape(3),
     lambda: int("seven"),
 ])  # fmt: skip
 def test_a_defect_keeps_its_traceback(main: Callable[[], object]) -> None:
-    with pytest.raises((KeyError, ValueError, RuntimeError)):
+    with pytest.raises((KeyError, ValueError, RuntimeError, OSError)):
         run_main(main)
 
 
@@ -114,11 +104,6 @@ def test_a_closed_pipe_ends_a_program_quietly(program: str) -> None:
         process.stdout.close()
         assert process.stderr.read() == b""
         assert process.wait() == 128 + 13
-
-
-def test_a_pipe_that_broke_elsewhere_keeps_its_traceback() -> None:
-    with pytest.raises(BrokenPipeError):
-        run_main(fails(BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))))
 
 
 def test_characters_that_a_terminal_cannot_show_are_printed_as_escapes() -> None:

@@ -68,7 +68,6 @@ def test_a_healthy_machine_is_ok_and_every_domain_is_shown() -> None:
     ("raise SystemExit('no GL')", None, ("No GL backend renders", "no GL", "apt-get install")),
     ("import time; time.sleep(600)", None, ("did not arrive within 0.5 s", "MUJOCO_GL=osmesa")),
     ("raise SystemExit('no GL')", "osmesa", ("MUJOCO_GL=osmesa was set by you", "Unset MUJOCO_GL")),
-    (PROBE, "nonsense", ("MUJOCO_GL=nonsense is not a GL backend",)),
     (PROBE, "off", ("switches rendering off",)),
 ])  # fmt: skip
 def test_a_machine_on_which_nothing_renders_is_not_ok_and_told_why(

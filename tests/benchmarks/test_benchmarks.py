@@ -14,14 +14,14 @@ from typing import Any
 import pytest
 import torch
 import tyro
-from benchmarks.loops import ITEMS, downstream
+from benchmarks.loops import ITEMS
 from benchmarks.measure import Loop, compare
 from benchmarks.synthetic import drifting_dataset, make_drifting
 from torch import nn
 from torchrl.data import LazyMemmapStorage
 
 from benchmarks import collection, gpu, loops, memory, revisions, sampling, synthetic, updates
-from crptpro.data import FrameDataset, FrameReplay
+from crptpro.data import FrameDataset
 from crptpro.domains import Domain
 from crptpro.envs import make_env
 from crptpro.errors import CRPTproError
@@ -104,22 +104,6 @@ def test_candidates_take_turns_and_times_are_per_unit() -> None:
     timings = compare(calls, unit="call", rounds=2, warmup=1, per_call=4)["timings"]
     assert order == ["a", "b", "a", "b", "a", "b"]
     assert all(t["rounds"] == 2 and t["best_s"] <= t["median_s"] <= t["worst_s"] for t in timings.values())
-
-
-def test_a_loop_is_the_librarys_and_its_laps_are_all_of_its_time() -> None:
-    plain = FrameReplay.sample, FrameReplay.extend
-    found: list[dict[str, float]] = []
-
-    def hold(laps: dict[str, float]) -> None:
-        found.append(laps)
-        if len(found) == 3:
-            raise EnoughError
-
-    with pytest.raises(EnoughError):
-        downstream(hold, transitions=20, batch_size=8, **SIZES)
-    assert all(laps.keys() == {"update", "store", "act"} for laps in found[1:])
-    assert all(seconds > 0 for laps in found[1:] for seconds in laps.values())
-    assert (FrameReplay.sample, FrameReplay.extend) == plain
 
 
 def test_a_process_of_its_own_answers_and_is_watched(tmp_path: Path) -> None:

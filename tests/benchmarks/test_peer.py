@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from benchmarks.peer import RandomCrop, load, peer_update
+from benchmarks.peer import load, peer_update
 from benchmarks.plain import Batch
 
 from crptpro.errors import CRPTproError
@@ -96,10 +96,3 @@ def test_what_is_no_released_agent_is_one_clear_error(checkout: Path, content: s
         (checkout / "proto.py").write_text(content)
     with pytest.raises(CRPTproError, match=message):
         load(checkout)
-
-
-def test_the_stand_in_crop_is_one_integer_crop_per_sample() -> None:
-    torch.manual_seed(0)
-    images = torch.arange(36.0).view(1, 1, 6, 6).expand(200, 1, 6, 6)
-    corners = RandomCrop((4, 4))(images)[:, 0, 0, 0]
-    assert corners.unique().tolist() == [0, 1, 2, 6, 7, 8, 12, 13, 14]

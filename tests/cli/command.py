@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable
 from pathlib import Path
 
+import pandas as pd
 from toy_world import FIXED, collect_toy
 
 SIZE = 16
@@ -34,5 +34,4 @@ def toy_dataset(path: Path, size: int = SIZE) -> Path:
 
 
 def rows(path: Path) -> list[dict[str, str]]:
-    with open(path, newline="") as file:
-        return list(csv.DictReader(file))
+    return pd.read_csv(path, dtype=str, keep_default_na=False).to_dict("records")

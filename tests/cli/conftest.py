@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-import logging
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -23,10 +21,8 @@ under a name that another has."""
 
 
 @pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Iterator[Call]:
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
     """Run the command in this process; returns exit status, standard output and standard error."""
-    library = logging.getLogger("crptpro")
-    before = library.handlers[:], library.level, library.propagate
     monkeypatch.setattr(domains, "_registered", {})
     monkeypatch.setattr(plugins, "_loaded", [])  # processes of later tests would load what these have loaded
     register_domain(FIXED)
@@ -41,9 +37,7 @@ def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
             status = stopped.code if isinstance(stopped.code, int) else int(stopped.code is not None)
         return status, *capsys.readouterr()
 
-    yield run
-    library.handlers[:], library.propagate = before[0], before[2]
-    library.setLevel(before[1])
+    return run
 
 
 @pytest.fixture

@@ -3,36 +3,27 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
-import gymnasium
 import pytest
 from command import SIZE, SMALL, TASK, Call, refused, rows
 
-import crptpro.objectives.methods as registry
 from crptpro import doctor, plugins
 from crptpro.data import FrameDataset
-from crptpro.experiments import matrix
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import get_method, method_names
 from crptpro.pretrained import load_pretrained
 from crptpro.training import pretrain
 
-
-@pytest.fixture
-def plugin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A file with methods of its own; what it registers is forgotten afterwards."""
-    monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
-    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if Path(entry) != Path(__file__).parent])
-    yield Path(__file__).with_name("own_method.py")
-    sys.modules.pop("own_method", None)
+pytestmark = pytest.mark.usefixtures("plugins_are_forgotten")
+METHODS = Path(__file__).with_name("own_method.py")
+WORLD = Path(__file__).parents[1] / "experiments" / "slow_world.py"
 
 
-def test_a_plugin_registers_a_method(call: Call, dataset: Path, tmp_path: Path, plugin: Path) -> None:
+def test_a_plugin_registers_a_method(call: Call, dataset: Path, tmp_path: Path) -> None:
     assert "slowness" not in method_names()
     out = tmp_path / "out"
-    own = ("pretrain", dataset, "--out", out, "--method", "slowness", "--log-interval", 1, "--plugin", plugin)
+    own = ("pretrain", dataset, "--out", out, "--method", "slowness", "--log-interval", 1, "--plugin", METHODS)
     assert call(*own)[0] == 0
     assert {"slowness", "slowness-active"} <= set(method_names())  # what lists methods lists it
     loaded = load_pretrained(out / "encoder")
@@ -40,7 +31,7 @@ def test_a_plugin_registers_a_method(call: Call, dataset: Path, tmp_path: Path, 
     assert float(rows(out / "pretrain.csv")[-1]["loss_slow"]) > 0
 
     again = (out / "encoder", dataset, "--out", tmp_path / "fine", "--updates", 1, "--batch-size", 4)
-    assert call("finetune", *again, "--plugin", plugin)[0] == 0
+    assert call("finetune", *again, "--plugin", METHODS)[0] == 0
     assert load_pretrained(tmp_path / "fine" / "encoder").label == "slowness-finetune"
 
     # In Python it is one line.
@@ -48,9 +39,9 @@ def test_a_plugin_registers_a_method(call: Call, dataset: Path, tmp_path: Path, 
     assert pretrain(loss, dataset, progress=False).updates == 2
 
 
-def test_a_users_method_explores_with_its_own_reward(call: Call, tmp_path: Path, plugin: Path) -> None:
+def test_a_users_method_explores_with_its_own_reward(call: Call, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    own = ("--plugin", plugin, "pretrain", TASK, "--out", out, "--method", "slowness-active")
+    own = ("--plugin", METHODS, "pretrain", TASK, "--out", out, "--method", "slowness-active")
     few = ("--log-interval", 1, "--hidden-dim", 8, "--replay-capacity", 40)
     status, _, err = call(*own, *few)
     assert status == 0, err
@@ -72,8 +63,7 @@ def test_a_users_method_explores_with_its_own_reward(call: Call, tmp_path: Path,
     assert (out / "pretrain.csv").read_bytes() == before
 
 
-def test_a_plugin_that_cannot_be_imported_says_so(call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "path", list(sys.path))
+def test_a_plugin_that_cannot_be_imported_says_so(call: Call, tmp_path: Path) -> None:
     (tmp_path / "needs_more.py").write_text("import a_package_that_nobody_has")
     (tmp_path / "json.py").write_text("")
     assert "it cannot be imported" in refused(call("--plugin", tmp_path / "needs_more.py", "doctor"))
@@ -95,41 +85,25 @@ def test_a_plugin_may_be_named_from_the_home_directory(tmp_path: Path, monkeypat
 
 # --- a world of the user's own --------------------------------------------------------------------------------------
 
-WORLD = "SlowWorld-v0"
 
-
-@pytest.fixture
-def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A file that registers a world of Gymnasium's; it is forgotten afterwards."""
-    monkeypatch.setattr(plugins, "_loaded", [])
-    monkeypatch.setattr(sys, "path", sys.path[:])
-    monkeypatch.setattr(matrix, "EXPERIMENTS", dict(matrix.EXPERIMENTS))
-    path = tmp_path / "plugin_of_a_world.py"
-    path.write_text((Path(__file__).parents[1] / "experiments" / "slow_world.py").read_text())
-    yield path
-    sys.modules.pop(path.stem, None)
-    gymnasium.registry.pop(WORLD, None)
-
-
-def test_a_plugins_environment_is_collected_and_learned_with_evaluation_workers(
-    call: Call, tmp_path: Path, world: Path
-) -> None:
-    task = f"gymnasium:{WORLD}"
+def test_a_plugins_environment_is_collected_and_learned_with_evaluation_workers(call: Call, tmp_path: Path) -> None:
+    task = "gymnasium:SlowWorld-v0"
     collect = ("collect", task, "--transitions", 15, "--workers", 1, "--out", tmp_path / "data")
-    status, _, err = call("--plugin", world, *collect)
+    status, _, err = call("--plugin", WORLD, *collect)
     assert status == 0, err
     (path,) = (tmp_path / "data").iterdir()
     assert len(FrameDataset.open(path)) == 15
 
     learn = ("downstream", task, "--pretrained", "random-encoder", "--out", tmp_path / "run")
     few = ("--env-steps", 24, "--random-agent-steps", 4, "--eval-interval-env-steps", 24, "--eval-workers", 1)
-    status, _, err = call("--plugin", world, *learn, *SMALL, *few)
+    status, _, err = call("--plugin", WORLD, *learn, *SMALL, *few)
     assert status == 0, err
     assert "MUJOCO" not in err
 
 
-def test_the_doctor_checks_a_plugins_environment(call: Call, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plugins.load_plugin(str(world))
-    (entry,) = doctor.render_domains((f"gymnasium:{WORLD}",), "egl", 100.0)
+@pytest.mark.usefixtures("call")
+def test_the_doctor_checks_a_plugins_environment() -> None:
+    plugins.load_plugin(str(WORLD))
+    (entry,) = doctor.render_domains(("gymnasium:SlowWorld-v0",), "egl", 100.0)
     assert entry["error"] == ""
     assert entry["agent_step_ms"] > 0

@@ -61,7 +61,6 @@ def test_all_means_the_experiments_with_requested_cells(call: Call, tmp_path: Pa
 @pytest.mark.parametrize(("arguments", "message"), [
     (("sen",), "no experiment 'sen'; choose from seen, unseen"),
     (("seen", "--methods", "atcc"), "'atcc'"),
-    (("seen", "--groups", "E"), "no group 'E'"),
     (("seen", "--groups", "A", "--tasks", "hopper_hop"), "Nothing of seen"),
     (("seen", "--partition", "gpu"), "--partition is for --launcher slurm; --launcher local does"),
     (("seen", "--launcher", "slurm", "--ray-address", "x:1"), "--ray-address is for --launcher ray"),

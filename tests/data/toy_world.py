@@ -79,6 +79,14 @@ class ToyEnv(EnvBase):
         self.episode_seed = seed or 0
 
 
+class PoisonedEnv(ToyEnv):
+    """Rewards NaN once, in the fourth step of its second episode of ten, unwatched."""
+
+    def _step(self, tensordict: TensorDict) -> TensorDict:
+        found = super()._step(tensordict)
+        return found.set("reward", torch.full((1,), torch.nan)) if self.steps == 14 else found
+
+
 def fixed_length(seed: int) -> int:
     return 10
 

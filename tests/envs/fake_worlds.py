@@ -5,14 +5,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import SimpleNamespace
 from typing import Any
 
-import dm_env
 import gymnasium
 import numpy as np
 import torch
-from dm_env import specs
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
@@ -129,29 +126,3 @@ class OwnWorld(EnvBase):
 def own(make: Any, **settings: Any) -> Domain:
     """A domain of one's own."""
     return Domain("mine", "mine_go", make=make, **settings)
-
-
-class FakeDmEnv(dm_env.Environment):
-    """Ends after ``length`` env steps; the reward is the number of the env step."""
-
-    def __init__(self, *, length: int = 5, bounds: Any = ([-1.0, -0.8], [1.1, 0.8])):
-        self._length, self._bounds = length, bounds
-        self.env_steps, self.actions = 0, list[np.ndarray]()
-        self.task = SimpleNamespace(random=np.random.RandomState(0))
-        self.physics = SimpleNamespace(free=lambda: None)
-
-    def reset(self) -> dm_env.TimeStep:
-        self.env_steps = 0
-        return dm_env.restart({})
-
-    def step(self, action: np.ndarray) -> dm_env.TimeStep:
-        self.env_steps += 1
-        self.actions.append(action)
-        end = dm_env.termination if self.env_steps >= self._length else dm_env.transition
-        return end(float(self.env_steps), {})
-
-    def observation_spec(self) -> dict[str, Any]:
-        return {}
-
-    def action_spec(self) -> specs.BoundedArray:
-        return specs.BoundedArray((2,), np.float64, *self._bounds)

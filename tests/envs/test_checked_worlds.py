@@ -11,7 +11,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -23,7 +22,6 @@ from gymnasium.spaces import Box, Discrete
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
-from crptpro.data import collect_random
 from crptpro.envs import make_env
 from crptpro.errors import CRPTproError, NonFiniteError, WorldError, WorldFailedError
 
@@ -163,13 +161,6 @@ def test_an_action_that_is_not_finite_names_world_episode_and_step_and_reaches_n
         td = env.reset().set("action", torch.tensor([0.0, np.nan]))
         with pytest.raises(NonFiniteError, match=r"action .*nan.* agent step 1 of episode 0"):
             env.step(td)
-
-
-def test_a_reward_that_is_not_finite_reaches_no_episode_that_is_collected(tmp_path: Path) -> None:
-    pictures = [torch.full((3, SIZE, SIZE), shade, dtype=torch.uint8) for shade in range(5)]
-    domain = own(lambda: OwnWorld(pictures.__getitem__, reward=lambda clock: np.nan if clock == 2 else 0.0))
-    with pytest.raises(CRPTproError, match="agent step 2"):
-        collect_random(domain, tmp_path, transitions=9, workers=1, image_size=SIZE, progress=False)
 
 
 def explode(clock: int) -> Any:

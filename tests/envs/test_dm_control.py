@@ -6,12 +6,13 @@ from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
+import dm_env
 import mujoco
 import numpy as np
 import pytest
 import torch
-from fake_worlds import FakeDmEnv
-from tensordict import TensorDict, TensorDictBase
+from dm_env import specs
+from tensordict import TensorDictBase
 from torchrl.envs import CatFrames, DMControlWrapper, EnvBase, check_env_specs
 
 from crptpro.domains import PAPER_DOMAINS, SUITE_TASKS, Domain, get_domain
@@ -209,22 +210,25 @@ def test_every_task_of_the_suite_is_known_to_dm_control_also_under_another_domai
         load_dm_env(Domain("own", "acrobot_dance", source="suite"))
 
 
-def env_of(fake: FakeDmEnv, action_repeat: int = 1) -> DMControlPixelEnv:
-    env = DMControlPixelEnv(fake, world="fake", image_size=8, action_repeat=action_repeat, render=False)
-    env.reset()
-    return env
+class FakeDmEnv(dm_env.Environment):
+    """Keeps the actions that it is given."""
 
+    def __init__(self, bounds: Any) -> None:
+        self.bounds, self.actions = bounds, list[np.ndarray]()
+        self.physics = SimpleNamespace(free=lambda: None)
 
-def step(env: EnvBase, *action: float) -> TensorDictBase:
-    return env.step(TensorDict({"action": torch.tensor(action)}))["next"]
+    def reset(self) -> dm_env.TimeStep:
+        return dm_env.restart({})
 
+    def step(self, action: np.ndarray) -> dm_env.TimeStep:
+        self.actions.append(action)
+        return dm_env.transition(0.0, {})
 
-def test_rewards_of_repeated_env_steps_are_summed_up_to_the_episodes_end() -> None:
-    fake = FakeDmEnv(length=5)
-    env = env_of(fake, action_repeat=3)
-    first, last = step(env, 0.0, 0.0), step(env, 0.0, 0.0)
-    assert (first["reward"].item(), first["done"].item()) == (1.0 + 2.0 + 3.0, False)
-    assert (last["reward"].item(), last["done"].item(), fake.env_steps) == (4.0 + 5.0, True, 5)
+    def observation_spec(self) -> dict[str, Any]:
+        return {}
+
+    def action_spec(self) -> specs.BoundedArray:
+        return specs.BoundedArray((2,), np.float64, *self.bounds)
 
 
 @pytest.mark.parametrize(
@@ -236,25 +240,11 @@ def test_rewards_of_repeated_env_steps_are_summed_up_to_the_episodes_end() -> No
     ],
 )
 def test_actions_are_mapped_to_the_actuators_ranges(bounds: Any, commands: list) -> None:
-    fake = FakeDmEnv(bounds=bounds)
-    env = env_of(fake)
+    fake = FakeDmEnv(bounds)
+    env = DMControlPixelEnv(fake, world="fake", image_size=8, action_repeat=1, render=False)
     for action in ((-1.0, -1.0), (1.0, 1.0), (0.0, 0.5)):
-        step(env, *action)
+        env.step(env.reset().set("action", torch.tensor(action)))
     np.testing.assert_allclose(fake.actions, commands, atol=1e-12)
-
-
-def test_bounds_on_one_side_only_are_refused() -> None:
-    with pytest.raises(CRPTproError, match="one side only"):
-        env_of(FakeDmEnv(bounds=([-1.0, 0.0], [np.inf, 4.0])))
-
-
-def test_seeding_reaches_the_generator_of_either_kind_of_environment() -> None:
-    suite_like, composer_like = FakeDmEnv(), FakeDmEnv()
-    composer_like.random_state = np.random.RandomState(0)  # type: ignore[attr-defined]
-    env_of(suite_like).set_seed(3)
-    env_of(composer_like).set_seed(3)
-    expected = np.random.RandomState(3).rand()
-    assert suite_like.task.random.rand() == composer_like.random_state.rand() == expected  # type: ignore[attr-defined]
 
 
 MODEL = """

@@ -98,19 +98,17 @@ def test_a_users_mujoco_gl_is_kept_and_proven(probe: Probe, spelling: str) -> No
         ({"MUJOCO_GL": "egl"}, answer(alive=False), "without content.*apt-get install libegl1", ["egl"]),
         ({"MUJOCO_GL": "egl"}, "print('hello')", "gave no answer.*apt-get install libegl1", ["egl"]),
         ({"MUJOCO_GL": "egl"}, "sys.exit(3)", "exit status 3.*apt-get install libegl1", ["egl"]),
-        # The time limit can be set from outside.
-        ({"MUJOCO_GL": "osmesa", "CRPTPRO_GL_TIMEOUT_S": "0.2"}, "time.sleep(600)", r"within 0\.2 s", None),
         ({"CRPTPRO_GL_TIMEOUT_S": "soon"}, ANSWER, "'soon'", []),
     ],
 )
 def test_what_does_not_render_is_one_error_that_says_why(
-    probe: Probe, environment: dict[str, str], code: str, complaint: str, tried: list[str] | None
+    probe: Probe, environment: dict[str, str], code: str, complaint: str, tried: list[str]
 ) -> None:
     os.environ.update(environment)
     started = probe(code)
     with pytest.raises(RenderingError, match=complaint):
         select_backend()
-    assert tried is None or started() == tried
+    assert started() == tried
     assert os.environ.get("MUJOCO_GL") == environment.get("MUJOCO_GL")
 
 

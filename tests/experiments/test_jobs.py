@@ -59,12 +59,6 @@ def test_a_changed_command_makes_another_job_and_so_do_its_dependents() -> None:
     assert len({probe(SCALE, job, dataset(SCALE, "walker", 0)).key for job in others}) == 6
 
 
-def test_a_plan_has_what_is_needed_first_and_nothing_twice(tmp_path: Path) -> None:
-    plan = make_plan([learned(), learned(), trained()], tmp_path)
-    assert [job.kind for job in plan.jobs] == ["dataset", "dataset", "encoder", "run"]
-    assert plan.missing == plan.jobs
-
-
 def test_a_job_whose_weights_were_removed_runs_again_only_if_another_job_needs_them(tmp_path: Path) -> None:
     finish(tmp_path, trained())
     plan = make_plan([learned()], tmp_path)  # what only the encoder needed is not asked for

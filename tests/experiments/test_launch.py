@@ -14,17 +14,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import gymnasium
 import psutil
 import pytest
 from filelock import FileLock
 
 import crptpro
-from crptpro import plugins
 from crptpro.artifact import read_json, write_json
 from crptpro.cli import main
 from crptpro.errors import CRPTproError, SubmissionError
-from crptpro.experiments import launch, matrix
+from crptpro.experiments import launch
 from crptpro.experiments.jobs import Job, describe, make_plan
 from crptpro.experiments.launch import (
     Failure,
@@ -310,26 +308,15 @@ def _collected(root: Path) -> int:
     return sum(read_json(path)["episodes"] for path in root.glob("jobs/dataset-*/*/card.json"))
 
 
-@pytest.fixture
-def plugin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A file with an experiment of some seconds; what it registers is forgotten afterwards."""
-    monkeypatch.setattr(plugins, "_loaded", [])
-    monkeypatch.setattr(sys, "path", sys.path[:])
-    monkeypatch.setattr(matrix, "EXPERIMENTS", matrix.EXPERIMENTS.copy())
-    monkeypatch.setattr("crptpro.cli.reproduce.EXPERIMENTS", matrix.EXPERIMENTS)
-    yield Path(__file__).with_name("slow_world.py")
-    gymnasium.registry.pop("SlowWorld-v0", None)
-    sys.modules.pop("slow_world", None)
-
-
 @pytest.mark.slow
+@pytest.mark.usefixtures("plugins_are_forgotten")
 def test_a_command_that_is_killed_continues(
-    tmp_path: Path, plugin: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
     root = tmp_path / "root"
     words = ("reproduce", "slow", "--scale", "tiny", "--jobs", 1, "--cores-per-job", 1, "--out", root)
-    arguments = ["--plugin", *map(str, (plugin, *words))]
+    arguments = ["--plugin", *map(str, (Path(__file__).with_name("slow_world.py"), *words))]
     command = subprocess.Popen([sys.executable, "-m", "crptpro", *arguments], start_new_session=True)
     deadline = time.monotonic() + 300
     while _collected(root) < 2 and time.monotonic() < deadline:

@@ -112,7 +112,6 @@ def test_downstream_settings_differ_from_crptpros_where_the_paper_says_so() -> N
         assert get_method(name).downstream == {"intrinsic_reward_coef": 0.0}
     drq = get_method("drq").downstream
     assert (drq["replay_capacity"], drq["learning_rate"]) == (100_000, 1e-3)
-    assert get_method("random-encoder-standardised").build_encoder().config["standardised"]
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import functools
 import hashlib
 import importlib.util
@@ -16,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
+import pandas as pd
 import pytest
 import torch
 
@@ -31,7 +31,7 @@ RECIPES = Path(__file__).parents[2] / "recipes"
 TASK = "gymnasium:Reacher-v5"
 """Real MuJoCo pixels with episodes of 25 decisions."""
 EPISODE = 50
-MEASURED = {"unix_time_s", "updates_per_s", "env_steps_per_s", "resident_bytes", "gpu_bytes"}
+MEASURED = ["unix_time_s", "updates_per_s", "env_steps_per_s", "resident_bytes", "gpu_bytes"]
 
 
 @functools.cache
@@ -144,8 +144,8 @@ def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def record(path: Path) -> list[dict[str, str]]:
-    with open(path, newline="") as file:
-        return [{k: v for k, v in row.items() if k not in MEASURED} for row in csv.DictReader(file)]
+    table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    return table.drop(columns=MEASURED, errors="ignore").to_dict("records")
 
 
 def left(out: Path) -> dict[str, object]:

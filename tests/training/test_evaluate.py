@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from toy_world import ToyEnv, fixed_length
+from toy_world import PoisonedEnv, fixed_length
 from worlds import EPISODE, SIZE, make_encoder, world
 
 from crptpro.envs import make_env
@@ -54,18 +54,12 @@ def test_a_non_finite_action_names_the_episode_and_the_decision() -> None:
         evaluate(lambda _: torch.full((2,), next(actions)), make_toy_env(), episodes=2, progress=False)
 
 
-class Poisoned(ToyEnv):
-    """Rewards NaN once, unwatched."""
-
-    def _step(self, tensordict: Any) -> Any:
-        found = super()._step(tensordict)
-        return found.set("reward", torch.full((1,), torch.nan)) if self.steps == EPISODE + 4 else found
-
-
 def test_a_reward_that_is_not_finite_names_the_episode_and_keeps_those_before() -> None:
     kept: list[Episode] = []
     with pytest.raises(NonFiniteError, match="episode 1, decision 3: the reward is nan"):
-        evaluate(lambda _: torch.zeros(2), Poisoned(fixed_length), episodes=3, progress=False, on_episode=kept.append)
+        evaluate(
+            lambda _: torch.zeros(2), PoisonedEnv(fixed_length), episodes=3, progress=False, on_episode=kept.append
+        )
     assert [episode.episode for episode in kept] == [0]
 
 

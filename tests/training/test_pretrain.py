@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import signal
 from pathlib import Path
@@ -57,11 +58,12 @@ class Brightness(LossModule):
         return TensorDict({"loss_brightness": loss}, [])
 
 
-def test_domains_take_turns_one_update_each() -> None:
+def test_domains_take_turns_and_their_cosines_are_watched_whatever_the_loss() -> None:
     loss = Brightness()
-    run(loss, 6)
+    result = run(loss, 5)
     is_bright = [mean > 0.4 for mean in loss.seen]
-    assert is_bright == [False, True] * 3
+    assert is_bright == [False, True, False, True, False]
+    assert "cosine/dark" in result.metrics or "cosine/bright" in result.metrics
 
 
 def test_a_loss_is_given_what_it_reads_and_nothing_else() -> None:
@@ -115,34 +117,15 @@ def test_a_resumed_run_gives_the_weights_and_the_record_of_an_uninterrupted_one(
 
     whole, parts = build(), build()
     run(whole, 14, tmp_path / "whole", warmup_updates=3)
+    updates = itertools.count(1)
+    parts.register_forward_hook(lambda *_: signal.raise_signal(signal.SIGINT) if next(updates) == 7 else None)
     with pytest.raises(KeyboardInterrupt):
-        run(parts, 14, tmp_path / "parts", warmup_updates=3, datasets=_interrupting(7))
+        run(parts, 14, tmp_path / "parts", warmup_updates=3)
     resumed = build()
     result = run(resumed, 14, tmp_path / "parts", warmup_updates=3)
     assert result.resumed_from == 7
     assert same_state(resumed, whole)
     assert record(tmp_path / "parts" / "pretrain.csv") == record(tmp_path / "whole" / "pretrain.csv")
-
-
-def _interrupting(update: int) -> dict[str, ReplayBuffer]:
-    """The usual datasets; the one of update number ``update`` (from 1) brings Ctrl-C with its batch."""
-    datasets, count = make_datasets(), 0
-
-    def watch(buffer: ReplayBuffer) -> None:
-        sample = buffer.sample
-
-        def sample_and_count(*arguments: Any, **options: Any) -> Any:
-            nonlocal count
-            count += 1
-            if count == update + len(datasets):  # each was sampled once to see what it shows
-                signal.raise_signal(signal.SIGINT)
-            return sample(*arguments, **options)
-
-        buffer.sample = sample_and_count  # type: ignore[method-assign]
-
-    for buffer in datasets.values():
-        watch(buffer)
-    return datasets
 
 
 def test_a_larger_budget_extends_a_finished_run(tmp_path: Path) -> None:
@@ -180,8 +163,11 @@ def test_finetuning_takes_the_updates_of_the_method_of_that_name(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     before = load_pretrained(save_pretrained(run(make_loss(), 1), tmp_path))
+    dataset, samples = make_dataset(0), itertools.count()
+    sample = dataset.sample
+    dataset.sample = lambda *a, **k: (next(samples) and signal.raise_signal(signal.SIGINT)) or sample(*a, **k)
     with caplog.at_level("WARNING", logger="crptpro"), pytest.raises(KeyboardInterrupt):
-        finetune(before, _interrupting(3), batch_size=8, progress=False)
+        finetune(before, dataset, batch_size=8, progress=False)
     assert "of 2,000 updates" in caplog.text
 
 
@@ -254,25 +240,6 @@ def test_a_dead_run_is_announced_by_name_of_the_plateau(caplog: pytest.LogCaptur
     assert "encoder has not begun to learn" in caplog.text
 
 
-def test_the_artifact_says_how_it_was_trained_and_can_be_trained_further(tmp_path: Path) -> None:
-    before = load_pretrained(save_pretrained(run(make_loss(), 6), tmp_path / "encoder"))
-    training = before.card["training"]
-    assert (before.method, training["updates"]) == ("crptpro", 6)
-    assert [facts["domain"] for facts in training["datasets"]] == ["dark", "bright"]
-    result = finetune(before, {"bright": make_dataset(1)}, config=SETTINGS, updates=3, progress=False)
-    assert result.method == "crptpro"
-    assert result.training["started_from"] == before.identity()
-    assert result.training["previous_training"]["updates"] == 6
-    save_pretrained(result, tmp_path / "tuned")
-    assert load_pretrained(tmp_path / "tuned").label == "crptpro-finetune"
-
-
-def test_any_loss_module_trains_without_targets_or_registration() -> None:
-    result = run(Brightness(), 5)
-    assert result.updates == 5
-    assert "cosine/dark" in result.metrics or "cosine/bright" in result.metrics
-
-
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 def test_the_compute_precision_is_left_as_it_was(precision: str) -> None:
     loss = make_loss()
@@ -299,20 +266,6 @@ def test_the_stacks_that_an_open_dataset_samples_must_fit_the_encoder_whatever_i
     assert run(make_loss(channels=3), 2, datasets=single).updates == 2
     with pytest.raises(DatasetError, match=r"shows 'pixels' as \(3, 16, 16\); the encoder takes \(9, 16, 16\)"):
         run(make_loss(channels=9), 2, datasets=single)
-
-
-@pytest.mark.parametrize(
-    ("setting", "value", "message"),
-    [
-        ("updates", 0, "`updates` must be at least 1, got 0"),
-        ("batch_size", 2.5, "`batch_size` must be a whole number, got 2.5"),
-        ("encoder_tau", 1.5, "`encoder_tau` must be at most 1, got 1.5"),
-        ("learning_rate", float("nan"), "`learning_rate` must be finite"),
-    ],
-)
-def test_an_impossible_setting_is_refused_by_name(setting: str, value: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        PretrainConfig(**{setting: value})
 
 
 def test_bf16_stays_within_the_spread_of_two_fp32_seeds() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import signal
 import subprocess
@@ -11,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -112,7 +112,5 @@ def same_state(one: torch.nn.Module, two: torch.nn.Module) -> bool:
 
 def record(path: Path) -> list[dict[str, str]]:
     """Rows of a CSV without what depends on the clock or the machine."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    left_out = ("time", "per_s", "bytes")
-    return [{k: v for k, v in row.items() if not any(part in k for part in left_out)} for row in rows]
+    table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    return table.loc[:, ~table.columns.str.contains("time|per_s|bytes")].to_dict("records")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -204,21 +205,14 @@ def test_threads_that_sample_side_by_side_get_each_their_own():
     encoder, replay = small_encoder(), FakeReplay()
     dense = dense_of(encoder, replay, generator=None)
     plain = {n: crops_and_features(encoder, replay.frames[n])[1] for n in range(12)}
-    wrong: list[int] = []
 
-    def sample():
-        for _ in range(20):
-            td = dense(replay.batch(6))
-            for number, features in zip(td["number"].tolist(), td["features"]):
-                if not ((plain[number] - features).abs().amax(-1) < 1e-5).any():
-                    wrong.append(number)
+    def sample(_) -> bool:
+        td = dense(replay.batch(6))
+        found = zip(td["number"].tolist(), td["features"])
+        return all(((plain[number] - features).abs().amax(-1) < 1e-5).any() for number, features in found)
 
-    threads = [threading.Thread(target=sample) for _ in range(3)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert not wrong
+    with ThreadPoolExecutor(3) as threads:
+        assert all(threads.map(sample, range(60)))
 
 
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])

@@ -124,7 +124,7 @@ def test_attaching_switches_to_evaluation_mode_and_it_still_acts_at_reset_and_st
     plain, env = FakePixelEnv(), TransformedEnv(FakePixelEnv(), made(case))
     assert not env.transform.training
     plain, rollout = plain.rollout(3), env.rollout(3)
-    for before, after in ((plain, rollout), (plain["next"], rollout["next"])):
+    for before, after in ((plain[0], rollout[0]), (plain["next"], rollout["next"])):
         found = changed(before.select("pixels"), after.select("pixels", "features", strict=False))
         assert found == CASES[case][1] & {"pixels", "features"}
 

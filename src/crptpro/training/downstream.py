@@ -398,7 +398,7 @@ def _record_evaluation(
 ) -> None:
     for e in episodes:
         row = {"episode_return": e.episode_return, "episode_agent_steps": e.agent_steps, "seed": e.seed}
-        run.write("eval", {**row, "method": method}, episode=e.episode, **counters)
+        run.write("eval", {**row, "method": method}, extra=None, episode=e.episode, **counters)
     scores = summarize(episodes)
     logger.info(
         "%s: %s env steps, %s updates, return %.1f ± %.1f over %d episodes",
