@@ -284,7 +284,8 @@ def _make_agent(
     widths: dict[str, Any] = {"hidden_dim": config.hidden_dim, "has_tanh": is_drq}
     actor: Any = SquashedGaussianActor(encoder.feature_dim, action_dim, **widths)
     if has_explored:
-        actor = copy.deepcopy(pretrained.actor).requires_grad_(True).train()
+        actor = copy.deepcopy(pretrained.actor)
+        actor.requires_grad_(True).train()
     networks = actor.to(device), TwinCritic(encoder.feature_dim, action_dim, **widths).to(device)
     options: dict[str, Any] = {"gamma": config.discount, "alpha_init": config.initial_temperature}
     make_loss = functools.partial(DrQLoss, encoder.requires_grad_(True)) if is_drq else RADSACLoss
