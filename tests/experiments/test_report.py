@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+import threading
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -382,7 +383,7 @@ def test_a_full_disk_is_reported_and_the_older_page_kept(tmp_path: Path) -> None
     page.section("One", "one")
     page.text("before")
     page.write("A title", "")
-    (tmp_path / f".index.html.{os.getpid()}.partial").symlink_to("/dev/full")
+    (tmp_path / f".index.html.{os.getpid()}.{threading.get_ident()}.partial").symlink_to("/dev/full")
     page.text("after")
     with pytest.raises(DiskSpaceError, match=r"disk is full: .*index\.html cannot be written"):
         page.write("A title", "")
