@@ -110,7 +110,7 @@ def downstream(
     hold: Hold, *, image_size: int, prototypes: int, transitions: int, task: str = "", passes: int = 2,
     is_filled: bool = True, **settings: Any,
 ) -> None:  # fmt: skip
-    """Time ``train_downstream(...)`` on the drifting world or a task: laps ``update``, ``store`` and ``act``.
+    """Time ``train_downstream(...)`` on the drifting environment or a task: laps ``update``, ``store`` and ``act``.
 
     The actor learns in every second pass. ``is_filled``: drifting pictures are stored and encoded before the first
     update; otherwise the loop fills its replay. ``store`` begins when the next observation has been drawn, so that
@@ -135,7 +135,7 @@ def downstream(
 
 
 def fill(replay: FrameReplay, transitions: int, image_size: int, *, encodes: bool) -> None:
-    """Store episodes of the drifting world, and encode them where the replay's transforms keep features."""
+    """Store episodes of the drifting environment, and encode them where the replay's transforms keep features."""
     action_dim = replay[:1]["action"].shape[-1] if len(replay) else synthetic.ACTION_DIM
     env = make_drifting(action_dim, seed=1, image_size=image_size)
     while len(replay) < transitions:
@@ -158,7 +158,7 @@ def opening(hold: Hold, *, path: str) -> None:
 
 
 def collecting(hold: Hold, *, root: str, image_size: int, transitions: int) -> None:
-    """Collect a dataset of the drifting world in one process, once a pass, and time its episodes.
+    """Collect a dataset of the drifting environment in one process, once a pass, and time its episodes.
 
     The median time from one reset to the next leaves out what a start costs. It is NaN below two whole episodes.
     """

@@ -1,4 +1,4 @@
-"""A world without a simulator: one smooth picture that drifts, whose steps cost next to nothing, and its datasets.
+"""An environment without a simulator, one smooth picture that drifts at next to no cost, and its datasets.
 
 Public names of the library only: ``benchmarks.revisions`` runs this with other revisions too.
 """
@@ -27,7 +27,7 @@ _PATCHES = 12
 """Side of the noise that is blown up to an image: patches of a few pixels, as rendered scenes have."""
 
 
-class DriftingWorld(EnvBase):
+class DriftingEnv(EnvBase):
     """Single frames of a drifting picture. No two frames of an episode are equal (below ``image_size ** 2``).
 
     Every reset appends the time and how many transitions came before it to the file ``clock``.
@@ -73,8 +73,8 @@ class DriftingWorld(EnvBase):
 def make_drifting(
     action_dim: int = ACTION_DIM, *, seed: int, image_size: int = 84, action_repeat: int = 2, clock: Path | None = None
 ) -> EnvBase:
-    """Build the world of a :class:`crptpro.domains.Domain`, whose decisions count as ``action_repeat`` env steps."""
-    return DriftingWorld(seed=seed, image_size=image_size, action_dim=action_dim, clock=clock)
+    """Build the environment of a domain; an agent step counts as ``action_repeat`` env steps."""
+    return DriftingEnv(seed=seed, image_size=image_size, action_dim=action_dim, clock=clock)
 
 
 register_domain(Domain("drifting", "drifting_task", make=make_drifting, episode_env_steps=2 * LENGTH))
@@ -84,7 +84,7 @@ def drifting_dataset(
     root: Path | str, *, transitions: int, image_size: int = 84, seed: int = 0, clock: Path | None = None,
     action_dim: int = ACTION_DIM,
 ) -> Path:  # fmt: skip
-    """Collect a dataset of the world in one process, or return it at once where it is complete."""
+    """Collect a dataset of the environment in one process, or return it at once where it is complete."""
     make = functools.partial(make_drifting, action_dim, clock=clock)
     domain = Domain(f"drifting_{seed}", "drifting_go", make=make, episode_env_steps=2 * LENGTH)
     return collect_random(domain, root, seed=seed, progress=False, transitions=transitions, image_size=image_size)

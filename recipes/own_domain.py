@@ -69,7 +69,7 @@ register_method("next-latent", NextLatentLoss, updates=300, batch_size=128, lear
 class Config:
     """A small run; increase the numbers for a real one."""
 
-    world: str = "gymnasium:HalfCheetah-v5"
+    task: str = "gymnasium:HalfCheetah-v5"
     """any Gymnasium id that renders RGB and has continuous actions"""
     out: Path = Path("runs/own_domain")
     """everything is written below this directory"""
@@ -99,13 +99,13 @@ def main(config: Config) -> None:
     """Collect, pre-train, learn."""
     seed, out = config.seed, config.out
     dataset = collect_random(
-        config.world, out / "data", transitions=config.transitions, seed=seed, workers=config.workers
+        config.task, out / "data", transitions=config.transitions, seed=seed, workers=config.workers
     )
     seed_everything(seed)
     loss = NextLatentLoss(PixelEncoder())
     result = pretrain(loss, dataset, run_dir=out / "pretrain", config=replace(config.pretrain, seed=seed))
     encoder = save_pretrained(result, out / "encoder")
-    train_downstream(config.world, encoder, run_dir=out / "downstream", config=replace(config.downstream, seed=seed))
+    train_downstream(config.task, encoder, run_dir=out / "downstream", config=replace(config.downstream, seed=seed))
 
 
 if __name__ == "__main__":

@@ -76,12 +76,12 @@ class Config:
 def main(config: Config) -> None:
     """Run the stages; finished ones are skipped."""
     get_domain(config.task)  # an unknown name ends the recipe here
-    world = {"seed": config.seed, "quality": config.quality, "action_repeat": config.action_repeat}
+    env_settings = {"seed": config.seed, "quality": config.quality, "action_repeat": config.action_repeat}
     scores = {}
 
     logger.info("1/4 collect %d random transitions per domain", config.transitions)
     datasets = collect_group(
-        config.domains, config.out / "data", transitions=config.transitions, workers=config.workers, **world
+        config.domains, config.out / "data", transitions=config.transitions, workers=config.workers, **env_settings
     )
 
     logger.info("2/4 pre-train one encoder on all of them")
@@ -96,7 +96,7 @@ def main(config: Config) -> None:
     logger.info("3/4 learn %s on the frozen encoder, and on an untrained one", config.task)
     for name, pretrained in {"crptpro": encoder, "random-encoder": "random-encoder"}.items():
         run = train_downstream(
-            config.task, pretrained, run_dir=config.out / name, config=replace(config.downstream, **world)
+            config.task, pretrained, run_dir=config.out / name, config=replace(config.downstream, **env_settings)
         )
         last = [row["episode_return"] for row in run.evaluations if row["env_steps"] == run.env_steps]
         scores[name] = {"mean": sum(last) / len(last), "min": min(last), "max": max(last)}

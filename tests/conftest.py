@@ -40,7 +40,7 @@ def plugins_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if Path(entry) != Path(__file__).parent / "cli"])
     with patch.dict(matrix.EXPERIMENTS), patch.dict(methods._METHODS), patch.dict(gymnasium.registry):
         yield
-    for name in ("own_method", "slow_world"):
+    for name in ("own_method", "slow_env"):
         sys.modules.pop(name, None)
 
 

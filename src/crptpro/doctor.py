@@ -25,7 +25,7 @@ from packaging.utils import canonicalize_name
 
 from crptpro import provenance
 from crptpro.domains import PAPER_DOMAINS, expand_groups
-from crptpro.errors import CRPTproError, RenderingError, WorldFailedError
+from crptpro.errors import CRPTproError, EnvCrashedError, RenderingError
 from crptpro.plugins import FLAG, load_plugins, loaded_plugins
 
 _BREAKING = ("mujoco", "dm-control", "torchrl", "tensordict")
@@ -211,7 +211,7 @@ def check_domain(name: str) -> dict[str, Any]:
         lacks_package = (ModuleNotFoundError, gymnasium.error.DependencyNotInstalled)
         has_remedy = isinstance(reason, CRPTproError) and not isinstance(reason, RenderingError)
         remedy = "" if has_remedy or isinstance(reason.__cause__ or reason, lacks_package) else _OTHER_BACKEND
-        has_name = isinstance(reason, (CRPTproError, WorldFailedError))
+        has_name = isinstance(reason, (CRPTproError, EnvCrashedError))
         return _failed(name, str(reason) if has_name else f"{type(reason).__name__}: {reason}", remedy)
     if first["pixels"].unique().numel() == 1 or first["pixels"].equal(last["pixels"]):
         return _failed(name, "its pixels are constant or do not change")

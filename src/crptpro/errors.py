@@ -18,11 +18,11 @@ class RenderingError(CRPTproError):
     """No GL backend renders, or the first frame did not arrive in time."""
 
 
-class WorldError(CRPTproError):
+class EnvOutputError(CRPTproError):
     """An environment returned an unusable image or step; the message names it."""
 
 
-class WorldFailedError(RuntimeError):
+class EnvCrashedError(RuntimeError):
     """The code of an environment raised an exception: a defect, so the command line shows its traceback."""
 
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
-from toy_world import random_episode, write_dataset
+from toy_env import random_episode, write_dataset
 
 from crptpro.analysis.probe import PENALTIES, ProbeResult, ProbeSamples, probe, probe_embeddings, probe_samples
 from crptpro.data import FrameDataset

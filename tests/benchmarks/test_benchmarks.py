@@ -140,7 +140,7 @@ def test_updates_beside_the_plain_implementation(tmp_path: Path, capsys: pytest.
 @pytest.mark.usefixtures("in_this_process")
 def test_a_decision_by_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drifting = Domain("cheap", "cheap_run", make=functools.partial(make_drifting, 2))
-    monkeypatch.setattr("crptpro.training.world.make_env", lambda _, **options: make_env(drifting, **options))
+    monkeypatch.setattr("crptpro.training.env_thread.make_env", lambda _, **options: make_env(drifting, **options))
     updates.main(dataclasses.replace(TINY, only=("decision",), out=tmp_path))
     found = written(tmp_path / "updates.json")["decision"]
     assert set(found["median_s_by_stage"]) == {"update", "store", "act"}

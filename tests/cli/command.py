@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
-from toy_world import FIXED, collect_toy
+from toy_env import FIXED, collect_toy
 
 SIZE = 16
 TASK = FIXED.task

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from command import SIZE, Call, toy_dataset
-from toy_world import FIXED
+from toy_env import FIXED
 
 from crptpro import domains, plugins
 from crptpro.cli import main

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from command import SIZE, SMALL, TASK, Call, refused, rows, toy_dataset
-from toy_world import PoisonedEnv, fixed_length
+from toy_env import PoisonedEnv, fixed_length
 
 from crptpro.cli import main
 from crptpro.data import FrameDataset
@@ -109,7 +109,7 @@ def test_every_command_works_on_an_environment_without_a_simulator(
         assert call(*command)[0] == 0
         assert (runs / record).read_bytes() == before
 
-    # An agent acts in its own kind of world, and is not taken for an encoder.
+    # An agent acts in its own kind of environment, and is not taken for an encoder.
     status, out, _ = call("evaluate", agent, "--episodes", 2, "--csv", runs / "new" / "a.csv")
     assert status == 0
     assert out.startswith(f"{TASK}: ")

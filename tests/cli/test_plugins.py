@@ -1,4 +1,4 @@
-"""What a plugin registers, methods and worlds, has names in every command and every process."""
+"""What a plugin registers, methods and environments, has names in every command and every process."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from crptpro.training import pretrain
 
 pytestmark = pytest.mark.usefixtures("plugins_are_forgotten")
 METHODS = Path(__file__).with_name("own_method.py")
-WORLD = Path(__file__).parents[1] / "experiments" / "slow_world.py"
+ENVIRONMENT = Path(__file__).parents[1] / "experiments" / "slow_env.py"
 
 
 def test_a_plugin_registers_a_method(call: Call, dataset: Path, tmp_path: Path) -> None:
@@ -83,27 +83,27 @@ def test_a_plugin_may_be_named_from_the_home_directory(tmp_path: Path, monkeypat
     del sys.modules["plugin_at_home"]
 
 
-# --- a world of the user's own --------------------------------------------------------------------------------------
+# --- an environment of the user's own --------------------------------------------------------------------------------
 
 
 def test_a_plugins_environment_is_collected_and_learned_with_evaluation_workers(call: Call, tmp_path: Path) -> None:
-    task = "gymnasium:SlowWorld-v0"
+    task = "gymnasium:SlowEnv-v0"
     collect = ("collect", task, "--transitions", 15, "--workers", 1, "--out", tmp_path / "data")
-    status, _, err = call("--plugin", WORLD, *collect)
+    status, _, err = call("--plugin", ENVIRONMENT, *collect)
     assert status == 0, err
     (path,) = (tmp_path / "data").iterdir()
     assert len(FrameDataset.open(path)) == 15
 
     learn = ("downstream", task, "--pretrained", "random-encoder", "--out", tmp_path / "run")
     few = ("--env-steps", 24, "--random-agent-steps", 4, "--eval-interval-env-steps", 24, "--eval-workers", 1)
-    status, _, err = call("--plugin", WORLD, *learn, *SMALL, *few)
+    status, _, err = call("--plugin", ENVIRONMENT, *learn, *SMALL, *few)
     assert status == 0, err
     assert "MUJOCO" not in err
 
 
 @pytest.mark.usefixtures("call")
 def test_the_doctor_checks_a_plugins_environment() -> None:
-    plugins.load_plugin(str(WORLD))
-    (entry,) = doctor.render_domains(("gymnasium:SlowWorld-v0",), "egl", 100.0)
+    plugins.load_plugin(str(ENVIRONMENT))
+    (entry,) = doctor.render_domains(("gymnasium:SlowEnv-v0",), "egl", 100.0)
     assert entry["error"] == ""
     assert entry["agent_step_ms"] > 0

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 import torch
 from command import SIZE, Call, rows
-from toy_world import collect_toy, random_episode, write_dataset
+from toy_env import collect_toy, random_episode, write_dataset
 
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import ProtoLoss

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from command import Call, refused
-from toy_world import FIXED
+from toy_env import FIXED
 
 from crptpro import domains
 from crptpro.artifact import read_json
@@ -138,7 +138,7 @@ def reproduce(root: Path, *arguments: str) -> int:
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A reproduction of a group of one world without a simulator: every kind of job."""
+    """A reproduction of a group of one environment without a simulator: every kind of job."""
     root = tmp_path_factory.mktemp("tiny")
     few = {"env_steps": 24, "random_agent_steps": 4, "checkpoint_interval_env_steps": 24}
     scale = replace(

@@ -20,13 +20,13 @@ import numpy as np
 import pytest
 import torch
 from torchrl.modules import RandomPolicy
-from toy_world import DYING, FAILING, FIXED, SLOW, VARIABLE, ToyEnv, collect_toy, data_bytes, make_toy, variable_length
+from toy_env import DYING, FAILING, FIXED, SLOW, VARIABLE, ToyEnv, collect_toy, data_bytes, make_toy, variable_length
 
 from crptpro.data import FrameDataset, collect, collect_group, collect_random
 from crptpro.data.collect import dataset_path
 from crptpro.domains import Domain
 from crptpro.envs import make_env, rendering
-from crptpro.errors import CRPTproError, DatasetError, DiskSpaceError, RenderingError, WorkerLostError, WorldFailedError
+from crptpro.errors import CRPTproError, DatasetError, DiskSpaceError, EnvCrashedError, RenderingError, WorkerLostError
 from crptpro.seeding import derive_seed
 
 SMALL: dict[str, Any] = {"image_size": 8, "progress": False}
@@ -152,7 +152,7 @@ def test_domains_are_collected_once_each_into_safe_directories(tmp_path: Path, m
     assert dataset_path(tmp_path, "gymnasium:Half/Cheetah-v5") == tmp_path / "gymnasium-Half-Cheetah-v5"
 
 
-def test_a_world_that_draws_by_itself_is_collected_without_gl_and_the_card_says_with_what(
+def test_an_environment_that_draws_by_itself_is_collected_without_gl_and_the_card_says_with_what(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rendering, "select_backend", lambda **_: pytest.fail("a GL backend was proven"))
@@ -173,8 +173,8 @@ def test_progress_is_logged_where_the_output_is_no_terminal(tmp_path: Path, capl
 # --- what goes wrong
 
 
-def test_a_world_that_fails_is_named_with_its_cause_and_does_not_block_the_repaired_one(tmp_path: Path) -> None:
-    with pytest.raises(WorldFailedError, match="the simulator exploded") as failure:
+def test_an_environment_that_fails_is_named_with_its_cause_and_does_not_block_the_repaired_one(tmp_path: Path) -> None:
+    with pytest.raises(EnvCrashedError, match="the simulator exploded") as failure:
         collect_random(FAILING, tmp_path, transitions=50, **SMALL)
     assert isinstance(failure.value.__cause__, ValueError)
     (note,) = failure.value.__notes__
@@ -191,7 +191,7 @@ def test_a_process_that_dies_gives_one_clear_error(tmp_path: Path) -> None:
         collect_random(DYING, tmp_path, transitions=50, workers=2, **SMALL)
 
 
-def test_a_world_that_no_other_process_can_import_is_collected_in_this_one_which_is_said(
+def test_an_environment_that_no_other_process_can_import_is_collected_in_this_one_which_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def of_a_cell(*, seed: int, image_size: int) -> ToyEnv:
@@ -211,7 +211,7 @@ def test_a_world_that_no_other_process_can_import_is_collected_in_this_one_which
 
 
 def test_a_program_from_standard_input_collects_the_same_with_several_processes(tmp_path: Path) -> None:
-    program = f"import sys\nsys.path.insert(0, {str(Path(__file__).parent)!r})\nfrom toy_world import SLOW\n"
+    program = f"import sys\nsys.path.insert(0, {str(Path(__file__).parent)!r})\nfrom toy_env import SLOW\n"
     program += "from crptpro.data import collect_random\n"
     program += f"collect_random(SLOW, {str(tmp_path)!r}, transitions=20, workers=2, image_size=8, progress=False)"
     run = subprocess.run([sys.executable], input=program, capture_output=True, text=True, check=False)
@@ -224,7 +224,7 @@ def test_a_program_from_standard_input_collects_the_same_with_several_processes(
 PROGRAM = """
     import sys
     sys.path.insert(0, {here!r})
-    from toy_world import SLOW
+    from toy_env import SLOW
     from crptpro.data import collect_random
     {more}
     if __name__ == "__main__":

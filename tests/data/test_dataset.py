@@ -17,7 +17,7 @@ from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.data import RandomSampler, ReplayBuffer, SliceSampler
 from torchrl.envs import CatFrames, TransformedEnv
-from toy_world import (
+from toy_env import (
     ToyEnv,
     collect_toy,
     collection_request,
@@ -68,9 +68,9 @@ def test_stacks_equal_a_live_stack_at_every_step(tmp_path: Path, frame_stack: in
         return env.rollout(100)
 
     catframes = CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same")
-    worlds = [ToyEnv(variable_length, seed=seed) for seed in range(4)]
-    live = torch.cat([rollout(TransformedEnv(world, catframes.clone()), 7) for world in worlds])
-    path = write_dataset(tmp_path, [rollout(world, 7) for world in worlds])
+    envs = [ToyEnv(variable_length, seed=seed) for seed in range(4)]
+    live = torch.cat([rollout(TransformedEnv(env, catframes.clone()), 7) for env in envs])
+    path = write_dataset(tmp_path, [rollout(env, 7) for env in envs])
     everything = FrameDataset.open(path, frame_stack=frame_stack)[:]
     for key in ("pixels", ("next", "pixels"), "action", ("next", "reward"), ("next", "done")):
         assert torch.equal(everything[key], live[key]), key

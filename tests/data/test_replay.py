@@ -18,7 +18,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import CatFrames, TransformedEnv
-from toy_world import ToyEnv, rollout_of, variable_length
+from toy_env import ToyEnv, rollout_of, variable_length
 
 from crptpro.data import FrameReplay, StoredReplay, storage
 from crptpro.errors import CheckpointError, DatasetError, DiskSpaceError, NonFiniteError

@@ -1,4 +1,4 @@
-"""dm_control's worlds behind ``make_env``: every frame and reward is what plain dm_control gives."""
+"""dm_control's environments behind ``make_env``: every frame and reward is what plain dm_control gives."""
 
 from __future__ import annotations
 
@@ -58,30 +58,30 @@ def played(request: pytest.FixtureRequest) -> Iterator[Any]:
 
 
 def plain_dm_control(domain: Domain, seed: int) -> tuple[Any, Any, Any]:
-    """Load a domain without this library; returns the world, the scaled world, and what its images are."""
+    """Load a domain without this library; returns the environment, the scaled one, and what its images are."""
     from dm_control import manipulation, suite
     from dm_control.suite.wrappers import action_scale
 
     if domain.source == "manipulation":
-        world = manipulation.load("reach_duplo_vision", seed=seed)
-        return world, action_scale.Wrapper(world, -1.0, 1.0), lambda step: step.observation["front_close"][0]
-    world = suite.load(domain.name, domain.task.removeprefix(f"{domain.name}_"), task_kwargs={"random": seed})
+        env = manipulation.load("reach_duplo_vision", seed=seed)
+        return env, action_scale.Wrapper(env, -1.0, 1.0), lambda step: step.observation["front_close"][0]
+    env = suite.load(domain.name, domain.task.removeprefix(f"{domain.name}_"), task_kwargs={"random": seed})
     camera = 2 if domain.name == "quadruped" else 0
-    scaled = action_scale.Wrapper(world, -1.0, 1.0)
-    return world, scaled, lambda _: world.physics.render(84, 84, camera_id=camera)
+    scaled = action_scale.Wrapper(env, -1.0, 1.0)
+    return env, scaled, lambda _: env.physics.render(84, 84, camera_id=camera)
 
 
 @pytest.mark.gl
 def test_every_paper_domain_gives_the_frames_and_rewards_of_plain_dm_control(played: Any) -> None:
-    world, scaled, image_of = plain_dm_control(PAPER_DOMAINS[played.name], SEED)
+    env, scaled, image_of = plain_dm_control(PAPER_DOMAINS[played.name], SEED)
     step = scaled.reset()
     frames, rewards = [torch.from_numpy(image_of(step).transpose(2, 0, 1).copy())], []
     for action in played.rollout["action"].numpy():
         steps = [scaled.step(action) for _ in range(2)]
         frames.append(torch.from_numpy(image_of(steps[-1]).transpose(2, 0, 1).copy()))
         rewards.append([np.float32(steps[0].reward + steps[1].reward)])
-    state = world.physics.data.qpos.copy()
-    world.close()
+    state = env.physics.data.qpos.copy()
+    env.close()
     shown = [frames[0]] * 3 + frames[1:]
     for index, td in enumerate(played.rollout):
         assert torch.equal(td["pixels"], torch.cat(shown[index : index + 3]))
@@ -181,8 +181,8 @@ def test_a_full_episode_is_truncated_and_not_terminated(task: str, agent_steps: 
 
 @pytest.mark.gl
 @pytest.mark.parametrize("task", [tasks[0] for tasks in SUITE_TASKS.values()])
-def test_a_task_of_every_world_of_the_suite_is_built_and_its_pixels_change(task: str) -> None:
-    # Long agent steps, so that every world moves visibly in one.
+def test_a_task_of_every_environment_of_the_suite_is_built_and_its_pixels_change(task: str) -> None:
+    # Long agent steps, so that every environment moves visibly in one.
     env = make_env(task, seed=0, image_size=48, frame_stack=1, action_repeat=20, quality="fast")
     first = env.reset()
     last = env.step(first.clone().set("action", torch.ones(env.action_spec.shape)))["next"]
@@ -199,7 +199,7 @@ def test_every_task_of_the_suite_is_known_to_dm_control_also_under_another_domai
     from dm_control import suite
 
     loaded = []
-    monkeypatch.setattr(suite, "load", lambda world, name, **options: loaded.append((world, name)))
+    monkeypatch.setattr(suite, "load", lambda domain, name, **options: loaded.append((domain, name)))
     for task in (task for tasks in SUITE_TASKS.values() for task in tasks):
         load_dm_env(get_domain(task))
     assert set(loaded) <= set(suite.ALL_TASKS)
@@ -241,7 +241,7 @@ class FakeDmEnv(dm_env.Environment):
 )
 def test_actions_are_mapped_to_the_actuators_ranges(bounds: Any, commands: list) -> None:
     fake = FakeDmEnv(bounds)
-    env = DMControlPixelEnv(fake, world="fake", image_size=8, action_repeat=1, render=False)
+    env = DMControlPixelEnv(fake, name="fake", image_size=8, action_repeat=1, render=False)
     for action in ((-1.0, -1.0), (1.0, 1.0), (0.0, 0.5)):
         env.step(env.reset().set("action", torch.tensor(action)))
     np.testing.assert_allclose(fake.actions, commands, atol=1e-12)

@@ -2,4 +2,4 @@ from __future__ import annotations
 
 # Looking for doctests would import this file once more, under a name that another conftest.py has too, and register
 # the plugin's experiment in every process.
-collect_ignore = ["conftest.py", "slow_world.py"]
+collect_ignore = ["conftest.py", "slow_env.py"]

@@ -316,7 +316,7 @@ def test_a_command_that_is_killed_continues(
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
     root = tmp_path / "root"
     words = ("reproduce", "slow", "--scale", "tiny", "--jobs", 1, "--cores-per-job", 1, "--out", root)
-    arguments = ["--plugin", *map(str, (Path(__file__).with_name("slow_world.py"), *words))]
+    arguments = ["--plugin", *map(str, (Path(__file__).with_name("slow_env.py"), *words))]
     command = subprocess.Popen([sys.executable, "-m", "crptpro", *arguments], start_new_session=True)
     deadline = time.monotonic() + 300
     while _collected(root) < 2 and time.monotonic() < deadline:

@@ -117,7 +117,7 @@ def quickstart(out: Path, half: int, learned: int) -> None:
 
 def own_domain(out: Path, half: int, learned: int) -> None:
     recipe = load("own_domain")
-    recipe.main(recipe.Config(world=TASK, out=out, transitions=12, workers=1, pretrain=pretraining(half),
+    recipe.main(recipe.Config(task=TASK, out=out, transitions=12, workers=1, pretrain=pretraining(half),
                               downstream=learning(learned)))  # fmt: skip
 
 
@@ -240,7 +240,7 @@ def test_the_pieces_of_the_quickstart_run_in_the_cells_of_a_notebook(tmp_path: P
         run = train_downstream({TASK!r}, encoder, run_dir=out / "crptpro", config=config)
         print(len(run.evaluations), "episodes evaluated")
     """
-    own_world = f"""
+    own_environment = f"""
         from crptpro.domains import Domain
         def make(*, seed, image_size):
             return make_env({TASK!r}, seed=seed, image_size=image_size, frame_stack=1)
@@ -254,11 +254,11 @@ def test_the_pieces_of_the_quickstart_run_in_the_cells_of_a_notebook(tmp_path: P
                 exec(compile(cell, f"<cell {number}>", "exec"), vars(sys.modules["__main__"]))
         asyncio.run(run_cells())
     """
-    cells = [imports, *map(textwrap.dedent, (pieces, own_world))]
+    cells = [imports, *map(textwrap.dedent, (pieces, own_environment))]
     command = [sys.executable, "-c", textwrap.dedent(kernel), *cells]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
-    # Only a world whose factory a cell defines is out of the worker processes' reach.
+    # Only an environment whose factory a cell defines is out of the worker processes' reach.
     assert re.findall("(.*) is collected in this process", ended.stderr) == ["mine"]
     assert ended.stdout.endswith("4 episodes evaluated\n")
 

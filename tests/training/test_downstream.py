@@ -12,8 +12,8 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from toy_world import ToyEnv, fixed_length
-from worlds import EPISODE, SIZE, make_encoder, make_pretrained, make_smooth, python, record, signalling, world
+from toy_env import ToyEnv, fixed_length
+from toy_runs import EPISODE, SIZE, make_encoder, make_pretrained, make_smooth, python, record, signalling, toy_domain
 
 from crptpro.errors import CheckpointError, PretrainedError
 from crptpro.modules import SquashedGaussianActor
@@ -27,7 +27,7 @@ SMALL = DownstreamConfig(
     eval_interval_env_steps=40, eval_episodes=2, checkpoint_interval_env_steps=20, log_interval_env_steps=20,
     precision="fp32", eval_workers=0,
 )  # fmt: skip
-TOY = world("toy")
+TOY = toy_domain("toy")
 
 
 def train(run_dir: Path | None, pretrained: Any = None, task: Any = TOY, **options: Any) -> DownstreamResult:
@@ -87,8 +87,8 @@ def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(tmp_path: Path,
 
 def test_a_killed_run_continues_with_the_same_command(tmp_path: Path) -> None:
     killed = python(
-        "import signal, pathlib, test_downstream, worlds\n"
-        f"task = worlds.signalling('toy', 77, signal.SIGKILL)\n"
+        "import signal, pathlib, test_downstream, toy_runs\n"
+        f"task = toy_runs.signalling('toy', 77, signal.SIGKILL)\n"
         f"test_downstream.train(pathlib.Path({str(tmp_path / 'parts')!r}), task=task)"
     )
     assert killed.returncode == -signal.SIGKILL, killed.stderr
@@ -100,8 +100,8 @@ def test_a_killed_run_continues_with_the_same_command(tmp_path: Path) -> None:
 def test_a_kill_during_the_last_evaluation_repeats_that_evaluation_alone(tmp_path: Path) -> None:
     # Two episodes of ten agent steps evaluate at 0, 40, 80 and 120 env steps; 60 agent steps train.
     killed = python(
-        "import signal, pathlib, test_downstream, worlds\n"
-        "task = worlds.signalling('toy', 125, signal.SIGKILL)\n"
+        "import signal, pathlib, test_downstream, toy_runs\n"
+        "task = toy_runs.signalling('toy', 125, signal.SIGKILL)\n"
         f"test_downstream.train(pathlib.Path({str(tmp_path)!r}), task=task)"
     )
     assert killed.returncode == -signal.SIGKILL, killed.stderr
@@ -110,7 +110,7 @@ def test_a_kill_during_the_last_evaluation_repeats_that_evaluation_alone(tmp_pat
     def make(*, seed: int, image_size: int, action_repeat: int) -> ToyEnv:
         return ToyEnv(fixed_length, seed=seed, image_size=image_size, on_step=steps.append)
 
-    assert train(tmp_path, task=world("toy", make)).evaluations[-1]["env_steps"] == 120
+    assert train(tmp_path, task=toy_domain("toy", make)).evaluations[-1]["env_steps"] == 120
     assert len(steps) == 2 * EPISODE
 
 
@@ -121,7 +121,7 @@ def test_an_agent_acts_in_the_precision_that_auto_meant_where_it_was_trained(tmp
 
 
 def test_dense_maps_and_encoding_anew_are_the_same_run_up_to_rounding(tmp_path: Path) -> None:
-    short: dict[str, Any] = {"task": world("smooth", make_smooth), "env_steps": 80, "eval_episodes": 1}
+    short: dict[str, Any] = {"task": toy_domain("smooth", make_smooth), "env_steps": 80, "eval_episodes": 1}
     for features in ("dense", "reencode", "dense-bf16"):
         train(tmp_path / features, features=features, **short)
     train(tmp_path / "other", seed=1, **short)

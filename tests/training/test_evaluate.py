@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 import torch
-from toy_world import PoisonedEnv, fixed_length
-from worlds import EPISODE, SIZE, make_encoder, world
+from toy_env import PoisonedEnv, fixed_length
+from toy_runs import EPISODE, SIZE, make_encoder, toy_domain
 
 from crptpro.envs import make_env
 from crptpro.errors import NonFiniteError
@@ -17,7 +17,7 @@ from crptpro.modules import SquashedGaussianActor
 from crptpro.training import PixelAgent, evaluate, summarize, uniform_policy
 from crptpro.training.evaluate import Episode, Evaluator
 
-make_toy_env = functools.partial(make_env, world("toy"), seed=0, image_size=SIZE)
+make_toy_env = functools.partial(make_env, toy_domain("toy"), seed=0, image_size=SIZE)
 
 
 def make_agent(seed: int = 0) -> PixelAgent:
@@ -118,7 +118,7 @@ def test_lost_workers_are_replaced_by_this_process(
     lost.close()
 
 
-def test_a_world_that_no_worker_can_build_is_evaluated_here() -> None:
+def test_an_environment_that_no_worker_can_build_is_evaluated_here() -> None:
     alone, results = evaluator(2, lambda: make_toy_env())
     alone.start(env_steps=0)
     assert len(results) == 1

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 from torchrl.objectives import LossModule
-from worlds import EPISODE, make_encoder, python, record, same_state, signalling, world
+from toy_runs import EPISODE, make_encoder, python, record, same_state, signalling, toy_domain
 
 from crptpro.errors import CheckpointError, CRPTproError
 from crptpro.objectives import get_method
@@ -20,7 +20,7 @@ SMALL = ExploreConfig(
     env_steps=112, batch_size=4, random_agent_steps=8, hidden_dim=16, queue_size=32, log_interval=4,
     checkpoint_interval_env_steps=32, precision="fp32",
 )  # fmt: skip
-LEFT, RIGHT = DOMAINS = [world("left"), world("right")]
+LEFT, RIGHT = DOMAINS = [toy_domain("left"), toy_domain("right")]
 
 
 def build(method: str) -> LossModule:
@@ -69,8 +69,8 @@ def test_every_method_explores_learns_and_resumes_as_if_uninterrupted(tmp_path: 
 
 def test_a_killed_run_continues_with_the_same_command(tmp_path: Path) -> None:
     killed = python(
-        "import signal, pathlib, test_explore, worlds\n"
-        f"domains = [worlds.signalling('left', 23, signal.SIGKILL), test_explore.RIGHT]\n"
+        "import signal, pathlib, test_explore, toy_runs\n"
+        f"domains = [toy_runs.signalling('left', 23, signal.SIGKILL), test_explore.RIGHT]\n"
         f"test_explore.run('proto-rl-c', pathlib.Path({str(tmp_path / 'parts')!r}), domains)"
     )
     assert killed.returncode == -signal.SIGKILL, killed.stderr
@@ -99,9 +99,9 @@ def test_a_domains_agent_does_not_depend_on_its_company(tmp_path: Path) -> None:
 
 
 def test_a_domain_whose_name_has_a_slash_is_explored_and_resumed(tmp_path: Path) -> None:
-    run("apt-s", tmp_path, [world("a/b")], env_steps=20)
+    run("apt-s", tmp_path, [toy_domain("a/b")], env_steps=20)
     assert (tmp_path / "replay" / "a-b").is_dir()
-    assert run("apt-s", tmp_path, [world("a/b")], env_steps=20).training["datasets"][0]["domain"] == "a/b"
+    assert run("apt-s", tmp_path, [toy_domain("a/b")], env_steps=20).training["datasets"][0]["domain"] == "a/b"
 
 
 def test_a_run_of_other_settings_is_refused_by_name(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 from torch import nn
-from worlds import python, record
+from toy_runs import python, record
 
 from crptpro.errors import CheckpointError, DiskSpaceError, NonFiniteError
 from crptpro.training import DownstreamConfig, PretrainConfig, Run

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded
-from toy_world import ToyEnv
+from toy_env import ToyEnv
 
 from crptpro.modules import PixelEncoder, Projector, Prototypes
 

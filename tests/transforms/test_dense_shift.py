@@ -14,7 +14,7 @@ from fake_pixel_env import SIZE, FakePixelEnv, FakeReplay, small_encoder, small_
 from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import Compose, TransformedEnv
-from toy_world import rollout_of
+from toy_env import rollout_of
 
 from crptpro.data import FrameReplay
 from crptpro.modules import PixelEncoder

@@ -90,7 +90,7 @@ def collect_group(
         UnknownNameError: an unknown domain.
         ValueError: an impossible number or path.
         WorkerLostError: a process died; finished episodes are kept.
-        WorldFailedError: the code of an environment raised an exception; likewise.
+        EnvCrashedError: the code of an environment raised an exception; likewise.
         CRPTproError: an environment returned something unusable, or hangs; likewise.
     """
     # Imported late: nothing that reads datasets needs the simulators.

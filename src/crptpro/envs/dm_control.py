@@ -11,8 +11,8 @@ from tensordict import TensorDictBase
 from torchrl.envs.libs.dm_control import DMControlWrapper
 
 from crptpro.domains import Domain
+from crptpro.envs.base import SimulatorEnv
 from crptpro.envs.rendering import render_context
-from crptpro.envs.worlds import SimulatorEnv
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.values import Quality
 
@@ -27,7 +27,7 @@ def make_dm_control(domain: Domain, *, quality: Quality, **settings: Any) -> DMC
     shadow_size = FAST_SHADOW_SIZE[domain.source] if quality == "fast" else None
     with render_context(None, is_first=True):  # composer renders once when it is built
         env = load_dm_env(domain)
-    return DMControlPixelEnv(env, world=domain.task, shadow_size=shadow_size, **settings)
+    return DMControlPixelEnv(env, name=domain.task, shadow_size=shadow_size, **settings)
 
 
 def load_dm_env(domain: Domain) -> dm_env.Environment:
@@ -42,7 +42,7 @@ def load_dm_env(domain: Domain) -> dm_env.Environment:
             observable.enabled = False
         return env
     # In the suite, lqr_2_1 is the task lqr_2_1 of the domain lqr.
-    tasks = {f"{world}_{task.removeprefix(f'{world}_')}": (world, task) for world, task in suite.ALL_TASKS}
+    tasks = {f"{name}_{task.removeprefix(f'{name}_')}": (name, task) for name, task in suite.ALL_TASKS}
     if domain.task not in tasks:
         raise UnknownNameError(f"Domain {domain.name!r} has the task {domain.task!r}, which the suite lacks.")
     return suite.load(*tasks[domain.task], task_kwargs={"random": 0})
@@ -63,7 +63,7 @@ def reverse_background(model: Any) -> None:
     """Reverse the RGB values of the background of a ``mujoco.MjModel`` in place, before its render context is made.
 
     The paper does not define the background. Here it is the skybox, and the planes and height fields that are fixed to
-    the world (floor, walls, terrain), except for materials and textures that something else uses too. A model without
+    the scenery (floor, walls, terrain), except for materials and textures that something else uses too. A model without
     one is a ``CRPTproError``.
     """
     import mujoco
@@ -105,7 +105,7 @@ class DMControlPixelEnv(SimulatorEnv, DMControlWrapper):
         self,
         env: Any,
         *,
-        world: str,
+        name: str,
         camera: Any = 0,
         shadow_size: int | None = None,
         reverses_background: bool = False,
@@ -116,7 +116,7 @@ class DMControlPixelEnv(SimulatorEnv, DMControlWrapper):
         self._model: Any = None
         spec = env.action_spec()
         low, high = (np.broadcast_to(bound, spec.shape) for bound in (spec.minimum, spec.maximum))
-        super().__init__(env, world=world, low=low, high=high, dtype=spec.dtype, **settings)
+        super().__init__(env, name=name, low=low, high=high, dtype=spec.dtype, **settings)
 
     def _check_kwargs(self, kwargs: dict[str, Any]) -> None:
         pass  # TorchRL's refuses composer environments

@@ -13,8 +13,8 @@ from torchrl.envs import CatFrames, Compose, DoubleToFloat, EnvBase, Transform, 
 from torchrl.envs.transforms import SelectTransform
 
 from crptpro.domains import GYMNASIUM_PREFIX, LONGEST_EPISODE_AGENT_STEPS, Domain, get_domain
+from crptpro.envs.base import CheckedEnv, FrameReader, passed_on
 from crptpro.envs.rendering import backend_card, select_backend
-from crptpro.envs.worlds import CheckedWorld, FrameReader, passed_on
 from crptpro.errors import CRPTproError
 from crptpro.values import MAX_SEED, Colors, Quality, as_int
 
@@ -37,7 +37,7 @@ def make_env(
     """Build an unbatched CPU environment that renders once per agent step.
 
     It is TorchRL's ``DMControlWrapper`` or ``GymWrapper``, or what your ``make`` returns, with ``CatFrames`` and the
-    checks of :class:`~crptpro.envs.worlds.CheckedWorld`. Create, step and close a dm_control environment in one thread.
+    checks of :class:`~crptpro.envs.base.CheckedEnv`. Create, step and close a dm_control environment in one thread.
 
     Keys: ``pixels`` uint8 ``[3 * frame_stack, H, W]``, oldest to newest (a reset repeats its first frame); ``action``
     float32 ``[A]`` in [-1, 1]; ``("next", "reward")`` float32 ``[1]``, summed over the repeated env steps; ``done``,
@@ -89,20 +89,20 @@ def make_env(
         select_backend()
         card |= backend_card()
     settings["physics_state"] = physics_state
-    world: Any
+    base: Any
     if domain.source == "own":
-        world = _own(domain, seed=seed, **settings)
+        base = _own(domain, seed=seed, **settings)
         card = {"task": domain.task}
     elif is_dm_control:
         from crptpro.envs.dm_control import make_dm_control  # late: dm_control keeps the GL backend of its import
 
-        world = make_dm_control(domain, render=render, reverses_background=reverses_background, **settings)
+        base = make_dm_control(domain, render=render, reverses_background=reverses_background, **settings)
     else:
-        from crptpro.envs.gymnasium_worlds import make_gymnasium
+        from crptpro.envs.gymnasium import make_gymnasium
 
-        world = make_gymnasium(domain.task, render=render, **settings)
+        base = make_gymnasium(domain.task, render=render, **settings)
     limit = LONGEST_EPISODE_AGENT_STEPS if domain.episode_env_steps is None else None
-    world.watch(card, agent_step_limit=limit, checks_frames=render or domain.source == "own")
+    base.watch(card, agent_step_limit=limit, checks_frames=render or domain.source == "own")
     transforms: list[Transform] = []
     if colors == "reversed_image":
         from crptpro.transforms.color_swap import ColorSwap  # late: its package imports the networks
@@ -110,7 +110,7 @@ def make_env(
         transforms.append(ColorSwap(in_keys=["pixels"]))
     if frame_stack > 1:
         transforms.append(CatFrames(N=frame_stack, dim=-3, in_keys=["pixels"], padding="same"))
-    env: EnvBase = TransformedEnv(world, Compose(*transforms)) if transforms else world
+    env: EnvBase = TransformedEnv(base, Compose(*transforms)) if transforms else base
     env.set_seed(seed)
     return env
 
@@ -153,19 +153,19 @@ def needs_gl(task: str | Domain) -> bool:
     return any(name in made_by for name in ("mujoco", "dm_control", "gymnasium_robotics"))
 
 
-class OwnEnv(CheckedWorld, TransformedEnv):
+class OwnEnv(CheckedEnv, TransformedEnv):
     """A user's TorchRL environment inside the transforms that adapt it."""
 
 
 class FrameTransform(Transform):
-    """Converts ``pixels`` with :class:`~crptpro.envs.worlds.FrameReader`, and adds ``truncated`` if it is missing.
+    """Converts ``pixels`` with :class:`~crptpro.envs.base.FrameReader`, and adds ``truncated`` if it is missing.
 
     TorchRL's ``PermuteTransform`` returns a view of the environment's buffer, ``ToTensorImage`` divides uint8 by 255.
     """
 
-    def __init__(self, world: str, image_size: int):
+    def __init__(self, name: str, image_size: int):
         super().__init__(in_keys=["pixels"], out_keys=["pixels"])
-        self._read_frame = FrameReader(world)
+        self._read_frame = FrameReader(name)
         self._shape = (3, image_size, image_size)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -230,7 +230,7 @@ def _broken_contract(env: Any, image_size: int) -> str:
     if not isinstance(env, EnvBase):
         return f"is a {type(env).__name__}; make must return a TorchRL EnvBase"
     if env.device is not None and env.device.type != "cpu":
-        return f"lives on {env.device}; it must be on the CPU, where frames are stored"
+        return f"is on {env.device}; it must be on the CPU, where frames are stored"
     if env.batch_size != torch.Size([]):
         return f"has batch size {tuple(env.batch_size)}; it must be unbatched"
     shown = env.observation_spec

@@ -29,10 +29,10 @@ from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import derive_seed, seed_everything
 from crptpro.training.agent import PixelAgent, SACLearner, save_agent
+from crptpro.training.env_thread import SPARE_FRAMES, EnvThread, make_replay
 from crptpro.training.evaluate import WORKER_BYTES, Episode, Evaluator, summarize
 from crptpro.training.pretrain import SHIFT_PAD
 from crptpro.training.run import Generators, Run
-from crptpro.training.world import SPARE_FRAMES, EnvThread, make_replay
 from crptpro.transforms import DenseShiftFeatures, FrozenEncoder, PrototypeReward, RandomShift, choose_feature_mode
 from crptpro.transforms.free_memory import free_bytes
 from crptpro.transforms.rewards import warn_if_mostly_zero

@@ -29,6 +29,7 @@ from crptpro.objectives import AveragedSACLoss, Method, RADSACLoss, SkillDDPGLos
 from crptpro.seeding import derive_seed
 from crptpro.training.agent import PixelAgent, SACLearner
 from crptpro.training.collapse import CollapseMonitor
+from crptpro.training.env_thread import SPARE_FRAMES, EnvThread, make_replay
 from crptpro.training.pretrain import (
     SHIFT_PAD,
     PretrainResult,
@@ -40,7 +41,6 @@ from crptpro.training.pretrain import (
     write_row,
 )
 from crptpro.training.run import Generators, Run
-from crptpro.training.world import SPARE_FRAMES, EnvThread, make_replay
 from crptpro.transforms import ContrastiveReward, FrozenEncoder, ParticleReward, PrototypeReward, RandomShift
 from crptpro.transforms.rewards import warn_if_mostly_zero
 from crptpro.values import Quality, check_numbers

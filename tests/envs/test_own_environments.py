@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_worlds import OwnWorld, own
+from fake_envs import PlainEnv, own
 from torchrl.data import Composite
 from torchrl.envs import (
     Compose,
@@ -31,7 +31,7 @@ each_stack = pytest.mark.parametrize("frame_stack", [1, 3])
 
 
 def make_chw(seed: int, image_size: int) -> EnvBase:
-    return OwnWorld()
+    return PlainEnv()
 
 
 def make_hwc(**_: Any) -> EnvBase:
@@ -40,7 +40,7 @@ def make_hwc(**_: Any) -> EnvBase:
         image[0, :, 1] = 200  # the top row is greener: catches swapped axes
         return image
 
-    return OwnWorld(pixels)
+    return PlainEnv(pixels)
 
 
 def checked(make: Any, **options: Any) -> EnvBase:
@@ -71,17 +71,17 @@ def test_a_seed_waits_for_the_next_reset_and_the_physical_state_is_kept_on_reque
 
 
 @each_stack
-def test_entries_that_a_worlds_own_transforms_read_back_are_kept(frame_stack: int) -> None:
+def test_entries_that_an_environments_own_transforms_read_back_are_kept(frame_stack: int) -> None:
     parts = (StepCounter, RewardSum, InitTracker)
-    env = checked(lambda: TransformedEnv(OwnWorld(), Compose(*(part() for part in parts))), frame_stack=frame_stack)
+    env = checked(lambda: TransformedEnv(PlainEnv(), Compose(*(part() for part in parts))), frame_stack=frame_stack)
     assert set(env.observation_spec.keys()) == {"pixels", "step_count", "episode_reward", "is_init"}
     rollout = env.rollout(3)["next"]
     assert rollout["step_count"].flatten().tolist() == [1, 2, 3]
     assert rollout["episode_reward"].flatten().tolist() == [1.0, 3.0, 6.0]
 
 
-def test_entries_that_a_world_without_a_state_reads_back_are_kept() -> None:
-    class Stateless(OwnWorld):
+def test_entries_that_an_environment_without_a_state_reads_back_are_kept() -> None:
+    class Stateless(PlainEnv):
         def __init__(self) -> None:
             super().__init__()
             self.state_spec = Composite(observation=self.observation_spec["observation"].clone())
@@ -98,7 +98,7 @@ def test_make_is_given_what_it_names_and_what_a_partial_has_bound_is_decided() -
 
     def make(image_size: int, quality: str, action_repeat: int, camera: str) -> EnvBase:
         given.update(image_size=image_size, quality=quality, action_repeat=action_repeat, camera=camera)
-        return OwnWorld()
+        return PlainEnv()
 
     domain = own(functools.partial(make, action_repeat=4, camera="side"))
     make_env(domain, seed=0, image_size=8, quality="fast")
@@ -106,7 +106,7 @@ def test_make_is_given_what_it_names_and_what_a_partial_has_bound_is_decided() -
     assert resolve_action_repeat(domain) == 4
     make_env(own(make), seed=0, image_size=8, action_repeat=3, camera="top")
     assert given == {"image_size": 8, "quality": "exact", "action_repeat": 3, "camera": "top"}
-    env = make_env(own(OwnWorld), seed=0, image_size=8)  # a class is a function, too
+    env = make_env(own(PlainEnv), seed=0, image_size=8)  # a class is a function, too
     assert env.rollout(2)["next", "reward"].sum() == 3.0
 
 
@@ -121,7 +121,7 @@ def test_an_option_that_make_does_not_take_is_said_to_do_nothing(caplog: pytest.
 
 @each_stack
 def test_float64_becomes_float32_and_an_environment_without_truncation_is_never_truncated(frame_stack: int) -> None:
-    make = functools.partial(OwnWorld, length=3, truncates=False, dtype=torch.float64)
+    make = functools.partial(PlainEnv, length=3, truncates=False, dtype=torch.float64)
     rollout = checked(lambda: make(), frame_stack=frame_stack).rollout(10)
     assert rollout["action"].dtype == rollout["next", "reward"].dtype == torch.float32
     assert rollout["next", "terminated"].flatten().tolist() == [False, False, True]
@@ -129,20 +129,22 @@ def test_float64_becomes_float32_and_an_environment_without_truncation_is_never_
 
 
 @pytest.mark.parametrize("truncates", [True, False])
-def test_a_world_without_an_end_is_truncated_and_starts_again(truncates: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_environment_without_an_end_is_truncated_and_starts_again(
+    truncates: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(factory, "LONGEST_EPISODE_AGENT_STEPS", 7)
-    env = checked(lambda: OwnWorld(length=10**9, truncates=truncates))
+    env = checked(lambda: PlainEnv(length=10**9, truncates=truncates))
     for _ in range(2):
         last = env.rollout(20)["next"]
         assert last["truncated"].flatten().tolist() == [False] * 6 + [True]
         assert torch.equal(last["done"], last["truncated"])
         assert not last["terminated"].any()
-    limited = own(lambda: OwnWorld(length=12), episode_env_steps=12)
+    limited = own(lambda: PlainEnv(length=12), episode_env_steps=12)
     assert make_env(limited, seed=0, image_size=8).rollout(50).shape == (12,)
 
 
-def test_agent_steps_are_counted_by_what_a_world_repeats() -> None:
-    repeating = own(lambda action_repeat: OwnWorld(), action_repeat=np.int64(4), episode_env_steps=2e1)
+def test_agent_steps_are_counted_by_what_an_environment_repeats() -> None:
+    repeating = own(lambda action_repeat: PlainEnv(), action_repeat=np.int64(4), episode_env_steps=2e1)
     endless = own(make_chw)
     assert resolve_action_repeat(endless) == resolve_action_repeat(endless, 4) == 1
     assert (resolve_action_repeat(repeating), resolve_action_repeat(repeating, 2)) == (4, 2)
@@ -156,12 +158,12 @@ def test_agent_steps_are_counted_by_what_a_world_repeats() -> None:
 
 
 @pytest.mark.parametrize(("make", "complaint"), [
-    (lambda: OwnWorld(bound=2.0), r"bounds other than \[-1, 1\]"),
-    (lambda: OwnWorld(actions=0), "bounded float vector"),
-    (lambda: TransformedEnv(OwnWorld(), ExcludeTransform("pixels")), "no 'pixels'"),
-    (lambda: TransformedEnv(OwnWorld(), UnsqueezeTransform(-4, in_keys=["pixels"])), r"shape \(1, 3, 8, 8\)"),
-    (lambda: SerialEnv(1, OwnWorld), "batch size"),
-    (lambda: OwnWorld().to("meta"), "lives on meta; it must be on the CPU"),
+    (lambda: PlainEnv(bound=2.0), r"bounds other than \[-1, 1\]"),
+    (lambda: PlainEnv(actions=0), "bounded float vector"),
+    (lambda: TransformedEnv(PlainEnv(), ExcludeTransform("pixels")), "no 'pixels'"),
+    (lambda: TransformedEnv(PlainEnv(), UnsqueezeTransform(-4, in_keys=["pixels"])), r"shape \(1, 3, 8, 8\)"),
+    (lambda: SerialEnv(1, PlainEnv), "batch size"),
+    (lambda: PlainEnv().to("meta"), "is on meta; it must be on the CPU"),
     (lambda: np.zeros(3), "ndarray; make must return a TorchRL EnvBase"),
     (None, "no make"),
 ])  # fmt: skip
@@ -171,14 +173,14 @@ def test_a_broken_contract_is_named(make: Any, complaint: str) -> None:
 
 
 @pytest.mark.parametrize("task", ["gymnasium:HalfCheetah-v5", Domain("own", "own", make=make_chw)])
-def test_only_dm_control_worlds_have_a_known_background(task: str | Domain) -> None:
+def test_only_dm_control_environments_have_a_known_background(task: str | Domain) -> None:
     with pytest.raises(CRPTproError, match=r"dm_control.*reversed_image"):
         make_env(task, seed=0, colors="reversed_background")
 
 
-def test_the_colours_of_whole_images_are_reversed_in_any_world() -> None:
+def test_the_colours_of_whole_images_are_reversed_in_any_environment() -> None:
     def pixels(clock: int) -> torch.Tensor:
         return torch.tensor([10, 20, 30], dtype=torch.uint8)[:, None, None].expand(3, 8, 8)
 
-    env = make_env(own(lambda: OwnWorld(pixels)), seed=0, image_size=8, colors="reversed_image")
+    env = make_env(own(lambda: PlainEnv(pixels)), seed=0, image_size=8, colors="reversed_image")
     assert env.reset()["pixels"][:, 0, 0].tolist() == [30, 20, 10] * 3

@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, GymLikeEnv
 
-from crptpro.errors import CRPTproError, NonFiniteError, WorldError, WorldFailedError
+from crptpro.errors import CRPTproError, EnvCrashedError, EnvOutputError, NonFiniteError
 
 logger = logging.getLogger(__name__)
 
@@ -31,10 +31,10 @@ LONG_EPISODE = 25
 _open: weakref.WeakSet[EnvBase] = weakref.WeakSet()
 
 
-class CheckedWorld:
+class CheckedEnv:
     """Mixin of the class that steps an environment.
 
-    - An exception of the environment's code is raised as :class:`~crptpro.errors.WorldFailedError`.
+    - An exception of the environment's code is raised as :class:`~crptpro.errors.EnvCrashedError`.
     - An action, reward or physical state that is not finite raises :class:`~crptpro.errors.NonFiniteError`.
     - An episode of identical frames is reported by one warning per environment.
     - After ``agent_step_limit`` agent steps an episode is truncated. (``StepCounter`` would add ``step_count``.)
@@ -51,7 +51,7 @@ class CheckedWorld:
 
     def watch(self, card: dict[str, Any], *, agent_step_limit: int | None = None, checks_frames: bool = True) -> None:
         """Set the card, whose ``task`` is the name in messages, and the checks."""
-        self._card, self.world = card, card["task"]
+        self._card, self._name = card, card["task"]
         self.agent_step_limit, self.checks_frames = agent_step_limit, checks_frames
         _open.add(cast(EnvBase, self))
 
@@ -62,7 +62,7 @@ class CheckedWorld:
         if self._agent_step >= LONG_EPISODE:
             self._report_still_frames()
         self._episode, self._agent_step = self._episode + 1, 0
-        with passed_on(self.world, "reset"):
+        with passed_on(self._name, "reset"):
             found: TensorDictBase = super()._reset(tensordict, **kwargs)  # type: ignore[misc]
         self._require_finite(found, "returned", "qpos", "qvel")
         self._first_frame = found.get("pixels")
@@ -72,7 +72,7 @@ class CheckedWorld:
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._agent_step += 1
         self._require_finite(tensordict, "received the", "action")
-        with passed_on(self.world, "step"):
+        with passed_on(self._name, "step"):
             found: TensorDictBase = super()._step(tensordict)  # type: ignore[misc]
         self._require_finite(found, "returned", "reward", "qpos", "qvel")
         if self._agent_step == self.agent_step_limit:
@@ -88,7 +88,7 @@ class CheckedWorld:
             value = td.get(key, None)
             if value is not None and not value.isfinite().all():
                 raise NonFiniteError(
-                    f"The environment {self.world!r} {verb} {key} {value.tolist()} in agent step {self._agent_step} of "
+                    f"The environment {self._name!r} {verb} {key} {value.tolist()} in agent step {self._agent_step} of "
                     f"episode {self._episode} (its first is 0). The step is not stored; fix what computes it, or keep "
                     "the actions where the environment is stable."
                 )
@@ -102,7 +102,7 @@ class CheckedWorld:
         logger.warning(
             "All frames of a whole episode of the environment %r are identical%s, over %d agent steps. Look at what it "
             "renders before you train on it.",
-            self.world, what, self._agent_step,
+            self._name, what, self._agent_step,
         )  # fmt: skip
 
     def close(self, *, raise_if_closed: bool = True) -> None:
@@ -120,36 +120,36 @@ def _close_what_is_open() -> None:
 
 
 @contextmanager
-def passed_on(world: str, call: str) -> Iterator[None]:
-    """Raise exceptions of an environment's code in the body as ``WorldFailedError``, with its name and the call."""
+def passed_on(name: str, call: str) -> Iterator[None]:
+    """Raise exceptions of an environment's code in the body as ``EnvCrashedError``, with its name and the call."""
     try:
         yield
-    except (CRPTproError, WorldFailedError):
+    except (CRPTproError, EnvCrashedError):
         raise
     except Exception as reason:
         origin: BaseException = reason
         while origin.__cause__ is not None:  # Gymnasium re-raises exceptions of a constructor
             origin = origin.__cause__
         where = traceback.extract_tb(origin.__traceback__)[-1]
-        raise WorldFailedError(
-            f"{reason} ({type(reason).__name__} in {call}() of the environment {world!r}, {where.filename}, line "
+        raise EnvCrashedError(
+            f"{reason} ({type(reason).__name__} in {call}() of the environment {name!r}, {where.filename}, line "
             f"{where.lineno})"
         ) from reason
 
 
-class SimulatorEnv(CheckedWorld, GymLikeEnv):
+class SimulatorEnv(CheckedEnv, GymLikeEnv):
     """Mixin of TorchRL's wrappers of simulators: scales the action, and draws one frame per agent step.
 
     TorchRL's ``from_pixels`` draws every env step of a repeated action. A subclass writes ``_render``, which returns an
     image, and ``_simulation``, which may have ``qpos`` and ``qvel``. The settings are those of
-    :func:`crptpro.envs.make_env`; ``world`` is the name in messages, ``low`` to ``high`` its actions.
+    :func:`crptpro.envs.make_env`; ``name`` is the name in messages, ``low`` to ``high`` its actions.
     """
 
     def __init__(
         self,
         env: Any,
         *,
-        world: str,
+        name: str,
         low: np.ndarray,
         high: np.ndarray,
         dtype: Any,
@@ -159,10 +159,10 @@ class SimulatorEnv(CheckedWorld, GymLikeEnv):
         physics_state: bool = False,
         **options: Any,
     ):
-        self.world, self._image_size, self._renders, self._has_state = world, image_size, render, physics_state
-        self._low, self._half = action_range(low, high, dtype, world)
+        self._name, self._image_size, self._renders, self._has_state = name, image_size, render, physics_state
+        self._low, self._half = action_range(low, high, dtype, name)
         self._action_dtype = dtype
-        self._read_frame = FrameReader(world)
+        self._read_frame = FrameReader(name)
         super().__init__(env=env, frame_skip=action_repeat, **options)
 
     def _make_specs(self, env: Any) -> None:
@@ -190,7 +190,7 @@ class SimulatorEnv(CheckedWorld, GymLikeEnv):
     def _draw(self) -> Tensor:
         if not self._renders:
             return torch.zeros(3, self._image_size, self._image_size, dtype=torch.uint8)
-        with passed_on(self.world, "render"):
+        with passed_on(self._name, "render"):
             image = self._render()
         return resize(self._read_frame(image), self._image_size)
 
@@ -212,12 +212,12 @@ def resize(frame: Tensor, size: int) -> Tensor:
 class FrameReader:
     """Copies an image to a frame, uint8 ``[3, H, W]``; floats in [0, 1] are multiplied by 255, which is logged once."""
 
-    def __init__(self, world: str):
-        self.world = world
+    def __init__(self, name: str):
+        self._name = name
         self._has_scaled = False
 
     def __call__(self, image: Any) -> Tensor:
-        """Return the frame of an array or tensor ``[H, W, 3]`` or ``[3, H, W]``; others are a ``WorldError``."""
+        """Return the frame of an array or tensor ``[H, W, 3]`` or ``[3, H, W]``; others are an ``EnvOutputError``."""
         if not isinstance(image, (np.ndarray, Tensor)):
             raise self._refusal(f"is {type(image).__name__}")
         if image.ndim != 3 or 3 not in (image.shape[0], image.shape[2]):
@@ -236,15 +236,15 @@ class FrameReader:
             raise self._refusal(f"holds {dtype} from {low:g} to {high:g}")
         if not self._has_scaled:
             self._has_scaled = True
-            logger.warning("Frames of the environment %r are %s in [0, 1], multiplied by 255.", self.world, dtype)
+            logger.warning("Frames of the environment %r are %s in [0, 1], multiplied by 255.", self._name, dtype)
         return (pixels * 255).round().to(torch.uint8).contiguous()
 
-    def _refusal(self, what: str) -> WorldError:
+    def _refusal(self, what: str) -> EnvOutputError:
         expected = "an RGB array [H, W, 3], uint8 or floats in [0, 1]"
-        return WorldError(f"The image that the environment {self.world!r} renders {what}; it must be {expected}.")
+        return EnvOutputError(f"The image that the environment {self._name!r} renders {what}; it must be {expected}.")
 
 
-def action_range(low: np.ndarray, high: np.ndarray, dtype: Any, world: str) -> tuple[np.ndarray, np.ndarray]:
+def action_range(low: np.ndarray, high: np.ndarray, dtype: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower end and half the width of an environment's action bounds; without bounds they are -1 and 1.
 
     Integer or empty actions, and bounds in the wrong order or on one side only, raise ``CRPTproError``.
@@ -264,5 +264,5 @@ def action_range(low: np.ndarray, high: np.ndarray, dtype: Any, world: str) -> t
     elif not (half > 0).all():
         wrong = f"has empty action bounds (low >= high): {bounds}"
     if wrong:
-        raise CRPTproError(f"The environment {world!r} {wrong}.")
+        raise CRPTproError(f"The environment {name!r} {wrong}.")
     return start, half

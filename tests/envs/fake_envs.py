@@ -1,4 +1,4 @@
-"""Worlds without a renderer: one of each library, whose answers a test sets."""
+"""Environments without a renderer: one of each library, whose answers a test sets."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def painter(max_episode_steps: int | None = 5, **options: Any) -> Iterator[str]:
         del gymnasium.registry[name]
 
 
-class OwnWorld(EnvBase):
+class PlainEnv(EnvBase):
     """A TorchRL environment of a user's; ``pixels`` and ``reward`` say what it emits at a clock."""
 
     def __init__(

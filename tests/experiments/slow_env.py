@@ -1,4 +1,4 @@
-"""A plugin: a world that takes its time, and an experiment that collects from it."""
+"""A plugin: an environment that takes its time, and an experiment that collects from it."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 
 from crptpro.experiments.matrix import EXPERIMENTS, Cell, Experiment, Request, dataset
 
-WORLD = "SlowWorld-v0"
+ENV_ID = "SlowEnv-v0"
 
 
-class SlowWorld(gymnasium.Env):
+class SlowEnv(gymnasium.Env):
     """A shade of grey that the action sets."""
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -41,12 +41,12 @@ class SlowWorld(gymnasium.Env):
         return picture
 
 
-gymnasium.register(WORLD, SlowWorld, max_episode_steps=20)
+gymnasium.register(ENV_ID, SlowEnv, max_episode_steps=20)
 
 
 def slow(request: Request) -> list[Cell]:
     """A collection of some seconds."""
-    return [Cell("slow", dataset(request.scale, f"gymnasium:{WORLD}", 0, 300), {"seed": 0})]
+    return [Cell("slow", dataset(request.scale, f"gymnasium:{ENV_ID}", 0, 300), {"seed": 0})]
 
 
 EXPERIMENTS["slow"] = Experiment("Slow", "A collection of some seconds.", slow)

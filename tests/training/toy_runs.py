@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
-from toy_world import ToyEnv, fixed_length
+from toy_env import ToyEnv, fixed_length
 
 from crptpro.domains import Domain
 from crptpro.modules import PixelEncoder, Projector, Prototypes
@@ -76,12 +76,12 @@ def make_smooth(*, seed: int, image_size: int, action_repeat: int) -> EnvBase:
     return SmoothToyEnv(fixed_length, seed=seed, image_size=image_size)
 
 
-def world(name: str, make: Callable[..., EnvBase] = make_toy) -> Domain:
+def toy_domain(name: str, make: Callable[..., EnvBase] = make_toy) -> Domain:
     return Domain(name, f"{name}_go", make=make)
 
 
 def signalling(name: str, step: int, number: signal.Signals) -> Domain:
-    """A world that sends a signal to this process with one of its steps."""
+    """An environment that sends a signal to this process with one of its steps."""
     steps = 0
 
     def count(_: int) -> None:
@@ -93,7 +93,7 @@ def signalling(name: str, step: int, number: signal.Signals) -> Domain:
     def make(*, seed: int, image_size: int, action_repeat: int) -> EnvBase:
         return ToyEnv(fixed_length, seed=seed, image_size=image_size, on_step=count)
 
-    return world(name, make)
+    return toy_domain(name, make)
 
 
 def python(code: str) -> subprocess.CompletedProcess[str]:

@@ -1,4 +1,4 @@
-"""What every world must keep, whichever library it is of: images, finite numbers, actions, errors with its name."""
+"""What every environment must keep, of whichever library: images, finite numbers, actions, errors with its name."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from fake_worlds import OwnWorld, own, painter
+from fake_envs import PlainEnv, own, painter
 from gymnasium.spaces import Box, Discrete
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
 from crptpro.envs import make_env
-from crptpro.errors import CRPTproError, NonFiniteError, WorldError, WorldFailedError
+from crptpro.errors import CRPTproError, EnvCrashedError, EnvOutputError, NonFiniteError
 
 SIZE = 8
 
@@ -34,14 +34,14 @@ def grey(shade: Any, dtype: Any = np.uint8) -> np.ndarray:
 
 @contextmanager
 def shows(image: Any, *, library: str, **options: Any) -> Iterator[EnvBase]:
-    """An environment of a world of either library that shows ``image(clock)``."""
+    """An environment of either library that shows ``image(clock)``."""
     if library == "gymnasium":
         with painter(image=image) as task:
             yield make_env(task, seed=0, image_size=SIZE, action_repeat=1, **options)
     else:
 
         def make() -> EnvBase:
-            return OwnWorld(lambda clock: torch.from_numpy(image(clock)))
+            return PlainEnv(lambda clock: torch.from_numpy(image(clock)))
 
         yield make_env(own(make), seed=0, image_size=SIZE, **options)
 
@@ -52,7 +52,9 @@ both = pytest.mark.parametrize("library", ["gymnasium", "own"])
 @both
 @pytest.mark.parametrize("frame_stack", [1, 3])
 @pytest.mark.parametrize("is_view", [False, True])
-def test_frames_outlive_the_buffer_that_a_world_uses_again(library: str, frame_stack: int, is_view: bool) -> None:
+def test_frames_outlive_the_buffer_that_an_environment_uses_again(
+    library: str, frame_stack: int, is_view: bool
+) -> None:
     buffer = grey(0)
     if is_view:  # of a buffer that is laid out as frames are stored
         buffer = np.zeros((3, SIZE, SIZE), np.uint8).transpose(1, 2, 0)
@@ -102,7 +104,7 @@ def test_images_that_are_neither_uint8_nor_floats_between_0_and_1_are_refused_by
 def test_what_is_no_rgb_image_is_refused_at_whatever_step_it_comes(image: Any, complaint: str) -> None:
     with painter(image=lambda clock: grey(clock) if clock < 2 else image) as task:
         env = make_env(task, seed=0, image_size=SIZE, action_repeat=1)
-        with pytest.raises(WorldError, match=rf"{task}.*{complaint}"):
+        with pytest.raises(EnvOutputError, match=rf"{task}.*{complaint}"):
             env.rollout(3)
 
 
@@ -131,14 +133,14 @@ def test_an_episode_in_which_something_moves_late_or_that_was_left_early_is_not_
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @both
-def test_a_reward_that_is_not_finite_names_world_episode_and_step_before_it_is_returned(
+def test_a_reward_that_is_not_finite_names_environment_episode_and_step_before_it_is_returned(
     library: str, value: float
 ) -> None:
     def reward(clock: int) -> float:
         return value if clock == 3 else 1.0
 
     with painter(reward=reward) as task:
-        domain = task if library == "gymnasium" else own(lambda: OwnWorld(reward=reward))
+        domain = task if library == "gymnasium" else own(lambda: PlainEnv(reward=reward))
         env = make_env(domain, seed=0, image_size=SIZE, action_repeat=1)
         env.rollout(2)
         name = task if library == "gymnasium" else "mine_go"
@@ -147,7 +149,7 @@ def test_a_reward_that_is_not_finite_names_world_episode_and_step_before_it_is_r
 
 
 def test_a_physical_state_that_is_not_finite_is_refused() -> None:
-    class Broken(OwnWorld):
+    class Broken(PlainEnv):
         def _observe(self, is_over: bool) -> Any:
             return super()._observe(is_over) | {"qpos": torch.tensor([np.nan], dtype=torch.float64)}
 
@@ -156,7 +158,7 @@ def test_a_physical_state_that_is_not_finite_is_refused() -> None:
 
 
 @both
-def test_an_action_that_is_not_finite_names_world_episode_and_step_and_reaches_no_simulator(library: str) -> None:
+def test_an_action_that_is_not_finite_names_environment_episode_and_step_and_reaches_no_simulator(library: str) -> None:
     with shows(grey, library=library) as env:
         td = env.reset().set("action", torch.tensor([0.0, np.nan]))
         with pytest.raises(NonFiniteError, match=r"action .*nan.* agent step 1 of episode 0"):
@@ -173,28 +175,28 @@ def explode_drawing(clock: int) -> Any:
     return grey(clock + int(explode(clock)))
 
 
-def test_an_exception_of_a_worlds_own_is_passed_on_with_its_name_and_the_call() -> None:
-    with painter(image=explode_drawing) as task, pytest.raises(WorldFailedError) as caught:
+def test_an_exception_of_an_environments_own_is_passed_on_with_its_name_and_the_call() -> None:
+    with painter(image=explode_drawing) as task, pytest.raises(EnvCrashedError) as caught:
         make_env(task, seed=0, image_size=SIZE, action_repeat=1).rollout(3)
     assert isinstance(caught.value.__cause__, ValueError)
     for part in ("the motor is on fire", "ValueError in render()", task, __file__):
         assert part in str(caught.value)
     with (
         painter(reward=explode) as task,
-        pytest.raises(WorldFailedError, match=r"ValueError in step\(\) of the environment"),
+        pytest.raises(EnvCrashedError, match=r"ValueError in step\(\) of the environment"),
     ):
         make_env(task, seed=0, image_size=SIZE).rollout(3)
-    with pytest.raises(WorldFailedError, match=r"on fire .*ValueError in step\(\) of the environment 'mine_go'"):
-        make_env(own(lambda: OwnWorld(reward=explode)), seed=0, image_size=SIZE).rollout(3)
+    with pytest.raises(EnvCrashedError, match=r"on fire .*ValueError in step\(\) of the environment 'mine_go'"):
+        make_env(own(lambda: PlainEnv(reward=explode)), seed=0, image_size=SIZE).rollout(3)
 
 
-def test_an_exception_of_a_worlds_own_is_never_taken_for_a_setting() -> None:
+def test_an_exception_of_an_environments_own_is_never_taken_for_a_setting() -> None:
     def picky(render_mode: str = "", camera_id: int = 0) -> Any:
         raise TypeError("unsupported operand type(s) for +: 'int' and 'str'")
 
     picky.metadata = {"render_modes": ["rgb_array"]}  # type: ignore[attr-defined]
     gymnasium.register("CrptproPicky-v0", picky, disable_env_checker=True)
-    with pytest.raises(WorldFailedError, match=r"unsupported operand.*make\(\).*CrptproPicky") as caught:
+    with pytest.raises(EnvCrashedError, match=r"unsupported operand.*make\(\).*CrptproPicky") as caught:
         make_env("gymnasium:CrptproPicky-v0", seed=0, camera=0)
     del gymnasium.registry["CrptproPicky-v0"]
     assert __file__ in str(caught.value)
@@ -203,9 +205,7 @@ def test_an_exception_of_a_worlds_own_is_never_taken_for_a_setting() -> None:
     def make(quality: str) -> EnvBase:
         raise ValueError("no such quality")
 
-    with pytest.raises(
-        WorldFailedError, match=r"no such quality \(ValueError in make\(\) of the environment 'mine_go'"
-    ):
+    with pytest.raises(EnvCrashedError, match=r"no such quality \(ValueError in make\(\) of the environment 'mine_go'"):
         make_env(own(make), seed=0)
 
 
@@ -213,7 +213,7 @@ def test_an_exception_of_a_worlds_own_is_never_taken_for_a_setting() -> None:
 def test_a_step_of_the_old_api_is_answered_with_what_is_expected(limit: int | None) -> None:
     with painter(limit, answer=lambda clock: (np.zeros(1), 0.0, False, {})) as task:
         env = make_env(task, seed=0, image_size=SIZE)
-        with pytest.raises(WorldError, match=rf"{task}.*five values.*got 4"):
+        with pytest.raises(EnvOutputError, match=rf"{task}.*five values.*got 4"):
             env.rollout(2)
 
 
@@ -273,10 +273,10 @@ print([tuple(env.reset()["pixels"].shape) for env in kept])
     assert done.stderr == ""
 
 
-def test_a_world_is_closed_once_however_often_it_is_asked() -> None:
+def test_an_environment_is_closed_once_however_often_it_is_asked() -> None:
     closed: list[str] = []
 
-    class Closing(OwnWorld):
+    class Closing(PlainEnv):
         def close(self, *, raise_if_closed: bool = True) -> None:
             closed.append("own")
             super().close(raise_if_closed=raise_if_closed)
@@ -311,7 +311,9 @@ def frames_alone(task: str) -> torch.Tensor:
 @pytest.mark.parametrize("is_closed", [True, False])
 @pytest.mark.parametrize("other", ["cartpole_balance", "gymnasium:Reacher-v5"])
 @pytest.mark.parametrize("task", ["cartpole_balance", "gymnasium:Reacher-v5"])
-def test_worlds_that_come_and_go_in_a_thread_change_no_frame_of_another(task: str, other: str, is_closed: bool) -> None:
+def test_environments_that_come_and_go_in_a_thread_change_no_frame_of_another(
+    task: str, other: str, is_closed: bool
+) -> None:
     beside: list[EnvBase] = []
 
     def come_and_go() -> None:

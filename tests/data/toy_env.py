@@ -1,4 +1,4 @@
-"""A world without a simulator: its pixels are a function of seed, time and actions alone."""
+"""An environment without a simulator: its pixels are a function of seed, time and actions alone."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def data_bytes(path: Path) -> dict[str, bytes]:
 
 
 def collection_request(**changes: Any) -> dict[str, Any]:
-    """What ``FrameDataset.create`` is asked for by the collection of a toy world."""
+    """What ``FrameDataset.create`` is asked for by the collection of a toy environment."""
     settings = {"image_size": 8, "action_repeat": 2, "camera": 0, "quality": "exact", "colors": "normal"}
     return {"domain": "toy", "task": "toy_go", "seed": 0, "transitions": 27, **settings} | changes
 
@@ -182,7 +182,7 @@ def write_dataset(path: Path, episodes: Iterable[TensorDict], **request: Any) ->
 def collect_toy(
     path: Path, lengths: Callable[[int], int] = fixed_length, *, episodes: int | None = None, **request: Any
 ) -> Path:
-    """Collect a toy world as ``collect_random`` does, all of it, or only so many episodes."""
+    """Collect a toy environment as ``collect_random`` does, all of it, or only so many episodes."""
     asked = collection_request(**request)
     dataset = FrameDataset.create(path, **asked)
     if dataset.is_complete:

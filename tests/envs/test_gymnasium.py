@@ -1,4 +1,4 @@
-"""Gymnasium worlds behind ``make_env``: scaled and repeated actions, resized images, seeds, ends."""
+"""Gymnasium environments behind ``make_env``: scaled and repeated actions, resized images, seeds, ends."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fake_worlds import painter
+from fake_envs import painter
 from torchrl.envs import GymWrapper, check_env_specs
 
 from crptpro.domains import Domain
 from crptpro.envs import factory, make_env, needs_gl
-from crptpro.envs.worlds import resize
+from crptpro.envs.base import resize
 from crptpro.errors import CRPTproError, RenderingError
 
 
@@ -35,7 +35,7 @@ def test_who_needs_gl(task: Any, answer: bool) -> None:
     assert needs_gl(task) is answer
 
 
-def test_a_world_that_draws_without_gl_asks_for_no_backend_and_a_mujoco_world_does(
+def test_an_environment_that_draws_without_gl_asks_for_no_backend_and_a_mujoco_environment_does(
     task: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse() -> None:
@@ -91,7 +91,7 @@ def test_without_rendering_rewards_and_episodes_are_the_same(task: str) -> None:
 
 
 @pytest.mark.parametrize("camera", [1, "side"])
-def test_a_world_without_cameras_says_so(task: str, camera: int | str) -> None:
+def test_an_environment_without_cameras_says_so(task: str, camera: int | str) -> None:
     with pytest.raises(CRPTproError, match="takes no camera"):
         make(task, camera=camera)
 

@@ -11,10 +11,10 @@ from tensordict import TensorDictBase
 from torchrl.envs.libs.gym import GymWrapper
 
 from crptpro.domains import GYMNASIUM_PREFIX
+from crptpro.envs.base import NO_BOUND, SimulatorEnv, passed_on
 from crptpro.envs.dm_control import FAST_SHADOW_SIZE, route_mujoco_warnings
 from crptpro.envs.rendering import render_context
-from crptpro.envs.worlds import NO_BOUND, SimulatorEnv, passed_on
-from crptpro.errors import CRPTproError, RenderingError, WorldError, WorldFailedError
+from crptpro.errors import CRPTproError, EnvCrashedError, EnvOutputError, RenderingError
 from crptpro.values import Quality
 
 
@@ -27,19 +27,19 @@ class GymnasiumPixelEnv(SimulatorEnv, GymWrapper):
     _episode_seed: int | None = None
     _has_drawn = False
 
-    def __init__(self, env: Any, *, world: str, **settings: Any):
+    def __init__(self, env: Any, *, name: str, **settings: Any):
         space = env.action_space
         if not isinstance(space, spaces.Box):
             raise CRPTproError(
-                f"{world} has {type(space).__name__} actions. Only continuous actions (a Box) are supported; wrap it, "
+                f"{name} has {type(space).__name__} actions. Only continuous actions (a Box) are supported; wrap it, "
                 "and register it with register_domain."
             )
         if (np.minimum(np.abs(space.low), np.abs(space.high)) >= NO_BOUND).any():
             raise CRPTproError(
-                f"{world} has actions without bounds ({space}), which cannot be mapped from [-1, 1]; wrap it with "
+                f"{name} has actions without bounds ({space}), which cannot be mapped from [-1, 1]; wrap it with "
                 "gymnasium.wrappers.RescaleAction or ClipAction, and register it with register_domain."
             )
-        super().__init__(env, world=world, low=space.low, high=space.high, dtype=space.dtype, **settings)
+        super().__init__(env, name=name, low=space.low, high=space.high, dtype=space.dtype, **settings)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
@@ -55,11 +55,11 @@ class GymnasiumPixelEnv(SimulatorEnv, GymWrapper):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         try:
             return super()._step(tensordict)
-        except WorldFailedError as reason:
+        except EnvCrashedError as reason:
             if "expected 5" not in str(reason):
                 raise
-            raise WorldError(
-                f"step() of the environment {self.world!r} does not return Gymnasium's five values (observation, "
+            raise EnvOutputError(
+                f"step() of the environment {self._name!r} does not return Gymnasium's five values (observation, "
                 f"reward, terminated, truncated, info): {reason.__cause__}. The old API ends with `done, info`."
             ) from reason
 
@@ -78,7 +78,7 @@ class GymnasiumPixelEnv(SimulatorEnv, GymWrapper):
             try:
                 image = self._env.render()
             except (ImportError, gymnasium.error.Error) as reason:
-                raise RenderingError(f"{self.world} does not render: {reason}") from reason
+                raise RenderingError(f"{self._name} does not render: {reason}") from reason
         self._has_drawn = True
         return image
 
@@ -117,7 +117,7 @@ def make_gymnasium(
     _fix_free_camera(env)
     if quality == "fast" and hasattr(model, "vis"):
         model.vis.quality.shadowsize = min(FAST_SHADOW_SIZE["suite"], model.vis.quality.shadowsize)
-    return GymnasiumPixelEnv(env, world=task, image_size=image_size, **settings)
+    return GymnasiumPixelEnv(env, name=task, image_size=image_size, **settings)
 
 
 def _fix_free_camera(env: Any) -> None:
