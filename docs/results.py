@@ -17,7 +17,7 @@ import pandas as pd
 ROOT = Path(__file__).resolve().parent.parent
 RECORDS = ROOT / "results"
 PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
-FIGURE = ROOT / "docs" / "results.png"
+FIGURE, CHEETAH = ROOT / "docs" / "results.png", ROOT / "docs" / "cheetah_run.png"
 METHODS = ("crptpro", "crptpro-fast", "crptpro-finetune", "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-s", "becl",
            "drq", "crptpro-no-bonus", "group-a-10k", "random-encoder", "random-encoder-standardised")  # fmt: skip
 DOMAINS = ("cheetah", "walker", "quadruped", "finger", "pendulum")
@@ -26,6 +26,8 @@ PROBES = {
     10_000: ROOT / "src" / "crptpro" / "encoders" / "group-a-10k" / "probe.csv",
 }
 """Updates of the probed encoders to their records."""
+SHOWN = (10_000, 20_000, 30_000, 40_000)
+"""Env steps of the evaluations in the table of two tasks."""
 
 
 def downstream_runs(record: str, file: str = "eval") -> pd.DataFrame:
@@ -51,6 +53,8 @@ def small_scale() -> pd.DataFrame:
     chance = pd.read_csv(RECORDS / "group_a_20k" / "uniform_walker_run.csv")["episode_return"]
     rows = [(f"`{method}`", len(own), _list(own)) for method, own in means.groupby("method", observed=True)]
     rows.append(("control: uniform random policy", f"{len(chance)} episodes", f"{chance.mean():.0f}"))
+    published = _published("walker_run")[20_000]
+    rows.append(("reference: `drq`, its authors' log", len(published), _spread(published) + " over runs"))
     return pd.DataFrame(rows, columns=["", "runs", "returns"])
 
 
@@ -74,17 +78,35 @@ def controls() -> pd.DataFrame:
     )
 
 
+def _published(task: str) -> pd.DataFrame:
+    """Return of every run of DrQ that its authors published, a column per evaluation."""
+    table = pd.read_csv(RECORDS / "references" / "drq.csv")
+    return table[table["task"] == task].pivot(index="seed", columns="env_steps", values="episode_return")
+
+
 def two_tasks() -> pd.DataFrame:
-    """Mean and standard deviation over ten episodes of the runs on an encoder of 3,000 updates of batch 512."""
+    """Mean and standard deviation of an evaluation's episodes, beside what others published for as many env steps."""
     rows = []
-    for task in ("walker_run", "cheetah_run"):
-        for name, encoder in (("crptpro", "crptpro"), ("random", "random-encoder")):
-            episodes = pd.read_csv(RECORDS / "group_a_20k" / f"eval_{task}_{name}.csv").groupby("env_steps")
-            shown = {f"{n:,} env steps": _spread(own["episode_return"]) for n, own in episodes if n}
-            rows.append({"task": task, "": f"`{encoder}`", **shown})
-        chance = pd.read_csv(RECORDS / "group_a_20k" / f"uniform_{task}.csv")["episode_return"]
-        rows.append({"task": task, "": "uniform random policy", "30,000 env steps": _spread(chance)})
-    return pd.DataFrame(rows).fillna("")
+    group_a, references = RECORDS / "group_a_20k", RECORDS / "references"
+    for task in ("cheetah_run", "walker_run"):
+        runs = {
+            "`crptpro` on `group-a-10k`": RECORDS / "paper_scale" / f"{task}_paper_seed_0" / "eval.csv",
+            "`crptpro`, 3,000 updates": group_a / f"eval_{task}_crptpro.csv",
+            "`random-encoder`": group_a / f"eval_{task}_random.csv",
+        }
+        for name, path in runs.items():
+            if path.exists():
+                episodes = pd.read_csv(path).groupby("env_steps")["episode_return"]
+                rows.append((task, name, "1", {n: _spread(own) for n, own in episodes}))
+        chance = pd.read_csv(group_a / f"uniform_{task}.csv")["episode_return"]
+        rows.append((task, "uniform random policy", "", dict.fromkeys(SHOWN, _spread(chance))))
+        if task == "cheetah_run":
+            log = pd.read_csv(references / "crptpro_cheetah_run_eval.csv", index_col="env_steps")["episode_return"]
+            rows.append((task, "CRPTpro, its authors' log", "1", log.map("{:.0f}".format).to_dict()))
+        drq = _published(task)
+        rows.append((task, "DrQ, its authors' log", str(len(drq)), {n: _spread(drq[n]) for n in drq}))
+    shown = [{f"{n:,} env steps": returns.get(n, "") for n in SHOWN} for *_, returns in rows]
+    return pd.DataFrame([{"task": t, "": name, "runs": n, **r} for (t, name, n, _), r in zip(rows, shown, strict=True)])
 
 
 def pretraining() -> pd.DataFrame:
@@ -147,6 +169,35 @@ def draw() -> None:
     figure.savefig(FIGURE, dpi=110, metadata={"Software": None})
 
 
+def draw_cheetah() -> None:
+    """Draw cheetah_run's training returns beside what others published."""
+    figure, axes = plt.subplots(figsize=(7.4, 3.6), layout="constrained")
+    drq = _published("cheetah_run").agg(["mean", "std"]).T
+    drq = drq[drq.index <= 100_000]
+    axes.plot(drq.index, drq["mean"], color="#8a7bd8", label="DrQ, its authors' log: evaluations, mean ± sd of 10 runs")
+    axes.fill_between(drq.index, drq["mean"] - drq["std"], drq["mean"] + drq["std"], color="#8a7bd8", alpha=0.15)
+    curves = {
+        "CRPTpro, its authors' log (1 run)": ("references/crptpro_cheetah_run_train.csv", "#5d6672"),
+        "this library, group-a-10k, paper's settings (1 run)": (
+            "paper_scale/cheetah_run_paper_seed_0/episodes.csv", "#0b80c3",
+        ),
+        "this library, encoder of 3,000 updates, batch 128, learning rate 1e-3 (1 run)": (
+            "group_a_20k/episodes_cheetah_run_crptpro.csv", "#109e77",
+        ),
+        "this library, untrained encoder, batch 128, learning rate 1e-3 (1 run)": (
+            "group_a_20k/episodes_cheetah_run_random.csv", "#d9640a",
+        ),
+    }  # fmt: skip
+    for label, (file, color) in curves.items():
+        episodes = pd.read_csv(RECORDS / file)
+        episodes = episodes[episodes["env_steps"] <= 100_000].set_index("env_steps")["episode_return"]
+        axes.plot(episodes.rolling(5, min_periods=1).mean(), color=color, label=label)
+    axes.set(title="cheetah_run", xlabel="env steps", ylabel="return, mean of 5 training episodes")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=8)
+    figure.savefig(CHEETAH, dpi=110, metadata={"Software": None})
+
+
 def filled(page: str) -> str:
     """Return the text of a page with every table computed from the records."""
 
@@ -173,3 +224,4 @@ if __name__ == "__main__":
     for path in PAGES:
         path.write_text(filled(path.read_text()))
     draw()
+    draw_cheetah()

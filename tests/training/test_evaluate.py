@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import queue
 from typing import Any
 
 import pytest
@@ -69,10 +70,12 @@ def test_an_impossible_number_of_episodes_is_refused(episodes: Any) -> None:
         evaluate(make_agent(), make_toy_env(), episodes=episodes, progress=False)
 
 
-def evaluator(workers: int, make: Any = make_toy_env, seed: int = 0) -> tuple[Evaluator, list[Any]]:
+def evaluator(
+    workers: int, make: Any = make_toy_env, seed: int = 0, on_end: Any = lambda episodes, counters: None
+) -> tuple[Evaluator, list[Any]]:
     results: list[Any] = []
     found = Evaluator(
-        make, make_agent(seed), episodes=2, seed=1, workers=workers, progress=False,
+        make, make_agent(seed), episodes=2, seed=1, workers=workers, progress=False, on_end=on_end,
         on_result=lambda episodes, counters: results.append((episodes, dict(counters))),
     )  # fmt: skip
     return found, results
@@ -99,6 +102,19 @@ def test_workers_evaluate_a_snapshot_hand_it_out_when_asked_and_it_is_part_of_a_
     assert again.state_dict() == {}
     for each in (here, beside, again):
         each.close()
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_returns_are_told_when_an_evaluation_ends_and_recorded_when_the_run_asks(workers: int) -> None:
+    ended: queue.Queue[Any] = queue.Queue()
+    running, results = evaluator(workers, on_end=lambda *evaluation: ended.put(evaluation))
+    running.start(env_steps=40)
+    told = ended.get(timeout=120)
+    assert results == ([] if workers else [told])
+    running.finish()
+    assert results == [told]
+    assert ended.empty()
+    running.close()
 
 
 def die() -> Any:
