@@ -178,9 +178,6 @@ def draw_cheetah() -> None:
     axes.fill_between(drq.index, drq["mean"] - drq["std"], drq["mean"] + drq["std"], color="#8a7bd8", alpha=0.15)
     curves = {
         "CRPTpro, its authors' log (1 run)": ("references/crptpro_cheetah_run_train.csv", "#5d6672"),
-        "this library, group-a-10k, paper's settings (1 run)": (
-            "paper_scale/cheetah_run_paper_seed_0/episodes.csv", "#0b80c3",
-        ),
         "this library, encoder of 3,000 updates, batch 128, learning rate 1e-3 (1 run)": (
             "group_a_20k/episodes_cheetah_run_crptpro.csv", "#109e77",
         ),
