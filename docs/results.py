@@ -109,6 +109,12 @@ def two_tasks() -> pd.DataFrame:
     return pd.DataFrame([{"task": t, "": name, "runs": n, **r} for (t, name, n, _), r in zip(rows, shown, strict=True)])
 
 
+def cheetah_run() -> pd.DataFrame:
+    """The part of the table of two tasks that the README shows."""
+    table = two_tasks()
+    return table[table["task"] == "cheetah_run"].drop(columns="task").rename(columns={"": "cheetah_run"})
+
+
 def pretraining() -> pd.DataFrame:
     """The record of pre-training with the paper's settings."""
     record = pd.read_csv(RECORDS / "paper_scale" / "pretrain.csv").set_index("updates")
@@ -138,8 +144,8 @@ def _probe_scores() -> dict[int, pd.Series]:
     return found
 
 
-TABLES = {"small scale": small_scale, "controls": controls, "two tasks": two_tasks, "pre-training": pretraining,
-          "probes": probes}  # fmt: skip
+TABLES = {"small scale": small_scale, "controls": controls, "two tasks": two_tasks, "cheetah_run": cheetah_run,
+          "pre-training": pretraining, "probes": probes}  # fmt: skip
 
 
 def draw() -> None:
@@ -178,6 +184,9 @@ def draw_cheetah() -> None:
     axes.fill_between(drq.index, drq["mean"] - drq["std"], drq["mean"] + drq["std"], color="#8a7bd8", alpha=0.15)
     curves = {
         "CRPTpro, its authors' log (1 run)": ("references/crptpro_cheetah_run_train.csv", "#5d6672"),
+        "this library, group-a-10k, the paper's settings (1 run)": (
+            "paper_scale/cheetah_run_paper_seed_0/episodes.csv", "#0b80c3",
+        ),
         "this library, encoder of 3,000 updates, batch 128, learning rate 1e-3 (1 run)": (
             "group_a_20k/episodes_cheetah_run_crptpro.csv", "#109e77",
         ),

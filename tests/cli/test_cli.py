@@ -286,4 +286,5 @@ def test_mirrors_begin_with_the_run_and_get_its_record(
     assert call(*common, "--logging.tensorboard")[0] == 0
     settings = json.loads((run / "config.json").read_text())["config"]
     assert (settings["task"], settings["learning_rate"]) == (TASK, 1e-4)
+    assert settings["pretrained"].startswith("random-encoder")
     assert call("report", run)[0] == 0

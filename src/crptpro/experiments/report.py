@@ -174,10 +174,10 @@ def _needed(keys: Iterable[str], jobs: pd.DataFrame, *kinds: str) -> list[str]:
 
 
 NOT_IN_LABELS = [
-    "seed", "task", "colors", "device", "precision", "compile", "eval_workers", "features", "eval_episodes",
-    "checkpoint_interval_env_steps", "log_interval_env_steps", "eval_interval_env_steps",
+    "seed", "task", "pretrained", "colors", "device", "precision", "compile", "eval_workers", "features",
+    "eval_episodes", "checkpoint_interval_env_steps", "log_interval_env_steps", "eval_interval_env_steps",
 ]  # fmt: skip
-"""Settings that do not distinguish methods: the seed, the task, how a run computes, and when it writes."""
+"""Settings that do not distinguish methods: seed, task and encoder, how a run computes, and when it writes."""
 
 
 def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:

@@ -173,18 +173,17 @@ def train_downstream(
         pretrained = random_pretrained(settings.seed, method=source) if is_control else load_pretrained(source)
     settings = settings.resolved(task, pretrained)
     name = task if isinstance(task, str) else task.task
+    what = {"task": name, "pretrained": pretrained.identity()}
     device = usable_device(settings.device)
     repeat = settings.action_repeat
     with contextlib.ExitStack() as stack:
         run = stack.enter_context(Run(run_dir, unit="env_steps", streams=("train", "episodes", "eval"), records=records,
-                                      config={"task": name, **dataclasses.asdict(settings)},
-                                      progress=progress))  # fmt: skip
+                                      config={**what, **dataclasses.asdict(settings)}, progress=progress))  # fmt: skip
         dtype = resolve_precision(run.saved_setting("precision", settings.precision), device)
         # The budget may grow, and machines differ; everything else decides the numbers of the run.
         free = ("env_steps", "eval_workers", "compile", "device")
         run.require_same({
-            "task": name, "pretrained": pretrained.identity(),
-            **{key: value for key, value in dataclasses.asdict(settings).items() if key not in free},
+            **what, **{key: value for key, value in dataclasses.asdict(settings).items() if key not in free},
             "precision": PRECISION_NAMES[dtype], "features": run.saved_setting("features", settings.features),
         })  # fmt: skip
         seed_everything(derive_seed(settings.seed, "downstream"))
