@@ -39,8 +39,8 @@ from crptpro.training import (
 
 logger = logging.getLogger("crptpro.quickstart")
 PRETRAIN = PretrainConfig(updates=600, batch_size=128, learning_rate=3e-4, log_interval=20)
-DOWNSTREAM = DownstreamConfig(env_steps=16_000, batch_size=128, learning_rate=1e-3, replay_capacity=5_000,
-                              random_agent_steps=500, eval_interval_env_steps=8_000)  # fmt: skip
+DOWNSTREAM = DownstreamConfig(env_steps=12_000, batch_size=128, learning_rate=1e-3, hidden_dim=256,
+                              replay_capacity=5_000, random_agent_steps=500, eval_interval_env_steps=6_000)  # fmt: skip
 
 
 @dataclass
@@ -70,7 +70,7 @@ class Config:
     pretrain: PretrainConfig = PRETRAIN
     """pre-training [50,000 updates of 512 transitions at 1e-4]"""
     downstream: DownstreamConfig = DOWNSTREAM
-    """SAC on the frozen encoder [500,000 env steps, updates of 512 transitions at 1e-4]"""
+    """SAC on the frozen encoder [500,000 env steps, updates of 512 transitions at 1e-4, layers of 1,024]"""
 
 
 def main(config: Config) -> None:
