@@ -25,7 +25,7 @@ from crptpro.envs import make_env
 from crptpro.experiments.report import build_report
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import ProtoLoss
-from crptpro.pretrained import save_pretrained
+from crptpro.pretrained import random_pretrained, save_pretrained
 from crptpro.seeding import derive_seed, seed_everything
 from crptpro.training import (
     DownstreamConfig,
@@ -38,9 +38,10 @@ from crptpro.training import (
 )
 
 logger = logging.getLogger("crptpro.quickstart")
-PRETRAIN = PretrainConfig(updates=600, batch_size=128, learning_rate=3e-4, log_interval=20)
-DOWNSTREAM = DownstreamConfig(env_steps=12_000, batch_size=128, learning_rate=1e-3, hidden_dim=256,
-                              replay_capacity=5_000, random_agent_steps=500, eval_interval_env_steps=6_000)  # fmt: skip
+ENCODER = {"channels": (16, 16, 16, 16), "strides": (2, 2, 1, 1)}  # 4,096 features, the paper's encoder has 39,200
+PRETRAIN = PretrainConfig(updates=700, batch_size=128, learning_rate=3e-4, log_interval=20)
+DOWNSTREAM = DownstreamConfig(env_steps=12_000, eval_interval_env_steps=12_000, batch_size=128, learning_rate=1e-3,
+                              hidden_dim=256, replay_capacity=5_000, random_agent_steps=500)  # fmt: skip
 
 
 @dataclass
@@ -87,14 +88,15 @@ def main(config: Config) -> None:
     logger.info("2/4 pre-train one encoder on all of them")
     seed_everything(config.seed)
     loss = ProtoLoss(
-        PixelEncoder(), num_prototypes=config.prototypes, assignment_temperature=config.assignment_temperature
+        PixelEncoder(**ENCODER), num_prototypes=config.prototypes, assignment_temperature=config.assignment_temperature
     )
     settings = replace(config.pretrain, seed=config.seed)
     result = pretrain(loss, datasets, run_dir=config.out / "pretrain", config=settings)
     encoder = save_pretrained(result, config.out / "encoder")
 
     logger.info("3/4 learn %s on the frozen encoder, and on an untrained one", config.task)
-    for name, pretrained in {"crptpro": encoder, "random-encoder": "random-encoder"}.items():
+    untrained = random_pretrained(config.seed, **ENCODER)
+    for name, pretrained in {"crptpro": encoder, "random-encoder": untrained}.items():
         run = train_downstream(
             config.task, pretrained, run_dir=config.out / name, config=replace(config.downstream, **env_settings)
         )
