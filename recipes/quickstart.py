@@ -4,7 +4,7 @@
     python recipes/quickstart.py --out runs/other --seed 1
 
 The controls are the same agent on an untrained encoder, and the uniform random policy; all three are evaluated on the
-same episodes. Writes OUT/report/index.html. Needs 1.2 GB of disk and 4 GB of memory. If killed, the same command
+same episodes. Writes OUT/report/index.html. Needs 0.6 GB of disk and 4 GB of memory. If killed, the same command
 resumes.
 """
 

@@ -282,6 +282,11 @@ def test_runs_are_compared_on_tasks_too_that_the_paper_has_no_score_of(made: Rep
     assert made.report().cell("Probability that a run of crptpro", "P(crptpro &gt; other)", "atc") == "0.50"
 
 
+def test_one_run_against_one_has_no_probability(made: Reproduction) -> None:
+    made.ask("seen", made.runs("crptpro", "walker_run", [500.0]) + made.runs("atc", "walker_run", [200.0]))
+    assert "Probability that" not in made.report().text
+
+
 def test_unreadable_records_are_left_out_by_name(made: Reproduction) -> None:
     cells = made.runs("crptpro", "walker_run", [500.0, 510.0, 520.0])
     paths = [made.root / "jobs" / job / "eval.csv" for _, job, _ in cells]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import signal
 from pathlib import Path
 from typing import Any
@@ -112,6 +113,18 @@ def test_a_kill_during_the_last_evaluation_repeats_that_evaluation_alone(tmp_pat
 
     assert train(tmp_path, task=toy_domain("toy", make)).evaluations[-1]["env_steps"] == 120
     assert len(steps) == 2 * EPISODE
+
+
+def test_a_run_that_has_ended_keeps_no_dense_maps() -> None:
+    gc.collect()
+    gc.disable()
+    try:
+        result = train(None, env_steps=40)
+        maps = [each for each in gc.get_objects() if type(each) is Tensor and each.ndim == 5]
+    finally:
+        gc.enable()
+    assert result.env_steps == 40
+    assert maps == []
 
 
 def test_an_agent_acts_in_the_precision_that_auto_meant_where_it_was_trained(tmp_path: Path) -> None:

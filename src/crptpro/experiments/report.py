@@ -496,11 +496,13 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
 
 
 def _improvement(page: Page, runs: pd.DataFrame) -> None:
-    """Compare runs of crptpro with those of each other method."""
+    """Compare runs of crptpro with those of each other method; one run against one says nothing."""
     by_label = {label: runs[runs["label"] == label] for label in in_order(runs["label"])}
     ours = by_label.pop("crptpro", None)
     rows = []
     for label, own in by_label.items() if ours is not None else ():
+        if len(ours) + len(own) == 2:
+            continue
         better = stats.estimate(stats.probability_of_improvement, ours, own)
         rows.append({"other method": label, "runs of both": better.runs, "P(crptpro > other)": f"{better:.2f}"})
     page.table(

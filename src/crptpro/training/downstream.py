@@ -207,6 +207,8 @@ def train_downstream(
         memory = attach_transforms(replay, pretrained, encoder, settings, generators, run, dtype=dtype,
                                    reserved_bytes=evaluator.workers * WORKER_BYTES)  # fmt: skip
         dense = next((each for each in replay.transform if isinstance(each, DenseShiftFeatures)), None)
+        if dense is not None:  # its replay refers to it, too: the maps would stay until cycles are collected
+            stack.callback(dense.forget)
         counters = run.tally
         counters.update(updates=0, episodes=0, last_evaluation=-1)
         run.keep(**learner.components(), **memory, generators=generators, evaluator=evaluator,
