@@ -1,4 +1,4 @@
-"""Compute the tables of docs/results.md and of the README from the records in results/.
+"""Compute the tables of the README, docs/start.md and docs/results.md from the records in results/.
 
 ``python docs/results.py`` writes each table between its markers, ``<!-- table: name -->`` and ``<!-- end -->``, and
 draws the figure. :func:`filled` is what a test compares the pages with.
@@ -16,7 +16,7 @@ import pandas as pd
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDS = ROOT / "results"
-PAGES = (ROOT / "README.md", ROOT / "docs" / "results.md")
+PAGES = (ROOT / "README.md", ROOT / "docs" / "start.md", ROOT / "docs" / "results.md")
 FIGURE, CHEETAH = ROOT / "docs" / "results.png", ROOT / "docs" / "cheetah_run.png"
 METHODS = ("crptpro", "crptpro-fast", "crptpro-finetune", "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-s", "becl",
            "drq", "crptpro-no-bonus", "group-a-10k", "random-encoder", "random-encoder-standardised")  # fmt: skip
@@ -43,6 +43,19 @@ def downstream_runs(record: str, file: str = "eval") -> pd.DataFrame:
     table = pd.concat(found, ignore_index=True)
     table["method"] = pd.Categorical(table["method"], METHODS)  # whose order is that of the tables
     return table.sort_values(["method", "run"], kind="stable")
+
+
+def quickstart() -> pd.DataFrame:
+    """Returns on walker_stand at the end of each run of the quickstart."""
+    rows = []
+    for record in sorted((RECORDS / "quickstart_4096").glob("seed_*")):
+        row = {"seed": f"[{record.name[5:]}](../results/quickstart_4096/{record.name}/report.md)"}
+        for name, method in {"pre-trained encoder": "crptpro", "untrained encoder": "random-encoder"}.items():
+            runs = pd.read_csv(record / method / "eval.csv")
+            row[name] = _spread(runs[runs["env_steps"] == runs["env_steps"].max()]["episode_return"])
+        chance = json.loads((record / "scores.json").read_text())["uniform random policy"]
+        rows.append(row | {"uniform random policy": f"{chance['mean']:.0f} ± {chance['std']:.0f}"})
+    return pd.DataFrame(rows)
 
 
 def small_scale() -> pd.DataFrame:
@@ -144,8 +157,8 @@ def _probe_scores() -> dict[int, pd.Series]:
     return found
 
 
-TABLES = {"small scale": small_scale, "controls": controls, "two tasks": two_tasks, "cheetah_run": cheetah_run,
-          "pre-training": pretraining, "probes": probes}  # fmt: skip
+TABLES = {"quickstart": quickstart, "small scale": small_scale, "controls": controls, "two tasks": two_tasks,
+          "cheetah_run": cheetah_run, "pre-training": pretraining, "probes": probes}  # fmt: skip
 
 
 def draw() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import runpy
 from pathlib import Path
 
@@ -15,3 +16,12 @@ def test_every_table_is_the_one_that_the_records_give(page: Path) -> None:
     text = page.read_text()
     assert "<!-- table: " in text
     assert RESULTS["filled"](text) == text, "run `python docs/results.py`"
+
+
+def test_the_readme_quotes_the_returns_of_the_quickstart() -> None:
+    readme = " ".join(RESULTS["PAGES"][0].read_text().split())
+    ours = r"returned (\d+) on the pre-trained encoder, (\d+) on the untrained one, and (\d+) with random actions"
+    quoted = re.search(ours + r"; a second seed (\d+), (\d+) and (\d+)", readme)
+    assert quoted is not None
+    table = RESULTS["quickstart"]().drop(columns="seed")
+    assert list(quoted.groups()) == [cell.split()[0] for cell in table.to_numpy().flat]
