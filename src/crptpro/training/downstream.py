@@ -83,7 +83,7 @@ class DownstreamConfig:
     eval_episodes: int = 10
     """episodes per evaluation"""
     eval_workers: int | None = None
-    """processes that evaluate meanwhile, 0.5 GB each; 0 evaluates in between (default: one per core where that helps)"""
+    """processes that evaluate meanwhile, 0.5 GB each; 0 evaluates in between (default: one per core if that helps)"""
     checkpoint_interval_env_steps: int = 5_000
     """simulator steps between two checkpoints, taken at episode ends"""
     log_interval_env_steps: int = 1_000
@@ -383,7 +383,7 @@ def attach_transforms(
 
 
 def _eval_workers(task: str, make_this_env: Callable[[], EnvBase], config: Any) -> int:
-    """Return the number of evaluating processes: as set, or one per core where that works and helps."""
+    """Return the number of evaluating processes: as set, or one per core if that works and helps."""
     if config.eval_workers is not None:
         if config.eval_workers and not can_be_sent(make_this_env):
             raise PretrainedError(
