@@ -64,7 +64,8 @@ class Loop:
         **settings: Any,
     ) -> None:  # fmt: skip
         self.item, self.of = item, of
-        environment = {**os.environ, "PYTHONPATH": f"{source / 'src'}{os.pathsep}{ROOT}"}
+        path = os.pathsep.join(filter(None, [f"{source / 'src'}", f"{ROOT}", os.environ.get("PYTHONPATH")]))
+        environment = {**os.environ, "PYTHONPATH": path}
         self.process = subprocess.Popen(
             [python, "-m", "benchmarks.loops", item, json.dumps(settings, default=str)], cwd=ROOT, text=True,
             env={**environment, "PYTHONDONTWRITEBYTECODE": "1"}, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
