@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -111,7 +112,7 @@ def check_parity(settings: Settings, paths: list[Path]) -> list[dict[str, Any]]:
 
     def pretrained(**switches: Any) -> nn.Module:
         loss = fresh_loss(**settings.sizes)
-        return pretrain(loss, paths, updates=settings.parity_updates, **common, **switches).loss
+        return pretrain(loss, paths, updates=settings.parity_updates, **{**common, **switches}).loss
 
     def learned(**switches: Any) -> nn.Module:
         torch.manual_seed(0)
@@ -125,6 +126,7 @@ def check_parity(settings: Settings, paths: list[Path]) -> list[dict[str, Any]]:
     checks = [check_batches(settings, paths[0])]
     for name, switches in settings.ways.items():
         checks.append(check_weights(f"pre-training, {name}", pretrained, **switches))
+        checks.append(check_weights(f"pre-training in bf16, {name}", partial(pretrained, **BF16), **switches))
         checks.append(check_weights(f"downstream, {name}", learned, **switches))
     print("| check | largest difference | allowed | |\n|---|---|---|---|")
     for check in checks:

@@ -19,11 +19,11 @@ RECORDS = ROOT / "results"
 PAGES = (ROOT / "README.md", ROOT / "docs" / "start.md", ROOT / "docs" / "results.md")
 FIGURE, CHEETAH = ROOT / "docs" / "results.png", ROOT / "docs" / "cheetah_run.png"
 METHODS = ("crptpro", "crptpro-fast", "crptpro-finetune", "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-s", "becl",
-           "drq", "crptpro-no-bonus", "group-a-10k", "random-encoder", "random-encoder-standardised")  # fmt: skip
+           "drq", "crptpro-no-bonus", "paper-scale-10k", "random-encoder", "random-encoder-standardised")  # fmt: skip
 DOMAINS = ("cheetah", "walker", "quadruped", "finger", "pendulum")
 PROBES = {
-    **{n: RECORDS / "paper_scale" / f"probe_{n}_updates.csv" for n in (0, 1_000, 3_000)},
-    10_000: ROOT / "src" / "crptpro" / "encoders" / "group-a-10k" / "probe.csv",
+    **{n: RECORDS / "paper_scale" / f"probe_{n}_updates.csv" for n in (0, 1_000, 3_000, 10_000, 30_000)},
+    50_000: ROOT / "src" / "crptpro" / "encoders" / "group-a" / "probe.csv",
 }
 """Updates of the probed encoders to their records."""
 SHOWN = (10_000, 20_000, 30_000, 40_000)
@@ -37,9 +37,9 @@ def downstream_runs(record: str, file: str = "eval") -> pd.DataFrame:
         facts = json.loads(done.with_name("job.json").read_text())["facts"]
         found.append(pd.read_csv(done.with_name(f"{file}.csv")).assign(method=facts["method"], run=facts["seed"]))
     if record == "controls":  # made with the same settings
-        for run in sorted((RECORDS / "paper_scale").glob("walker_run_seed_*")):
+        for run in sorted((RECORDS / "paper_scale_10k").glob("walker_run_seed_*")):
             table = pd.read_csv(run / f"{file}.csv")
-            found.append(table.assign(method="group-a-10k", run=int(run.name.rpartition("_")[2])))
+            found.append(table.assign(method="paper-scale-10k", run=int(run.name.rpartition("_")[2])))
     table = pd.concat(found, ignore_index=True)
     table["method"] = pd.Categorical(table["method"], METHODS)  # whose order is that of the tables
     return table.sort_values(["method", "run"], kind="stable")
@@ -103,7 +103,7 @@ def two_tasks() -> pd.DataFrame:
     group_a, references = RECORDS / "group_a_20k", RECORDS / "references"
     for task in ("cheetah_run", "walker_run"):
         runs = {
-            "`crptpro` on `group-a-10k`": RECORDS / "paper_scale" / f"{task}_paper_seed_0" / "eval.csv",
+            "`crptpro`, 10,000 updates": RECORDS / "paper_scale_10k" / f"{task}_paper_seed_0" / "eval.csv",
             "`crptpro`, 3,000 updates": group_a / f"eval_{task}_crptpro.csv",
             "`random-encoder`": group_a / f"eval_{task}_random.csv",
         }
@@ -131,7 +131,7 @@ def cheetah_run() -> pd.DataFrame:
 def pretraining() -> pd.DataFrame:
     """The record of pre-training with the paper's settings."""
     record = pd.read_csv(RECORDS / "paper_scale" / "pretrain.csv").set_index("updates")
-    rows = record.loc[[500, 1_000, 3_000, 5_000, 10_000, 15_000, 20_000, record.index[-1]]]
+    rows = record.loc[[500, 1_000, 3_000, 5_000, 10_000, 20_000, 30_000, 40_000, 50_000]]
     columns = {"updates": rows.index.map("{:,}".format), "loss": rows["loss_comp"].map("{:.3f}".format)}
     columns |= {f"cosine: {name}": rows[f"cosine/{name}"].map("{:.3f}".format) for name in DOMAINS[:3]}
     columns["prototypes in use"] = rows["prototypes_in_use"].map("{:.0f}".format)
@@ -197,8 +197,8 @@ def draw_cheetah() -> None:
     axes.fill_between(drq.index, drq["mean"] - drq["std"], drq["mean"] + drq["std"], color="#8a7bd8", alpha=0.15)
     curves = {
         "CRPTpro, its authors' log (1 run)": ("references/crptpro_cheetah_run_train.csv", "#5d6672"),
-        "this library, group-a-10k, the paper's settings (1 run)": (
-            "paper_scale/cheetah_run_paper_seed_0/episodes.csv", "#0b80c3",
+        "this library, encoder of 10,000 updates, the paper's settings (1 run, stopped)": (
+            "paper_scale_10k/cheetah_run_paper_seed_0/episodes.csv", "#0b80c3",
         ),
         "this library, encoder of 3,000 updates, batch 128, learning rate 1e-3 (1 run)": (
             "group_a_20k/episodes_cheetah_run_crptpro.csv", "#109e77",

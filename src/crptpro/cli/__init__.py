@@ -231,7 +231,7 @@ class Downstream:
     task: Positional[str]
     """task to learn, e.g. walker_run, reach_duplo, gymnasium:HalfCheetah-v5"""
     pretrained: str
-    """directory of the pretrained encoder, the name of one that ships (group-a-10k), `random-encoder` for the untrained
+    """directory of the pretrained encoder, the name of one that ships (group-a), `random-encoder` for the untrained
     control, or `drq` to learn the encoder with the task"""
     out: Path
     """run directory: eval.csv, train.csv, checkpoints, and the agent in OUT/agent"""
