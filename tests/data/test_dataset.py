@@ -344,3 +344,9 @@ def test_another_backend_or_renderer_may_not_continue(tmp_path: Path, now: dict[
     with pytest.raises(DatasetError, match=message):
         resumed.writer.note_environment(now)
     resumed.writer.close()
+
+
+def test_a_dataset_takes_21_kb_per_transition(tmp_path: Path) -> None:
+    path = write_dataset(tmp_path, [random_episode(100, size=84)])
+    size = sum(file.stat().st_size for file in path.rglob("*.memmap"))
+    assert size / 100 < 1.01 * (3 * 84 * 84) + 100
