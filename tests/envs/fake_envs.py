@@ -11,8 +11,8 @@ import gymnasium
 import numpy as np
 import torch
 from tensordict import TensorDict
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Bounded, Unbounded
+from toy_env import ToyEnv
 
 from crptpro.domains import Domain
 
@@ -72,7 +72,7 @@ def painter(max_episode_steps: int | None = 5, **options: Any) -> Iterator[str]:
         del gymnasium.registry[name]
 
 
-class PlainEnv(EnvBase):
+class PlainEnv(ToyEnv):
     """A TorchRL environment of a user's; ``pixels`` and ``reward`` say what it emits at a clock."""
 
     def __init__(
@@ -86,41 +86,28 @@ class PlainEnv(EnvBase):
         bound: float = 1.0,
         actions: int = 2,
     ):
-        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
-        self.pixels = pixels or (lambda clock: torch.full((3, 8, 8), 10 * self.seed + clock, dtype=torch.uint8))
-        self.reward, self.length, self.truncates, self.dtype_ = reward, length, truncates, dtype
-        self.seed = self.clock = 0
+        super().__init__(lambda seed: length, physics_state=True)
+        self.pixels = pixels or (lambda clock: torch.full((3, 8, 8), 10 * self.episode_seed + clock, dtype=torch.uint8))
+        self.reward, self.dtype_, self.count, self.total = reward, dtype, 0, 0.0
         shown = self.pixels(0)
-        self.observation_spec = Composite(
-            pixels=Bounded(0, 255, shape=shown.shape, dtype=shown.dtype),
-            qpos=Unbounded(shape=(1,), dtype=torch.float64),
-            observation=Unbounded(shape=(2,)),
-        )
+        self.observation_spec["pixels"] = Bounded(0, 255, shape=shown.shape, dtype=shown.dtype)
+        self.observation_spec["observation"] = Unbounded(shape=(2,))
         self.action_spec = Bounded(-bound, bound, shape=(actions,), dtype=dtype)
         self.reward_spec = Unbounded(shape=(1,), dtype=dtype)
-        flag = Categorical(2, shape=(1,), dtype=torch.bool)
-        names = ("done", "terminated", "truncated") if truncates else ("done", "terminated")
-        self.done_spec = Composite({name: flag.clone() for name in names})
+        if not truncates:
+            del self.done_spec["truncated"]
 
-    def _observe(self, is_over: bool) -> dict[str, torch.Tensor]:
-        over, never = torch.tensor([is_over]), torch.tensor([False])
-        flags = {"done": over, "terminated": never if self.truncates else over}
-        flags |= {"truncated": over} if self.truncates else {}
-        qpos = torch.tensor([float(self.clock)], dtype=torch.float64)
-        return {"pixels": self.pixels(self.clock), "qpos": qpos, "observation": torch.zeros(2), **flags}
+    def _observe(self) -> dict[str, torch.Tensor]:
+        return super()._observe() | {"pixels": self.pixels(self.count), "observation": torch.zeros(2)}
 
-    def _reset(self, tensordict: Any = None, **kwargs: Any) -> TensorDict:
-        self.clock = 0
-        return TensorDict(self._observe(False), [])
+    def _flags(self, terminated: bool, truncated: bool) -> dict[str, torch.Tensor]:
+        flags = super()._flags(terminated, truncated)
+        return {name: flags[name] for name in self.done_spec.keys()}  # noqa: SIM118
 
     def _step(self, tensordict: Any) -> TensorDict:
         assert tensordict["action"].dtype == self.dtype_
-        self.clock += 1
-        reward = torch.tensor([self.reward(self.clock)], dtype=self.dtype_)
-        return TensorDict({**self._observe(self.clock >= self.length), "reward": reward}, [])
-
-    def _set_seed(self, seed: int | None) -> None:
-        self.seed = seed or 0
+        found = super()._step(tensordict)
+        return found.set("reward", torch.tensor([self.reward(self.count)], dtype=self.dtype_))
 
 
 def own(make: Any, **settings: Any) -> Domain:

@@ -1,5 +1,3 @@
-"""What every environment must keep, of whichever library: images, finite numbers, actions, errors with its name."""
-
 from __future__ import annotations
 
 import functools
@@ -20,12 +18,12 @@ import torch
 from fake_envs import PlainEnv, own, painter
 from gymnasium.spaces import Box, Discrete
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import step_mdp
 
 from crptpro.envs import make_env
 from crptpro.errors import CRPTproError, EnvCrashedError, EnvOutputError, NonFiniteError
 
 SIZE = 8
+HUGE = float(np.finfo(np.float32).max)
 
 
 def grey(shade: Any, dtype: Any = np.uint8) -> np.ndarray:
@@ -52,9 +50,7 @@ both = pytest.mark.parametrize("library", ["gymnasium", "own"])
 @both
 @pytest.mark.parametrize("frame_stack", [1, 3])
 @pytest.mark.parametrize("is_view", [False, True])
-def test_frames_outlive_the_buffer_that_an_environment_uses_again(
-    library: str, frame_stack: int, is_view: bool
-) -> None:
+def test_frames_outlive_a_buffer_that_is_used_again(library: str, frame_stack: int, is_view: bool) -> None:
     buffer = grey(0)
     if is_view:  # of a buffer that is laid out as frames are stored
         buffer = np.zeros((3, SIZE, SIZE), np.uint8).transpose(1, 2, 0)
@@ -70,9 +66,7 @@ def test_frames_outlive_the_buffer_that_an_environment_uses_again(
 
 @pytest.mark.parametrize(("library", "size"), [("gymnasium", SIZE), ("gymnasium", 3 * SIZE), ("own", SIZE)])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_floats_between_0_and_1_are_scaled_once_and_said(
-    library: str, size: int, dtype: Any, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_floats_are_scaled_once_and_said(library: str, size: int, dtype: Any, caplog: pytest.LogCaptureFixture) -> None:
     def image(clock: int) -> np.ndarray:  # Gymnasium's are resized
         return np.full((size, size, 3), clock / 5, dtype)
 
@@ -88,9 +82,7 @@ def test_floats_between_0_and_1_are_scaled_once_and_said(
     (grey(300, np.uint16), "uint16"), (grey(3, np.int64), "int64"), (grey(True, bool), "bool"),
     (grey(np.nan, np.float32), "nan"), (grey(200.0, np.float32), "200"), (grey(-0.5, np.float64), "-0.5"),
 ])  # fmt: skip
-def test_images_that_are_neither_uint8_nor_floats_between_0_and_1_are_refused_by_name(
-    library: str, image: np.ndarray, complaint: str
-) -> None:
+def test_other_numbers_than_bytes_and_unit_floats_are_refused(library: str, image: np.ndarray, complaint: str) -> None:
     with pytest.raises(CRPTproError, match=complaint):  # noqa: SIM117
         with shows(lambda _: image, library=library) as env:
             env.reset()
@@ -110,9 +102,7 @@ def test_what_is_no_rgb_image_is_refused_at_whatever_step_it_comes(image: Any, c
 
 @both
 @pytest.mark.parametrize(("shade", "word"), [(0, "black"), (7, "of one shade")])
-def test_an_episode_whose_frames_are_all_alike_is_reported_once(
-    library: str, shade: int, word: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_still_episode_is_logged_once(library: str, shade: int, word: str, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING), shows(lambda _: grey(shade), library=library) as env:
         for _ in range(3):
             env.rollout(10)
@@ -121,9 +111,7 @@ def test_an_episode_whose_frames_are_all_alike_is_reported_once(
 
 
 @both
-def test_an_episode_in_which_something_moves_late_or_that_was_left_early_is_not_reported(
-    library: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_moves_late_or_was_left_early_is_not_reported(library: str, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING), shows(lambda clock: grey(clock // 4), library=library) as env:
         env.rollout(10)
         env.rollout(2)
@@ -133,9 +121,7 @@ def test_an_episode_in_which_something_moves_late_or_that_was_left_early_is_not_
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
 @both
-def test_a_reward_that_is_not_finite_names_environment_episode_and_step_before_it_is_returned(
-    library: str, value: float
-) -> None:
+def test_a_reward_that_is_not_finite_names_environment_episode_and_step(library: str, value: float) -> None:
     def reward(clock: int) -> float:
         return value if clock == 3 else 1.0
 
@@ -150,8 +136,8 @@ def test_a_reward_that_is_not_finite_names_environment_episode_and_step_before_i
 
 def test_a_physical_state_that_is_not_finite_is_refused() -> None:
     class Broken(PlainEnv):
-        def _observe(self, is_over: bool) -> Any:
-            return super()._observe(is_over) | {"qpos": torch.tensor([np.nan], dtype=torch.float64)}
+        def _observe(self) -> Any:
+            return super()._observe() | {"qpos": torch.full((2,), torch.nan, dtype=torch.float64)}
 
     with pytest.raises(NonFiniteError, match=r"'mine_go' .*qpos"):
         make_env(own(Broken), seed=0, image_size=SIZE, physics_state=True).reset()
@@ -171,21 +157,12 @@ def explode(clock: int) -> Any:
     return 0.0
 
 
-def explode_drawing(clock: int) -> Any:
-    return grey(clock + int(explode(clock)))
-
-
 def test_an_exception_of_an_environments_own_is_passed_on_with_its_name_and_the_call() -> None:
-    with painter(image=explode_drawing) as task, pytest.raises(EnvCrashedError) as caught:
+    with painter(image=lambda clock: grey(explode(clock))) as task, pytest.raises(EnvCrashedError) as caught:
         make_env(task, seed=0, image_size=SIZE, action_repeat=1).rollout(3)
     assert isinstance(caught.value.__cause__, ValueError)
     for part in ("the motor is on fire", "ValueError in render()", task, __file__):
         assert part in str(caught.value)
-    with (
-        painter(reward=explode) as task,
-        pytest.raises(EnvCrashedError, match=r"ValueError in step\(\) of the environment"),
-    ):
-        make_env(task, seed=0, image_size=SIZE).rollout(3)
     with pytest.raises(EnvCrashedError, match=r"on fire .*ValueError in step\(\) of the environment 'mine_go'"):
         make_env(own(lambda: PlainEnv(reward=explode)), seed=0, image_size=SIZE).rollout(3)
 
@@ -217,9 +194,6 @@ def test_a_step_of_the_old_api_is_answered_with_what_is_expected(limit: int | No
             env.rollout(2)
 
 
-HUGE = float(np.finfo(np.float32).max)
-
-
 @pytest.mark.parametrize(("space", "complaint"), [
     (Discrete(3), "Discrete actions"), (Box(0, 10, (2,), np.int64), "actions of int64"),
     (Box(-1.0, 1.0, (0,)), "empty action"), (Box(-HUGE, HUGE, (2,)), "without bounds"),
@@ -229,18 +203,6 @@ HUGE = float(np.finfo(np.float32).max)
 def test_action_spaces_that_cannot_be_mapped_from_minus_1_to_1_are_refused_by_name(space: Any, complaint: str) -> None:
     with painter(action_space=space) as task, pytest.raises(CRPTproError, match=rf"{task}.*{complaint}"):
         make_env(task, seed=0)
-
-
-def test_numbers_are_taken_as_what_they_mean() -> None:
-    with painter() as task:
-        plain = make_env(task, seed=3, image_size=8, action_repeat=2, frame_stack=2)
-        meant: dict[str, Any] = {
-            "seed": np.int64(3), "image_size": 8.0, "action_repeat": torch.tensor(2), "frame_stack": np.int8(2)
-        }  # fmt: skip
-        other = make_env(task, **meant)
-        assert torch.equal(plain.reset()["pixels"], other.reset()["pixels"])
-        assert plain.card() == other.card()
-        assert {type(other.card()[name]) for name in ("image_size", "action_repeat")} == {int}
 
 
 def test_specs_do_not_follow_torchs_default_dtype() -> None:
@@ -274,32 +236,26 @@ print([tuple(env.reset()["pixels"].shape) for env in kept])
 
 
 def test_an_environment_is_closed_once_however_often_it_is_asked() -> None:
-    closed: list[str] = []
+    closed: list[bool] = []
 
     class Closing(PlainEnv):
         def close(self, *, raise_if_closed: bool = True) -> None:
-            closed.append("own")
+            closed.append(True)
             super().close(raise_if_closed=raise_if_closed)
 
-    with painter() as task:
-        for domain in (task, own(lambda: Closing())):
-            env = make_env(domain, seed=0, image_size=SIZE)
-            env.close()
-            env.close()
-            assert env.is_closed
-    assert closed == ["own"]
+    env = make_env(own(Closing), seed=0, image_size=SIZE)
+    env.close()
+    env.close()
+    assert env.is_closed
+    assert closed == [True]
 
 
 def frames(task: str, after_each: Callable[[], None]) -> torch.Tensor:
-    env, seen = make_env(task, seed=0, image_size=32), []
-    td = env.reset()
-    for _ in range(4):
-        td["action"] = torch.full(env.action_spec.shape, 0.5)
-        td = step_mdp(env.step(td))
-        seen.append(td["pixels"][-3:])
-        after_each()
+    env = make_env(task, seed=0, image_size=32)
+    action = torch.full(env.action_spec.shape, 0.5)
+    shown = env.rollout(5, lambda td: td.set("action", action), lambda *_: after_each())["next", "pixels"][:, -3:]
     env.close()
-    return torch.stack(seen)
+    return shown
 
 
 @functools.cache
@@ -311,9 +267,7 @@ def frames_alone(task: str) -> torch.Tensor:
 @pytest.mark.parametrize("is_closed", [True, False])
 @pytest.mark.parametrize("other", ["cartpole_balance", "gymnasium:Reacher-v5"])
 @pytest.mark.parametrize("task", ["cartpole_balance", "gymnasium:Reacher-v5"])
-def test_environments_that_come_and_go_in_a_thread_change_no_frame_of_another(
-    task: str, other: str, is_closed: bool
-) -> None:
+def test_environments_that_come_and_go_change_no_frame_of_another(task: str, other: str, is_closed: bool) -> None:
     beside: list[EnvBase] = []
 
     def come_and_go() -> None:

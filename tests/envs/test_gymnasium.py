@@ -1,5 +1,3 @@
-"""Gymnasium environments behind ``make_env``: scaled and repeated actions, resized images, seeds, ends."""
-
 from __future__ import annotations
 
 from collections.abc import Iterator
@@ -11,8 +9,7 @@ import torch
 from fake_envs import painter
 from torchrl.envs import GymWrapper, check_env_specs
 
-from crptpro.domains import Domain
-from crptpro.envs import factory, make_env, needs_gl
+from crptpro.envs import factory, make_env
 from crptpro.envs.base import resize
 from crptpro.errors import CRPTproError, RenderingError
 
@@ -27,17 +24,7 @@ def make(task: str, **options: Any) -> Any:
     return make_env(task, seed=3, image_size=16, **options)
 
 
-@pytest.mark.parametrize(("task", "answer"), [
-    ("walker_run", True), ("reach_duplo", True), ("gymnasium:HalfCheetah-v5", True),
-    ("gymnasium:Pendulum-v1", False), (Domain("own", "own", make=lambda: None), False),
-])  # fmt: skip
-def test_who_needs_gl(task: Any, answer: bool) -> None:
-    assert needs_gl(task) is answer
-
-
-def test_an_environment_that_draws_without_gl_asks_for_no_backend_and_a_mujoco_environment_does(
-    task: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_a_mujoco_environment_asks_for_a_backend(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse() -> None:
         raise RenderingError("no GL here")
 
@@ -129,13 +116,8 @@ def test_a_mujoco_episode_is_drawn_the_same_whatever_was_drawn_before_it(env_id:
 
 
 @pytest.mark.gl
-def test_a_camera_that_a_mujoco_model_has_not_is_refused_where_mujoco_would_end_the_process() -> None:
-    with pytest.raises(CRPTproError, match=r"Reacher-v5 has no camera 5"):
-        make_env("gymnasium:Reacher-v5", seed=0, camera=5)
-
-
-@pytest.mark.gl
-def test_a_camera_name_that_a_mujoco_model_has_not_is_refused_with_those_it_has() -> None:
-    with pytest.raises(CRPTproError, match=r"has no camera 'trakc'; its model has 1, from 0 on: \['track'\]"):
-        make_env("gymnasium:HalfCheetah-v5", seed=0, camera="trakc")
+@pytest.mark.parametrize("camera", [5, "trakc"])  # for 5 MuJoCo would end the process
+def test_a_camera_that_a_mujoco_model_has_not_is_refused_with_those_it_has(camera: int | str) -> None:
+    with pytest.raises(CRPTproError, match=rf"has no camera {camera!r}; its model has 1, from 0 on: \['track'\]"):
+        make_env("gymnasium:HalfCheetah-v5", seed=0, camera=camera)
     make_env("gymnasium:HalfCheetah-v5", seed=0, camera="track").close()

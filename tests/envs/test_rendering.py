@@ -98,7 +98,6 @@ def test_a_users_mujoco_gl_is_kept_and_proven(probe: Probe, spelling: str) -> No
         ({"MUJOCO_GL": "egl"}, answer(alive=False), "without content.*apt-get install libegl1", ["egl"]),
         ({"MUJOCO_GL": "egl"}, "print('hello')", "gave no answer.*apt-get install libegl1", ["egl"]),
         ({"MUJOCO_GL": "egl"}, "sys.exit(3)", "exit status 3.*apt-get install libegl1", ["egl"]),
-        ({"CRPTPRO_GL_TIMEOUT_S": "soon"}, ANSWER, "'soon'", []),
     ],
 )
 def test_what_does_not_render_is_one_error_that_says_why(
@@ -112,9 +111,7 @@ def test_what_does_not_render_is_one_error_that_says_why(
     assert os.environ.get("MUJOCO_GL") == environment.get("MUJOCO_GL")
 
 
-def test_a_hung_first_frame_is_ended_and_named_with_its_cause_and_the_alternatives(
-    probe: Probe, tmp_path: Path
-) -> None:
+def test_a_hung_first_frame_is_ended_and_named_with_cause_and_remedies(probe: Probe, tmp_path: Path) -> None:
     os.environ["MUJOCO_GL"] = "egl"
     probe(f"open({str(tmp_path / 'pid')!r}, 'w').write(str(os.getpid())); time.sleep(600)")
     start = time.monotonic()
@@ -127,22 +124,11 @@ def test_a_hung_first_frame_is_ended_and_named_with_its_cause_and_the_alternativ
     assert not Path(f"/proc/{(tmp_path / 'pid').read_text()}").exists()
 
 
-@pytest.mark.parametrize(
-    ("code", "said"),
-    [
-        ("time.sleep(600)", ["egl: the first frame did not arrive"]),
-        ("sys.exit('ImportError: no libEGL')", ["no libEGL", "apt-get install libegl1"]),
-    ],
-)
-def test_a_backend_that_hangs_or_fails_gives_way_to_one_that_renders_and_is_not_tried_again(
-    probe: Probe, caplog: pytest.LogCaptureFixture, code: str, said: list[str]
-) -> None:
-    started = probe(f"if b == 'egl': {code}\n{ANSWER}")
-    os.environ[TIMEOUT_VARIABLE] = "4"
+def test_a_backend_that_fails_gives_way_and_is_not_tried_again(probe: Probe, caplog: pytest.LogCaptureFixture) -> None:
+    started = probe(f"if b == 'egl': sys.exit('ImportError: no libEGL')\n{ANSWER}")
     with caplog.at_level(logging.WARNING):
         assert select_backend() == "osmesa"
-    assert all(part in caplog.text for part in said)
-    os.environ[TIMEOUT_VARIABLE] = "10"
+    assert "egl: ImportError: no libEGL. Install EGL (Debian, Ubuntu: apt-get install libegl1" in caplog.text
     assert select_backend(processes=2) == "osmesa"
     assert started() == ["egl", "osmesa", "osmesa", "osmesa"]
 
@@ -170,18 +156,14 @@ def test_a_backend_that_dm_control_was_imported_with_is_said(probe: Probe, monke
 @pytest.mark.parametrize(
     ("kind", "threads", "expected"), [("software", None, "1"), ("software", "4", "4"), ("hardware", None, None)]
 )
-def test_software_gl_gets_one_thread_unless_the_user_says_otherwise(
-    probe: Probe, kind: str, threads: str | None, expected: str | None
-) -> None:
+def test_software_gl_takes_one_thread(probe: Probe, kind: str, threads: str | None, expected: str | None) -> None:
     probe(answer(gl_kind=kind))
     os.environ.update({} if threads is None else {"LP_NUM_THREADS": threads})
     select_backend()
     assert os.environ.get("LP_NUM_THREADS") == expected
 
 
-def test_the_watchdog_names_a_slow_first_frame_and_is_silent_about_a_quick_one(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_the_watchdog_names_a_slow_first_frame_and_no_quick_one(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.ERROR):
         with first_frame_watchdog():
             pass
@@ -193,18 +175,7 @@ def test_the_watchdog_names_a_slow_first_frame_and_is_silent_about_a_quick_one(
     assert "MUJOCO_GL=osmesa" in caplog.text
 
 
-@pytest.mark.gl
-def test_a_real_backend_renders_and_describes_itself() -> None:
-    backend = select_backend()
-    card = backend_card()
-    assert card["backend"] == backend
-    assert card["gl_vendor"] not in ("", "unknown")
-    assert card["gl_kind"] in ("software", "hardware")
-
-
-def test_a_backend_that_cannot_be_loaded_is_one_error_that_names_the_remedy_at_the_import(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_backend_that_cannot_be_loaded_is_one_error_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     os.environ["MUJOCO_GL"] = "osmesa"
     monkeypatch.setitem(sys.modules, "torchrl.envs", None)  # makes its import fail, as MuJoCo's failure does
     with pytest.raises(RenderingError, match=r"MUJOCO_GL=osmesa is set, and cannot be loaded.*libosmesa6"):
@@ -212,7 +183,7 @@ def test_a_backend_that_cannot_be_loaded_is_one_error_that_names_the_remedy_at_t
 
 
 @pytest.mark.parametrize("text", ["inf", "nan", "0", "-1", "1e300", "soon"])
-def test_a_time_limit_that_cannot_be_is_refused(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
-    monkeypatch.setenv(rendering.TIMEOUT_VARIABLE, text)
+def test_a_time_limit_that_cannot_be_is_refused(text: str) -> None:
+    os.environ[TIMEOUT_VARIABLE] = text
     with pytest.raises(RenderingError, match=f"CRPTPRO_GL_TIMEOUT_S must be a positive number .* got '{text}'"):
         rendering.first_frame_timeout_s()

@@ -1,5 +1,3 @@
-"""What a container or a batch job may still take, from files like those of Linux."""
-
 from __future__ import annotations
 
 from pathlib import Path
@@ -11,10 +9,8 @@ import torch
 from crptpro.transforms import free_memory
 from crptpro.transforms.free_memory import cgroup_free_bytes, free_bytes
 
-Files = dict[str, object]
 
-
-def v2(limit: object, used: int, **more: object) -> Files:
+def v2(limit: object, used: int, **more: object) -> dict[str, object]:
     return {"memory.max": limit, "memory.current": used, **{k.replace("__", "."): v for k, v in more.items()}}
 
 
@@ -37,9 +33,7 @@ def v2(limit: object, used: int, **more: object) -> Files:
         ("0::/\n", {"": v2("a lot", 1)}, []),
     ],
 )
-def test_what_the_cgroups_around_a_process_leave(
-    tmp_path: Path, own: str, groups: dict[str, Files], left: list[int]
-) -> None:
+def test_what_the_cgroups_leave(tmp_path: Path, own: str, groups: dict[str, dict], left: list[int]) -> None:
     (tmp_path / "own").write_text(own)
     for group, files in groups.items():
         directory = tmp_path / "root" / group

@@ -1,5 +1,3 @@
-"""The frozen encoder: any module, any batch, environments and buffers, never a gradient."""
-
 from __future__ import annotations
 
 import pytest
@@ -7,7 +5,7 @@ import torch
 from fake_pixel_env import SIZE, FakePixelEnv, small_encoder
 from tensordict import TensorDict
 from torch import nn
-from torchrl.envs import SerialEnv, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 from crptpro.transforms import FrozenEncoder
 
@@ -46,20 +44,9 @@ def test_any_module_is_an_encoder_for_any_batch_and_stays_frozen(make, lead):
     assert all(torch.equal(value, state[name]) for name, value in encoder.state_dict().items())
 
 
-def test_partial_resets_of_a_batched_environment_renew_only_what_was_reset():
-    env = TransformedEnv(SerialEnv(2, FakePixelEnv), FrozenEncoder(small_encoder()))
-    td = env.rand_step(env.reset())["next"]
-    before = td["features"].clone()
-    td["_reset"] = torch.tensor([[True], [False]])
-    after = env.reset(td)["features"]
-    assert torch.equal(after[1], before[1])
-    assert not torch.equal(after[0], before[0])
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_the_spec_says_what_reset_and_step_return(dtype):
+def test_the_spec_says_what_reset_and_step_return():
     encoder = small_encoder()
-    encoder.compute_dtype = dtype
+    encoder.compute_dtype = torch.bfloat16
     env = TransformedEnv(FakePixelEnv(), FrozenEncoder(encoder, out_keys=("agent", "features")))
     spec = env.observation_spec["agent", "features"]
     with torch.no_grad():
@@ -67,27 +54,12 @@ def test_the_spec_says_what_reset_and_step_return(dtype):
         for part in (td, td["next"]):
             assert torch.equal(part["agent", "features"], encoder(part["pixels"]))
             assert spec.shape == part["agent", "features"].shape
-            assert spec.dtype == part["agent", "features"].dtype == dtype
-
-
-class _ElsewhereEncoder(nn.Module):
-    """Lives on "meta", where nothing can be copied back from, and answers from the CPU."""
-
-    def __init__(self):
-        super().__init__()
-        self.weight = nn.Parameter(torch.zeros(1, device="meta"))
-        self.seen = []
-
-    def forward(self, pixels):
-        self.seen.append(pixels.device.type)
-        return torch.ones(pixels.shape[0], 3)
+            assert spec.dtype == part["agent", "features"].dtype == torch.bfloat16
 
 
 def test_pixels_go_to_the_encoders_device_and_features_come_back():
-    encoder = _ElsewhereEncoder()
-    assert FrozenEncoder(encoder)(TensorDict(pixels=images(2)))["features"].device.type == "cpu"
-    assert encoder.seen == ["meta"]
-    with pytest.raises(NotImplementedError, match="copy out of meta"):  # the way back is attempted
+    # Nothing can come back from "meta", but it is attempted: the images have gone there.
+    with pytest.raises(NotImplementedError, match="copy out of meta"):
         FrozenEncoder(small_encoder().to("meta"))(TensorDict(pixels=images(2)))
 
 
@@ -99,10 +71,5 @@ def test_missing_pixels_keys_that_do_not_pair_and_an_encoder_that_returns_no_ten
         TransformedEnv(FakePixelEnv(), frames).observation_spec  # noqa: B018
     with pytest.raises(ValueError, match="pair up"):
         FrozenEncoder(small_encoder(), in_keys=["a", "b"])
-
-    class Pair(nn.Module):
-        def forward(self, pixels):
-            return pixels, pixels
-
-    with pytest.raises(TypeError, match="Pair returned tuple, not a tensor"):
-        FrozenEncoder(Pair())(TensorDict(pixels=images(1)))
+    with pytest.raises(TypeError, match="MaxPool2d returned tuple, not a tensor"):
+        FrozenEncoder(nn.MaxPool2d(2, return_indices=True))(TensorDict(pixels=torch.rand(1, 9, 8, 8)))

@@ -16,16 +16,12 @@ def pad_then_slice(pixels, offsets, pad):
     return torch.stack(crops)
 
 
-def every_offset(pad):
-    side = torch.arange(2 * pad + 1)
-    return torch.cartesian_prod(side, side)
-
-
 @pytest.mark.parametrize("shift", [random_shift, lambda x, o, pad: _shift_by_gather(x, o, pad)])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32, torch.bfloat16])
 @pytest.mark.parametrize(("pad", "size"), [(4, (11, 14)), (1, (11, 14)), (0, (11, 14)), (4, (3, 2))])
 def test_every_shift_equals_replicate_padding_and_slicing(shift, dtype, pad, size):
-    offsets = every_offset(pad)
+    side = torch.arange(2 * pad + 1)
+    offsets = torch.cartesian_prod(side, side)
     pixels = torch.randint(0, 256, (len(offsets), 3, *size)).to(dtype)
     before = pixels.clone()
     shifted = shift(pixels, offsets, pad=pad)
