@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 import pytest
 import torch
@@ -101,6 +102,13 @@ def test_a_complete_dataset_is_returned_as_it_is(collected: dict[str, Path], cap
         assert collect_group([FIXED], path.parent, **ASKED) == {"toy-fixed": path}
     assert {file: file.stat().st_mtime_ns for file in path.rglob("*")} == written
     assert "is complete" in caplog.text
+
+
+def test_numbers_are_taken_as_they_are_meant_and_the_dataset_can_be_read(tmp_path: Path) -> None:
+    meant = {"transitions": 1e1, "seed": np.int64(3), "action_repeat": torch.tensor(1), "image_size": np.float32(8)}
+    path = collect_random(FIXED, tmp_path, workers=np.int32(1), progress=False, **meant)
+    card = FrameDataset.open(path).card
+    assert [card[name] for name in meant] == [10, 3, 1, 8]
 
 
 @pytest.mark.parametrize(("asked", "message"), [
