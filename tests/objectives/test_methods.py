@@ -105,15 +105,6 @@ def test_how_each_active_method_explores() -> None:
     assert get_method("becl").build_encoder(3, 20).pixel_offset == 0.5
 
 
-def test_downstream_settings_differ_from_crptpros_where_the_paper_says_so() -> None:
-    assert get_method("crptpro").downstream == {}
-    assert get_method("proto-rl-s").downstream == {"replay_capacity": 100_000}
-    for name in ("atc", "apt-c", "becl", "random-encoder", "crptpro-no-bonus"):
-        assert get_method(name).downstream == {"intrinsic_reward_coef": 0.0}
-    drq = get_method("drq").downstream
-    assert (drq["replay_capacity"], drq["learning_rate"]) == (100_000, 1e-3)
-
-
 @pytest.mark.parametrize(
     ("act", "error", "message"),
     [
