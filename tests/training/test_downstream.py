@@ -211,6 +211,9 @@ def test_what_does_not_fit_a_run_is_refused_by_name(tmp_path: Path) -> None:
         train(tmp_path, batch_size=4)
     with pytest.raises(CheckpointError, match="cuda_graph was False, now True"):
         train(tmp_path, cuda_graph=True)
+    with pytest.raises(ValueError, match="`cuda_graph` needs a GPU, but `device` is 'cpu'"):
+        train(tmp_path / "new", cuda_graph=True)
+    assert not (tmp_path / "new" / "episodes.csv").exists()
     with pytest.raises(CheckpointError, match="pretrained was"):
         train(tmp_path, make_pretrained("proto-rl-c"))
     with pytest.raises(PretrainedError, match="cannot be built in another process"):
@@ -219,12 +222,6 @@ def test_what_does_not_fit_a_run_is_refused_by_name(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"to continue it needs its frames, and .* is gone"):
         train(tmp_path)
     train(tmp_path, env_steps=40)  # complete: nothing is needed
-
-
-def test_a_cuda_graph_without_a_gpu_is_refused_before_the_first_step(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="`cuda_graph` needs a GPU, but `device` is 'cpu'"):
-        train(tmp_path / "run", cuda_graph=True)
-    assert not (tmp_path / "run" / "episodes.csv").exists()
 
 
 @pytest.mark.parametrize(

@@ -117,7 +117,6 @@ def test_a_loss_without_the_networks_of_the_reward_is_refused() -> None:
     [
         ("apt-s", {"domains": DOMAINS}, "apt-s pre-trains on one domain, got 2"),
         ("proto-rl-c", {"domains": [LEFT, LEFT]}, "named twice"),
-        ("proto-rl-c", {"domains": ["walkr"]}, "Nearest: walker"),
         ("proto-rl-c", {"env_steps": 10}, "nothing would be learned"),
         ("crptpro", {}, "learns from datasets and does not explore"),
     ],
