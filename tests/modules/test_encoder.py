@@ -108,6 +108,7 @@ def test_features_are_flattened_maps_of_any_size_and_leading_dimensions_are_kept
     assert encoder.feature_map(pixels(2, size=31)).shape[-1] == 11
     assert torch.equal(encoder(images.reshape(2, 3, 3, 21, 21)), features.reshape(2, 3, -1))
     assert encoder(images[0]).shape == (encoder.feature_dim,)
+    assert small().double()(images).dtype == torch.float64
     for nothing in (images[:0], images[:0].float()):
         assert encoder(nothing).shape == (0, encoder.feature_dim)
 

@@ -85,8 +85,8 @@ def view_batch(count: int = 6, seed: int = 0) -> TensorDict:
 
 
 def skill_image_batch(count: int = 6, seed: int = 0) -> TensorDict:
-    """With five rows, the skill of one is its own."""
-    skills = F.one_hot(torch.arange(count) % SKILLS, SKILLS).float()
+    """With five rows, the first alone has its skill."""
+    skills = F.one_hot((torch.arange(count) % SKILLS).roll(3), SKILLS).float()
     return image_batch(count, seed).set("skill", skills)
 
 
