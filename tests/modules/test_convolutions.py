@@ -37,19 +37,6 @@ def rows() -> tuple[Tensor, list[Tensor]]:
     return images, [torch.randn(5, 3, generator=generator).requires_grad_(), torch.zeros(3).requires_grad_()]
 
 
-def test_outputs_and_gradients_of_chunks_are_those_of_the_whole_batch(threads: int) -> None:
-    images, parameters = rows()
-    expected = affine(images, parameters)
-    found = apply_to_chunks(affine, images.split(2), parameters)
-    torch.testing.assert_close(found, expected)
-    weights = torch.linspace(-1, 1, found.numel()).reshape(found.shape)
-    first = torch.autograd.grad(found, parameters, weights, retain_graph=True)
-    torch.testing.assert_close(first, torch.autograd.grad(expected, parameters, weights))
-    torch.testing.assert_close(torch.autograd.grad(found, parameters, weights), first, rtol=0, atol=0)
-    with torch.no_grad():
-        assert not apply_to_chunks(affine, images.split(2), parameters).requires_grad
-
-
 def test_every_thread_computes_alone_in_the_callers_gradient_mode_and_passes_errors_on(threads: int) -> None:
     together, seen = threading.Barrier(threads), []
 
@@ -90,28 +77,32 @@ def test_the_graphs_are_freed_by_the_backward_pass_although_somebody_keeps_the_l
     assert bias.grad is not None
 
 
-def test_the_number_of_threads_changes_no_bit_of_the_encoder() -> None:
+def encoder_and_images() -> tuple[PixelEncoder, Tensor]:
     torch.manual_seed(0)
     encoder = PixelEncoder(3, channels=(8, 8), strides=(2, 1), image_size=21)
     encoder.micro_batch = 3
-    images, before = torch.randint(0, 256, (11, 3, 21, 21), dtype=torch.uint8), torch.get_num_threads()
+    return encoder, torch.randint(0, 256, (11, 3, 21, 21), dtype=torch.uint8)
+
+
+def test_neither_the_number_of_threads_nor_a_second_backward_pass_changes_a_bit_of_the_encoder() -> None:
+    (encoder, images), before = encoder_and_images(), torch.get_num_threads()
+    parameters = list(encoder.parameters())
     for dtype in (torch.float32, torch.bfloat16):
         encoder.compute_dtype = dtype
         outcomes = []
         for threads in (1, 2):
             torch.set_num_threads(threads)
-            encoder.zero_grad()
             features = encoder(images)
-            features.float().square().sum().backward()
-            outcomes.append([features, *[p.grad for p in encoder.parameters()]])
-        assert all(torch.equal(first, second) for first, second in zip(*outcomes))
+            for _ in range(2):
+                gradients = torch.autograd.grad(features.float().square().sum(), parameters, retain_graph=True)
+                outcomes.append([features, *gradients])
+        for outcome in outcomes[1:]:
+            assert all(torch.equal(first, second) for first, second in zip(outcomes[0], outcome))
     torch.set_num_threads(before)
 
 
 def test_autocast_and_functional_transforms_see_the_operations_of_the_encoder() -> None:
-    encoder = PixelEncoder(3, channels=(8, 8), strides=(2, 1), image_size=21)
-    encoder.micro_batch = 3
-    images = torch.randint(0, 256, (11, 3, 21, 21), dtype=torch.uint8)
+    encoder, images = encoder_and_images()
     with torch.autocast("cpu", torch.bfloat16):
         assert encoder(images).dtype == torch.bfloat16
     weights = {name: weight.detach() for name, weight in encoder.named_parameters()}

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 import torch
 
-from crptpro.errors import CRPTproError
 from crptpro.modules import (
     PixelEncoder,
     SquashedGaussianActor,
@@ -16,10 +15,8 @@ from crptpro.modules import (
     computing,
     resolve_precision,
     set_compute_dtype,
-    usable_device,
 )
 from crptpro.modules import precision as precision_module
-from crptpro.modules.precision import linear_in
 from crptpro.objectives import ProtoLoss, RADSACLoss
 
 
@@ -92,14 +89,3 @@ def test_a_compute_dtype_reaches_the_networks_that_a_loss_hides_and_ends_with_it
         assert {network.compute_dtype for network in networks} == {torch.float32}
     with pytest.raises(ValueError, match="float16"):
         set_compute_dtype(encoder, torch.float16)
-
-
-def test_linear_in_adds_the_bias_in_full_precision() -> None:
-    layer = torch.nn.Linear(4, 2)
-    layer.bias.data = torch.tensor([1.0009765625, 0.1])
-    assert torch.equal(linear_in(torch.zeros(1, 4), layer, torch.bfloat16)[0], layer.bias)
-
-
-def test_a_device_that_is_not_there_is_refused() -> None:
-    with pytest.raises(CRPTproError, match="'cpu' always works"):
-        usable_device("nowhere")

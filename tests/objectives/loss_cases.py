@@ -18,6 +18,7 @@ from crptpro.objectives import (
     AveragedSACLoss,
     BeCLLoss,
     DrQLoss,
+    PretrainingLoss,
     ProtoLoss,
     RADSACLoss,
     SimCLRLoss,
@@ -33,27 +34,18 @@ def small_encoder() -> PixelEncoder:
     return PixelEncoder(IMAGE[0], channels=(4, 4), strides=(2, 1), image_size=IMAGE[1])
 
 
-# Losses: each of a seed, and with options of the loss ------------------------------------------------------
+def maker(loss_class: type[PretrainingLoss], **small: Any) -> Callable[..., Any]:
+    def make(seed: int = 0, **options: Any) -> PretrainingLoss:
+        torch.manual_seed(seed)
+        return loss_class(small_encoder(), **{**small, **options})
+
+    return make
 
 
-def proto(seed: int = 0, **options) -> ProtoLoss:
-    torch.manual_seed(seed)
-    return ProtoLoss(small_encoder(), **{"num_prototypes": 10, "latent_dim": 6, "hidden_dim": 16, **options})
-
-
-def atc(seed: int = 0, **options) -> ATCLoss:
-    torch.manual_seed(seed)
-    return ATCLoss(small_encoder(), **{"latent_dim": 6, "hidden_dim": 16, **options})
-
-
-def simclr(seed: int = 0, **options) -> SimCLRLoss:
-    torch.manual_seed(seed)
-    return SimCLRLoss(small_encoder(), **{"latent_dim": 6, **options})
-
-
-def becl(seed: int = 0, **options) -> BeCLLoss:
-    torch.manual_seed(seed)
-    return BeCLLoss(small_encoder(), **{"skill_dim": SKILLS, "hidden_dim": 16, **options})
+proto = maker(ProtoLoss, num_prototypes=10, latent_dim=6, hidden_dim=16)
+atc = maker(ATCLoss, latent_dim=6, hidden_dim=16)
+simclr = maker(SimCLRLoss, latent_dim=6)
+becl = maker(BeCLLoss, skill_dim=SKILLS, hidden_dim=16)
 
 
 def rad_sac(seed: int = 0, loss_class: type[RADSACLoss] = RADSACLoss, **options) -> RADSACLoss:
@@ -81,9 +73,6 @@ def skill_ddpg(seed: int = 0, **options) -> SkillDDPGLoss:
     return SkillDDPGLoss(actor, critic, **options)
 
 
-# Batches ---------------------------------------------------------------------------------------------------
-
-
 def image_batch(count: int = 6, seed: int = 0) -> TensorDict:
     generator = torch.Generator().manual_seed(seed)
     pixels, following = torch.randint(0, 256, (2, count, *IMAGE), dtype=torch.uint8, generator=generator)
@@ -96,7 +85,8 @@ def view_batch(count: int = 6, seed: int = 0) -> TensorDict:
 
 
 def skill_image_batch(count: int = 6, seed: int = 0) -> TensorDict:
-    skills = F.one_hot(torch.arange(count) % SKILLS, SKILLS).float()
+    """With five rows, the first alone has its skill."""
+    skills = F.one_hot((torch.arange(count) % SKILLS).roll(3), SKILLS).float()
     return image_batch(count, seed).set("skill", skills)
 
 
@@ -139,17 +129,10 @@ class LossCase:
     name: str
     make: Callable[..., LossModule]
     batch: Callable[..., TensorDict]
-    routing: dict[str, set[str]]
-    """``loss_*`` key -> names of the parameter groups that receive its gradient."""
-
-    keys: dict[str, object]
-    """Configurable key -> its default."""
-
-    targets: tuple[str, ...] = ()
-    """Networks that have target parameters."""
-
-    keys_hold_under_next: bool = False
-    """Whether a key also names the entry under "next"."""
+    routing: dict[str, set[str]]  # ``loss_*`` key -> the parameter groups that receive its gradient
+    keys: dict[str, object]  # configurable key -> its default
+    targets: tuple[str, ...] = ()  # networks that have target parameters
+    keys_hold_under_next: bool = False  # whether a key also names the entry under "next"
 
     def __str__(self) -> str:
         return self.name
@@ -188,9 +171,6 @@ CASES = [
 ]  # fmt: skip
 
 
-# Helpers ---------------------------------------------------------------------------------------------------
-
-
 def run(loss: LossModule, td: TensorDictBase, seed: int = 7) -> TensorDictBase:
     torch.manual_seed(seed)
     return loss(td)
@@ -227,6 +207,17 @@ def assert_same(actual: TensorDictBase, expected: TensorDict) -> None:
     assert set(actual.keys()) == set(expected.keys())
     for key, value in expected.items():
         torch.testing.assert_close(actual[key], value, msg=lambda text, key=key: f"{key}: {text}")
+
+
+def released_sinkhorn(scores: Tensor, temperature: float, iterations: int = 3) -> Tensor:
+    """The released code's arithmetic (denisyarats/proto, proto.py): exponentiated, on the transpose."""
+    scaled = scores / temperature
+    q = torch.exp(scaled - scaled.max()).T
+    q = q / q.sum()
+    for _ in range(iterations):
+        q = q * (1 / q.shape[0] / q.sum(dim=1)).unsqueeze(1)
+        q = q * (1 / q.shape[1] / q.sum(dim=0)).unsqueeze(0)
+    return (q / q.sum(dim=0, keepdim=True)).T
 
 
 def double(rows: list) -> Tensor:

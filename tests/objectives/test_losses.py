@@ -7,7 +7,7 @@ import pickle
 
 import pytest
 import torch
-from loss_cases import CASES, LossCase, assert_same, keep_targets, leaves, run, total
+from loss_cases import CASES, LossCase, assert_same, disturb, keep_targets, leaves, run, total
 from tensordict import TensorDictBase
 from tensordict.utils import unravel_key
 
@@ -50,9 +50,7 @@ def test_each_key_has_its_default_and_can_be_renamed_and_nested(case: LossCase) 
 @each
 def test_forward_writes_neither_to_its_input_nor_to_a_parameter(case: LossCase) -> None:
     loss, td = case.make(), case.batch()
-    with torch.no_grad():
-        for parameter in loss.parameters():
-            parameter.add_(0.1)
+    disturb(loss)
     before = {**leaves(td.clone()), **{name: value.clone() for name, value in loss.state_dict().items()}}
     run(loss, td)
     after = {**leaves(td), **loss.state_dict()}
@@ -116,9 +114,7 @@ def test_each_loss_term_reaches_exactly_its_parameters(case: LossCase) -> None:
 def test_state_dict_round_trip_restores_outputs_and_targets(case: LossCase) -> None:
     first, second = case.make(seed=0), case.make(seed=1)
     td = case.batch()
-    with torch.no_grad():
-        for parameter in first.parameters():
-            parameter.add_(0.1)  # the targets differ from their sources
+    disturb(first)
     keep_targets(case, second)
     assert not torch.equal(total(run(first, td)), total(run(second, td)))
     second.load_state_dict(first.state_dict())
@@ -138,9 +134,7 @@ def test_copies_are_equal_and_independent_and_their_networks_hold_their_paramete
     for name, module in vars(twin).items():
         if isinstance(module, torch.nn.Module):
             assert {id(p) for p in module.parameters()} <= own, name
-    with torch.no_grad():
-        for parameter in twin.parameters():
-            parameter.mul_(2)
+    disturb(twin)
     assert_same(run(loss, td), expected)
     fresh = case.make(seed=1)  # never copied, so it cannot hold anything stale
     fresh.load_state_dict(twin.state_dict())
@@ -151,9 +145,7 @@ def test_copies_are_equal_and_independent_and_their_networks_hold_their_paramete
 def test_soft_update_moves_targets_by_tau(case: LossCase) -> None:
     loss = case.make()
     update_targets = keep_targets(case, loss)
-    with torch.no_grad():
-        for parameter in loss.parameters():
-            parameter.add_(torch.randn_like(parameter))
+    disturb(loss)
     before = {k: v.clone() for k, v in loss.state_dict().items()}
     update_targets()
     after = loss.state_dict()

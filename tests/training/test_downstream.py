@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import gc
 import signal
@@ -10,11 +11,20 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.data import LazyTensorStorage, ReplayBuffer
-from toy_env import ToyEnv, fixed_length
-from toy_runs import EPISODE, SIZE, make_encoder, make_pretrained, make_smooth, python, record, signalling, toy_domain
+from toy_runs import (
+    EPISODE,
+    SIZE,
+    SmoothToyEnv,
+    kill,
+    make_dataset,
+    make_encoder,
+    make_pretrained,
+    record,
+    same_state,
+    signalling,
+    toy_domain,
+)
 
 from crptpro.errors import CheckpointError, PretrainedError
 from crptpro.modules import SquashedGaussianActor
@@ -36,12 +46,20 @@ def train(run_dir: Path | None, pretrained: Any = None, task: Any = TOY, **optio
     return train_downstream(task, artifact, run_dir=run_dir, config=SMALL, progress=False, **options)
 
 
-def weights(result: DownstreamResult) -> dict[str, Tensor]:
-    return result.agent.actor.state_dict()
+def train_until_killed(run_dir: Path, step: int) -> None:
+    task = f"toy_runs.signalling('toy', {step}, signal.SIGKILL)"
+    kill(f"import test_downstream\ntest_downstream.train(pathlib.Path({str(run_dir)!r}), task={task})")
 
 
-def same_weights(one: DownstreamResult, two: DownstreamResult) -> bool:
-    return all(torch.equal(value, weights(two)[key]) for key, value in weights(one).items())
+def same_actor(one: DownstreamResult, two: DownstreamResult) -> bool:
+    return same_state(one.agent.actor, two.agent.actor)
+
+
+def loads(result: DownstreamResult, encoder: nn.Module | None = None) -> bool:
+    """Whether the agent that was saved acts as the one that was trained."""
+    agent, _ = load_agent(result.agent_path, encoder=encoder)
+    pixels = torch.randint(0, 256, (9, SIZE, SIZE), dtype=torch.uint8)
+    return torch.equal(agent(pixels), result.agent(pixels))
 
 
 def losses(run_dir: Path) -> Tensor:
@@ -57,19 +75,19 @@ def test_a_run_evaluates_at_every_interval_and_at_both_ends(tmp_path: Path) -> N
     assert result.evaluations[-1]["updates"] == 60 - 12
     assert len(record(tmp_path / "eval.csv")) == 8
     assert [row["episode_agent_steps"] for row in record(tmp_path / "episodes.csv")] == [str(EPISODE)] * 6
-    agent, card = load_agent(tmp_path / "agent")
-    pixels = torch.randint(0, 256, (9, SIZE, SIZE), dtype=torch.uint8)
-    assert torch.equal(agent(pixels), result.agent(pixels))
+    assert loads(result)
+    _, card = load_agent(tmp_path / "agent")
     assert (card["task"], card["env_steps"], card["config"]["seed"]) == ("toy_go", 120, 0)
 
 
-def test_the_encoder_stays_as_it_was_and_sac_learns() -> None:
-    pretrained = make_pretrained()
-    before = {key: value.clone() for key, value in pretrained.encoder.state_dict().items()}
-    result = train(None, pretrained, env_steps=40)
-    for encoder in (pretrained.encoder, result.agent.encoder):
-        assert all(torch.equal(value, before[key]) for key, value in encoder.state_dict().items())
-    assert not same_weights(result, train(None, pretrained, env_steps=20))
+@pytest.mark.parametrize("method", ["crptpro", "drq"])
+def test_only_drq_trains_the_encoder_and_the_one_given_stays_as_it_was(tmp_path: Path, method: str) -> None:
+    pretrained = make_pretrained(method)
+    before = copy.deepcopy(pretrained.encoder)
+    result = train(tmp_path, pretrained, env_steps=40)
+    assert same_state(pretrained.encoder, before)
+    assert same_state(result.agent.encoder, before) == (method == "crptpro")
+    assert loads(result)
 
 
 @pytest.mark.parametrize("settings", [{}, {"features": "reencode"}, {"features": "dense-bf16"}, {"method": "drq"}])
@@ -80,38 +98,24 @@ def test_a_resumed_run_gives_the_numbers_of_an_uninterrupted_one(tmp_path: Path,
     train(parts, pretrained, **options, env_steps=60)
     for _ in range(2):  # the second finds it complete
         resumed = train(parts, pretrained, **options)
-        assert same_weights(resumed, whole)
+        assert same_actor(resumed, whole)
         rows = [row for row in record(parts / "eval.csv") if row["env_steps"] != "60"]
         assert rows == record(tmp_path / "whole" / "eval.csv")
         assert record(parts / "train.csv") == record(tmp_path / "whole" / "train.csv")
 
 
 def test_a_killed_run_continues_with_the_same_command(tmp_path: Path) -> None:
-    killed = python(
-        "import signal, pathlib, test_downstream, toy_runs\n"
-        f"task = toy_runs.signalling('toy', 77, signal.SIGKILL)\n"
-        f"test_downstream.train(pathlib.Path({str(tmp_path / 'parts')!r}), task=task)"
-    )
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
-    assert same_weights(train(tmp_path / "parts"), train(tmp_path / "whole"))
+    train_until_killed(tmp_path / "parts", 77)
+    assert same_actor(train(tmp_path / "parts"), train(tmp_path / "whole"))
     for name in ("eval.csv", "train.csv", "episodes.csv"):
         assert record(tmp_path / "parts" / name) == record(tmp_path / "whole" / name)
 
 
 def test_a_kill_during_the_last_evaluation_repeats_that_evaluation_alone(tmp_path: Path) -> None:
     # Two episodes of ten agent steps evaluate at 0, 40, 80 and 120 env steps; 60 agent steps train.
-    killed = python(
-        "import signal, pathlib, test_downstream, toy_runs\n"
-        "task = toy_runs.signalling('toy', 125, signal.SIGKILL)\n"
-        f"test_downstream.train(pathlib.Path({str(tmp_path)!r}), task=task)"
-    )
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
-    steps = []
-
-    def make(*, seed: int, image_size: int, action_repeat: int) -> ToyEnv:
-        return ToyEnv(fixed_length, seed=seed, image_size=image_size, on_step=steps.append)
-
-    assert train(tmp_path, task=toy_domain("toy", make)).evaluations[-1]["env_steps"] == 120
+    train_until_killed(tmp_path, 125)
+    steps: list[int] = []
+    assert train(tmp_path, task=toy_domain("toy", on_step=steps.append)).evaluations[-1]["env_steps"] == 120
     assert len(steps) == 2 * EPISODE
 
 
@@ -134,7 +138,7 @@ def test_an_agent_acts_in_the_precision_that_auto_meant_where_it_was_trained(tmp
 
 
 def test_dense_maps_and_encoding_anew_are_the_same_run_up_to_rounding(tmp_path: Path) -> None:
-    short: dict[str, Any] = {"task": toy_domain("smooth", make_smooth), "env_steps": 80, "eval_episodes": 1}
+    short: dict[str, Any] = {"task": toy_domain("smooth", SmoothToyEnv), "env_steps": 80, "eval_episodes": 1}
     for features in ("dense", "reencode", "dense-bf16"):
         train(tmp_path / features, features=features, **short)
     train(tmp_path / "other", seed=1, **short)
@@ -148,28 +152,16 @@ def test_workers_of_their_own_evaluate_the_same_episodes(tmp_path: Path) -> None
     here = train(tmp_path / "here", env_steps=60)
     beside = train(tmp_path / "beside", env_steps=60, eval_workers=2)
     assert record(tmp_path / "here" / "eval.csv") == record(tmp_path / "beside" / "eval.csv")
-    assert same_weights(here, beside)
+    assert same_actor(here, beside)
 
 
 def test_the_bonus_is_added_where_there_are_prototypes_and_a_coefficient(caplog: pytest.LogCaptureFixture) -> None:
     bonus, none = train(None, env_steps=40), train(None, env_steps=40, intrinsic_reward_coef=0)
-    assert not same_weights(bonus, none)
+    assert not same_actor(bonus, none)
     encoder_only = dataclasses.replace(make_pretrained(), projector=None, prototypes=None)
     with caplog.at_level("INFO", logger="crptpro"):
-        assert same_weights(train(None, encoder_only, env_steps=40), none)
+        assert same_actor(train(None, encoder_only, env_steps=40), none)
     assert "no exploration bonus" in caplog.text
-
-
-def test_drq_trains_its_encoder(tmp_path: Path) -> None:
-    pretrained = make_pretrained("drq")
-    before = {key: value.clone() for key, value in pretrained.encoder.state_dict().items()}
-    result = train(tmp_path, pretrained, env_steps=40)
-    assert all(torch.equal(value, before[key]) for key, value in pretrained.encoder.state_dict().items())
-    moved = result.agent.encoder.state_dict()
-    assert any(not torch.equal(value, moved[key]) for key, value in before.items())
-    agent, _ = load_agent(tmp_path / "agent")
-    pixels = torch.randint(0, 256, (9, SIZE, SIZE), dtype=torch.uint8)
-    assert torch.equal(agent(pixels), result.agent(pixels))
 
 
 def test_an_actor_that_explored_the_task_is_where_learning_begins(tmp_path: Path) -> None:
@@ -177,8 +169,7 @@ def test_an_actor_that_explored_the_task_is_where_learning_begins(tmp_path: Path
     actor = SquashedGaussianActor(make_encoder(9).feature_dim, 2, hidden_dim=16)
     with_actor = dataclasses.replace(make_pretrained(), actor=actor)
     begun = train(tmp_path / "explored", with_actor, env_steps=20)
-    for key, value in actor.state_dict().items():
-        assert torch.equal(weights(begun)[key], value)
+    assert same_state(begun.agent.actor, actor)
     # It acts from the first decision on, where others act at random until the first update.
     train(tmp_path / "random", env_steps=20)
     explored, random = (record(tmp_path / name / "episodes.csv")[0] for name in ("explored", "random"))
@@ -201,19 +192,15 @@ class OwnEncoder(nn.Module):
 def test_any_module_is_trained_saved_loaded_and_serves_as_a_frozen_encoder_that_is_encoded_anew(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    data = ReplayBuffer(storage=LazyTensorStorage(20))
-    pixels = torch.randint(0, 256, (20, 9, SIZE, SIZE), dtype=torch.uint8)
-    data.extend(TensorDict({"pixels": pixels, "next": {"pixels": pixels.roll(1, -1)}}, [20]))
     loss = ProtoLoss(OwnEncoder(), num_prototypes=8, latent_dim=4, hidden_dim=8)
-    path = save_pretrained(pretrain(loss, data, updates=2, batch_size=4, progress=False), tmp_path / "encoder")
+    trained = pretrain(loss, make_dataset(0, channels=9), updates=2, batch_size=4, progress=False)
+    path = save_pretrained(trained, tmp_path / "encoder")
     own = load_pretrained(path, classes={"OwnEncoder": OwnEncoder})
     with caplog.at_level("INFO", logger="crptpro"):
         result = train(tmp_path, own, env_steps=40)
     assert result.evaluations[-1]["updates"] == 8
     assert "re-encoding" in caplog.text
-    agent, _ = load_agent(tmp_path / "agent", encoder=OwnEncoder())
-    pixels = torch.randint(0, 256, (9, SIZE, SIZE), dtype=torch.uint8)
-    assert torch.equal(agent(pixels), result.agent(pixels))
+    assert loads(result, OwnEncoder())
     with pytest.raises(CheckpointError, match="acts on a OwnEncoder, which only its author can build"):
         load_agent(tmp_path / "agent")
 
@@ -224,6 +211,9 @@ def test_what_does_not_fit_a_run_is_refused_by_name(tmp_path: Path) -> None:
         train(tmp_path, batch_size=4)
     with pytest.raises(CheckpointError, match="cuda_graph was False, now True"):
         train(tmp_path, cuda_graph=True)
+    with pytest.raises(ValueError, match="`cuda_graph` needs a GPU, but `device` is 'cpu'"):
+        train(tmp_path / "new", cuda_graph=True)
+    assert not (tmp_path / "new" / "episodes.csv").exists()
     with pytest.raises(CheckpointError, match="pretrained was"):
         train(tmp_path, make_pretrained("proto-rl-c"))
     with pytest.raises(PretrainedError, match="cannot be built in another process"):
@@ -234,18 +224,18 @@ def test_what_does_not_fit_a_run_is_refused_by_name(tmp_path: Path) -> None:
     train(tmp_path, env_steps=40)  # complete: nothing is needed
 
 
-def test_a_cuda_graph_without_a_gpu_is_refused_before_the_first_step(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="`cuda_graph` needs a GPU, but `device` is 'cpu'"):
-        train(tmp_path / "run", cuda_graph=True)
-    assert not (tmp_path / "run" / "episodes.csv").exists()
-
-
-def test_what_is_left_open_is_the_methods_own() -> None:
-    own = DownstreamConfig().resolved("walker_run", make_pretrained("crptpro"))
-    assert (own.env_steps, own.replay_capacity, own.learning_rate) == (500_000, 40_000, 1e-4)
-    assert (own.intrinsic_reward_coef, own.action_repeat) == (0.2, 2)
-    drq = DownstreamConfig().resolved("walker_run", make_pretrained("drq"))
-    assert (drq.env_steps, drq.replay_capacity, drq.learning_rate) == (1_000_000, 100_000, 1e-3)
-    proto = DownstreamConfig(env_steps=10).resolved("walker_run", make_pretrained("proto-rl-c"))
-    assert (proto.env_steps, proto.replay_capacity, proto.intrinsic_reward_coef) == (10, 100_000, 0.2)
-    assert DownstreamConfig().resolved("walker_run", make_pretrained("atc")).intrinsic_reward_coef == 0
+@pytest.mark.parametrize(
+    ("methods", "own"),
+    [
+        (["crptpro"], {"env_steps": 500_000, "replay_capacity": 40_000, "learning_rate": 1e-4, "action_repeat": 2}),
+        (["crptpro", "proto-rl-c", "proto-rl-s"], {"intrinsic_reward_coef": 0.2}),
+        (["proto-rl-c", "proto-rl-s"], {"replay_capacity": 100_000}),
+        (["atc", "apt-c", "becl", "random-encoder", "crptpro-no-bonus"], {"intrinsic_reward_coef": 0.0}),
+        (["drq"], {"env_steps": 1_000_000, "replay_capacity": 100_000, "learning_rate": 1e-3}),
+    ],
+)
+def test_what_is_left_open_is_the_methods_own(methods: list[str], own: dict[str, Any]) -> None:
+    for method in methods:
+        resolved = dataclasses.asdict(DownstreamConfig().resolved("walker_run", make_pretrained(method)))
+        assert resolved == {**resolved, **own}
+    assert DownstreamConfig(env_steps=10).resolved("walker_run", make_pretrained("drq")).env_steps == 10

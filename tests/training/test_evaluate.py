@@ -64,12 +64,6 @@ def test_a_reward_that_is_not_finite_names_the_episode_and_keeps_those_before() 
     assert [episode.episode for episode in kept] == [0]
 
 
-@pytest.mark.parametrize("episodes", [0, 1.5, "2"])
-def test_an_impossible_number_of_episodes_is_refused(episodes: Any) -> None:
-    with pytest.raises(ValueError, match="`episodes` must be"):
-        evaluate(make_agent(), make_toy_env(), episodes=episodes, progress=False)
-
-
 def evaluator(
     workers: int, make: Any = make_toy_env, seed: int = 0, on_end: Any = lambda episodes, counters: None
 ) -> tuple[Evaluator, list[Any]]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +27,14 @@ SIZE, EPISODE = 16, 10
 HERE = Path(__file__).parent
 
 
-def make_dataset(domain: int, *, transitions: int = 60, action_dim: int = 2) -> ReplayBuffer:
-    """Smooth noise that drifts by one pixel per transition; the mean brightness tells the domain."""
+def make_dataset(domain: int, *, channels: int = 3, action_dim: int = 2) -> ReplayBuffer:
+    """Noise that drifts by one pixel per transition; the mean brightness tells the domain."""
     generator = torch.Generator().manual_seed(domain)
-    base = torch.rand(transitions, 3, SIZE, SIZE, generator=generator) * 120 + 60 * domain
+    base = torch.rand(60, channels, SIZE, SIZE, generator=generator) * 120 + 60 * domain
     pixels = base.to(torch.uint8)
-    buffer = ReplayBuffer(storage=LazyTensorStorage(transitions))
-    rows = {"pixels": pixels, "action": torch.zeros(transitions, action_dim), "next": {"pixels": pixels.roll(1, -1)}}
-    buffer.extend(TensorDict(rows, [transitions]))
+    buffer = ReplayBuffer(storage=LazyTensorStorage(60))
+    rows = {"pixels": pixels, "action": torch.zeros(60, action_dim), "next": {"pixels": pixels.roll(1, -1)}}
+    buffer.extend(TensorDict(rows, [60]))
     return buffer
 
 
@@ -58,10 +59,6 @@ def make_pretrained(method: str = "crptpro") -> Pretrained:
     return Pretrained(encoder, **heads, card={"method": method})
 
 
-def make_toy(*, seed: int, image_size: int, action_repeat: int) -> EnvBase:
-    return ToyEnv(fixed_length, seed=seed, image_size=image_size)
-
-
 class SmoothToyEnv(ToyEnv):
     """Its pictures do not depend on the actions, and its rewards depend on them smoothly."""
 
@@ -72,28 +69,18 @@ class SmoothToyEnv(ToyEnv):
         return observed
 
 
-def make_smooth(*, seed: int, image_size: int, action_repeat: int) -> EnvBase:
-    return SmoothToyEnv(fixed_length, seed=seed, image_size=image_size)
+def make_toy(env: type[ToyEnv], on_step: Any, *, seed: int, image_size: int, action_repeat: int) -> EnvBase:
+    return env(fixed_length, seed=seed, image_size=image_size, on_step=on_step)
 
 
-def toy_domain(name: str, make: Callable[..., EnvBase] = make_toy) -> Domain:
-    return Domain(name, f"{name}_go", make=make)
+def toy_domain(name: str, env: type[ToyEnv] = ToyEnv, on_step: Any = None) -> Domain:
+    return Domain(name, f"{name}_go", make=partial(make_toy, env, on_step))
 
 
 def signalling(name: str, step: int, number: signal.Signals) -> Domain:
     """An environment that sends a signal to this process with one of its steps."""
-    steps = 0
-
-    def count(_: int) -> None:
-        nonlocal steps
-        steps += 1
-        if steps == step:
-            os.kill(os.getpid(), number)
-
-    def make(*, seed: int, image_size: int, action_repeat: int) -> EnvBase:
-        return ToyEnv(fixed_length, seed=seed, image_size=image_size, on_step=count)
-
-    return toy_domain(name, make)
+    steps = itertools.count(1)
+    return toy_domain(name, on_step=lambda _: next(steps) == step and os.kill(os.getpid(), number))
 
 
 def python(code: str) -> subprocess.CompletedProcess[str]:
@@ -102,6 +89,12 @@ def python(code: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": path}
     command = [sys.executable, "-c", code]
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+def kill(code: str) -> None:
+    """Run a program that kills itself."""
+    found = python(f"import pathlib, signal, toy_runs\n{code}")
+    assert found.returncode == -signal.SIGKILL, found.stderr
 
 
 def same_state(one: torch.nn.Module, two: torch.nn.Module) -> bool:
