@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import functools
 import importlib
 import json
 import re
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -29,7 +29,6 @@ from crptpro.errors import CRPTproError
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "benchmarks" / "README.md").read_text()
 NAMES = sorted(set(re.findall(r"^\| `python -m benchmarks\.(\w+)", README, re.MULTILINE)))
-SIZES: dict[str, Any] = {"image_size": 16, "prototypes": 8}
 
 
 class EnoughError(Exception):
@@ -42,26 +41,19 @@ class LoopInThisProcess(Loop):
     def __init__(
         self, item: str, *, of: Any = (), source: object = None, python: object = None, **settings: Any
     ) -> None:
-        self.of, self.found, self.enough = of, list[dict[str, float]](), 14
+        self.of, self.found, self.process = of, list[dict[str, float]](), Mock()
         own = {name: value for name, value in settings.items() if name not in ("threads", "tf32")}
         with contextlib.suppress(EnoughError):
             ITEMS[item](self._hold, **json.loads(json.dumps(own, default=str)))
-        self.laps = self.found.pop(0)
+        self.laps = self._read()
 
     def _hold(self, laps: dict[str, float]) -> None:
         self.found.append(laps)
-        if len(self.found) >= self.enough:
+        if len(self.found) >= 14:
             raise EnoughError
 
     def _read(self) -> dict[str, float]:
         return self.found.pop(0)
-
-    def __call__(self) -> float:
-        self.laps = self._read()
-        return sum(self.laps[name] for name in self.of or self.laps)
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
 
 @pytest.fixture
@@ -115,36 +107,32 @@ def test_a_process_of_its_own_answers_and_is_watched(tmp_path: Path) -> None:
 
 # --- the scripts -----------------------------------------------------------------------------------------------------
 
-TINY = updates.Settings(
-    rounds=1, threads=torch.get_num_threads(), batch_size=8, prototypes=8, image_size=16, transitions=20,
-    replay_transitions=20, decisions=6, sustained_updates=4, parity_updates=4,
-)  # fmt: skip
-
 
 @pytest.mark.usefixtures("in_this_process")
-def test_updates_beside_the_plain_implementation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    only: Any = ("pretrain", "downstream", "sustained", "parity")
-    updates.main(dataclasses.replace(TINY, only=only, out=tmp_path))
+def test_updates_beside_the_plain_implementation_and_a_decision_by_stage(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cheap = Domain("cheap", "cheap_run", make=functools.partial(make_drifting, 2))
+    monkeypatch.setattr("crptpro.training.env_thread.make_env", lambda _, **options: make_env(cheap, **options))
+    settings = updates.Settings(
+        rounds=1, threads=torch.get_num_threads(), batch_size=8, prototypes=8, image_size=16, transitions=20,
+        replay_transitions=20, decisions=6, sustained_updates=4, parity_updates=4, out=tmp_path,
+        only=("pretrain", "downstream", "decision", "sustained", "parity"),
+    )  # fmt: skip
+    updates.main(settings)
     results, told = written(tmp_path / "updates.json"), capsys.readouterr().out
     assert set(results["pretrain"]["timings"]) == {"plain fp32", *(f"ours {p}" for p in updates.precisions())}
     assert [name for name in results["downstream"]["timings"] if name.endswith("dense features")]
     for section in ("pretrain", "downstream"):
         assert all(one["median_s"] > 0 for one in results[section]["timings"].values())
         assert results[section]["times_slower"][results[section]["than"]] == 1
+    decision = results["decision"]
+    assert set(decision["median_s_by_stage"]) == {"update", "store", "act"}
+    assert decision["projected_hours"] == pytest.approx(decision["median_s"] * 250_000 / 3600)
     assert results["sustained"]["projected_hours"] > 0
     assert results["parity"]["fp32"] != results["parity"]["other seed"]
     assert told.count("| plain fp32 |") == 2
     assert "| loss_comp |" in told
-
-
-@pytest.mark.usefixtures("in_this_process")
-def test_a_decision_by_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drifting = Domain("cheap", "cheap_run", make=functools.partial(make_drifting, 2))
-    monkeypatch.setattr("crptpro.training.env_thread.make_env", lambda _, **options: make_env(drifting, **options))
-    updates.main(dataclasses.replace(TINY, only=("decision",), out=tmp_path))
-    found = written(tmp_path / "updates.json")["decision"]
-    assert set(found["median_s_by_stage"]) == {"update", "store", "act"}
-    assert found["projected_hours"] == pytest.approx(found["median_s"] * 250_000 / 3600)
 
 
 def test_sampling_beside_torchrls_ways(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -157,9 +145,7 @@ def test_sampling_beside_torchrls_ways(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize("name", sampling.WAYS)
-def test_every_way_to_sample_returns_what_ours_has_for_the_same_transitions(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_way_to_sample_returns_what_ours_does(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(synthetic, "LENGTH", 9)
     dataset = FrameDataset.open(drifting_dataset(tmp_path, transitions=40, image_size=12))
     torch.manual_seed(0)
@@ -167,8 +153,7 @@ def test_every_way_to_sample_returns_what_ours_has_for_the_same_transitions(
     batch = sampling.WAYS[name](dataset, 64, storage)()
     place = dataset.transitions["episode"] * 1000 + dataset.transitions["step"]
     expected = dataset[torch.searchsorted(place, batch["episode"] * 1000 + batch["step"])]
-    following = [("next", key) for key in ("pixels", "reward", "done", "truncated")]
-    for key in ("pixels", "action", *following):
+    for key in ("pixels", "action", *(("next", name) for name in ("pixels", "reward", "done", "truncated"))):
         assert batch[key].dtype == expected[key].dtype
         assert torch.equal(batch[key], expected[key])
 
@@ -222,10 +207,8 @@ def test_fast_updates_that_leave_other_weights_fail_their_check(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def check(value: float) -> dict[str, Any]:
-        def train(**switches: bool) -> nn.Module:
-            return nn.ParameterList([torch.tensor([value if switches else 1.0])])
-
-        return gpu.check_weights(str(value), train, cuda_graph=True)
+        train = {False: nn.ParameterList([torch.ones(1)]), True: nn.ParameterList([torch.tensor([value])])}
+        return gpu.check_weights(str(value), lambda **switches: train[bool(switches)], cuda_graph=True)
 
     assert [check(value)["passed"] for value in (1.0, 1.1, float("nan"))] == [True, False, False]
     monkeypatch.setattr(gpu, "check_parity", lambda *_: [check(1.0), check(1.1)])
@@ -238,8 +221,8 @@ def test_fast_updates_that_leave_other_weights_fail_their_check(
 
 @pytest.mark.usefixtures("in_this_process")
 def test_another_revision_takes_turns_with_this_one(tmp_path: Path) -> None:
-    sizes: dict[str, Any] = {"batch_size": 8, "transitions": 30, "rounds": 1, "warmup": 1, **SIZES}
-    revisions.main(revisions.Settings(old=ROOT, out=tmp_path, **sizes))
+    sizes: dict[str, Any] = {"batch_size": 8, "transitions": 30, "image_size": 16, "prototypes": 8}
+    revisions.main(revisions.Settings(old=ROOT, rounds=1, warmup=1, out=tmp_path, **sizes))
     found = written(tmp_path / "revisions.json")
     assert found.pop("old") == found.pop("new")
     assert list(found) == ["pretrain", "downstream", "decision", "sample", "open", "collect"]

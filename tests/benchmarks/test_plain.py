@@ -72,40 +72,37 @@ class Agents:
         torch.manual_seed(0)
         encoder = PixelEncoder(**ENCODER).requires_grad_(False)
         heads = Projector(encoder.feature_dim, 16), Prototypes(64, 16)
-        self.pretrained = Pretrained(encoder, heads[0], prototypes=heads[1])
         sizes = {"bottleneck_dim": 10, "hidden_dim": 32}
         actor = SquashedGaussianActor(encoder.feature_dim, A, **sizes)
         critic = TwinCritic(encoder.feature_dim, A, **sizes)
-        self.plain = PlainDownstream(self.pretrained, actor, critic, seeded(7))
+        self.plain = PlainDownstream(Pretrained(encoder, heads[0], prototypes=heads[1]), actor, critic, seeded(7))
         self.loss = RADSACLoss(actor, critic, generator=seeded(7))
         self.bonus = PrototypeReward(*heads, coef=0.2, generator=seeded(8))
         same_stream = seeded(8)
         self.plain.draw_candidates = lambda scores: draw_candidates(scores, same_stream)
         self.batch = Batch(pixels(1), torch.rand(B, A) * 2 - 1, torch.rand(B, 1), pixels(2), torch.ones(B, 1))
         self.batch.not_terminated[::3] = 0
-        with torch.no_grad():
-            self.h, self.next_h = self.plain.encoder(self.batch.obs), self.plain.encoder(self.batch.next_obs)
-
-    @torch.no_grad()
-    def td(self) -> TensorDict:
-        h, next_h = (self.pretrained.encoder(x) for x in (self.batch.obs, self.batch.next_obs))
         end = self.batch.not_terminated == 0
-        following = {"features": next_h, "reward": self.batch.reward, "done": end, "terminated": end}
-        return TensorDict({"features": h, "action": self.batch.action, "next": following}, [B])
+        following = {"features": encoder(self.batch.next_obs), "reward": self.batch.reward}
+        following |= {"done": end, "terminated": end}
+        features = {"features": encoder(self.batch.obs), "action": self.batch.action}
+        self.td = TensorDict({**features, "next": following}, [B])
 
     def critic_losses(self) -> tuple[Tensor, Tensor]:
-        batch = self.batch
-        theirs = self.plain.critic_loss(self.h, batch.action, batch.reward, self.next_h, batch.not_terminated)
-        return self.loss.critic_loss(self.td())["loss_qvalue"], theirs
+        batch, h, next_h = self.batch, self.td["features"], self.td["next", "features"]
+        theirs = self.plain.critic_loss(h, batch.action, batch.reward, next_h, batch.not_terminated)
+        return self.loss.critic_loss(self.td)["loss_qvalue"], theirs
 
 
 def test_the_plain_features_critic_actor_and_temperature_are_ours_in_losses_and_gradients() -> None:
     agents = Agents()
-    td, ours, plain = agents.td(), agents.loss, agents.plain
-    assert_all_close([td["features"], td["next", "features"]], [agents.h, agents.next_h])
+    td, ours, plain = agents.td, agents.loss, agents.plain
+    with torch.no_grad():
+        theirs = [plain.encoder(images) for images in (agents.batch.obs, agents.batch.next_obs)]
+    assert_all_close([td["features"], td["next", "features"]], theirs)
     qvalue_losses = agents.critic_losses()
     out = ours.actor_and_temperature_loss(td)
-    pairs = [qvalue_losses, *zip((out["loss_actor"], out["loss_alpha"]), plain.actor_loss(agents.h), strict=True)]
+    pairs = [qvalue_losses, *zip((out["loss_actor"], out["loss_alpha"]), plain.actor_loss(td["features"]), strict=True)]
     networks = [(ours.critic, plain.critic), (ours.actor, plain.actor)]
     for (one, other), compared in zip(pairs, [networks[0], networks[1], None], strict=True):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
@@ -122,7 +119,7 @@ def test_plain_downstream_updates_have_the_losses_of_the_learner_and_its_queue_t
     learner = SACLearner(agents.loss)
     for agent_step in range(3):
         agents.plain.update(agents.batch, agent_step)
-        learner.update(agents.bonus(agents.td()), agent_step=agent_step)
+        learner.update(agents.bonus(agents.td.clone()), agent_step=agent_step)
     agents.plain.generator.set_state(agents.loss.generator.get_state())
     torch.testing.assert_close(agents.bonus.queue, agents.plain.queue)
     torch.testing.assert_close(*agents.critic_losses(), rtol=1e-3, atol=0)

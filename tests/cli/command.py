@@ -6,10 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
-from toy_env import FIXED, collect_toy
+from toy_env import FIXED, random_episode, write_dataset
 
 SIZE = 16
 TASK = FIXED.task
+FEW = ("--updates", 2, "--batch-size", 4, "--log-interval", 1)
 SMALL = (
     "--env-steps", 60, "--random-agent-steps", 12, "--batch-size", 4, "--replay-capacity", 20,
     "--eval-episodes", 1, "--eval-interval-env-steps", 20, "--checkpoint-interval-env-steps", 20,
@@ -30,8 +31,9 @@ def refused(result: tuple[int, str, str]) -> str:
 
 
 def toy_dataset(path: Path, size: int = SIZE) -> Path:
-    return collect_toy(path, domain=path.name, task=f"{path.name}_go", image_size=size)
+    episodes = [random_episode(10, size=size, seed=index) for index in range(6)]
+    return write_dataset(path, episodes, domain=path.name)
 
 
-def rows(path: Path) -> list[dict[str, str]]:
+def rows(path: Path | str) -> list[dict[str, str]]:
     return pd.read_csv(path, dtype=str, keep_default_na=False).to_dict("records")

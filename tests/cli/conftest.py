@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,14 +16,15 @@ from crptpro.modules import PixelEncoder
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import save_pretrained
 
-collect_ignore = ["own_method.py", "conftest.py"]
+collect_ignore = ["own_method.py", "slow_env.py", "conftest.py"]
 """What a test hands to the command must not have been imported by looking for doctests in it; nor may this file be,
 under a name that another has."""
 
 
 @pytest.fixture
-def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Call:
-    """Run the command in this process; returns exit status, standard output and standard error."""
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Call:
+    """Run the command in this process, in ``tmp_path``; returns exit status, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(domains, "_registered", {})
     monkeypatch.setattr(plugins, "_loaded", [])  # processes of later tests would load what these have loaded
     register_domain(FIXED)
@@ -49,4 +51,5 @@ def dataset(tmp_path: Path) -> Path:
 def encoder(tmp_path: Path) -> Path:
     torch.manual_seed(0)
     loss = ProtoLoss(PixelEncoder(image_size=SIZE), num_prototypes=16, latent_dim=4, hidden_dim=8)
-    return save_pretrained(loss, tmp_path / "encoder")
+    trained = SimpleNamespace(loss=loss, method="crptpro", training={"datasets": [{"domain": "toy"}]})
+    return save_pretrained(trained, tmp_path / "encoder")

@@ -8,34 +8,26 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import psutil
 import pytest
 from filelock import FileLock
 
-import crptpro
+from crptpro import plugins
 from crptpro.artifact import read_json, write_json
 from crptpro.cli import main
 from crptpro.errors import CRPTproError, SubmissionError
 from crptpro.experiments import launch
 from crptpro.experiments.jobs import Job, describe, make_plan
-from crptpro.experiments.launch import (
-    Failure,
-    LocalLauncher,
-    RayLauncher,
-    SlurmLauncher,
-    Work,
-    divide,
-    run_jobs,
-    slurm_parameters,
-)
+from crptpro.experiments.launch import Failure, RayLauncher, SlurmLauncher, Work, run_jobs
 
-ROOT = Path(crptpro.__file__).parents[1]
 UNTRAINED = Job("untrained", "u", ("pretrain", "--method", "random-encoder", "--out", "{out}", "--seed", "0"), {})
 
 
@@ -44,97 +36,81 @@ def job(name: str, *needs: Job, kind: str = "run") -> Job:
 
 
 class FakeLauncher:
-    """Notes what is started; every job ends at the second look, unless it is told otherwise."""
+    """Notes what it is told; every job ends when it is looked at."""
 
     is_one_machine = True
 
-    def __init__(self, *, lost: dict[str, int] | None = None, refuses: int = 0) -> None:
-        self.started: list[Work] = []
-        self.at_once: list[set[str]] = []
-        self.lost, self.refuses, self.running = dict(lost or {}), refuses, set[str]()
+    def __init__(self, *, lost: dict[str, int] | None = None, answers: Iterable[str] = ()) -> None:
+        self.started, self.stopped = list[tuple[str, int]](), list[tuple[str, bool]]()
+        self.running, self.at_once = set[str](), list[int]()
+        self.lost, self.answers, self.at_look = Counter(lost), iter(answers), lambda: None
+
+    def run(self, root: Path, *wanted: Job, **how: Any) -> list[Failure]:
+        return run_jobs(make_plan(wanted, root), root, self, **how)
 
     def start(self, work: Work, *, is_exclusive: bool) -> Any:
-        if self.started and self.refuses:
-            self.refuses -= 1
-            raise SubmissionError("The queue is full.")
-        self.started.append(work)
-        self.running.add(work.key)
-        self.at_once.append(set(self.running))
-        looks = iter([None])
+        if refusal := next(self.answers, ""):
+            raise SubmissionError(refusal)
+        name = work.key.split("-")[1]
+        self.started.append((name, work.threads))
+        self.running.add(name)
+        self.at_once.append(len(self.running))
 
-        def poll() -> str | None:
-            for look in looks:
-                return look
-            name = work.key.split("-")[1]
-            self.running.discard(work.key)
-            if self.lost.get(name, 0):
+        def poll() -> str:
+            self.at_look()
+            self.running.discard(name)
+            if self.lost[name]:
                 self.lost[name] -= 1
                 return "it was lost"
             write_json(work.directory / "done.json", {})
             return ""
 
-        return SimpleNamespace(poll=poll, stop=lambda at_once: None)
+        return SimpleNamespace(poll=poll, stop=lambda at_once: self.stopped.append((name, at_once)))
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(launch, "POLL_S", 0.001)
+    monkeypatch.setattr(launch, "POLL_S", 0.01)
     monkeypatch.setattr(launch, "REFUSED_S", 0.01)
-
-
-def launched(
-    root: Path, *wanted: Job, launcher: FakeLauncher | None = None, **how: Any
-) -> tuple[list[str], list[Failure]]:
-    launcher = launcher or FakeLauncher()
-    failures = run_jobs(make_plan(wanted, root), root, launcher, **how)
-    return [work.key.split("-")[1] for work in launcher.started], failures
 
 
 def test_a_job_starts_when_its_needs_are_finished(tmp_path: Path) -> None:
     a, b = job("a"), job("b")
-    launcher = FakeLauncher()
-    order, failures = launched(tmp_path, job("c", a, b), job("d", a), job("e"), launcher=launcher, jobs=2)
-    assert failures == []
+    wanted, launcher, again = (job("c", a, b), job("d", a), job("e")), FakeLauncher(), FakeLauncher()
+    assert launcher.run(tmp_path, *wanted, jobs=2) == []
+    order = [name for name, _ in launcher.started]
     assert sorted(order) == ["a", "b", "c", "d", "e"]
     assert order.index("c") > max(order.index("a"), order.index("b"))
-    assert max(map(len, launcher.at_once)) == 2
-    again, _ = launched(tmp_path, job("c", a, b), job("d", a), job("e"))
-    assert again == []
+    assert max(launcher.at_once) == 2
+    again.run(tmp_path, *wanted)
+    assert again.started == []
 
 
 def test_a_timing_runs_alone_and_has_all_cores(tmp_path: Path) -> None:
     launcher = FakeLauncher()
-    wanted = [job("t", kind="timing"), job("a"), job("b"), job("u", kind="timing")]
-    launched(tmp_path, *wanted, launcher=launcher, jobs=2, cores=3)
-    threads = {work.key: work.threads for work in launcher.started}
-    assert [threads[each.key] for each in wanted] == [6, 3, 3, 6]
-    assert sorted(map(len, launcher.at_once)) == [1, 1, 1, 2]
+    launcher.run(tmp_path, job("t", kind="timing"), job("a"), job("b"), job("u", kind="timing"), jobs=2, cores=3)
+    assert sorted(launcher.started) == [("a", 3), ("b", 3), ("t", 6), ("u", 6)]
+    assert sorted(launcher.at_once) == [1, 1, 1, 2]
 
 
 def test_a_lost_job_is_retried_and_dependents_of_a_failed_job_do_not_start(tmp_path: Path) -> None:
     bad, lucky = job("bad"), job("lucky")
     launcher = FakeLauncher(lost={"bad": 9, "lucky": 1})
     wanted = (job("child", bad), job("grandchild", job("child", bad)), lucky, job("other"))
-    order, failures = launched(tmp_path, *wanted, launcher=launcher, attempts=2)
-    assert sorted(order) == ["bad", "bad", "lucky", "lucky", "other"]
+    failures = launcher.run(tmp_path, *wanted, attempts=2)
+    assert sorted(name for name, _ in launcher.started) == ["bad", "bad", "lucky", "lucky", "other"]
     assert [(f.key.split("-")[1], f.attempts, f.log is None) for f in failures] == [
         ("bad", 2, False), ("child", 0, True), ("grandchild", 0, True),
     ]  # fmt: skip
     assert failures[0].reason == "it was lost"
 
 
-def test_a_full_queue_is_retried_but_a_refusal_of_the_first_job_ends_the_command(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    order, failures = launched(tmp_path / "a", job("a"), job("b"), launcher=FakeLauncher(refuses=2), jobs=2)
-    assert (order, failures) == (["a", "b"], [])
-
-    class Closed(FakeLauncher):
-        def start(self, work: Work, *, is_exclusive: bool) -> Any:
-            raise SubmissionError("No such partition.")
-
+def test_a_full_queue_is_retried_but_a_refusal_of_the_first_job_ends_the_command(tmp_path: Path) -> None:
+    launcher = FakeLauncher(answers=("", "The queue is full.", "The queue is full."))
+    assert launcher.run(tmp_path / "a", job("a"), job("b"), jobs=2) == []
+    assert [name for name, _ in launcher.started] == ["a", "b"]
     with pytest.raises(SubmissionError, match="No such partition"):
-        launched(tmp_path / "b", job("a"), launcher=Closed())
+        FakeLauncher(answers=["No such partition."]).run(tmp_path / "b", job("a"))
 
 
 @pytest.fixture
@@ -154,20 +130,11 @@ def usual_signals() -> Iterator[None]:
 def test_a_signal_stops_all_jobs_at_a_checkpoint_and_a_second_one_at_once(
     tmp_path: Path, number: signal.Signals, error: type[BaseException]
 ) -> None:
-    stopped: list[tuple[str, bool]] = []
-
-    class Interrupted(FakeLauncher):
-        def start(self, work: Work, *, is_exclusive: bool) -> Any:
-            def poll() -> str | None:
-                if len(stopped) < 4:
-                    signal.raise_signal(number)
-                return ""
-
-            return SimpleNamespace(poll=poll, stop=lambda at_once: stopped.append((work.key, at_once)))
-
+    launcher = FakeLauncher()
+    launcher.at_look = lambda: signal.raise_signal(number) if len(launcher.stopped) < 4 else None
     with pytest.raises(error):
-        launched(tmp_path, job("a"), job("b"), job("c", job("a")), launcher=Interrupted(), jobs=2)
-    assert stopped == [(job(name).key, at_once) for at_once in (False, True) for name in "ab"]
+        launcher.run(tmp_path, job("a"), job("b"), job("c", job("a")), jobs=2)
+    assert launcher.stopped == [(name, at_once) for at_once in (False, True) for name in "ab"]
 
 
 def test_a_job_has_its_whole_command(tmp_path: Path) -> None:
@@ -190,12 +157,11 @@ def test_a_job_has_its_whole_command(tmp_path: Path) -> None:
 def test_an_attempt_says_in_its_log_why_it_failed_and_the_time_of_earlier_ones_counts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: BaseException | None, reason: str
 ) -> None:
-    def main() -> None:
+    def command() -> None:
         print("error: the encoder is missing", file=sys.stderr)
         if ending is not None:
             raise ending
 
-    monkeypatch.setattr("crptpro.cli.main", main)
     monkeypatch.setattr(sys, "argv", sys.argv)
     wanted, earlier = job("a"), time.time() - 1_000
     describe(tmp_path, make_plan([wanted], tmp_path))
@@ -206,7 +172,7 @@ def test_an_attempt_says_in_its_log_why_it_failed_and_the_time_of_earlier_ones_c
         os.utime(directory / name, (at, at))
     log = open(directory / "log.txt", "w", buffering=1)  # noqa: SIM115
     with log, redirect_stdout(log), redirect_stderr(log):
-        assert Work(str(tmp_path), wanted.key).run(main) == reason
+        assert Work(str(tmp_path), wanted.key).run(command) == reason
     last = (directory / "log.txt").read_text().splitlines()[-1]
     assert last == (f"error: {reason}" if reason else "finished")
     if reason:
@@ -218,8 +184,7 @@ def test_an_attempt_says_in_its_log_why_it_failed_and_the_time_of_earlier_ones_c
         assert 150 <= done["seconds"] < 200
 
 
-def test_two_commands_on_one_root_do_not_run_a_job_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("crptpro.cli.main", lambda: pytest.fail("it ran twice"))
+def test_two_commands_on_one_root_do_not_run_a_job_twice(tmp_path: Path) -> None:
     wanted = job("a")
     describe(tmp_path, make_plan([wanted], tmp_path))
     directory = tmp_path / "jobs" / wanted.key
@@ -231,7 +196,7 @@ def test_two_commands_on_one_root_do_not_run_a_job_twice(tmp_path: Path, monkeyp
         other.release()
 
     threading.Timer(0.3, finish).start()
-    assert Work(str(tmp_path), wanted.key).run(main) == ""
+    assert Work(str(tmp_path), wanted.key).run(lambda: pytest.fail("it ran twice")) == ""
 
 
 # --- resources ------------------------------------------------------------------------------------------------------
@@ -243,7 +208,7 @@ def test_a_machine_is_divided_among_jobs(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
 
     def divided(launcher: str = "local", device: str = "cpu", **given: Any) -> tuple:
-        return divide(launcher, device=device, **{"jobs": None, "cores": None, **given})
+        return launch.divide(launcher, device=device, **{"jobs": None, "cores": None, **given})
 
     assert divided() == (8, 1, ())
     assert divided(jobs=3) == (3, 2, ())
@@ -256,26 +221,15 @@ def test_a_machine_is_divided_among_jobs(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_gpus_are_shared_evenly_and_jobs_have_their_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    environments = []
-
-    class Process:
-        def __init__(self, command: list[str], *, env: dict[str, str], **_: Any) -> None:
-            environments.append((env["CUDA_VISIBLE_DEVICES"], env["OMP_NUM_THREADS"]))
-
-        def poll(self) -> None: ...
-
-    monkeypatch.setattr(subprocess, "Popen", Process)
-    launcher = LocalLauncher(("0", "1"))
+    started = Mock(return_value=Mock(poll=Mock(return_value=None)))
+    monkeypatch.setattr(subprocess, "Popen", started)
+    launcher = launch.LocalLauncher(("0", "1"))
     for name in "abcd":
         describe(tmp_path, make_plan([job(name)], tmp_path))
         launcher.start(Work(str(tmp_path), job(name).key, threads=3), is_exclusive=False)
-    assert sorted(environments) == [("0", "3"), ("0", "3"), ("1", "3"), ("1", "3")]
-
-
-def test_slurm_needs_its_commands(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shutil.which", lambda name: None)
-    with pytest.raises(CRPTproError, match="needs sbatch and srun"):
-        SlurmLauncher({})
+    environments = [call.kwargs["env"] for call in started.call_args_list]
+    assert sorted(each["CUDA_VISIBLE_DEVICES"] for each in environments) == ["0", "0", "1", "1"]
+    assert {each["OMP_NUM_THREADS"] for each in environments} == {"3"}
 
 
 def test_a_slurm_job_requests_its_cores_and_a_refusal_is_reported(
@@ -288,7 +242,7 @@ def test_a_slurm_job_requests_its_cores_and_a_refusal_is_reported(
         (folder / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
     asked: dict[str, Any] = {"partition": None, "hours": 1 / 12, "memory_gb": 2.0, "sbatch": ("--qos=high",)}
-    launcher = SlurmLauncher(slurm_parameters(**asked, has_gpu=True))
+    launcher = SlurmLauncher(launch.slurm_parameters(**asked, has_gpu=True))
     work = Work(str(tmp_path), "key", threads=4)
     launcher.start(work, is_exclusive=True)
     [script] = (tmp_path / "submitted").rglob("12_submission.sh")
@@ -313,10 +267,10 @@ def _collected(root: Path) -> int:
 def test_a_command_that_is_killed_continues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
     root = tmp_path / "root"
+    plugin = Path(__file__).parents[1] / "cli" / "slow_env.py"
     words = ("reproduce", "slow", "--scale", "tiny", "--jobs", 1, "--cores-per-job", 1, "--out", root)
-    arguments = ["--plugin", *map(str, (Path(__file__).with_name("slow_env.py"), *words))]
+    arguments = ["--plugin", *map(str, (plugin, *words))]
     command = subprocess.Popen([sys.executable, "-m", "crptpro", *arguments], start_new_session=True)
     deadline = time.monotonic() + 300
     while _collected(root) < 2 and time.monotonic() < deadline:
@@ -339,9 +293,7 @@ def test_a_command_that_is_killed_continues(
 
 
 @pytest.mark.slow
-def test_a_slurm_job_runs_as_submitit_runs_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(launch, "POLL_S", 0.2)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
+def test_a_slurm_job_runs_as_submitit_runs_it(tmp_path: Path) -> None:
     launcher = SlurmLauncher({"timeout_min": 60}, cluster="local")
     assert run_jobs(make_plan([UNTRAINED], tmp_path), tmp_path, launcher, attempts=1) == []
     assert (tmp_path / "jobs" / UNTRAINED.key / "encoder" / "weights.safetensors").exists()
@@ -353,34 +305,19 @@ def test_a_slurm_job_runs_as_submitit_runs_it(tmp_path: Path, monkeypatch: pytes
 def test_ray_runs_jobs_and_one_whose_worker_died_is_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(launch, "POLL_S", 0.2)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")]))
     monkeypatch.setenv("RAY_ADDRESS", "local")
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     ray = pytest.importorskip("ray")
-    plan = make_plan([UNTRAINED], tmp_path)
-    describe(tmp_path, plan)
-    directory = tmp_path / "jobs" / UNTRAINED.key
-    launcher, killed = RayLauncher(), list[int]()
-    start = launcher.start
-
-    def start_and_kill(work: Work, *, is_exclusive: bool) -> Any:
-        handle, deadline = start(work, is_exclusive=is_exclusive), time.monotonic() + 120
-        while not killed and time.monotonic() < deadline:
-            if (directory / "log.txt").exists() and "process " in (directory / "log.txt").read_text():
-                process = psutil.Process(int((directory / "log.txt").read_text().split("process ")[1].split(",")[0]))
-                killed.append(process.ppid())
-                os.kill(process.ppid(), signal.SIGKILL)
-            time.sleep(0.01)
-        return handle
-
-    monkeypatch.setattr(launcher, "start", start_and_kill)
+    begun, plugin = tmp_path / "begun", tmp_path / "kills_its_worker.py"
+    kill = f"os.kill(os.getppid(), {signal.SIGKILL:d})"
+    plugin.write_text(f"import os\nif not os.path.exists({str(begun)!r}):\n    open({str(begun)!r}, 'w')\n    {kill}")
+    monkeypatch.setattr(plugins, "_loaded", [str(plugin)])
     try:
-        assert run_jobs(plan, tmp_path, launcher, attempts=2) == []
+        assert run_jobs(make_plan([UNTRAINED], tmp_path), tmp_path, RayLauncher(), attempts=2) == []
     finally:
         ray.shutdown()
-    assert killed
-    assert (directory / "encoder" / "weights.safetensors").exists()
+    assert begun.exists()
+    assert (tmp_path / "jobs" / UNTRAINED.key / "encoder" / "weights.safetensors").exists()
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "ray://127.0.0.1:1"])

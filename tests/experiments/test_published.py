@@ -4,19 +4,7 @@ import numpy as np
 import pytest
 
 from crptpro.domains import GROUPS, TASKS
-from crptpro.experiments.published import (
-    COLORS,
-    EFFICIENCY,
-    EXPERT_SCORES,
-    FINETUNE_UPDATES,
-    METHODS,
-    PROTOTYPE_METRICS,
-    SEEN,
-    SEEN_MEAN,
-    SEEN_NORMALIZED_MEAN,
-    UNSEEN,
-    published_score,
-)
+from crptpro.experiments import published as paper
 from crptpro.objectives import method_names
 
 
@@ -30,30 +18,34 @@ from crptpro.objectives import method_names
     (("proto-rl-s", "A", "walker_run"), "None"),
 ])  # fmt: skip
 def test_published_scores_are_found_by_their_place(place: tuple, printed: str) -> None:
-    assert str(published_score(*place)) == printed
+    assert str(paper.published_score(*place)) == printed
 
 
 def test_the_printed_means_and_claims_follow_from_the_printed_cells() -> None:
-    for method in METHODS:
-        scores = [row.scores[method].mean for row in SEEN]
-        assert np.mean(scores) == pytest.approx(SEEN_MEAN[method], abs=0.5)
-        normalized = np.mean([score / EXPERT_SCORES[row.task] for score, row in zip(scores, SEEN)])
+    for method in paper.METHODS:
+        scores = [row.scores[method].mean for row in paper.SEEN]
+        assert np.mean(scores) == pytest.approx(paper.SEEN_MEAN[method], abs=0.5)
+        normalized = np.mean([score / paper.EXPERT_SCORES[row.task] for score, row in zip(scores, paper.SEEN)])
         # Rounded cells move the mean by a few thousandths at most, but for APT's, which its cells do not give.
-        expected = 0.4195 if method == "apt-c" else SEEN_NORMALIZED_MEAN[method]
+        expected = 0.4195 if method == "apt-c" else paper.SEEN_NORMALIZED_MEAN[method]
         assert normalized == pytest.approx(expected, abs=2e-3)
-    ratios = [means["crptpro"] / means["proto-rl-c"] for means in (SEEN_MEAN, SEEN_NORMALIZED_MEAN)]
+    ratios = [means["crptpro"] / means["proto-rl-c"] for means in (paper.SEEN_MEAN, paper.SEEN_NORMALIZED_MEAN)]
     assert ratios == pytest.approx([1.238, 1.785], abs=5e-4)
-    assert sum(row.scores["crptpro"].mean > row.scores["proto-rl-c"].mean for row in SEEN) == 11
-    assert EFFICIENCY["crptpro"].hours[2] / EFFICIENCY["proto-rl-c"].hours[2] == pytest.approx(0.545, abs=5e-4)
-    assert 50_000 + sum(FINETUNE_UPDATES.values()) == 58_500
+    assert sum(row.scores["crptpro"].mean > row.scores["proto-rl-c"].mean for row in paper.SEEN) == 11
+    assert paper.EFFICIENCY["crptpro"].hours[2] / paper.EFFICIENCY["proto-rl-c"].hours[2] == pytest.approx(
+        0.545, abs=5e-4
+    )
+    assert 50_000 + sum(paper.FINETUNE_UPDATES.values()) == 58_500
     for method in ("crptpro", "proto-rl-c", "proto-rl-s"):
-        assert all(a < b for a, b in zip(PROTOTYPE_METRICS[method, True], PROTOTYPE_METRICS[method, False]))
+        assert all(a < b for a, b in zip(paper.PROTOTYPE_METRICS[method, True], paper.PROTOTYPE_METRICS[method, False]))
 
 
 def test_rows_are_the_papers_groups_and_methods() -> None:
-    assert [(row.group, TASKS[row.task]) for row in SEEN] == [(g, d) for g in GROUPS for d in GROUPS[g]]
+    assert [(row.group, TASKS[row.task]) for row in paper.SEEN] == [(g, d) for g in GROUPS for d in GROUPS[g]]
     for group in ("A", "C"):
-        elsewhere = {row.task for row in UNSEEN if row.group == group}
+        elsewhere = {row.task for row in paper.UNSEEN if row.group == group}
         assert elsewhere == {task for task, domain in TASKS.items() if domain not in GROUPS[group]}
-    assert all(tuple(row.scores) == METHODS for row in (*UNSEEN, *COLORS))
-    assert {*METHODS, *EFFICIENCY, *(method for method, _ in PROTOTYPE_METRICS)} <= set(method_names())
+    assert all(tuple(row.scores) == paper.METHODS for row in (*paper.UNSEEN, *paper.COLORS))
+    assert {*paper.METHODS, *paper.EFFICIENCY, *(method for method, _ in paper.PROTOTYPE_METRICS)} <= set(
+        method_names()
+    )

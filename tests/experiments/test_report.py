@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import threading
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,12 @@ from matplotlib.image import imread
 
 from crptpro.artifact import write_json
 from crptpro.errors import DiskSpaceError, RecordError
+from crptpro.experiments.measure import write_rows
 from crptpro.experiments.report import Page, build_report, left_plateau
 
 RESULTS = Path(__file__).parents[2] / "results"
+COST, HOURS, SPREAD = "Mean cost of jobs", "Pre-training by number of domains", "Spread of the prototypes at the end"
+ENDS = "Group A: diagnostics at the end"
 HARDWARE = {"cpu": "A CPU", "cpu_cores": 2, "ram_bytes": 24 * 2**30, "gpus": []}
 
 
@@ -68,6 +72,10 @@ def test_every_experiment_is_counted_and_every_job(seen: Report) -> None:
     assert "22 of 22 run" in seen.text
     assert "24.9 h of work in all" in seen.text
     assert len(seen.table("probe: 90 jobs")) == 90
+    assert len(seen.table(ENDS)) == 4
+    machines = seen.table("Machines").set_index("machine")["where"].to_dict()
+    assert machines["2"] == "Intel(R) Xeon(R) Processor, 2 cores, 24 GiB, no GPU, 1 thread"
+    assert "Compare times within one machine only" in seen.text
 
 
 def test_budgets_are_shown_beside_the_papers(seen: Report) -> None:
@@ -104,55 +112,39 @@ def test_returns_are_shown_beside_the_papers_without_intervals_of_two_runs(seen:
     assert "Brackets are" not in seen.text
 
 
-def test_the_cost_of_jobs_is_shown_with_the_machine(seen: Report) -> None:
-    took = seen.table("Mean cost of jobs").set_index(["kind", "of", "machine"])
-    assert took.loc[("explored", "becl", "2")].tolist() == ["1", "2,997", "40,002", "2.6 h"]
-    assert took.loc[("encoder", "atc", "1"), ["updates", "wall clock"]].tolist() == ["3,000", "20 min"]
-    assert took.loc[("dataset", "walker", "1"), ["env_steps", "wall clock"]].tolist() == ["40,000", "10 min"]
-    assert took.loc[("run", "drq", "1"), ["jobs", "wall clock"]].tolist() == ["2", "85 min"]
-    machines = seen.table("Machines").set_index("machine")["where"].to_dict()
-    assert machines["2"] == "Intel(R) Xeon(R) Processor, 2 cores, 24 GiB, no GPU, 1 thread"
-    assert "Compare times within one machine only" in seen.text
-
-
-def test_hours_of_the_papers_budget_include_collecting(seen: Report) -> None:
-    hours = seen.table("Pre-training by number of domains").set_index(["method", "domains"])
-    crptpro, explorer = hours.loc[("crptpro", "3")], hours.loc[("proto-rl-c", "3")]
-    assert crptpro[["s per encoder update", "hours at this scale"]].tolist() == ["0.133 (n = 1)", "0.111"]
-    assert crptpro[["hours of collecting", "hours, paper's budget"]].tolist() == ["0.435", "5.73 · paper 4.8"]
-    assert (crptpro["the same and collecting"], explorer["the same and collecting"]) == ("7.91", "12.7")
-    assert hours.loc[("apt-s", "3"), "hours, paper's budget"] == "158 · paper 61.8"
-    assert hours.loc[("becl", "2"), "encoder updates, paper's budget"] == "144,000 · paper 50,000"
-    assert hours.loc[("crptpro-fast", "1"), ["on", "machine"]].tolist() == ["2 threads", "7"]
-
-
-def test_measurements_of_encoders_and_data_are_those_of_their_records(seen: Report) -> None:
-    spread = seen.table("Spread of the prototypes at the end").set_index("variant")
-    assert spread.loc["crptpro with L_intr"].tolist() == [
-        "1", "3,000", "125.156 · paper -26.545", "3.513", "2.848 · paper 7.996", "1.726 · paper -31.080",
-    ]  # fmt: skip
-    assert spread.loc["crptpro-fast with L_intr", "KNE, k = 3"] == "3028.036"
-    assert spread.loc["proto-rl-s without L_intr", "ANE"] == "6.620 · paper 48.774"
-    assert seen.cell("Coverage at the end", "coverage", "walker", "proto-rl-c explorer") == "0.2630"
-    assert seen.cell("Coverage at the end", "all windows", "walker", "random policy") == "0.2467"
-    finals = seen.table("Group A: diagnostics at the end").set_index("label")
-    assert finals["left the plateau at"].to_dict() == {
-        "crptpro": "1,700", "crptpro without dispersion": "1,700", "crptpro-fast": "600", "proto-rl-c": "1,250",
-    }  # fmt: skip
-    assert finals.loc["crptpro", r"comparative loss \[nats\]"] == "4.744"
-
-
-@pytest.mark.parametrize(("table", "encoder", "column", "number"), [
-    ("R2 of positions, features", "crptpro", "walker", "0.598 · seen"),
-    ("R2 of velocities, features", "random-encoder", "walker", "0.172 · unseen"),
-    ("R2 of velocities, features", "proto-rl-s", "cheetah", "0.719 · unseen"),
-    ("R2 of velocities, features", "atc", "finger, reversed background", "0.604 · unseen"),
-    ("R2 of velocities, embedding z", "apt-s", "pendulum", "0.918 · unseen"),
-    ("Effective rank (at most the number of observations), features", "becl", "walker", "1631.4 · seen"),
-    ("Mean pairwise cosine, embedding z", "apt-c", "cheetah", "0.0403 · seen"),
+@pytest.mark.parametrize(("table", "row", "numbers"), [
+    (COST, "explored, becl, 2", {"jobs": "1", "updates": "2,997", "env_steps": "40,002", "wall clock": "2.6 h"}),
+    (COST, "encoder, atc, 1", {"updates": "3,000", "wall clock": "20 min"}),
+    (COST, "dataset, walker, 1", {"env_steps": "40,000", "wall clock": "10 min"}),
+    (COST, "run, drq, 1", {"jobs": "2", "wall clock": "85 min"}),
+    (HOURS, "crptpro, 3", {"s per encoder update": "0.133 (n = 1)", "hours at this scale": "0.111"}),
+    (HOURS, "crptpro, 3", {"hours of collecting": "0.435", "hours, paper's budget": "5.73 · paper 4.8"}),
+    (HOURS, "crptpro, 3", {"the same and collecting": "7.91"}),
+    (HOURS, "proto-rl-c, 3", {"the same and collecting": "12.7"}),
+    (HOURS, "apt-s, 3", {"hours, paper's budget": "158 · paper 61.8"}),
+    (HOURS, "becl, 2", {"encoder updates, paper's budget": "144,000 · paper 50,000"}),
+    (HOURS, "crptpro-fast, 1", {"on": "2 threads", "machine": "7"}),
+    (SPREAD, "crptpro with L_intr", {"encoders": "1", "updates": "3,000", "KNE, k = 3": "125.156 · paper -26.545"}),
+    (SPREAD, "crptpro with L_intr", {"KNE, k = M/2": "3.513", "ANE": "2.848 · paper 7.996"}),
+    (SPREAD, "crptpro with L_intr", {"L_intr": "1.726 · paper -31.080"}),
+    (SPREAD, "crptpro-fast with L_intr", {"KNE, k = 3": "3028.036"}),
+    (SPREAD, "proto-rl-s without L_intr", {"ANE": "6.620 · paper 48.774"}),
+    ("Coverage at the end", "walker, proto-rl-c explorer", {"coverage": "0.2630"}),
+    ("Coverage at the end", "walker, random policy", {"all windows": "0.2467"}),
+    (ENDS, "crptpro", {"left the plateau at": "1,700", r"comparative loss \[nats\]": "4.744"}),
+    (ENDS, "crptpro without dispersion", {"left the plateau at": "1,700"}),
+    (ENDS, "crptpro-fast", {"left the plateau at": "600"}),
+    (ENDS, "proto-rl-c", {"left the plateau at": "1,250"}),
+    ("R2 of positions, features", "crptpro", {"walker": "0.598 · seen"}),
+    ("R2 of velocities, features", "random-encoder", {"walker": "0.172 · unseen"}),
+    ("R2 of velocities, features", "proto-rl-s", {"cheetah": "0.719 · unseen"}),
+    ("R2 of velocities, features", "atc", {"finger, reversed background": "0.604 · unseen"}),
+    ("R2 of velocities, embedding z", "apt-s", {"pendulum": "0.918 · unseen"}),
+    ("Effective rank (at most the number of observations), features", "becl", {"walker": "1631.4 · seen"}),
+    ("Mean pairwise cosine, embedding z", "apt-c", {"cheetah": "0.0403 · seen"}),
 ])  # fmt: skip
-def test_probes_have_every_domain_and_colours(seen: Report, table: str, encoder: str, column: str, number: str) -> None:
-    assert seen.cell(table, column, encoder) == number
+def test_numbers_are_those_of_their_records(seen: Report, table: str, row: str, numbers: dict[str, str]) -> None:
+    assert {column: seen.cell(table, column, *row.split(", ")) for column in numbers} == numbers
 
 
 def test_both_files_show_every_table_and_figures_that_are_there(seen: Report) -> None:
@@ -168,11 +160,6 @@ def test_both_files_show_every_table_and_figures_that_are_there(seen: Report) ->
 # --- made-up records ------------------------------------------------------------------------------------------------
 
 
-def write_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(list(rows)).to_csv(path, index=False)
-
-
 def evaluations(score: float, *, method: str = "crptpro") -> list[dict]:
     """Eleven evaluations of two episodes, in which the return rises from 0 to a score."""
     return [
@@ -182,11 +169,11 @@ def evaluations(score: float, *, method: str = "crptpro") -> list[dict]:
     ]
 
 
+@dataclass
 class Reproduction:
     """Jobs and requests of a root, written as ``crptpro reproduce`` writes them."""
 
-    def __init__(self, root: Path) -> None:
-        self.root = root
+    root: Path
 
     def job(
         self, key: str, kind: str, needs: Iterable[str] = (), *, done: bool = True, facts: Any = None, **tables: Any

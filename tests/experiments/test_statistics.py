@@ -1,62 +1,30 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.stats import mannwhitneyu
 
 from crptpro.experiments import statistics
-from crptpro.experiments.statistics import (
-    COVERAGE,
-    MIN_RUNS,
-    estimate,
-    iqm,
-    mean,
-    median,
-    optimality_gap,
-    probability_of_improvement,
-    relative_mean,
-)
-
-TWO_TASKS = [np.array([1.0, 2.0, 3.0, 10.0]), np.array([0.0, 0.5, 0.5, 3.0])]
+from crptpro.experiments.statistics import COVERAGE, MIN_RUNS, estimate, mean, probability_of_improvement
 
 
-def runs(scores: dict[str, list[float]], encoders: dict[str, list[str]] | None = None) -> pd.DataFrame:
+def runs(scores: dict[str, list[float]], encoders: list[str] | None = None) -> pd.DataFrame:
     """A row per run; each has an encoder of its own unless they are told."""
-    rows = []
-    for task, values in scores.items():
-        for place, score in enumerate(values):
-            name = f"{task} {place}"
-            encoder = name if encoders is None else encoders[task][place]
-            rows.append({"task": task, "encoder": encoder, "run": name, "score": score})
-    return pd.DataFrame(rows)
-
-
-@pytest.mark.parametrize(("aggregate", "by_hand"), [
-    (mean, (4.0 + 1.0) / 2),
-    (median, (4.0 + 1.0) / 2),
-    (iqm, (0.5 + 1.0 + 2.0 + 3.0) / 4),  # of 0, 0.5, 0.5, 1, 2, 3, 3, 10
-    (optimality_gap, (0.0 + (1.0 + 0.5 + 0.5) / 4) / 2),
-])  # fmt: skip
-def test_aggregates_match_a_computation_by_hand(aggregate: Callable, by_hand: float) -> None:
-    assert aggregate(TWO_TASKS) == pytest.approx(by_hand)
-    # Replicates and curves are further axes before the runs.
-    stacked = [np.stack([task, task + 1]) for task in TWO_TASKS]
-    np.testing.assert_allclose(aggregate(stacked)[0], by_hand)
+    rows = [(task, f"{task} {place}", score) for task, each in scores.items() for place, score in enumerate(each)]
+    table = pd.DataFrame(rows, columns=["task", "run", "score"])
+    return table.assign(encoder=table["run"] if encoders is None else encoders)
 
 
 def test_the_probability_of_improvement_counts_pairs_and_halves_ties() -> None:
     x, y = [np.array([1.0, 3.0])], [np.array([1.0, 2.0, 2.0])]
     assert probability_of_improvement(x, y) == pytest.approx((0.5 + 0 + 0 + 3) / 6)
-    assert probability_of_improvement(x, y) == pytest.approx(mannwhitneyu(x[0], y[0]).statistic / 6)
     assert probability_of_improvement(y, x) == pytest.approx(1 - 3.5 / 6)
     alike = [np.ones(3)]
     assert probability_of_improvement(alike, alike) == 0.5
-    assert relative_mean(x, y) == pytest.approx(2 / (5 / 3))
+    assert statistics.relative_mean(x, y) == pytest.approx(2 / (5 / 3))
 
 
 RLIABLE = json.loads(Path(__file__).with_name("rliable_values.json").read_text())
@@ -101,10 +69,10 @@ def test_below_five_runs_on_any_task_there_is_no_interval() -> None:
 
 def test_the_same_runs_give_the_same_interval_in_any_order_and_another_seed_another() -> None:
     own = fixed_scores("6x3")
-    first = estimate(iqm, own)
-    again = estimate(iqm, own.sample(frac=1, random_state=3))
+    first = estimate(statistics.iqm, own)
+    again = estimate(statistics.iqm, own.sample(frac=1, random_state=3))
     assert (first.low, first.high) == (again.low, again.high)
-    assert estimate(iqm, own, seed=1).low != first.low
+    assert estimate(statistics.iqm, own, seed=1).low != first.low
 
 
 def test_intervals_of_a_mean_have_the_stated_coverage() -> None:
@@ -118,12 +86,12 @@ def test_intervals_of_a_mean_have_the_stated_coverage() -> None:
 def test_runs_that_share_encoders_have_the_wider_interval_of_their_encoders() -> None:
     # Three encoders that differ, three alike runs on each: nine runs tell no more than three encoders do.
     scores = {"a": [0.0] * 3 + [1.0] * 3 + [2.0] * 3}
-    shared = estimate(mean, runs(scores, {"a": ["x"] * 3 + ["y"] * 3 + ["z"] * 3}))
+    shared = estimate(mean, runs(scores, ["x"] * 3 + ["y"] * 3 + ["z"] * 3))
     alone = estimate(mean, runs(scores))
     assert (shared.encoders, alone.encoders, shared.runs) == (3, 9, 9)
     assert shared.value == alone.value
     assert shared.high[0] - shared.low[0] > 1.4 * (alone.high[0] - alone.low[0])
-    one = estimate(mean, runs(scores, {"a": ["x"] * 9}))  # these runs of this encoder
+    one = estimate(mean, runs(scores, ["x"] * 9))  # these runs of this encoder
     np.testing.assert_allclose([one.low, one.high], [alone.low, alone.high], atol=0.12)
 
 

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
-import importlib.util
 import re
 import shutil
 import subprocess
 import sys
 import textwrap
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
-from types import ModuleType
+from typing import Any
+from unittest.mock import Mock
 
 import pandas as pd
 import pytest
@@ -33,114 +33,54 @@ TASK = "gymnasium:Reacher-v5"
 EPISODE = 50
 MEASURED = ["unix_time_s", "updates_per_s", "env_steps_per_s", "resident_bytes", "gpu_bytes"]
 
-
-@functools.cache
-def load(recipe: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"{recipe}_recipe", RECIPES / f"{recipe}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look their annotations up
-    spec.loader.exec_module(module)
-    return module
-
-
-class StoppedError(Exception):
-    """Ends a recipe after its pre-training."""
-
-
-def stop(*_: object, **__: object) -> None:
-    raise StoppedError
-
-
-def pretraining(half: int) -> PretrainConfig:
-    return PretrainConfig(updates=2 * half, batch_size=4, log_interval=1, precision="fp32")
-
-
-def exploring(domains: int) -> ExploreConfig:
-    return ExploreConfig(
-        env_steps=32 * domains, batch_size=4, random_agent_steps=8, hidden_dim=16, log_interval=4,
-        queue_size=1024, checkpoint_interval_env_steps=100, precision="fp32",
-    )  # fmt: skip
-
-
-def learning(half: int) -> DownstreamConfig:
-    return DownstreamConfig(
-        env_steps=half * EPISODE, batch_size=4, replay_capacity=60, random_agent_steps=12, hidden_dim=16,
-        queue_size=1024, eval_interval_env_steps=EPISODE, eval_episodes=1, eval_workers=0,
-        checkpoint_interval_env_steps=EPISODE, log_interval_env_steps=20, precision="fp32",
-    )  # fmt: skip
-
-
-Run = Callable[[Path, int, int], None]
-"""A recipe with a directory, and so many halves of its budgets: of pre-training, and of learning."""
-
-
-def paper(method: str) -> Run:
-    def run(out: Path, half: int, learned: int) -> None:
-        recipe = load("paper")
-        config = recipe.Config(group="D", method=method, tasks=(TASK,), out=out, transitions=12, workers=1)
-        budgets = {"pretrain": pretraining(half), "downstream": learning(learned)}
-        recipe.main(replace(config, quality="fast", **budgets))
-
-    return run
-
-
-def explore(method: str) -> Run:
-    def run(out: Path, half: int, learned: int) -> None:
-        recipe, domains = load("explore"), (TASK, "cartpole") if method == "proto-rl-c" else (TASK,)
-        recipe.main(recipe.Config(method=method, domains=domains, tasks=(TASK,), out=out, quality="fast",
-                                  explore=exploring(len(domains)), downstream=learning(learned)))  # fmt: skip
-
-    return run
-
-
-def finetune(out: Path, half: int, learned: int) -> None:
-    recipe, source = load("finetune"), out.parent / "source"
-    if not source.exists():
-        torch.manual_seed(0)
-        save_pretrained(ProtoLoss(PixelEncoder(), num_prototypes=16, latent_dim=8, hidden_dim=16), source)
-    recipe.main(recipe.Config(pretrained=str(source), domain=TASK, out=out, transitions=12, workers=1, quality="fast",
-                              pretrain=pretraining(half), downstream=learning(learned)))  # fmt: skip
-
-
-def drq(out: Path, half: int, learned: int) -> None:
-    recipe = load("drq")
-    recipe.main(recipe.Config(tasks=(TASK,), out=out, downstream=learning(learned)))
-
-
-def quickstart(out: Path, half: int, learned: int) -> None:
-    recipe = load("quickstart")
-    recipe.main(recipe.Config(out=out, task=TASK, domains=GROUPS["D"], transitions=12, workers=1, action_repeat=2,
-                              pretrain=pretraining(half), downstream=learning(learned)))  # fmt: skip
-
-
-def own_domain(out: Path, half: int, learned: int) -> None:
-    recipe = load("own_domain")
-    recipe.main(recipe.Config(task=TASK, out=out, transitions=12, workers=1, pretrain=pretraining(half),
-                              downstream=learning(learned)))  # fmt: skip
-
-
 DATA = ["crptpro", "crptpro-fast", "released-code", "atc", "atc-native"]
-ACTIVE = ["proto-rl-c", "proto-rl-s", "apt-c", "apt-s", "becl"]
 CONTROLS = ["random-encoder", "random-encoder-standardised"]
-WAYS: dict[str, Run] = {
-    **{method: paper(method) for method in [*DATA, *CONTROLS]},
-    **{method: explore(method) for method in ACTIVE},
-    "crptpro-finetune": finetune,
-    "drq": drq,
+ACTIVE = dict.fromkeys(("proto-rl-s", "apt-c", "apt-s", "becl"), (TASK,)) | {"proto-rl-c": (TASK, "cartpole")}
+WAYS: dict[str, tuple[str, dict[str, Any]]] = {
+    **{method: ("paper", {"group": "D", "method": method, "tasks": (TASK,)}) for method in [*DATA, *CONTROLS]},
+    **{method: ("explore", {"method": method, "domains": on, "tasks": (TASK,)}) for method, on in ACTIVE.items()},
+    "crptpro-finetune": ("finetune", {"domain": TASK}),
+    "drq": ("drq", {"tasks": (TASK,)}),
 }
-RESUMED: dict[str, Run] = {
-    "paper": WAYS["crptpro"], "finetune": finetune, "drq": drq, "quickstart": quickstart, "own_domain": own_domain,
-}  # fmt: skip
+"""The recipe of a method, and its settings."""
+RESUMED: dict[str, dict[str, Any]] = {
+    **dict(WAYS[method] for method in ("crptpro", "crptpro-finetune", "drq")),
+    "quickstart": {"task": TASK, "domains": GROUPS["D"], "action_repeat": 2},
+    "own_domain": {"task": TASK},
+}
 
 
 @pytest.fixture(scope="session")
-def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The random data that the recipes of group D would collect themselves."""
-    out = tmp_path_factory.mktemp("data") / "data"
-    collect_group(GROUPS["D"], out, transitions=12, seed=0, workers=1, quality="fast", progress=False)
-    return out
+def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., None]:
+    """Run a recipe on random data of group D, or on an encoder to fine-tune, that are made once."""
+    made = tmp_path_factory.mktemp("made")
+    collect_group(GROUPS["D"], made / "data", transitions=12, seed=0, workers=1, quality="fast", progress=False)
+    torch.manual_seed(0)
+    save_pretrained(ProtoLoss(PixelEncoder(), num_prototypes=16, latent_dim=8, hidden_dim=16), made / "source")
+
+    def run(name: str, out: Path, half: int, learned: int, **settings: Any) -> None:
+        """So many halves of the budgets: of pre-training, and of learning."""
+        recipe = import_module(f"recipes.{name}")
+        small = {"batch_size": 4, "precision": "fp32"}
+        acting = {**small, "random_agent_steps": 8, "hidden_dim": 16, "queue_size": 1024}
+        usual = {
+            "transitions": 12, "workers": 1, "quality": "fast", "pretrained": str(made / "source"),
+            "pretrain": PretrainConfig(updates=2 * half, log_interval=1, **small),
+            "explore": ExploreConfig(
+                env_steps=32 * len(settings.get("domains", (TASK,))), log_interval=4,
+                checkpoint_interval_env_steps=100, **acting,
+            ),
+            "downstream": DownstreamConfig(
+                env_steps=learned * EPISODE, replay_capacity=60, eval_interval_env_steps=EPISODE, eval_episodes=1,
+                eval_workers=0, checkpoint_interval_env_steps=EPISODE, log_interval_env_steps=20, **acting
+            ),
+        }  # fmt: skip
+        names = {field.name for field in fields(recipe.Config)}
+        if name in ("paper", "quickstart") and not out.exists():
+            shutil.copytree(made / "data", out / "data")
+        recipe.main(recipe.Config(out=out, **{k: v for k, v in usual.items() if k in names}, **settings))
+
+    return run
 
 
 def record(path: Path) -> list[dict[str, str]]:
@@ -167,11 +107,9 @@ def test_no_method_is_left_out() -> None:
 @pytest.mark.gl
 @pytest.mark.slow
 @pytest.mark.parametrize("method", WAYS)
-def test_every_method_ends_in_evaluations(method: str, tmp_path: Path, collected: Path) -> None:
-    out = tmp_path / "out"
-    if method in DATA or method in CONTROLS:
-        shutil.copytree(collected, out / "data")
-    WAYS[method](out, 1, 1)
+def test_every_method_ends_in_evaluations(method: str, tmp_path: Path, run: Callable[..., None]) -> None:
+    out, (recipe, settings) = tmp_path / "out", WAYS[method]
+    run(recipe, out, 1, 1, **settings)
     (evaluation,) = out.rglob("eval.csv")
     assert [row["env_steps"] for row in record(evaluation)] == ["0", str(EPISODE)]
     assert {row["method"] for row in record(evaluation)} == {method}
@@ -189,23 +127,20 @@ def test_every_method_ends_in_evaluations(method: str, tmp_path: Path, collected
 @pytest.mark.slow
 @pytest.mark.parametrize("recipe", RESUMED)
 def test_twice_the_budget_is_the_budget_and_the_same_call_again(
-    recipe: str, tmp_path: Path, collected: Path, monkeypatch: pytest.MonkeyPatch
+    recipe: str, tmp_path: Path, run: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run, parts = RESUMED[recipe], tmp_path / "parts"
-    for out in (tmp_path / "whole", parts):
-        if recipe in ("paper", "quickstart"):
-            shutil.copytree(collected, out / "data")
+    whole, parts, settings = tmp_path / "whole", tmp_path / "parts", RESUMED[recipe]
     with monkeypatch.context() as patch:
-        patch.setattr(load("quickstart"), "build_report", lambda out: out)
-        run(tmp_path / "whole", 2, 2)
+        patch.setattr("recipes.quickstart.build_report", lambda out: out)
+        run(recipe, whole, 2, 2, **settings)
         with monkeypatch.context() as stopping:
-            stopping.setattr(load(recipe), "train_downstream", stop)
-            with pytest.raises(StoppedError):
-                run(parts, 1, 1)
+            stopping.setattr(f"recipes.{recipe}.train_downstream", Mock(side_effect=KeyboardInterrupt))
+            with pytest.raises(KeyboardInterrupt):
+                run(recipe, parts, 1, 1, **settings)
         if recipe != "quickstart":  # whose learning is that of the others
-            run(parts, 2, 1)
-    run(parts, 2, 2)
-    expected, found = left(tmp_path / "whole"), left(parts)
+            run(recipe, parts, 2, 1, **settings)
+    run(recipe, parts, 2, 2, **settings)
+    expected, found = left(whole), left(parts)
     assert expected.keys() == found.keys()
     assert [name for name in expected if expected[name] != found[name]] == []
     if recipe == "quickstart":
@@ -221,7 +156,7 @@ def test_twice_the_budget_is_the_budget_and_the_same_call_again(
 def test_the_method_is_written_with_torchrls_idioms_in_sixty_lines() -> None:
     text = (RECIPES / "plain_torchrl.py").read_text()
     assert len(text.splitlines()) <= 60
-    sac = load("plain_torchrl").main(TASK, transitions=100, updates=2, batch_size=8, agent_steps=12)
+    sac = import_module("recipes.plain_torchrl").main(TASK, transitions=100, updates=2, batch_size=8, agent_steps=12)
     assert all(torch.isfinite(parameter).all() for parameter in sac.parameters())
 
 
@@ -235,9 +170,9 @@ def test_the_pieces_of_the_quickstart_run_in_the_cells_of_a_notebook(tmp_path: P
         loss = ProtoLoss(PixelEncoder(channels=(4,), strides=(2,)), num_prototypes=16)
         result = pretrain(loss, datasets, run_dir=out / "pretrain", updates=2, batch_size=4)
         encoder = save_pretrained(result, out / "encoder")
-        config = DownstreamConfig(env_steps=50, batch_size=4, replay_capacity=60, random_agent_steps=12, hidden_dim=16,
-                                  eval_interval_env_steps=50, eval_episodes=2, eval_workers=1)
-        run = train_downstream({TASK!r}, encoder, run_dir=out / "crptpro", config=config)
+        run = train_downstream({TASK!r}, encoder, run_dir=out / "crptpro", env_steps=50, batch_size=4,
+                               replay_capacity=60, random_agent_steps=12, hidden_dim=16, eval_interval_env_steps=50,
+                               eval_episodes=2, eval_workers=1)
         print(len(run.evaluations), "episodes evaluated")
     """
     own_environment = f"""
@@ -276,7 +211,7 @@ def test_the_pieces_of_the_quickstart_run_in_the_cells_of_a_notebook(tmp_path: P
 def test_a_wrong_name_ends_a_recipe_before_it_collects(
     recipe: str, changes: dict[str, object], message: str, tmp_path: Path
 ) -> None:
-    module = load(recipe)
+    module = import_module(f"recipes.{recipe}")
     with pytest.raises((CRPTproError, ValueError), match=message):
         module.main(module.Config(out=tmp_path / "out", **changes))
     assert not (tmp_path / "out").exists()

@@ -21,23 +21,19 @@ class SlowEnv(gymnasium.Env):
     observation_space = gymnasium.spaces.Box(0.0, 1.0, (1,))
     render_mode, shade = "rgb_array", 0.5
 
-    def __init__(self, render_mode: str = "rgb_array") -> None:
-        """Nothing is set up."""
+    def __init__(self, render_mode: str = "rgb_array") -> None: ...
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[Any, dict]:
-        """Begin."""
         return np.zeros(1, np.float32), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
-        """Wait a little."""
         time.sleep(0.02)
         self.shade = float(action[0] + 1) / 2
         return np.zeros(1, np.float32), self.shade, False, False, {}
 
     def render(self) -> Any:
-        """Draw the shade below a black half."""
         picture = np.full((16, 16, 3), int(255 * self.shade), np.uint8)
-        picture[:8] = 0
+        picture[:8] = 0  # no flat colour
         return picture
 
 
