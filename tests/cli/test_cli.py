@@ -149,6 +149,20 @@ def test_a_real_process_ends_with_the_same_line(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.gl
+@pytest.mark.slow
+def test_collect_pretrain_and_downstream_on_a_real_domain(call: Call) -> None:
+    fast = ("--quality", "fast", "--action-repeat", 4)
+    assert call("collect", "cartpole", "--out", "data", "--transitions", 20, "--workers", 1, *fast)[0] == 0
+    assert call("pretrain", "data/cartpole", "--out", "first", *FEW)[0] == 0
+    assert load_pretrained("first/encoder").card["training"]["datasets"][0]["action_repeat"] == 4
+    down = ("downstream", "cartpole_balance", "--pretrained", "first/encoder", "--out", "down", *SMALL, *fast)
+    assert call(*down, "--eval-interval-env-steps", 60)[0] == 0
+    found = rows("down/eval.csv")
+    assert [(row["env_steps"], row["episode_agent_steps"]) for row in found] == [("0", "250"), ("60", "250")]
+    assert all(0 <= float(row["episode_return"]) <= 1000 for row in found)
+
+
 def table(out: str) -> list[list[str]]:
     lines = [line for line in out.splitlines() if line.startswith("|")]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]

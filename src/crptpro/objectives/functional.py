@@ -115,31 +115,25 @@ def info_nce(
     *,
     temperature: float | Tensor = 1.0,
     negatives: Literal["positives", "both"] = "positives",
-    valid: Tensor | None = None,
     reduction: Reduction = "mean",
 ) -> Tensor:
     """Contrastive cross-entropy in nats; row i of the positives belongs to row i of the anchors, both ``[B, D]``.
 
     ``negatives="positives"`` compares each anchor with all B positives (ATC), ``"both"`` each of the 2B views, which
-    SimCLR normalises beforehand, with the other 2B - 1. Rows that are False in ``valid``, bool ``[B]``, do not count,
-    but their positives stay negatives of the others; with ``"positives"`` their anchors may be NaN. ``reduction`` is
-    over the valid rows; ``"none"`` gives ``[B]`` (``"both"``: ``[2B]``), zero where invalid.
+    SimCLR normalises beforehand, with the other 2B - 1. ``reduction="none"`` gives ``[B]`` (``"both"``: ``[2B]``).
     """
     count = anchors.shape[0]
     labels = torch.arange(count, device=anchors.device)
     if negatives == "positives":
-        # Masking the loss alone would give NaN gradients, 0 times NaN.
-        queries = anchors if valid is None else anchors.where(valid.unsqueeze(-1), 0.0)
-        logits = queries @ positives.T / temperature  # (B, D) x (D, B) -> (B, B)
+        logits = anchors @ positives.T / temperature  # (B, D) x (D, B) -> (B, B)
     elif negatives == "both":
         views = torch.cat([anchors, positives])
         logits = (views @ views.T / temperature).masked_fill(_diagonal(2 * count, anchors), float("-inf"))
         labels = torch.cat([labels + count, labels])
-        valid = None if valid is None else torch.cat([valid, valid])
     else:
         raise ValueError(f"negatives must be 'positives' or 'both', got {negatives!r}.")
     rows = F.cross_entropy(_at_least_float32(logits), labels, reduction="none")
-    return _reduced(rows, reduction, valid)
+    return _reduced(rows, reduction)
 
 
 def becl_loss(
@@ -221,16 +215,14 @@ def prototype_metrics(prototypes: Tensor, *, offset: float = 1.5) -> dict[str, T
     }
 
 
-def _reduced(rows: Tensor, reduction: Reduction, valid: Tensor | None = None) -> Tensor:
+def _reduced(rows: Tensor, reduction: Reduction) -> Tensor:
     if reduction not in ("none", "mean", "sum"):
         raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}.")
-    if valid is not None:
-        rows = torch.where(valid, rows, torch.zeros_like(rows))
     if reduction == "none":
         return rows
     if reduction == "sum":
         return rows.sum()
-    return rows.sum() / (max(rows.numel(), 1) if valid is None else valid.sum().clamp_min(1))
+    return rows.sum() / max(rows.numel(), 1)
 
 
 def _at_least_float32(values: Tensor) -> Tensor:
