@@ -7,7 +7,6 @@ import os
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from torch import nn
 
 from crptpro import artifact
 from crptpro.artifact import read_artifact, read_json, require_disk, write_artifact, write_json, write_whole
-from crptpro.errors import CRPTproError, DatasetError, DiskSpaceError, PretrainedError
+from crptpro.errors import CRPTproError, DiskSpaceError, PretrainedError
 
 
 def write(path: Path, value: float = 1.0, **card: Any) -> Path:
@@ -36,45 +35,31 @@ def value_of(path: Path) -> float:
     return float(read(path)[1]["layer.weight"][0, 0])
 
 
-# --- files --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("content", ["caf\N{LATIN SMALL LETTER E WITH ACUTE}\r\n", b"\x00\xff"])
-def test_what_is_written_is_read_and_its_directory_made(tmp_path: Path, content: str | bytes) -> None:
-    path = write_whole(tmp_path / "made" / "a.txt", content)
-    assert path.read_bytes() == (content if isinstance(content, bytes) else content.encode())
-    assert [file.name for file in path.parent.iterdir()] == ["a.txt"]
-
-
-@pytest.mark.parametrize(("number", "kind", "message"), [
-    (errno.ENOSPC, DiskSpaceError, r"disk is full: .*/card\.json cannot be written"),
-    (errno.EDQUOT, DiskSpaceError, r"disk is full: .*/card\.json cannot be written"),
-    (errno.EIO, OSError, r"Input/output error: '.*/card\.json'"),
+@pytest.mark.parametrize(("step", "number", "kind", "message"), [
+    ("fsync", errno.ENOSPC, DiskSpaceError, "disk is full: {} cannot be written"),
+    ("replace", errno.EDQUOT, DiskSpaceError, "disk is full: {} cannot be written"),
+    ("rename", errno.EIO, OSError, "Input/output error: '{}'"),
 ])  # fmt: skip
-def test_a_write_that_fails_names_the_file_and_keeps_the_old_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, kind: type[Exception], message: str
+def test_a_write_that_fails_names_what_it_writes_and_keeps_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, number: int, kind: type[Exception], message: str
 ) -> None:
-    path = tmp_path / "card.json"
-    write_json(path, {"a": 1})
+    card = tmp_path / "card.json"
+    write_json(card, {"a": 1})
+    write(tmp_path / "a", 1.0)
 
-    def fail(descriptor: int) -> None:
+    def fail(*_: object) -> None:
         raise OSError(number, os.strerror(number))  # of an open file, the system says no name
 
-    monkeypatch.setattr(artifact.os, "fsync", fail)
-    with pytest.raises(kind, match=message):
-        write_json(path, {"a": 2})
-    assert read_json(path) == {"a": 1}
-    assert [p.name for p in tmp_path.iterdir()] == ["card.json"]
-
-
-@pytest.mark.parametrize(("text", "message"), [
-    ("{", "cannot be read as JSON"), ("[1]", "holds a list"), (None, r"card\.json does not exist"),
-])  # fmt: skip
-def test_a_damaged_or_missing_card_is_named(tmp_path: Path, text: str | None, message: str) -> None:
-    if text is not None:
-        (tmp_path / "card.json").write_text(text)
-    with pytest.raises(DatasetError, match=message):
-        read_json(tmp_path / "card.json", error=DatasetError)
+    with monkeypatch.context() as patched:
+        patched.setattr(artifact.os, step, fail)
+        with pytest.raises(kind, match=message.format(tmp_path / "a")):
+            write(tmp_path / "a", 2.0)
+        if step != "rename":  # a single file is written without it
+            with pytest.raises(kind, match=message.format(card)):
+                write_json(card, {"a": 2})
+    assert read_json(card) == {"a": 1}
+    assert value_of(tmp_path / "a") == 1
+    assert {path.name for path in tmp_path.iterdir()} == {"a", "card.json"}
 
 
 def test_every_number_in_a_card_is_the_plain_number_it_means_or_refused_by_name(tmp_path: Path) -> None:
@@ -96,22 +81,15 @@ def test_a_disk_that_cannot_hold_the_data_is_refused_with_both_sizes(tmp_path: P
     require_disk(tmp_path / "not" / "yet", 1, "collection")
 
 
-@pytest.fixture
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+def test_paths_mean_what_a_shell_means(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    home = tmp_path / "home"
+    monkeypatch.setenv("HOME", str(home))
     monkeypatch.chdir(tmp_path)
-    return tmp_path / "home"
-
-
-def test_paths_mean_what_a_shell_means_and_empty_ones_are_refused(home: Path) -> None:
     write(Path("~/runs/a"), 3.0)
     assert value_of(home / "runs" / "a") == value_of(Path("~/runs/a")) == 3
-    write_json("~/card.json", {})
-    assert (home / "card.json").exists()
+    write_json("~/card.json", {"a": 1})
+    assert read_json(home / "card.json") == read_json("~/card.json") == {"a": 1}
     assert not Path("~").exists()
-    for bad in ("", b"\xff".decode(errors="surrogateescape")):
-        with pytest.raises(ValueError, match=r"is empty|is not UTF-8"):
-            write_artifact(bad, {}, card={}, format_name="test", version=1)
 
 
 @pytest.mark.parametrize("mask", [0o027, 0o077, 0o002])
@@ -125,52 +103,18 @@ def test_files_and_directories_have_the_rights_that_the_umask_leaves(tmp_path: P
     assert {file.stat().st_mode & 0o777 for file in path.iterdir()} == {0o666 & ~mask}
 
 
-# --- artifacts ----------------------------------------------------------------------------------------------------
-
-
-def test_weights_and_card_round_trip_and_writing_again_replaces_them(tmp_path: Path) -> None:
-    write(tmp_path / "a", 1.0)
-    card, tensors = read(write(tmp_path / "a", 2.5))
-    assert (card["task"], card["format"]) == ("walker", "test")
-    assert set(tensors) == {"layer.weight", "layer.bias"}
-    assert torch.equal(tensors["layer.weight"], torch.full((3, 2), 2.5))
-    assert [p.name for p in tmp_path.iterdir()] == ["a"]
-
-
-def test_what_is_no_artifact_of_this_kind_is_not_replaced(tmp_path: Path) -> None:
-    run_dir = tmp_path / "run"
+def test_what_is_of_another_kind_is_neither_replaced_nor_read(tmp_path: Path) -> None:
+    run_dir, other = tmp_path / "run", tmp_path / "a"
     (run_dir / "checkpoints").mkdir(parents=True)
-    with pytest.raises(CRPTproError, match="is not a 'test', so it was left unchanged"):
-        write(run_dir)
+    write_artifact(other, {}, card={}, format_name="other", version=1)
+    for path in (run_dir, other):
+        with pytest.raises(CRPTproError, match="is not a 'test', so it was left unchanged"):
+            write(path)
     assert [path.name for path in run_dir.iterdir()] == ["checkpoints"]
-    write_artifact(tmp_path / "a", {}, card={}, format_name="other", version=1)
-    with pytest.raises(CRPTproError, match="is not a 'test'"):
-        write(tmp_path / "a")
+    with pytest.raises(PretrainedError, match="is a 'other', expected 'test'"):
+        read(other)
     (tmp_path / "empty").mkdir()
     assert read(write(tmp_path / "empty"))[0]["task"] == "walker"
-
-
-@pytest.mark.parametrize(("step", "error", "kind", "message"), [
-    ("os.fsync", OSError(errno.ENOSPC, "No space left"), DiskSpaceError, "disk is full: {} cannot"),
-    ("os.replace", OSError(errno.EDQUOT, "Quota"), DiskSpaceError, "disk is full: {} cannot"),
-    ("os.rename", OSError(errno.EIO, "Input/output error"), OSError, "error: '{}"),
-])  # fmt: skip
-def test_a_failed_write_keeps_the_old_artifact_and_names_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str, error: Exception, kind: type[Exception], message: str
-) -> None:
-    write(tmp_path / "a", 1.0)
-
-    def fail(*args: object) -> None:
-        raise error
-
-    with monkeypatch.context() as patched:
-        patched.setattr(f"crptpro.artifact.{step}", fail)
-        with pytest.raises(kind, match=message.format(tmp_path / "a")):
-            write(tmp_path / "a", 2.0)
-    with pytest.raises(ValueError, match=r"card\.json\.odd"):
-        write(tmp_path / "a", 2.0, odd=object())
-    assert value_of(tmp_path / "a") == 1
-    assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
 
 def test_what_was_written_is_read_back_before_it_replaces_anything(
@@ -195,13 +139,12 @@ def test_the_directory_that_one_is_in_is_read_but_never_replaced(
     write(tmp_path / "a", 1.0)
     (tmp_path / "a" / "sub").mkdir()
     monkeypatch.chdir(tmp_path / "a" / "sub")
-    assert value_of(Path("..")) == value_of(Path("../sub/..")) == 1
+    assert value_of(Path("..")) == 1
     monkeypatch.chdir(tmp_path / "a")
-    assert value_of(Path(".")) == 1
     for path in (Path("."), tmp_path / "a"):
         with pytest.raises(CRPTproError, match="a is the working directory, which is not replaced"):
             write(path, 2.0)
-    assert value_of(Path(".")) == value_of(tmp_path / "a") == 1
+        assert value_of(path) == 1
 
 
 def test_a_kill_between_the_two_renames_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -247,28 +190,18 @@ def test_threads_that_write_one_file_leave_a_whole_one(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
-def end_weights_with(end: bytes, path: Path) -> None:
-    weights = path / "weights.safetensors"
-    weights.write_bytes(weights.read_bytes()[:-4] + end)
-
-
 @pytest.mark.parametrize(("damage", "message"), [
     (shutil.rmtree, "does not exist"),
-    (lambda p: (p / "card.json").unlink(), "card.json does not exist"),
-    (lambda p: (p / "weights.safetensors").unlink(), "weights.safetensors is missing"),
-    (partial(end_weights_with, b""), "truncated, damaged or replaced"),
-    (partial(end_weights_with, b"\1\0\0\0"), "truncated, damaged or replaced"),
+    (lambda p: (p / "card.json").unlink(), r"card\.json does not exist"),
+    (lambda p: (p / "card.json").write_text("{"), r"card\.json cannot be read as JSON"),
+    (lambda p: (p / "card.json").write_text("[1]"), r"card\.json holds a list"),
+    (lambda p: (p / "weights.safetensors").unlink(), r"weights\.safetensors is missing"),
+    (lambda p: os.truncate(p / "weights.safetensors", 90), "truncated, damaged or replaced"),
+    (lambda p: (p / "weights.safetensors").write_bytes(bytes(200)), "truncated, damaged or replaced"),
+    (lambda p: write_artifact(p, {}, card={}, format_name="test", version=3), "format version 3; .* reads up to 2"),
 ])  # fmt: skip
-def test_each_kind_of_damage_is_named(tmp_path: Path, damage: Callable[[Path], None], message: str) -> None:
+def test_what_is_damaged_or_too_new_is_named(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
     write(tmp_path / "a")
     damage(tmp_path / "a")
     with pytest.raises(PretrainedError, match=message):
         read(tmp_path / "a")
-
-
-def test_an_artifact_of_another_kind_or_a_newer_version_is_refused(tmp_path: Path) -> None:
-    write(tmp_path / "a")
-    with pytest.raises(PretrainedError, match="is a 'test', expected 'agent'"):
-        read_artifact(tmp_path / "a", format_name="agent", version=2, error=PretrainedError)
-    with pytest.raises(PretrainedError, match="format version 2; this crptpro reads up to 1"):
-        read_artifact(tmp_path / "a", format_name="test", version=1, error=PretrainedError)

@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+import wandb
 
 from crptpro.errors import DiskSpaceError
 from crptpro.logging import RunLogger, WandbOptions
@@ -102,59 +103,47 @@ def test_no_text_in_a_name_or_a_value_breaks_the_record_or_its_reopening(tmp_pat
         assert rows[0]["note"] == text
 
 
-def test_a_resumed_run_writes_each_row_once(tmp_path: Path) -> None:
+def test_a_resumed_run_writes_each_row_once_and_leaves_the_streams_of_other_stages(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     def write(logger: RunLogger, start: int, stop: int) -> None:
         for updates in range(start, stop):
             logger.log({"loss": updates / 7}, stream="train", updates=updates)
             if updates % 3 == 0:
                 logger.log({"score": updates}, stream="eval", updates=updates)
 
-    with RunLogger(tmp_path / "whole") as whole:
-        write(whole, 0, 12)
-    with RunLogger(tmp_path / "parts") as first:
-        write(first, 0, 5)
-        state = first.state_dict(["train", "eval", "late"])
-        write(first, 5, 8)
-        first.log({"new_column": 1, "loss": 0}, stream="train", updates=8)
-        first.log({"x": 1}, stream="late", updates=8)
-    with RunLogger(tmp_path / "parts") as second:
-        second.load_state_dict(state)
-        assert not (tmp_path / "parts" / "late.csv").exists()
-        write(second, 5, 12)
-    for stream in ("train", "eval"):
-        assert table(tmp_path / "parts", stream) == table(tmp_path / "whole", stream)
-    assert lines(tmp_path / "parts") == lines(tmp_path / "whole")
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    with RunLogger(whole) as logger:
+        write(logger, 0, 5)
+        logger.log({"x": 1}, stream="other", updates=8)
+        write(logger, 5, 12)
+    with RunLogger(parts) as logger:
+        write(logger, 0, 5)
+        state = logger.state_dict(["train", "eval", "late"])
+        logger.log({"x": 1}, stream="other", updates=8)
+        write(logger, 5, 8)
+        logger.log({"new_column": 1, "loss": 0}, stream="train", updates=8)
+        logger.log({"x": 1}, stream="late", updates=8)
+    with RunLogger(parts) as logger:
+        logger.load_state_dict(state)
+        assert not (parts / "late.csv").exists()
+        write(logger, 5, 12)
+    for stream in ("train", "eval", "other"):
+        assert table(parts, stream) == table(whole, stream)
+    assert lines(parts) == lines(whole)
+    assert not caplog.records
 
 
-def test_a_state_restores_the_streams_it_names_and_announces_rows_that_are_missing(
+def test_rows_that_a_state_counted_and_are_missing_are_announced(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with RunLogger(tmp_path) as logger:
         logger.log({"a": 1}, stream="train", updates=1)
-        state = logger.state_dict(["train"])
-        logger.log({"a": 2}, stream="train", updates=2)
-        logger.log({"a": 3}, stream="eval", env_steps=5)
-        logger.load_state_dict(state)
-        assert [row["updates"] for row in logger.rows("train")] == [1]
-        assert [row["env_steps"] for row in logger.rows("eval")] == [5]
-        assert not caplog.records
         logger.load_state_dict({"train": 5})
     assert "4 rows of 'train' are missing" in caplog.text
 
 
-def test_a_torn_last_line_is_dropped_and_the_csv_repaired(tmp_path: Path) -> None:
-    with RunLogger(tmp_path) as logger:
-        logger.log({"a": 1}, stream="train", updates=1)
-        logger.log({"a": 2}, stream="train", updates=2)
-    text = (tmp_path / "metrics.jsonl").read_text()
-    (tmp_path / "metrics.jsonl").write_text(text[:-5])
-    with RunLogger(tmp_path) as logger:
-        logger.log({"a": 3}, stream="train", updates=3)
-    assert [row["updates"] for row in table(tmp_path, "train")] == ["1", "3"]
-    assert [row["updates"] for row in lines(tmp_path)] == [1, 3]
-
-
-def test_a_process_killed_while_logging_leaves_whole_rows(tmp_path: Path) -> None:
+def test_a_process_killed_while_logging_leaves_whole_rows_and_a_torn_last_one_is_dropped(tmp_path: Path) -> None:
     script = (
         "import sys\nfrom crptpro.logging import RunLogger\nlogger = RunLogger(sys.argv[1])\n"
         "for i in range(10**6):\n    logger.log({'a': i, 'b': 'x' * 200}, stream='train', updates=i)\n"
@@ -164,11 +153,14 @@ def test_a_process_killed_while_logging_leaves_whole_rows(tmp_path: Path) -> Non
         assert process.stdout is not None
         process.stdout.readline()
         process.send_signal(signal.SIGKILL)
+    record = tmp_path / "metrics.jsonl"
+    written = len(record.read_bytes().splitlines())
+    os.truncate(record, record.stat().st_size - 5)  # as a kill within a write would leave it
     with RunLogger(tmp_path) as logger:
-        count = len(logger.rows("train"))
-        logger.log({"a": count, "b": "y"}, stream="train", updates=count)
-    assert count > 20
-    assert [int(row["updates"]) for row in table(tmp_path, "train")] == list(range(count + 1))
+        assert len(logger.rows("train")) == written - 1 >= 20
+        logger.log({"a": 1, "b": "y"}, stream="train", updates=written - 1)
+    for rows in (table(tmp_path, "train"), lines(tmp_path)):
+        assert [int(row["updates"]) for row in rows] == list(range(written))
 
 
 def test_a_full_disk_is_one_clear_error_without_half_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,8 +207,6 @@ def test_the_config_is_kept_with_versions_from_the_first_row_that_the_disk_takes
 
 # --- mirrors ----------------------------------------------------------------------------------------------------------
 
-WANDB_VARIABLES = ("API_KEY", "MODE", "BASE_URL", "PROJECT", "NAME", "RUN_GROUP")
-
 
 class FakeRun:
     """Stands in for a W&B run."""
@@ -237,15 +227,13 @@ class FakeRun:
 
 @pytest.fixture
 def no_account(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in WANDB_VARIABLES:
+    for name in ("API_KEY", "MODE", "BASE_URL", "PROJECT", "NAME", "RUN_GROUP"):
         monkeypatch.delenv(f"WANDB_{name}", raising=False)
     monkeypatch.setenv("NETRC", "/nowhere/netrc")
 
 
 @pytest.fixture
 def fake_wandb(monkeypatch: pytest.MonkeyPatch, no_account: None) -> Iterator[list[FakeRun]]:
-    import wandb
-
     runs: list[FakeRun] = []
 
     def init(**options: Any) -> FakeRun:
@@ -310,8 +298,6 @@ def test_a_failing_mirror_is_switched_off_with_one_warning_and_the_record_is_com
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_wandb: list[FakeRun], caplog: pytest.LogCaptureFixture,
     broken: str,
 ) -> None:  # fmt: skip
-    import wandb
-
     def fail(*arguments: Any, **options: Any) -> None:
         raise wandb.errors.CommError("no route to host")
 
@@ -328,8 +314,6 @@ def test_a_failing_mirror_is_switched_off_with_one_warning_and_the_record_is_com
 def test_an_unreachable_server_means_offline(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_wandb: list[FakeRun]
 ) -> None:
-    import wandb
-
     working = wandb.init
 
     def init(**options: Any) -> Any:

@@ -5,6 +5,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+import torch
 
 from crptpro import provenance
 
@@ -17,28 +18,22 @@ def test_provenance_names_every_package_that_can_change_a_number() -> None:
     json.dumps(content)
 
 
-def test_a_gpu_with_a_broken_driver_is_recorded_and_stops_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hardware_names_the_instructions_that_torch_uses_and_what_is_wrong_with_a_gpu(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def name(index: int) -> str:
         if index == 1:
             raise RuntimeError("CUDA driver version is insufficient\nfor the runtime")
         return "Some GPU"
 
-    monkeypatch.setattr(provenance.torch.cuda, "device_count", lambda: 2)
-    monkeypatch.setattr(provenance.torch.cuda, "get_device_name", name)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "get_device_name", name)
+    monkeypatch.setattr(torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
+    monkeypatch.setattr(torch.cpu, "_is_amx_tile_supported", lambda: False)
     found = provenance.hardware.__wrapped__()
+    assert found["cpu_instructions"] == "AVX512, AVX512-BF16"
     assert found["gpus"] == ["Some GPU", "unusable: CUDA driver version is insufficient"]
-
-
-@pytest.mark.parametrize(("bf16", "amx", "named"), [
-    (False, False, "AVX512"), (True, False, "AVX512, AVX512-BF16"), (True, True, "AVX512, AVX512-BF16, AMX"),
-])  # fmt: skip
-def test_processors_of_one_name_are_told_apart_by_what_torch_computes_with(
-    monkeypatch: pytest.MonkeyPatch, bf16: bool, amx: bool, named: str
-) -> None:
-    monkeypatch.setattr(provenance.torch.backends.cpu, "get_cpu_capability", lambda: "AVX512")
-    monkeypatch.setattr(provenance.torch.cpu, "_is_avx512_bf16_supported", lambda: bf16)
-    monkeypatch.setattr(provenance.torch.cpu, "_is_amx_tile_supported", lambda: amx)
-    assert provenance.hardware.__wrapped__()["cpu_instructions"] == named
 
 
 @pytest.mark.parametrize("is_tracked", [True, False])

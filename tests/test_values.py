@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import itertools
 import json
-from dataclasses import dataclass
+import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from crptpro.values import as_float, as_int, as_path, check_numbers
+from crptpro.training import PretrainConfig
+from crptpro.values import as_float, as_int, as_path
 
 
 @pytest.mark.parametrize(
@@ -21,63 +24,38 @@ def test_a_number_of_any_library_is_taken_as_the_plain_number_it_means(value: An
     assert json.dumps([whole, real]) == "[3, 3.0]"
 
 
+NO_NUMBERS = (
+    "3", None, True, math.nan, math.inf, [3], np.array([3]), torch.ones(2), np.True_, torch.tensor(True),
+    torch.tensor([True]), torch.tensor([3]),
+)  # fmt: skip
+
+
 @pytest.mark.parametrize(
-    "value",
-    [
-        2.5,
-        "3",
-        None,
-        True,
-        float("nan"),
-        float("inf"),
-        [3],
-        np.array([3]),
-        torch.ones(2),
-        np.True_,
-        torch.tensor(True),
-        torch.tensor([True]),
-        torch.tensor([3]),
-    ],
+    ("convert", "value"),
+    [*itertools.product((as_int, as_float), NO_NUMBERS), (as_int, 2.5), pytest.param(as_float, 10**400, id="huge")],
 )
-def test_what_is_no_whole_number_is_refused_with_its_name_and_value(value: Any) -> None:
-    with pytest.raises(ValueError, match="`transitions` must be a whole number, got"):
-        as_int(value, "transitions")
+def test_what_is_no_whole_or_finite_number_is_refused_with_its_name_and_value(convert: Any, value: Any) -> None:
+    with pytest.raises(ValueError, match=rf"`rate` must be .*, got {re.escape(repr(value))}\."):
+        convert(value, "rate")
 
 
-@pytest.mark.parametrize("value", [
-    "3", None, True, float("nan"), float("inf"), np.array([1.0, 2.0]), np.True_, torch.tensor(True),
-    pytest.param(10**400, id="huge"),
+def test_settings_of_a_stage_are_plain_numbers_or_left_open() -> None:
+    config = PretrainConfig(updates=np.int64(3), learning_rate=torch.tensor(0.5), seed=7.0)
+    found = (config.updates, config.learning_rate, config.seed, config.warmup_updates)
+    assert repr(found) == "(3, 0.5, 7, None)"
+
+
+@pytest.mark.parametrize(("wrong", "message"), [
+    ({"updates": 0}, "`updates` must be at least 1, got 0"),
+    ({"encoder_tau": 1.5}, r"`encoder_tau` must be at most 1, got 1\.5"),
+    ({"encoder_tau": -1}, "`encoder_tau` must be at least 0, got -1"),
+    ({"seed": -1}, "`seed` must be at least 0, got -1"),
+    ({"seed": None}, "`seed` must be a whole number, got None"),
+    ({"seed": 2**32}, "`seed` must be at most"),
 ])  # fmt: skip
-def test_what_is_no_finite_number_is_refused_with_its_name_and_value(value: Any) -> None:
-    with pytest.raises(ValueError, match="`rate` must be"):
-        as_float(value, "rate")
-
-
-@dataclass(frozen=True)
-class Stage:
-    updates: int | None = None
-    tau: float | None = None
-    seed: int = 0
-    name: str = "a"
-
-    def __post_init__(self) -> None:
-        check_numbers(self, minima={}, maxima={"tau": 1})
-
-
-def test_numbers_of_a_stage_are_plain_and_in_their_range_or_left_open() -> None:
-    given: tuple[Any, ...] = (np.int64(3), torch.tensor(0.5), 7.0)
-    assert repr(Stage(*given)) == "Stage(updates=3, tau=0.5, seed=7, name='a')"
-    assert Stage() == Stage(None, None, 0)
-    for wrong, message in (
-        ({"updates": 0}, "`updates` must be at least 1, got 0"),
-        ({"tau": 1.5}, r"`tau` must be at most 1, got 1\.5"),
-        ({"tau": -1}, "`tau` must be at least 0, got -1"),
-        ({"seed": -1}, "`seed` must be at least 0, got -1"),
-        ({"seed": None}, "`seed` must be a whole number, got None"),
-        ({"seed": 2**32}, "`seed` must be at most"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            Stage(**wrong)  # type: ignore[arg-type]
+def test_a_setting_out_of_its_range_is_refused(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        PretrainConfig(**wrong)
 
 
 def test_a_path_is_expanded_and_one_that_no_record_can_hold_is_refused() -> None:
