@@ -140,7 +140,7 @@ def test_atc_golden_values() -> None:
     assert info_nce(anchors, positives).item() == pytest.approx(0.838414, abs=1e-6)
     assert info_nce(anchors, positives, reduction="sum").item() == pytest.approx(3 * 0.838414, abs=3e-6)
     for wrong in ({"negatives": "all"}, {"reduction": "median"}):
-        with pytest.raises(ValueError, match="got '(all|median)'"):
+        with pytest.raises(ValueError, match=r"got '(all|median)'"):
             info_nce(anchors, positives, **wrong)  # type: ignore[arg-type]
 
 
