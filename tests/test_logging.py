@@ -72,6 +72,7 @@ def test_a_row_is_written_without_reading_those_before_wherever_the_process_has_
     ({"a": 1}, "train", {"updates": 1.5}, "whole number"),
     ({"stream": 1}, "train", {"updates": 1}, "cannot name a metric"),
     ({"updates": 1}, "train", {"updates": 1}, "cannot name a metric"),
+    ({"": 1}, "train", {"updates": 1}, "cannot name a metric"),
     ({"a": torch.zeros(2)}, "train", {"updates": 1}, "not a scalar"),
     ({"a": 1}, "../x", {"updates": 1}, "stream is named"),
 ])  # fmt: skip

@@ -112,7 +112,7 @@ class RunLogger:
             raise ValueError(f"A row of {stream!r} needs a counter, such as updates=100.")
         for key in (*counters, *metrics):
             is_taken = key in ("stream", "unix_time_s") or (key in counters and key in metrics)
-            if is_taken or not key.isprintable() or re.search('[,"]', key):
+            if is_taken or not key or not key.isprintable() or re.search('[,"]', key):
                 raise ValueError(
                     f"{key!r} cannot name a metric of {stream!r}: it is reserved, a counter, or unfit for a CSV header."
                 )

@@ -107,11 +107,6 @@ def test_a_run_of_other_settings_is_refused_by_name(tmp_path: Path) -> None:
     assert run("apt-s", tmp_path, env_steps=20, log_interval=3).env_steps == 20  # it decides no number
 
 
-def test_a_loss_without_the_networks_of_the_reward_is_refused() -> None:
-    with pytest.raises(CRPTproError, match="The prototype reward needs a loss with prototypes; SimCLRLoss has none"):
-        run("proto-rl-s", loss=build("apt-s"))
-
-
 @pytest.mark.parametrize(
     ("method", "options", "message"),
     [
@@ -119,11 +114,14 @@ def test_a_loss_without_the_networks_of_the_reward_is_refused() -> None:
         ("proto-rl-c", {"domains": [LEFT, LEFT]}, "named twice"),
         ("proto-rl-c", {"env_steps": 10}, "nothing would be learned"),
         ("crptpro", {}, "learns from datasets and does not explore"),
+        ("proto-rl-s", {"loss": "apt-s"}, "prototype reward needs a loss with prototypes; SimCLRLoss has none"),
     ],
 )
 def test_what_cannot_run_is_refused_before_anything_is_written(
     tmp_path: Path, method: str, options: dict[str, Any], message: str
 ) -> None:
+    if "loss" in options:
+        options = {"loss": build(options["loss"])}
     with pytest.raises(CRPTproError, match=message):
         run(method, tmp_path / "run", **options)
     assert not (tmp_path / "run").exists()

@@ -191,11 +191,12 @@ def pretrain_active(
     plan = plan_exploration(recipe, list(named.values()), given)
     exploration: Any = recipe.exploration
     settings = given.resolved(recipe)
-    prototypes = getattr(loss, "prototypes", None) if exploration.reward == "prototype" else None
-    if prototypes is not None and settings.queue_size % len(prototypes.weight):
-        raise ValueError(
-            f"queue_size must be a multiple of num_prototypes, got {settings.queue_size} and {len(prototypes.weight)}."
-        )
+    if isinstance(kind := exploration.reward, str):
+        for name in ("projector", "prototypes") if kind == "prototype" else ("projector",):
+            if getattr(loss, name, None) is None:
+                raise CRPTproError(f"The {kind} reward needs a loss with {name}; {type(loss).__name__} has none.")
+    if kind == "prototype" and settings.queue_size % (count := len(loss.prototypes.weight)):
+        raise ValueError(f"queue_size must be a multiple of num_prototypes, got {settings.queue_size} and {count}.")
     device = usable_device(settings.device)
     loss.to(device).train()
     with contextlib.ExitStack() as stack:
@@ -401,9 +402,6 @@ class Explorer:
         loss, generator, kind = self.loss, self.generators["reward"], self.exploration.reward
         if callable(kind):  # a registered method's own function
             return kind(loss, generator).to(self.device)
-        needs = ("projector", "prototypes") if kind == "prototype" else ("projector",)
-        if missing := [name for name in needs if getattr(loss, name, None) is None]:
-            raise CRPTproError(f"The {kind} reward needs a loss with {missing[0]}; {type(loss).__name__} has none.")
         reward: Transform
         if kind == "prototype":
             warn_if_mostly_zero(len(loss.prototypes.weight), self.config.batch_size, 3)
