@@ -205,8 +205,8 @@ def test_an_artifact_of_a_bare_name_is_found_between_the_two_renames_of_its_repl
 def test_a_task_is_learned_on_every_encoder_that_ships() -> None:
     for name in shipped_encoders():
         learned = train_downstream(
-            "finger_spin", name, env_steps=20, random_agent_steps=4, batch_size=4, replay_capacity=20,
-            features="reencode", eval_episodes=1, eval_workers=0, progress=False,
+            "finger_spin", name, env_steps=200, action_repeat=20, random_agent_steps=4, batch_size=4,
+            replay_capacity=20, features="reencode", eval_episodes=1, eval_workers=0, progress=False,
         )  # fmt: skip
         before, after = (row["episode_return"] for row in learned.evaluations)
         assert 0 <= min(before, after) <= max(before, after) <= 1_000
