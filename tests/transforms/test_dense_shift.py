@@ -7,10 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from fake_pixel_env import SIZE, FakeReplay, small_encoder, small_heads
+from fake_pixel_env import SIZE, FakePixelEnv, FakeReplay, small_encoder, small_heads
 from tensordict import TensorDict
 from torch import nn
-from torchrl.envs import Compose
+from torchrl.envs import Compose, TransformedEnv
 from toy_env import rollout_of
 
 from crptpro.data import FrameReplay
@@ -226,7 +226,9 @@ def test_what_has_no_dense_maps_and_what_does_not_fit_is_refused(encoder, option
         DenseShiftFeatures(encoder, FakeReplay(), **options)
 
 
-def test_frames_of_another_size_and_a_missing_number_are_refused():
+def test_frames_of_another_size_a_missing_number_and_an_environment_are_refused():
+    with pytest.raises(NotImplementedError, match="on an environment use FrozenEncoder"):
+        TransformedEnv(FakePixelEnv(), dense_of()).observation_spec  # noqa: B018
     with pytest.raises(KeyError, match="'number'"):
         dense_of()(TensorDict(pixels=torch.zeros(1)))
     with pytest.raises(ValueError, match="expected pixels"):
