@@ -26,8 +26,8 @@ PROBES = {
     50_000: ROOT / "src" / "crptpro" / "encoders" / "group-a" / "probe.csv",
 }
 """Updates of the probed encoders to their records."""
-SHOWN = (10_000, 20_000, 30_000, 40_000)
-"""Env steps of the evaluations in the table of two tasks."""
+CHEETAH_RUNS = RECORDS / "paper_scale" / "cheetah_run"
+"""Runs of cheetah_run with the paper's settings, one directory per run."""
 
 
 def downstream_runs(record: str, file: str = "eval") -> pd.DataFrame:
@@ -98,34 +98,47 @@ def _published(task: str) -> pd.DataFrame:
 
 
 def two_tasks() -> pd.DataFrame:
-    """Mean and standard deviation of an evaluation's episodes, beside what others published for as many env steps."""
+    """Mean and standard deviation of an evaluation's episodes, beside what DrQ's authors published."""
     rows = []
-    group_a, references = RECORDS / "group_a_20k", RECORDS / "references"
     for task in ("cheetah_run", "walker_run"):
-        runs = {
-            "`crptpro`, 10,000 updates": RECORDS / "paper_scale_10k" / f"{task}_paper_seed_0" / "eval.csv",
-            "`crptpro`, 3,000 updates": group_a / f"eval_{task}_crptpro.csv",
-            "`random-encoder`": group_a / f"eval_{task}_random.csv",
-        }
-        for name, path in runs.items():
-            if path.exists():
-                episodes = pd.read_csv(path).groupby("env_steps")["episode_return"]
-                rows.append((task, name, "1", {n: _spread(own) for n, own in episodes}))
-        chance = pd.read_csv(group_a / f"uniform_{task}.csv")["episode_return"]
-        rows.append((task, "uniform random policy", "", dict.fromkeys(SHOWN, _spread(chance))))
-        if task == "cheetah_run":
-            log = pd.read_csv(references / "crptpro_cheetah_run_eval.csv", index_col="env_steps")["episode_return"]
-            rows.append((task, "CRPTpro, its authors' log", "1", log.map("{:.0f}".format).to_dict()))
+        for name, file in {"`crptpro`": "crptpro", "`random-encoder`": "random"}.items():
+            episodes = pd.read_csv(RECORDS / "group_a_20k" / f"eval_{task}_{file}.csv").groupby("env_steps")
+            rows.append((task, name, "1", {n: _spread(own) for n, own in episodes["episode_return"]}))
+        chance = pd.read_csv(RECORDS / "group_a_20k" / f"uniform_{task}.csv")["episode_return"]
         drq = _published(task)
         rows.append((task, "DrQ, its authors' log", str(len(drq)), {n: _spread(drq[n]) for n in drq}))
-    shown = [{f"{n:,} env steps": returns.get(n, "") for n in SHOWN} for *_, returns in rows]
+        rows.append((task, "uniform random policy", "", dict.fromkeys(drq, _spread(chance))))
+    shown = [{f"{n:,} env steps": returns[n] for n in (10_000, 20_000, 30_000)} for *_, returns in rows]
     return pd.DataFrame([{"task": t, "": name, "runs": n, **r} for (t, name, n, _), r in zip(rows, shown, strict=True)])
 
 
+def cheetah_runs() -> pd.DataFrame:
+    """Every evaluated episode of cheetah_run with the paper's settings, with the names of the condition and the run."""
+    runs = (path.parent for path in sorted(CHEETAH_RUNS.glob("*/eval.csv")))
+    found = [pd.read_csv(d / "eval.csv").assign(condition=d.name.partition("_seed")[0], run=d.name) for d in runs]
+    return pd.concat(found, ignore_index=True)
+
+
 def cheetah_run() -> pd.DataFrame:
-    """The part of the table of two tasks that the README shows."""
-    table = two_tasks()
-    return table[table["task"] == "cheetah_run"].drop(columns="task").rename(columns={"": "cheetah_run"})
+    """Return of cheetah_run with the paper's settings: mean, least and greatest run of each condition."""
+    means = cheetah_runs().groupby(["condition", "run", "env_steps"])["episode_return"].mean().unstack()
+    chance = pd.read_csv(RECORDS / "group_a_20k" / "uniform_cheetah_run.csv")["episode_return"].mean()
+    log = pd.read_csv(RECORDS / "references" / "crptpro_cheetah_run_eval.csv", index_col="env_steps")["episode_return"]
+    drq = _published("cheetah_run")
+    rows = [
+        (f"`{condition.replace('no_bonus', 'crptpro-no-bonus')}`", own) for condition, own in means.groupby(level=0)
+    ]
+    rows += [("CRPTpro, its authors' log", log.to_frame().T), ("DrQ, its authors' log", drq)]
+    table = [
+        {
+            "cheetah_run": name,
+            "runs": len(own),
+            **{f"{n:,} env steps": _over_runs(own[n]) for n in range(20_000, 100_001, 20_000)},
+        }
+        for name, own in rows
+    ]
+    control = {"cheetah_run": "uniform random policy", "runs": "", **dict.fromkeys([*table[0]][2:], f"{chance:.0f}")}
+    return pd.DataFrame([*table, control])
 
 
 def pretraining() -> pd.DataFrame:
@@ -190,27 +203,26 @@ def draw() -> None:
 
 def draw_cheetah() -> None:
     """Draw cheetah_run's training returns beside what others published."""
-    figure, axes = plt.subplots(figsize=(7.4, 3.6), layout="constrained")
+    figure, axes = plt.subplots(figsize=(7.4, 3.8), layout="constrained")
     drq = _published("cheetah_run").agg(["mean", "std"]).T
     drq = drq[drq.index <= 100_000]
     axes.plot(drq.index, drq["mean"], color="#8a7bd8", label="DrQ, its authors' log: evaluations, mean ± sd of 10 runs")
     axes.fill_between(drq.index, drq["mean"] - drq["std"], drq["mean"] + drq["std"], color="#8a7bd8", alpha=0.15)
-    curves = {
-        "CRPTpro, its authors' log (1 run)": ("references/crptpro_cheetah_run_train.csv", "#5d6672"),
-        "this library, encoder of 10,000 updates, the paper's settings (1 run, stopped)": (
-            "paper_scale_10k/cheetah_run_paper_seed_0/episodes.csv", "#0b80c3",
-        ),
-        "this library, encoder of 3,000 updates, batch 128, learning rate 1e-3 (1 run)": (
-            "group_a_20k/episodes_cheetah_run_crptpro.csv", "#109e77",
-        ),
-        "this library, untrained encoder, batch 128, learning rate 1e-3 (1 run)": (
-            "group_a_20k/episodes_cheetah_run_random.csv", "#d9640a",
-        ),
-    }  # fmt: skip
-    for label, (file, color) in curves.items():
-        episodes = pd.read_csv(RECORDS / file)
+    curves = [
+        (RECORDS / "references" / "crptpro_cheetah_run_train.csv", "CRPTpro, its authors' log (1 run)", "#5d6672")
+    ]
+    for condition, name, color in (
+        ("crptpro", "this library", "#0b80c3"),
+        ("no_bonus", "this library, without bonus", "#109e77"),
+        ("random_encoder", "this library, untrained encoder, without bonus", "#d9640a"),
+    ):
+        runs = sorted(CHEETAH_RUNS.glob(f"{condition}_seed_*/episodes.csv"))
+        labels = [f"{name} ({len(runs)} run{'s' * (len(runs) > 1)})"] + [""] * (len(runs) - 1)
+        curves += [(path, label, color) for path, label in zip(runs, labels[: len(runs)], strict=True)]
+    for path, label, color in curves:
+        episodes = pd.read_csv(path)
         episodes = episodes[episodes["env_steps"] <= 100_000].set_index("env_steps")["episode_return"]
-        axes.plot(episodes.rolling(5, min_periods=1).mean(), color=color, label=label)
+        axes.plot(episodes.rolling(5, min_periods=1).mean(), color=color, label=label or None, linewidth=1.2)
     axes.set(title="cheetah_run", xlabel="env steps", ylabel="return, mean of 5 training episodes")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8)
@@ -233,6 +245,16 @@ def _markdown(table: pd.DataFrame) -> str:
 
 def _list(returns: pd.Series) -> str:
     return ", ".join(f"{value:.0f}" for value in returns)
+
+
+def _over_runs(returns: pd.Series) -> str:
+    """Mean over runs, with the standard deviation from five runs up, the extremes below."""
+    returns = returns.dropna()
+    if len(returns) < 2:
+        return f"{returns.mean():.0f}" if len(returns) else ""
+    return (
+        _spread(returns) if len(returns) >= 5 else f"{returns.mean():.0f} ({returns.min():.0f} to {returns.max():.0f})"
+    )
 
 
 def _spread(returns: pd.Series) -> str:
