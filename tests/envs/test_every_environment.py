@@ -226,9 +226,12 @@ def test_settings_that_cannot_be_are_refused_before_anything_is_loaded(option: s
 @pytest.mark.gl
 def test_what_nobody_closed_is_closed_at_exit_without_a_line() -> None:
     code = """
+import warnings
 from crptpro.envs import make_env
 kept = [make_env(task, seed=0, frame_stack=1) for task in ("gymnasium:Reacher-v5", "cartpole")]
 print([tuple(env.reset()["pixels"].shape) for env in kept])
+# dm_control's import would show the deprecations of all packages, NumPy's at every env step among them.
+warnings.warn_explicit("deprecated", DeprecationWarning, "package.py", 1, module="package")
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True)
     assert "(3, 84, 84), (3, 84, 84)" in done.stdout

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from typing import Any
 
 import dm_env
@@ -32,8 +33,10 @@ def make_dm_control(domain: Domain, *, quality: Quality, **settings: Any) -> DMC
 
 def load_dm_env(domain: Domain) -> dm_env.Environment:
     """Load ``domain.task`` from dm_control with a constant seed, without the camera observations of composer tasks."""
-    from dm_control import manipulation, suite
+    from dm_control import suite
 
+    with warnings.catch_warnings():  # its import shows every DeprecationWarning of the process from then on
+        from dm_control import manipulation
     route_mujoco_warnings()
     if domain.source == "manipulation":
         env = manipulation.load(f"{domain.task}_vision", seed=0)
