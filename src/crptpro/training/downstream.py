@@ -199,8 +199,7 @@ def train_downstream(
         set_compute_dtype(learner.loss, dtype)
         evaluator = Evaluator(env.make_env, agent, episodes=settings.eval_episodes, seed=settings.seed,
                               workers=_eval_workers(name, env.make_env, settings), progress=progress,
-                              on_end=functools.partial(_log_evaluation, name),
-                              on_result=functools.partial(_record_evaluation, run, pretrained.label))  # fmt: skip
+                              on_result=functools.partial(_record_evaluation, run, name, pretrained.label))  # fmt: skip
         stack.callback(evaluator.close)
         is_complete = bool(run.saved.get("is_finished")) and run.saved["position"] >= settings.env_steps
         replay = _make_replay(run, env.env, settings, generators["replay"], is_complete=is_complete)
@@ -221,6 +220,7 @@ def train_downstream(
 
         interval = settings.eval_interval_env_steps
         for first in run.until(settings.env_steps, checkpoint_interval=settings.checkpoint_interval_env_steps):
+            evaluator.poll()
             if first // interval > counters["last_evaluation"] // interval:
                 start_evaluation()
             td = env.reset(derive_seed(settings.seed, "downstream", "episode", counters["episodes"]))
@@ -396,13 +396,12 @@ def _eval_workers(task: str, make_this_env: Callable[[], EnvBase], config: Any) 
     return workers if workers > 1 and episodes >= 20 else 0  # starting one takes as long as an episode
 
 
-def _record_evaluation(run: Run, method: str, episodes: Sequence[Episode], counters: Mapping[str, int]) -> None:
+def _record_evaluation(
+    run: Run, task: str, method: str, episodes: Sequence[Episode], counters: Mapping[str, int]
+) -> None:
     for e in episodes:
         row = {"episode_return": e.episode_return, "episode_agent_steps": e.agent_steps, "seed": e.seed}
         run.write("eval", {**row, "method": method}, extra=None, episode=e.episode, **counters)
-
-
-def _log_evaluation(task: str, episodes: Sequence[Episode], counters: Mapping[str, int]) -> None:
     scores = summarize(episodes)
     logger.info(
         "%s: %s env steps, %s updates, return %.1f ± %.1f over %d episodes",

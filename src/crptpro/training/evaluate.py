@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import logging
 import math
 import pickle
 import statistics
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
@@ -125,10 +123,9 @@ def summarize(episodes: Sequence[Episode]) -> dict[str, float]:
 class Evaluator:
     """Evaluates snapshots of an agent in worker processes during training, or at once in this process.
 
-    ``on_end`` gets the episodes and the counters of an evaluation as soon as it has ended, in another thread if workers
-    evaluate; ``on_result`` gets the same when :meth:`finish` is called, so that the record of a run does not depend on
-    the speed of its machine. Without ``workers``, or where none can import ``make_env``, this process evaluates. One
-    CPU thread computes every decision either way.
+    ``on_result`` gets the episodes and the counters of an evaluation, called by :meth:`poll` once it has ended, or by
+    :meth:`finish`. Without ``workers``, or where none can import ``make_env``, this process evaluates. One CPU thread
+    computes every decision either way.
     """
 
     def __init__(
@@ -140,15 +137,13 @@ class Evaluator:
         seed: int,
         workers: int,
         on_result: Callable[[list[Episode], Mapping[str, int]], None],
-        on_end: Callable[[list[Episode], Mapping[str, int]], None] = lambda episodes, counters: None,
         progress: bool = True,
     ) -> None:
         self.make_env, self.agent, self.episodes, self.seed = make_env, agent, episodes, seed
         self.workers = min(workers, episodes) if can_be_sent(make_env) else 0
-        self.on_result, self.on_end, self.progress = on_result, on_end, progress
+        self.on_result, self.progress = on_result, progress
         self._pool: WorkerPool | None = None
         self._env: EnvBase | None = None
-        self._watcher = threading.Thread()
         self._pending: tuple[PixelAgent, dict[str, int], int, list[Future[Episode]]] | None = None
 
     def start(self, agent: PixelAgent | None = None, /, **counters: int) -> None:
@@ -166,13 +161,12 @@ class Evaluator:
             sent = pickle.dumps(copy.deepcopy(agent).cpu())
             seeds = [episode_seed(seed, episode) for episode in range(self.episodes)]
             futures = [self._pool.submit(_evaluate, sent, *numbered) for numbered in enumerate(seeds)]
-            self._watcher = threading.Thread(target=self._watch, args=(futures, counters), daemon=True)
-            self._watcher.start()
         self._pending = (agent, counters, seed, futures)
 
-    def _watch(self, futures: list[Future[Episode]], counters: dict[str, int]) -> None:
-        with contextlib.suppress(Exception):  # :meth:`finish` deals with what went wrong
-            self.on_end([future.result() for future in futures], counters)
+    def poll(self) -> None:
+        """Deliver the evaluation that is under way if it has ended."""
+        if self._pending is not None and all(future.done() for future in self._pending[-1]):
+            self.finish()
 
     def finish(self) -> None:
         """Wait for the evaluation that is under way, if any, and deliver its episodes."""
@@ -181,8 +175,6 @@ class Evaluator:
         agent, counters, seed, futures = self._pending
         try:
             episodes = [future.result() for future in futures]
-            if futures:
-                self._watcher.join()
         except (BrokenProcessPool, pickle.PicklingError, OSError) as reason:
             logger.warning("The evaluating processes are lost (%s); evaluating in this process from here on.", reason)
             self.workers, futures = 0, []
@@ -194,7 +186,6 @@ class Evaluator:
                 episodes = evaluate(agent, self._env, episodes=self.episodes, seed=seed, progress=self.progress)
             finally:
                 torch.set_num_threads(threads)
-            self.on_end(episodes, counters)
         self._pending = None
         self.on_result(episodes, counters)
 
@@ -209,7 +200,7 @@ class Evaluator:
         if state:
             agent = copy.deepcopy(self.agent)
             agent.load_state_dict(state["agent"])
-            self._begin(agent, state["counters"])  # delivered by the next start or finish, when the record is restored
+            self._begin(agent, state["counters"])  # delivered later, when the record is restored
 
     def close(self) -> None:
         if self._pool is not None:
