@@ -247,8 +247,10 @@ class _Workers:
 
     def _lost(self, title: str) -> WorkerLostError:
         processes = self._pool.processes.values()
-        for process in processes:
-            process.join(2.0)
+        deadline = time.monotonic() + 2.0
+        # Not `join`: the executor joins them in its thread, and only one of two that wait at once learns the status.
+        while any(process.exitcode is None for process in processes) and time.monotonic() < deadline:
+            time.sleep(0.01)
         # The executor terminates the others after the first has died.
         codes = [process.exitcode for process in processes if process.exitcode not in (None, 0, -signal.SIGTERM)]
         code = codes[0] if codes else -signal.SIGTERM
