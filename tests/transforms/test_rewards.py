@@ -221,6 +221,16 @@ def test_the_reward_is_added_with_its_coefficient_or_left_alone(kind):
     assert not half["next", "intrinsic_reward"].requires_grad
 
 
+@pytest.mark.parametrize("kind", [prototype, particle])
+def test_features_on_another_device_are_not_waited_for(kind):
+    td = batch()
+    external = td["next", "reward"]
+    td["next", "features"] = latents().to("meta")  # it has no values: reading one is an error
+    kind(None, prototypes_of().to("meta"), coef=0.5).to("meta")(td)
+    assert external.device.type == "cpu"
+    assert td["next", "reward"].device.type == "meta"
+
+
 @each
 def test_keys_can_be_renamed_and_nested_and_what_is_missing_is_named(kind):
     td, renamed = batch(), batch()

@@ -66,8 +66,9 @@ class IntrinsicReward(Transform):
         intrinsic = self.intrinsic_reward(rows, *extra)
         if self.coef is None:
             return tensordict.set(self.out_keys[0], intrinsic.reshape(*features.shape[:-1], 1))
-        reward = read_entry(self, tensordict, self.reward_key)
-        intrinsic = intrinsic.to(reward).view_as(reward)
+        # The result is on the features' device: that of a GPU goes on without being waited for.
+        reward = read_entry(self, tensordict, self.reward_key).to(intrinsic.device)
+        intrinsic = intrinsic.to(reward.dtype).view_as(reward)
         tensordict.set(self.out_keys[0], intrinsic)
         # A new tensor: the sampled reward may share memory with the storage.
         return tensordict.set(self.reward_key, reward + self.coef * intrinsic)
