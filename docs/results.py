@@ -27,7 +27,7 @@ PROBES = {
 }
 """Updates of the probed encoders to their records."""
 CHEETAH_RUNS = RECORDS / "paper_scale" / "cheetah_run"
-"""Runs of cheetah_run with the paper's settings, one directory per run."""
+"""Runs of cheetah_run with the paper's settings, in directories METHOD_seed_N."""
 
 
 def downstream_runs(record: str, file: str = "eval") -> pd.DataFrame:
@@ -112,33 +112,18 @@ def two_tasks() -> pd.DataFrame:
     return pd.DataFrame([{"task": t, "": name, "runs": n, **r} for (t, name, n, _), r in zip(rows, shown, strict=True)])
 
 
-def cheetah_runs() -> pd.DataFrame:
-    """Every evaluated episode of cheetah_run with the paper's settings, with the names of the condition and the run."""
-    runs = (path.parent for path in sorted(CHEETAH_RUNS.glob("*/eval.csv")))
-    found = [pd.read_csv(d / "eval.csv").assign(condition=d.name.partition("_seed")[0], run=d.name) for d in runs]
-    return pd.concat(found, ignore_index=True)
-
-
 def cheetah_run() -> pd.DataFrame:
-    """Return of cheetah_run with the paper's settings: mean, least and greatest run of each condition."""
-    means = cheetah_runs().groupby(["condition", "run", "env_steps"])["episode_return"].mean().unstack()
+    """Return of cheetah_run with the paper's settings: mean, least and greatest run of each method."""
+    runs = {path.parent.name: pd.read_csv(path) for path in sorted(CHEETAH_RUNS.glob("*/eval.csv"))}
+    means = pd.concat(runs, names=["run"]).groupby(["run", "env_steps"])["episode_return"].mean().unstack()
     chance = pd.read_csv(RECORDS / "group_a_20k" / "uniform_cheetah_run.csv")["episode_return"].mean()
     log = pd.read_csv(RECORDS / "references" / "crptpro_cheetah_run_eval.csv", index_col="env_steps")["episode_return"]
-    drq = _published("cheetah_run")
-    rows = [
-        (f"`{condition.replace('no_bonus', 'crptpro-no-bonus')}`", own) for condition, own in means.groupby(level=0)
-    ]
-    rows += [("CRPTpro, its authors' log", log.to_frame().T), ("DrQ, its authors' log", drq)]
-    table = [
-        {
-            "cheetah_run": name,
-            "runs": len(own),
-            **{f"{n:,} env steps": _over_runs(own[n]) for n in range(20_000, 100_001, 20_000)},
-        }
-        for name, own in rows
-    ]
-    control = {"cheetah_run": "uniform random policy", "runs": "", **dict.fromkeys([*table[0]][2:], f"{chance:.0f}")}
-    return pd.DataFrame([*table, control])
+    rows = [(f"`{method}`", own) for method, own in means.groupby(lambda run: run.partition("_seed_")[0])]
+    rows += [("CRPTpro, its authors' log", log.to_frame().T), ("DrQ, its authors' log", _published("cheetah_run"))]
+    shown = range(20_000, 100_001, 20_000)
+    table = [[name, str(len(own)), *(_over_runs(own[n]) for n in shown)] for name, own in rows]
+    table.append(["uniform random policy", "", *[f"{chance:.0f}"] * len(shown)])
+    return pd.DataFrame(table, columns=["cheetah_run", "runs", *(f"{n:,} env steps" for n in shown)])
 
 
 def pretraining() -> pd.DataFrame:
@@ -211,18 +196,14 @@ def draw_cheetah() -> None:
     curves = [
         (RECORDS / "references" / "crptpro_cheetah_run_train.csv", "CRPTpro, its authors' log (1 run)", "#5d6672")
     ]
-    for condition, name, color in (
-        ("crptpro", "this library", "#0b80c3"),
-        ("no_bonus", "this library, without bonus", "#109e77"),
-        ("random_encoder", "this library, untrained encoder, without bonus", "#d9640a"),
-    ):
-        runs = sorted(CHEETAH_RUNS.glob(f"{condition}_seed_*/episodes.csv"))
-        labels = [f"{name} ({len(runs)} run{'s' * (len(runs) > 1)})"] + [""] * (len(runs) - 1)
-        curves += [(path, label, color) for path, label in zip(runs, labels[: len(runs)], strict=True)]
+    for method, color in {"crptpro": "#0b80c3", "crptpro-no-bonus": "#109e77", "random-encoder": "#d9640a"}.items():
+        runs = sorted(CHEETAH_RUNS.glob(f"{method}_seed_*/episodes.csv"))
+        label = f"{method}, this library ({len(runs)} run{'s' * (len(runs) > 1)})"
+        curves += [(path, None if place else label, color) for place, path in enumerate(runs)]
     for path, label, color in curves:
         episodes = pd.read_csv(path)
         episodes = episodes[episodes["env_steps"] <= 100_000].set_index("env_steps")["episode_return"]
-        axes.plot(episodes.rolling(5, min_periods=1).mean(), color=color, label=label or None, linewidth=1.2)
+        axes.plot(episodes.rolling(5, min_periods=1).mean(), color=color, label=label, linewidth=1.2)
     axes.set(title="cheetah_run", xlabel="env steps", ylabel="return, mean of 5 training episodes")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8)
