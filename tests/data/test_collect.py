@@ -210,11 +210,13 @@ def program(root: Path, *, workers: int = 2, limit: str = "pass", more: str = "p
     """)
 
 
+QUICK = replace(SLOW, make=partial(make_toy, variable_length))
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     """The data of the program, collected without pauses in this process."""
-    quick = replace(SLOW, make=partial(make_toy, variable_length))
-    return data_bytes(collect_random(quick, tmp_path_factory.mktemp("whole"), transitions=300, seed=1, **SMALL))
+    return data_bytes(collect_random(QUICK, tmp_path_factory.mktemp("whole"), transitions=300, seed=1, **SMALL))
 
 
 def test_a_program_from_standard_input_collects_with_several_processes(tmp_path: Path, whole: dict[str, bytes]) -> None:
@@ -272,15 +274,15 @@ def test_interrupted_or_killed_and_started_again_gives_the_same_bytes(tmp_path: 
     for root in (interrupted, killed):
         with pytest.raises(DatasetError, match="is unfinished"):
             FrameDataset.open(root / "toy-slow")
-        path = collect_random(SLOW, root, transitions=300, seed=1, **SMALL)
+        path = collect_random(QUICK, root, transitions=300, seed=1, **SMALL)
         assert data_bytes(path) == whole
 
 
 @pytest.mark.slow
 def test_processes_that_cannot_be_started_are_an_error_that_says_why(tmp_path: Path) -> None:
-    few = "import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (32, 32))"
+    few = "import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (20, 20))"
     unguarded = 'collect_random(SLOW, sys.argv[0] + "data", transitions=400, workers=2, image_size=8)'
-    programs = [start(tmp_path / "few", workers=8, limit=few), start(tmp_path / "unguarded", more=unguarded)]
+    programs = [start(tmp_path / "few", workers=4, limit=few), start(tmp_path / "unguarded", more=unguarded)]
     limited, unguarded_said = (program.communicate(timeout=300)[1] for program in programs)
     assert b"Use fewer workers, or raise the limit of open files (`ulimit -n 4096`)" in limited
     assert b'needs `if __name__ == "__main__":` around its main program' in unguarded_said
