@@ -231,11 +231,10 @@ def _list(returns: pd.Series) -> str:
 def _over_runs(returns: pd.Series) -> str:
     """Mean over runs, with the standard deviation from five runs up, the extremes below."""
     returns = returns.dropna()
-    if len(returns) < 2:
-        return f"{returns.mean():.0f}" if len(returns) else ""
-    return (
-        _spread(returns) if len(returns) >= 5 else f"{returns.mean():.0f} ({returns.min():.0f} to {returns.max():.0f})"
-    )
+    if len(returns) >= 5:
+        return _spread(returns)
+    extremes = f" ({returns.min():.0f} to {returns.max():.0f})" if len(returns) > 1 else ""
+    return f"{returns.mean():.0f}{extremes}" if len(returns) else ""
 
 
 def _spread(returns: pd.Series) -> str:
