@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import gc
 import signal
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -146,6 +147,20 @@ def test_dense_maps_and_encoding_anew_are_the_same_run_up_to_rounding(tmp_path: 
     for features, share in (("dense", 1e-3), ("dense-bf16", 0.1)):
         difference = (losses(tmp_path / features) - losses(tmp_path / "reencode")).abs().mean()
         assert difference < share * other, features
+
+
+def test_the_environment_computes_on_one_core_beside_the_update(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("crptpro.training.env_thread.cpu_cores", lambda: 2)
+    found = set()
+    task = toy_domain("toy", on_step=lambda _: found.add((threading.current_thread().name, torch.get_num_threads())))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        train(None, task=task, env_steps=20, eval_interval_env_steps=20)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    assert found == {("environment_0", 1), ("MainThread", 1)}  # the latter evaluates
 
 
 def test_workers_of_their_own_evaluate_the_same_episodes(tmp_path: Path) -> None:

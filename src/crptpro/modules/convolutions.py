@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import os
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -16,6 +15,8 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+from crptpro.workers import single_core_threads
 
 ChunkFunction = Callable[[Tensor, Sequence[Tensor]], Tensor]
 
@@ -77,22 +78,7 @@ def _map(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
 
 @functools.cache
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads whose tensor operations run on one core each."""
-    before = torch.get_num_threads()
-    together = threading.Barrier(threads)
-
-    def compute_alone(_: int) -> None:
-        together.wait(60.0)  # every thread of the pool must get one of these calls
-        torch.get_num_threads()  # a thread's first call sets its number to the process's
-        torch.set_num_threads(1)
-
-    pool = ThreadPoolExecutor(threads, thread_name_prefix="chunks")
-    try:
-        list(pool.map(compute_alone, range(threads)))
-    finally:
-        together.abort()  # if a thread could not start, the others stop waiting
-        torch.set_num_threads(before)  # the number is per thread, but new threads take the last one set
-    return pool
+    return single_core_threads(threads, "chunks")
 
 
 os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive a fork

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import shutil
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from crptpro.envs import make_env, needs_gl
 from crptpro.envs.rendering import select_backend
 from crptpro.provenance import cpu_cores
 from crptpro.training.run import Run
-from crptpro.workers import Inline
+from crptpro.workers import Inline, single_core_threads
 
 SPARE_FRAMES = 2_000
 
@@ -48,7 +48,7 @@ class EnvThread:
         # A torch limited to one thread leaves the cores to others.
         has_cores = cpu_cores() > 1 and torch.get_num_threads() > 1
         runs_ahead = has_cores and not (needs_gl(domain) and select_backend() == "glfw")
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="environment") if runs_ahead else Inline()
+        self._thread = single_core_threads(1, "environment") if runs_ahead else Inline()
         self.env: EnvBase = self._thread.submit(self.make_env).result()
 
     def reset(self, seed: int) -> TensorDictBase:
