@@ -49,7 +49,11 @@ def quickstart() -> pd.DataFrame:
     """Returns on walker_stand at the end of each run of the quickstart."""
     rows = []
     for record in sorted((RECORDS / "quickstart_4096").glob("seed_*")):
-        row = {"seed": f"[{record.name[5:]}](../results/quickstart_4096/{record.name}/report.md)"}
+        hardware = json.loads((record / "crptpro" / "config.json").read_text())["hardware"]
+        row = {
+            "seed": f"[{record.name.split('_')[1]}](../results/quickstart_4096/{record.name}/report.md)",
+            "two cores with": hardware["cpu_instructions"].split(", ")[-1],
+        }
         for name, method in {"pre-trained encoder": "crptpro", "untrained encoder": "random-encoder"}.items():
             runs = pd.read_csv(record / method / "eval.csv")
             row[name] = _spread(runs[runs["env_steps"] == runs["env_steps"].max()]["episode_return"])
