@@ -1,4 +1,4 @@
-"""The order in which data walks the house: an import may only point towards the entrance."""
+"""The layers of the package: a module imports from its own layer and from lower ones."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 
 def rank_of(module: str) -> int:
     candidates = [part for part in RANKS if module == part or module.startswith(f"{part}.")]
-    assert candidates, f"{module} has no place in the house; give it one in {Path(__file__).name}"
+    assert candidates, f"{module} belongs to no layer; name one in {Path(__file__).name}"
     return RANKS[max(candidates, key=len)]
 
 
@@ -39,13 +39,13 @@ def imports_of(path: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_imports_point_to_an_earlier_part(path: Path) -> None:
+def test_imports_point_to_the_same_layer_or_a_lower_one(path: Path) -> None:
     module = ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix("__init__").strip(".")
     if module in ("", "cli", "__main__"):
         return
     for name in imports_of(path):
         if name.startswith("crptpro."):
-            assert rank_of(name.removeprefix("crptpro.")) <= rank_of(module), f"{module} imports {name}, a later part"
+            assert rank_of(name.removeprefix("crptpro.")) <= rank_of(module), f"{module} imports {name}, of a higher layer"
 
 
 @pytest.mark.parametrize("part", ["modules", "objectives", "transforms"])
