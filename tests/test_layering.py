@@ -45,7 +45,7 @@ def test_imports_point_to_the_same_layer_or_a_lower_one(path: Path) -> None:
         return
     for name in imports_of(path):
         if name.startswith("crptpro."):
-            assert rank_of(name.removeprefix("crptpro.")) <= rank_of(module), f"{module} imports {name}, of a higher layer"
+            assert rank_of(name.removeprefix("crptpro.")) <= rank_of(module), f"{module} imports {name}, a higher layer"
 
 
 @pytest.mark.parametrize("part", ["modules", "objectives", "transforms"])
