@@ -13,6 +13,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import pandas as pd
+from scipy.stats import ttest_ind
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDS = ROOT / "results"
@@ -76,23 +77,45 @@ def small_scale() -> pd.DataFrame:
 
 
 def controls() -> pd.DataFrame:
-    """Mean return over the finished runs of each control, and each run's at the end."""
-    runs = downstream_runs("controls")
-    means = runs.groupby(["method", "run", "env_steps"], observed=True)["episode_return"].mean().unstack()
-    trained = downstream_runs("controls", "episodes").groupby(["method", "run"], observed=True)["episode_return"]
-    last = trained.apply(lambda returns: returns.tail(5).mean())
+    """Mean return over the runs of each control, and each run's at the end."""
+    evaluated, trained = _control_returns()
     return pd.DataFrame(
         {
             "": f"`{method}`",
             "runs": len(own),
-            "before learning": f"{own[0].mean():.0f}",
-            "10,000 env steps": f"{own[10_000].mean():.0f}",
-            "20,000 env steps": f"{own[20_000].mean():.0f}",
+            "before learning": _over_runs(own[0]),
+            "10,000 env steps": _over_runs(own[10_000]),
+            "20,000 env steps": _over_runs(own[20_000]),
             "each run": _list(own[20_000]),
-            "last five training episodes of each run": _list(last[method]),
+            "last five training episodes of each run": _list(trained[method]),
         }
-        for method, own in means.groupby("method", observed=True)
+        for method, own in evaluated.groupby("method", observed=True)
     )
+
+
+def control_differences() -> pd.DataFrame:
+    """Differences between the controls at the end, with Welch's 95 % interval over runs."""
+    evaluated, trained = _control_returns()
+    rows = []
+    for what, first, second in (
+        ("the bonus", "crptpro", "crptpro-no-bonus"),
+        ("pre-training, without bonus", "crptpro-no-bonus", "random-encoder"),
+        ("standardised features, untrained encoder", "random-encoder-standardised", "random-encoder"),
+        ("these instead of pre-training, without bonus", "random-encoder-standardised", "crptpro-no-bonus"),
+    ):
+        row = {"what differs": what, "": f"`{first}` - `{second}`"}
+        for measure, returns in {"evaluations": evaluated[20_000], "last five training episodes": trained}.items():
+            low, high = ttest_ind(returns[first], returns[second], equal_var=False).confidence_interval()
+            row[measure] = f"{returns[first].mean() - returns[second].mean():+.0f} ({low:+.0f} to {high:+.0f})"
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _control_returns() -> tuple[pd.DataFrame, pd.Series]:
+    """Return of each run by method: of its evaluations, a column each, and of its last five training episodes."""
+    trained = downstream_runs("controls", "episodes").groupby(["method", "run"], observed=True)["episode_return"]
+    evaluated = downstream_runs("controls").groupby(["method", "run", "env_steps"], observed=True)["episode_return"]
+    return evaluated.mean().unstack(), trained.apply(lambda returns: returns.tail(5).mean())
 
 
 def _published(task: str) -> pd.DataFrame:
@@ -160,7 +183,8 @@ def _probe_scores() -> dict[int, pd.Series]:
 
 
 TABLES = {"quickstart": quickstart, "small scale": small_scale, "controls": controls, "two tasks": two_tasks,
-          "cheetah_run": cheetah_run, "pre-training": pretraining, "probes": probes}  # fmt: skip
+          "control differences": control_differences, "cheetah_run": cheetah_run, "pre-training": pretraining,
+          "probes": probes}  # fmt: skip
 
 
 def draw() -> None:
