@@ -33,8 +33,8 @@ class Config:
     """-c: one encoder for several domains; -s: for one domain"""
     domains: tuple[str, ...] = ("A",)
     """domains or group letters"""
-    tasks: tuple[str, ...] = ()
-    """tasks to learn (default: the domains' own)"""
+    tasks: tuple[str, ...] | None = None
+    """tasks to learn (None: the domains' own)"""
     out: Path = Path("runs/explore")
     """everything is written below this directory"""
     seed: int = 0

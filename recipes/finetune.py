@@ -31,7 +31,7 @@ class Config:
     domain: str = "pendulum"
     """domain to fine-tune on"""
     task: str | None = None
-    """downstream task (default: the domain's)"""
+    """downstream task (None: the domain's)"""
     out: Path = Path("runs/finetune")
     """everything is written below this directory"""
     seed: int = 0

@@ -37,8 +37,8 @@ class Config:
     method: str = "crptpro"
     """any method that learns from random data: crptpro, crptpro-fast, released-code, atc, atc-native, and the controls
     random-encoder and random-encoder-standardised"""
-    tasks: tuple[str, ...] = ()
-    """tasks to learn (default: the group's own)"""
+    tasks: tuple[str, ...] | None = None
+    """tasks to learn (None: the group's own)"""
     out: Path = Path("runs/paper")
     """everything is written below this directory"""
     seed: int = 0

@@ -57,9 +57,9 @@ class Logging:
     wandb: Literal["off", "auto", "offline", "online"] = "off"
     """mirror to Weights & Biases; auto is online when logged in, else offline"""
     wandb_project: str | None = None
-    """W&B project (default: $WANDB_PROJECT, or crptpro)"""
+    """W&B project (None: $WANDB_PROJECT, or crptpro)"""
     wandb_group: str | None = None
-    """W&B group (default: $WANDB_RUN_GROUP, or none)"""
+    """W&B group (None: $WANDB_RUN_GROUP, or none)"""
     wandb_tags: Annotated[tuple[str, ...], arg(help_behavior_hint="(default: none)")] = ()
     """W&B tags"""
     tensorboard: bool = False
@@ -121,7 +121,7 @@ class Collect:
     colors: Colors = "normal"
     """colours of the environments; reversed_background are the unseen ones of the paper"""
     action_repeat: int | None = None
-    """simulator steps per decision (default: the domain's, 2)"""
+    """simulator steps per decision (None: the domain's, 2)"""
 
     def run(self) -> None:
         settings = {k: v for k, v in vars(self).items() if k not in ("domains", "out")}
@@ -256,17 +256,17 @@ class Evaluate:
     agent: Positional[str]
     """directory of an agent (OUT/agent of a downstream run), or `random-policy`"""
     task: str | None = None
-    """task to act in (default: the agent's own)"""
+    """task to act in (None: the agent's own)"""
     episodes: int = 10
     """whole episodes"""
     seed: int = 0
     """seeds the episodes"""
     quality: Quality | None = None
-    """render quality (default: the one the agent was trained with; exact for the random policy)"""
+    """render quality (None: the one the agent was trained with; exact for the random policy)"""
     colors: Colors | None = None
-    """colours of the environment (default: those of the agent's training; normal for the random policy)"""
+    """colours of the environment (None: those of the agent's training; normal for the random policy)"""
     action_repeat: int | None = None
-    """simulator steps per decision (default: what the agent was trained with; the domain's for the random policy)"""
+    """simulator steps per decision (None: what the agent was trained with; the domain's for the random policy)"""
     csv: Path | None = None
     """write one row per episode here"""
     video: Path | None = None
@@ -370,7 +370,7 @@ class Report:
     directory: Positional[Path]
     """directory of `crptpro reproduce`, or any with downstream runs in or below it"""
     out: Path | None = None
-    """directory of the report (default: DIRECTORY/report)"""
+    """directory of the report (None: DIRECTORY/report)"""
 
     def run(self) -> None:
         from crptpro.experiments.report import build_report

@@ -66,16 +66,16 @@ class Reproduce:
     launcher: Literal["local", "slurm", "ray"] = "local"
     """local: processes here; slurm, ray: a cluster whose nodes share ROOT"""
     jobs: int | None = None
-    """most jobs at a time, each with its own memory (default: one per core, or as many as the GPUs take by
+    """most jobs at a time, each with its own memory (None: one per core, or as many as the GPUs take by
     --jobs-per-gpu, which is also the most here; on a cluster 16)"""
     cores_per_job: int | None = None
-    """cores of each job (default: this machine's divided by jobs; on a cluster 1, beside a GPU 4)"""
+    """cores of each job (None: this machine's divided by jobs; on a cluster 1, beside a GPU 4)"""
     jobs_per_gpu: int = 1
     """local, ray: how many jobs share a GPU"""
     attempts: int = 3
     """how often a job is tried before it counts as failed; each attempt continues the one before"""
     partition: str | None = None
-    """slurm: partition (default: the cluster's)"""
+    """slurm: partition (None: the cluster's)"""
     hours: float = 24.0
     """slurm: time limit of a job; one that reaches it is queued again and continues"""
     memory_gb: float = 16.0
@@ -83,7 +83,7 @@ class Reproduce:
     sbatch: Annotated[tuple[str, ...], arg(help_behavior_hint="(default: none)")] = ()
     """slurm: further options as `key=value`, e.g. `account=robots qos=high`"""
     ray_address: Annotated[str | None, arg(metavar="HOST:PORT")] = None
-    """ray: head of the cluster (default: RAY_ADDRESS, or one on this machine)"""
+    """ray: head of the cluster (None: RAY_ADDRESS, or one on this machine)"""
 
     def run(self) -> None:
         root = as_path(self.out, "out")

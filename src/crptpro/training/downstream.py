@@ -50,15 +50,15 @@ class DownstreamConfig:
     """
 
     env_steps: int | None = None
-    """budget in simulator steps (default: the method's; 500,000, drq 1,000,000); an episode running then is cut"""
+    """budget in simulator steps (None: the method's; 500,000, drq 1,000,000); an episode running then is cut"""
     batch_size: int = 512
     """transitions per update"""
     replay_capacity: int | None = None
-    """transitions kept (default: the method's; 40,000, proto-rl and drq 100,000); the oldest go first"""
+    """transitions kept (None: the method's; 40,000, proto-rl and drq 100,000); the oldest go first"""
     random_agent_steps: int = 1_000
     """decisions before the first update, uniformly at random unless the actor has explored the domain (proto-rl-s)"""
     intrinsic_reward_coef: float | None = None
-    """weight of the prototype-kNN bonus (default: the method's; 0.2 for those with prototypes); 0 switches it off"""
+    """weight of the prototype-kNN bonus (None: the method's; 0.2 for those with prototypes); 0 switches it off"""
     knn_k: int = 3
     """the bonus is the distance to the k-th nearest candidate"""
     queue_size: int = 2_048
@@ -68,13 +68,13 @@ class DownstreamConfig:
     discount: float = 0.99
     """per agent step; only true terminations stop bootstrapping, time limits never do"""
     learning_rate: float | None = None
-    """of the Adam optimisers of actor, critic and temperature (default: the method's; 1e-4, drq 1e-3)"""
+    """of the Adam optimisers of actor, critic and temperature (None: the method's; 1e-4, drq 1e-3)"""
     initial_temperature: float = 0.1
     """SAC's alpha at the start"""
     critic_tau: float = 0.01
     """EMA rate of the target critic, at every second update"""
     action_repeat: int | None = None
-    """simulator steps per decision (default: the domain's, 2)"""
+    """simulator steps per decision (None: the domain's, 2)"""
     features: Literal["auto", "dense", "dense-bf16", "reencode"] = "auto"
     """features of shifted observations: crops of dense maps, stored once per observation (exact; in bfloat16 rounded
     once, with half the memory), or the encoder at every update; auto takes dense maps where the memory suffices"""
@@ -83,7 +83,7 @@ class DownstreamConfig:
     eval_episodes: int = 10
     """episodes per evaluation"""
     eval_workers: int | None = None
-    """processes that evaluate meanwhile, 0.5 GB each; 0 evaluates in between (default: one per core if that helps)"""
+    """processes that evaluate meanwhile, 0.5 GB each; 0 evaluates in between (None: one per core if that helps)"""
     checkpoint_interval_env_steps: int = 5_000
     """simulator steps between two checkpoints, taken at episode ends"""
     log_interval_env_steps: int = 1_000

@@ -59,17 +59,17 @@ class ExploreConfig:
     """
 
     env_steps: int | None = None
-    """budget in simulator steps, shared by all domains (default: the method's; -c 200,000, -s 500,000)"""
+    """budget in simulator steps, shared by all domains (None: the method's; -c 200,000, -s 500,000)"""
     batch_size: int | None = None
-    """transitions per update, of encoder and agent alike (default: the method's)"""
+    """transitions per update, of encoder and agent alike (None: the method's)"""
     learning_rate: float | None = None
-    """of the encoder's Adam (default: the method's)"""
+    """of the encoder's Adam (None: the method's)"""
     encoder_update_interval: int | None = None
-    """decisions in a domain between two encoder updates on it (default: the method's, 2)"""
+    """decisions in a domain between two encoder updates on it (None: the method's, 2)"""
     random_agent_steps: int | None = None
-    """decisions per domain taken uniformly at random before its first update (default: the method's)"""
+    """decisions per domain taken uniformly at random before its first update (None: the method's)"""
     replay_capacity: int | None = None
-    """transitions kept per domain (default: the method's, 100,000)"""
+    """transitions kept per domain (None: the method's, 100,000)"""
     hidden_dim: int = 1_024
     """width of the two hidden layers of the agents' actors and critics"""
     queue_size: int = 2_048

@@ -41,15 +41,15 @@ class PretrainConfig:
     """How an encoder is pre-trained on datasets. ``None`` means the method's own value, which is the paper's."""
 
     updates: int | None = None
-    """encoder updates, over all domains (default: the method's; crptpro 50,000; fine-tuning 2,000)"""
+    """encoder updates, over all domains (None: the method's; crptpro 50,000; fine-tuning 2,000)"""
     batch_size: int | None = None
-    """transitions per update (default: the method's; crptpro 512)"""
+    """transitions per update (None: the method's; crptpro 512)"""
     learning_rate: float | None = None
-    """of Adam (default: the method's; crptpro 1e-4)"""
+    """of Adam (None: the method's; crptpro 1e-4)"""
     warmup_updates: int | None = None
-    """updates over which the learning rate rises linearly from 0 (default: the method's; atc 1,000)"""
+    """updates over which the learning rate rises linearly from 0 (None: the method's; atc 1,000)"""
     encoder_tau: float | None = None
-    """EMA rate of the target networks, every update (default: the method's; crptpro 0.05)"""
+    """EMA rate of the target networks, every update (None: the method's; crptpro 0.05)"""
     seed: int = 0
     """seeds sampling, shifts, and what the loss draws"""
     precision: Precision = "auto"
@@ -63,7 +63,7 @@ class PretrainConfig:
     log_interval: int = 100
     """updates between two rows of the record"""
     checkpoint_interval: int | None = None
-    """updates between two checkpoints (default: about every five minutes)"""
+    """updates between two checkpoints (None: about every five minutes)"""
 
     def __post_init__(self) -> None:
         check_numbers(self, minima={"warmup_updates": 0}, maxima={"encoder_tau": 1})
