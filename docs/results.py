@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -141,16 +142,41 @@ def two_tasks() -> pd.DataFrame:
 
 def cheetah_run() -> pd.DataFrame:
     """Return of cheetah_run with the paper's settings: mean, least and greatest run of each method."""
-    runs = {path.parent.name: pd.read_csv(path) for path in sorted(CHEETAH_RUNS.glob("*/eval.csv"))}
-    means = pd.concat(runs, names=["run"]).groupby(["run", "env_steps"])["episode_return"].mean().unstack()
     chance = pd.read_csv(RECORDS / "group_a_20k" / "uniform_cheetah_run.csv")["episode_return"].mean()
-    log = pd.read_csv(RECORDS / "references" / "crptpro_cheetah_run_eval.csv", index_col="env_steps")["episode_return"]
-    rows = [(f"`{method}`", own) for method, own in means.groupby(lambda run: run.partition("_seed_")[0])]
-    rows += [("CRPTpro, its authors' log", log.to_frame().T), ("DrQ, its authors' log", _published("cheetah_run"))]
     shown = range(20_000, 100_001, 20_000)
-    table = [[name, str(len(own)), *(_over_runs(own[n]) for n in shown)] for name, own in rows]
+    table = [[name, str(len(own)), *(_over_runs(own[n]) for n in shown)] for name, own in _cheetah_evaluations()]
     table.append(["uniform random policy", "", *[f"{chance:.0f}"] * len(shown)])
     return pd.DataFrame(table, columns=["cheetah_run", "runs", *(f"{n:,} env steps" for n in shown)])
+
+
+def cheetah_run_means() -> pd.DataFrame:
+    """Means of cheetah_run over the evaluations decided on beforehand, and over the last training episodes."""
+    files = {path.parent.name: path for path in sorted(CHEETAH_RUNS.glob("*/episodes.csv"))}
+    files["CRPTpro, its authors' log_seed_0"] = RECORDS / "references" / "crptpro_cheetah_run_train.csv"
+    episodes = pd.concat({run: pd.read_csv(path) for run, path in files.items()}, names=["run"])
+    episodes = episodes[episodes["env_steps"].between(80_000, 97_000, inclusive="right")]
+    trained = episodes.groupby("run")["episode_return"].mean()
+    rows = []
+    for name, own in _cheetah_evaluations():
+        last = trained[trained.index.str.startswith(name.strip("`") + "_seed_")]
+        planned = own[[60_000, 80_000, 100_000]].mean(axis=1, skipna=False)
+        row = {"cheetah_run": name, "runs": len(own)}
+        row["evaluations at 60,000 and 80,000 env steps"] = _over_runs(own[[60_000, 80_000]].mean(axis=1), each=True)
+        row["at 60,000, 80,000 and 100,000"] = _over_runs(planned, each=True)
+        row["training episodes, 80,000 to 97,000 env steps"] = _over_runs(last, each=True)
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _cheetah_evaluations() -> list[tuple[str, pd.DataFrame]]:
+    """Return of cheetah_run by method: a row per run, a column per evaluation."""
+    runs = {path.parent.name: pd.read_csv(path) for path in sorted(CHEETAH_RUNS.glob("*/eval.csv"))}
+    means = pd.concat(runs, names=["run"]).groupby(["run", "env_steps"])["episode_return"].mean().unstack()
+    log = pd.read_csv(RECORDS / "references" / "crptpro_cheetah_run_eval.csv", index_col="env_steps")["episode_return"]
+    rows = [(f"`{method}`", own) for method, own in means.groupby(lambda run: run.partition("_seed_")[0])]
+    return [
+        *rows, ("CRPTpro, its authors' log", log.to_frame().T), ("DrQ, its authors' log", _published("cheetah_run"))
+    ]  # fmt: skip
 
 
 def pretraining() -> pd.DataFrame:
@@ -167,15 +193,16 @@ def pretraining() -> pd.DataFrame:
 def probes() -> pd.DataFrame:
     """R² of positions and velocities along pre-training; a negative one counts as 0."""
     rows = []
-    for updates, scores in _probe_scores().items():
+    for updates, scores in probe_scores(PROBES).items():
         cells = {name: f"{scores[name, 'r2_position']:.3f} / {scores[name, 'r2_velocity']:.3f}" for name in DOMAINS}
         rows.append({"updates": f"{updates:,}" if updates else "0 (`random-encoder`)", **cells})
     return pd.DataFrame(rows)
 
 
-def _probe_scores() -> dict[int, pd.Series]:
+def probe_scores(paths: Mapping[int, Path]) -> dict[int, pd.Series]:
+    """Mean R² of each domain's coordinates by updates; a negative one counts as 0."""
     found = {}
-    for updates, path in PROBES.items():
+    for updates, path in paths.items():
         table = pd.read_csv(path)
         table = table[table["embedding"] == "features"].assign(value=table["value"].clip(lower=0))
         found[updates] = table.groupby(["domain", "measure"])["value"].mean()
@@ -183,8 +210,8 @@ def _probe_scores() -> dict[int, pd.Series]:
 
 
 TABLES = {"quickstart": quickstart, "small scale": small_scale, "controls": controls, "two tasks": two_tasks,
-          "control differences": control_differences, "cheetah_run": cheetah_run, "pre-training": pretraining,
-          "probes": probes}  # fmt: skip
+          "control differences": control_differences, "cheetah_run": cheetah_run,
+          "cheetah_run means": cheetah_run_means, "pre-training": pretraining, "probes": probes}  # fmt: skip
 
 
 def draw() -> None:
@@ -194,7 +221,7 @@ def draw() -> None:
     loss.plot(record["updates"], record["loss_comp"], label="paper's settings, group A")
     loss.axhline(math.log(512), color="grey", linestyle=":", label="ln 512: uniform predictions")
     loss.set(title="Pre-training (1 run)", xlabel="updates", ylabel="comparative loss")
-    scores = _probe_scores()
+    scores = probe_scores(PROBES)
     for name in DOMAINS:
         gains = [scores[n][name, "r2_velocity"] - scores[0][name, "r2_velocity"] for n in PROBES]
         unseen = name not in DOMAINS[:3]
@@ -256,13 +283,13 @@ def _list(returns: pd.Series) -> str:
     return ", ".join(f"{value:.0f}" for value in returns)
 
 
-def _over_runs(returns: pd.Series) -> str:
-    """Mean over runs, with the standard deviation from five runs up, the extremes below."""
+def _over_runs(returns: pd.Series, *, each: bool = False) -> str:
+    """Mean over runs, with the standard deviation from five runs up, below it the extremes or each run."""
     returns = returns.dropna()
     if len(returns) >= 5:
         return _spread(returns)
-    extremes = f" ({returns.min():.0f} to {returns.max():.0f})" if len(returns) > 1 else ""
-    return f"{returns.mean():.0f}{extremes}" if len(returns) else ""
+    runs = _list(returns) if each else f"{returns.min():.0f} to {returns.max():.0f}"
+    return "" if returns.empty else f"{returns.mean():.0f}" + (f" ({runs})" if len(returns) > 1 else "")
 
 
 def _spread(returns: pd.Series) -> str:

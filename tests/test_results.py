@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import re
 import runpy
+from collections.abc import Iterator
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 RESULTS = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "results.py"))
+RECORDS = RESULTS["RECORDS"]
+RUNS = ("paper_scale", "paper_scale_10k")
 
 
 @pytest.mark.parametrize("page", RESULTS["PAGES"], ids=lambda page: page.name)
@@ -24,3 +28,45 @@ def test_the_readme_quotes_the_returns_of_the_quickstart() -> None:
     quoted = re.search(ours, readme)
     assert quoted is not None
     assert list(quoted.groups()) == [cell.split()[0] for cell in RESULTS["quickstart"]().iloc[-1, -3:]]
+
+
+def sentences() -> Iterator[str]:
+    """What the page says outside its tables, computed from the records."""
+    record, first = (pd.read_csv(RECORDS / name / "pretrain.csv", index_col="updates")["loss_comp"] for name in RUNS)
+    yield f"The loss is lowest at {record.idxmin():,} updates"
+    yield f"a first attempt had a loss lower by {record[24_000] - first[24_000]:.3f} at 24,000 updates"
+
+    paths = RESULTS["PROBES"] | {-n: RECORDS / RUNS[1] / f"probe_{n}_updates.csv" for n in (1_000, 3_000, 10_000)}
+    probes = pd.DataFrame(RESULTS["probe_scores"](paths)).unstack("domain").loc[["r2_position", "r2_velocity"]]
+    gains = (probes[50_000] - probes[30_000]).loc["r2_velocity"]
+    much = gains[["cheetah", "finger", "walker"]]
+    yield (
+        f"the velocities of cheetah, finger and walker still gain {much.min():.3f} to {much.max():.3f}, those of the "
+        f"others {gains.drop(much.index).max():.3f} at most"
+    )
+    apart = max((probes[n] - probes[-n]).abs().max().max() for n in (1_000, 3_000, 10_000))
+    yield f"a first attempt's after 1,000, 3,000 and 10,000 updates differ by {apart:.3f} at most"
+
+    means = RESULTS["cheetah_run_means"]().set_index("cheetah_run").iloc[:, 1:].map(lambda cell: cell.split(" ")[0])
+    no_bonus, untrained = means.loc["`crptpro-no-bonus`"], means.loc["`random-encoder`"]
+    yield f"{no_bonus.iloc[1]} on the pre-trained encoder, {untrained.iloc[1]} on an untrained one"
+    at = RESULTS["cheetah_run"]().set_index("cheetah_run").map(lambda cell: cell.split(" ")[0])
+    (ours, log), days = (at.loc[name] for name in ("`crptpro`", "CRPTpro, its authors' log")), ["60,000", "80,000"]
+    yield "{} and {} after 60,000 and 80,000 env steps".format(*(ours[f"{n} env steps"] for n in days))
+    yield "log](#a-task-with-the-settings-of-the-paper) {} and {}".format(*(log[f"{n} env steps"] for n in days))
+    runs = RESULTS["CHEETAH_RUNS"].glob("crptpro_seed_*/episodes.csv")
+    ends = [pd.read_csv(path)["env_steps"].max() for path in runs]
+    yield f"cut off after {min(ends):,} to {max(ends):,} env steps"
+
+    returns = RESULTS["_control_returns"]()[0][20_000].unstack("run")
+    bonus = returns.loc["crptpro"] - returns.loc["crptpro-no-bonus"]
+    yield f"Each of the five seeds returned more with it, by {bonus.min():.0f} to {bonus.max():.0f}"
+    (small,) = (RECORDS / "controls" / "jobs").glob("encoder-crptpro-*/pretrain.csv")
+    end = pd.read_csv(small).iloc[-1]
+    below = 1 - end["loss_comp"] / end["ln_num_prototypes"]
+    yield f"its comparative loss is {below:.0%} below that of uniform predictions".replace("%", " %")
+
+
+@pytest.mark.parametrize("sentence", list(sentences()))
+def test_the_page_says_what_the_records_give(sentence: str) -> None:
+    assert sentence in " ".join((RESULTS["ROOT"] / "docs" / "results.md").read_text().split())
