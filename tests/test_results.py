@@ -47,9 +47,9 @@ def sentences() -> Iterator[str]:
     apart = max((probes[n] - probes[-n]).abs().max().max() for n in (1_000, 3_000, 10_000))
     yield f"a first attempt's after 1,000, 3,000 and 10,000 updates differ by {apart:.3f} at most"
 
-    means = RESULTS["cheetah_run_means"]().set_index("cheetah_run").iloc[:, 1:].map(lambda cell: cell.split(" ")[0])
-    no_bonus, untrained = means.loc["`crptpro-no-bonus`"], means.loc["`random-encoder`"]
-    yield f"{no_bonus.iloc[1]} on the pre-trained encoder, {untrained.iloc[1]} on an untrained one"
+    means = RESULTS["cheetah_run_means"]().set_index("cheetah_run")["at 60,000, 80,000 and 100,000"]
+    first, second = re.findall(r"[(, ](\d+)", means["`random-encoder`"])
+    yield f"{means['`crptpro-no-bonus`']} on the pre-trained encoder, {first} and {second} on untrained ones"
     at = RESULTS["cheetah_run"]().set_index("cheetah_run").map(lambda cell: cell.split(" ")[0])
     (ours, log), days = (at.loc[name] for name in ("`crptpro`", "CRPTpro, its authors' log")), ["60,000", "80,000"]
     yield "{} and {} after 60,000 and 80,000 env steps".format(*(ours[f"{n} env steps"] for n in days))
