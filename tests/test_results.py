@@ -13,6 +13,7 @@ import pytest
 RESULTS = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "results.py"))
 RECORDS = RESULTS["RECORDS"]
 RUNS = ("paper_scale", "paper_scale_10k")
+AUTHORS = "CRPTpro, its authors' log"
 
 
 @pytest.mark.parametrize("page", RESULTS["PAGES"], ids=lambda page: page.name)
@@ -48,12 +49,12 @@ def sentences() -> Iterator[str]:
     yield f"a first attempt's after 1,000, 3,000 and 10,000 updates differ by {apart:.3f} at most"
 
     means = RESULTS["cheetah_run_means"]().set_index("cheetah_run")["at 60,000, 80,000 and 100,000"]
-    first, second = re.findall(r"[(, ](\d+)", means["`random-encoder`"])
-    yield f"{means['`crptpro-no-bonus`']} on the pre-trained encoder, {first} and {second} on untrained ones"
+    each = " and ".join(re.findall(r"[(, ](\d+)", means["`random-encoder`"]))
+    yield f"{means['`crptpro-no-bonus`']} on the pre-trained encoder, {each} on untrained ones"
     at = RESULTS["cheetah_run"]().set_index("cheetah_run").map(lambda cell: cell.split(" ")[0])
-    (ours, log), days = (at.loc[name] for name in ("`crptpro`", "CRPTpro, its authors' log")), ["60,000", "80,000"]
-    yield "{} and {} after 60,000 and 80,000 env steps".format(*(ours[f"{n} env steps"] for n in days))
-    yield "log](#a-task-with-the-settings-of-the-paper) {} and {}".format(*(log[f"{n} env steps"] for n in days))
+    ours, log = (at.loc[name, ["60,000 env steps", "80,000 env steps"]] for name in ("`crptpro`", AUTHORS))
+    yield "{} and {} after 60,000 and 80,000 env steps".format(*ours)
+    yield "log](#a-task-with-the-settings-of-the-paper) {} and {}".format(*log)
     runs = RESULTS["CHEETAH_RUNS"].glob("crptpro_seed_*/episodes.csv")
     ends = [pd.read_csv(path)["env_steps"].max() for path in runs]
     yield f"cut off after {min(ends):,} to {max(ends):,} env steps"
