@@ -49,12 +49,17 @@ def sentences() -> Iterator[str]:
     yield f"a first attempt's after 1,000, 3,000 and 10,000 updates differ by {apart:.3f} at most"
 
     means = RESULTS["cheetah_run_means"]().set_index("cheetah_run")["at 60,000, 80,000 and 100,000"]
-    each = " and ".join(re.findall(r"[(, ](\d+)", means["`random-encoder`"]))
-    yield f"{means['`crptpro-no-bonus`']} on the pre-trained encoder, {each} on untrained ones"
+    *most, last = re.findall(r"[(, ](\d+)", means["`random-encoder`"])
+    yield f"{means['`crptpro-no-bonus`']} on the pre-trained encoder, {', '.join(most)} and {last} on untrained ones"
     at = RESULTS["cheetah_run"]().set_index("cheetah_run").map(lambda cell: cell.split(" ")[0])
     ours, log = (at.loc[name, ["60,000 env steps", "80,000 env steps"]] for name in ("`crptpro`", AUTHORS))
     yield "{} and {} after 60,000 and 80,000 env steps".format(*ours)
     yield "log](#a-task-with-the-settings-of-the-paper) {} and {}".format(*log)
+    runs = {path.parent.name: pd.read_csv(path) for path in sorted(RESULTS["CHEETAH_RUNS"].glob("*/train.csv"))}
+    near = pd.Series({name: run["env_steps"][run["entropy"] >= 3].max() for name, run in runs.items()})
+    is_trained = near.index.str.startswith("crptpro")
+    yield "up to {:,}, {:,} and {:,} env steps".format(*near[~is_trained])
+    yield f"is so up to {near[is_trained].min():,} to {near[is_trained].max():,}"
     runs = RESULTS["CHEETAH_RUNS"].glob("crptpro_seed_*/episodes.csv")
     ends = [pd.read_csv(path)["env_steps"].max() for path in runs]
     yield f"cut off after {min(ends):,} to {max(ends):,} env steps"
