@@ -58,8 +58,8 @@ def sentences() -> Iterator[str]:
     runs = {path.parent.name: pd.read_csv(path) for path in sorted(RESULTS["CHEETAH_RUNS"].glob("*/train.csv"))}
     near = pd.Series({name: run["env_steps"][run["entropy"] >= 3].max() for name, run in runs.items()})
     is_trained = near.index.str.startswith("crptpro")
-    yield "up to {:,}, {:,} and {:,} env steps".format(*near[~is_trained])
-    yield f"is so up to {near[is_trained].min():,} to {near[is_trained].max():,}"
+    yield "falls below 3 nats (uniform: 4.16) after {:,}, {:,} and {:,} env steps".format(*near[~is_trained])
+    yield f"it does so after {near[is_trained].min():,} to {near[is_trained].max():,}"
     runs = RESULTS["CHEETAH_RUNS"].glob("crptpro_seed_*/episodes.csv")
     ends = [pd.read_csv(path)["env_steps"].max() for path in runs]
     yield f"cut off after {min(ends):,} to {max(ends):,} env steps"
