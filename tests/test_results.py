@@ -49,8 +49,8 @@ def sentences() -> Iterator[str]:
     yield f"a first attempt's after 1,000, 3,000 and 10,000 updates differ by {apart:.3f} at most"
 
     means = RESULTS["cheetah_run_means"]().set_index("cheetah_run")["at 60,000, 80,000 and 100,000"]
-    *most, last = re.findall(r"[(, ](\d+)", means["`random-encoder`"])
-    yield f"{means['`crptpro-no-bonus`']} on the pre-trained encoder, {', '.join(most)} and {last} on untrained ones"
+    each = means.str.findall(r"[(, ](\d+)").map(lambda runs: " and ".join(", ".join(runs).rsplit(", ", 1)))
+    yield f"{each['`crptpro-no-bonus`']} on the pre-trained encoder, {each['`random-encoder`']} on untrained ones"
     at = RESULTS["cheetah_run"]().set_index("cheetah_run").map(lambda cell: cell.split(" ")[0])
     ours, log = (at.loc[name, ["60,000 env steps", "80,000 env steps"]] for name in ("`crptpro`", AUTHORS))
     yield "{} and {} after 60,000 and 80,000 env steps".format(*ours)
