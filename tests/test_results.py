@@ -51,6 +51,16 @@ def sentences() -> Iterator[str]:
     means = RESULTS["cheetah_run_means"]().set_index("cheetah_run")["at 60,000, 80,000 and 100,000"]
     each = means.str.findall(r"[(, ](\d+)").map(lambda runs: " and ".join(", ".join(runs).rsplit(", ", 1)))
     yield f"{each['`crptpro-no-bonus`']} on the pre-trained encoder, {each['`random-encoder`']} on untrained ones"
+    trained, untrained = (
+        dict(RESULTS["_cheetah_evaluations"]())[name][[60_000, 80_000, 100_000]].mean(axis=1)
+        for name in ("`crptpro-no-bonus`", "`random-encoder`")
+    )
+    helps = trained.mean() - untrained.mean() >= 100 and trained.min() > untrained.max()
+    yield f"is {trained.mean():.0f} on the pre-trained encoder and {untrained.mean():.0f} on untrained ones"
+    yield f"beforehand](#what-comes-next-decided-beforehand) pre-training {'helps' if helps else 'does not help'}"
+    both = RESULTS["cheetah_run_means"]().set_index("cheetah_run")["evaluations at 60,000 and 80,000 env steps"]
+    bonus, none = (both[name].split()[0] for name in ("`crptpro`", "`crptpro-no-bonus`"))
+    yield f"the runs with bonus average {bonus}, those without {none}"
     at = RESULTS["cheetah_run"]().set_index("cheetah_run").map(lambda cell: cell.split(" ")[0])
     ours, log = (at.loc[name, ["60,000 env steps", "80,000 env steps"]] for name in ("`crptpro`", AUTHORS))
     yield "{} and {} after 60,000 and 80,000 env steps".format(*ours)
