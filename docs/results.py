@@ -10,6 +10,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -19,17 +20,19 @@ from scipy.stats import ttest_ind
 ROOT = Path(__file__).resolve().parent.parent
 RECORDS = ROOT / "results"
 PAGES = (ROOT / "README.md", ROOT / "docs" / "start.md", ROOT / "docs" / "results.md")
-FIGURE, CHEETAH = ROOT / "docs" / "results.png", ROOT / "docs" / "cheetah_run.png"
+FIGURE = ROOT / "docs" / "results.png"
 METHODS = ("crptpro", "crptpro-fast", "crptpro-finetune", "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-s", "becl",
            "drq", "crptpro-no-bonus", "paper-scale-10k", "random-encoder", "random-encoder-standardised")  # fmt: skip
 DOMAINS = ("cheetah", "walker", "quadruped", "finger", "pendulum")
+PAPER_SCALE = RECORDS / "paper_scale"
+"""Records with the paper's settings; downstream runs in directories TASK/METHOD_seed_N."""
+ENV_STEPS = {"cheetah_run": 100_000, "finger_spin": 60_000}
+"""Length of these runs."""
 PROBES = {
-    **{n: RECORDS / "paper_scale" / f"probe_{n}_updates.csv" for n in (0, 1_000, 3_000, 10_000, 30_000)},
+    **{n: PAPER_SCALE / f"probe_{n}_updates.csv" for n in (0, 1_000, 3_000, 10_000, 30_000)},
     50_000: ROOT / "src" / "crptpro" / "encoders" / "group-a" / "probe.csv",
 }
 """Updates of the probed encoders to their records."""
-CHEETAH_RUNS = RECORDS / "paper_scale" / "cheetah_run"
-"""Runs of cheetah_run with the paper's settings, in directories METHOD_seed_N."""
 
 
 def downstream_runs(record: str, file: str = "eval") -> pd.DataFrame:
@@ -140,48 +143,65 @@ def two_tasks() -> pd.DataFrame:
     return pd.DataFrame([{"task": t, "": name, "runs": n, **r} for (t, name, n, _), r in zip(rows, shown, strict=True)])
 
 
-def cheetah_run() -> pd.DataFrame:
-    """Return of cheetah_run with the paper's settings: mean, least and greatest run of each method."""
-    chance = pd.read_csv(RECORDS / "group_a_20k" / "uniform_cheetah_run.csv")["episode_return"].mean()
-    shown = range(20_000, 100_001, 20_000)
-    table = [[name, str(len(own)), *(_over_runs(own[n]) for n in shown)] for name, own in _cheetah_evaluations()]
+def paper_scale(task: str) -> pd.DataFrame:
+    """Return of a task with the paper's settings: mean, least and greatest run of each method."""
+    (path,) = RECORDS.glob(f"*/uniform_{task}.csv")
+    chance = pd.read_csv(path)["episode_return"].mean()
+    shown = range(20_000, ENV_STEPS[task] + 1, 20_000)
+    table = [[name, str(len(own)), *(_over_runs(own[n]) for n in shown)] for name, own in evaluations(task)]
     table.append(["uniform random policy", "", *[f"{chance:.0f}"] * len(shown)])
-    return pd.DataFrame(table, columns=["cheetah_run", "runs", *(f"{n:,} env steps" for n in shown)])
+    return pd.DataFrame(table, columns=[task, "runs", *(f"{n:,} env steps" for n in shown)])
 
 
 def cheetah_run_means() -> pd.DataFrame:
     """Means of cheetah_run over the evaluations decided on beforehand, and over the last training episodes."""
-    files = {path.parent.name: path for path in sorted(CHEETAH_RUNS.glob("*/episodes.csv"))}
-    files["CRPTpro, its authors' log_seed_0"] = RECORDS / "references" / "crptpro_cheetah_run_train.csv"
+    return _means(
+        "cheetah_run",
+        {
+            "evaluations at 60,000 and 80,000 env steps": [60_000, 80_000],
+            "at 60,000, 80,000 and 100,000": [60_000, 80_000, 100_000],
+        },
+        trained=(80_000, 97_000),
+    )
+
+
+def finger_spin_means() -> pd.DataFrame:
+    """Means of finger_spin over the evaluations decided on beforehand, and over the last training episodes."""
+    columns = {"evaluations at 40,000 and 60,000 env steps": [40_000, 60_000]}
+    return _means("finger_spin", columns, trained=(40_000, 60_000))
+
+
+def _means(task: str, columns: dict[str, list[int]], trained: tuple[int, int]) -> pd.DataFrame:
+    files = {path.parent.name: path for path in sorted((PAPER_SCALE / task).glob("*/episodes.csv"))}
+    for path in RECORDS.glob(f"references/crptpro_{task}_train.csv"):
+        files["CRPTpro, its authors' log_seed_0"] = path
     episodes = pd.concat({run: pd.read_csv(path) for run, path in files.items()}, names=["run"])
-    episodes = episodes[episodes["env_steps"].between(80_000, 97_000, inclusive="right")]
-    trained = episodes.groupby("run")["episode_return"].mean()
+    episodes = episodes[episodes["env_steps"].between(*trained, inclusive="right")]
+    last = episodes.groupby("run")["episode_return"].mean()
+    last_column = "training episodes, {:,} to {:,} env steps".format(*trained)
     rows = []
-    for name, own in _cheetah_evaluations():
-        last = trained[trained.index.str.startswith(name.strip("`") + "_seed_")]
-        planned = own[[60_000, 80_000, 100_000]].mean(axis=1, skipna=False)
-        row = {"cheetah_run": name, "runs": len(own)}
-        row["evaluations at 60,000 and 80,000 env steps"] = _over_runs(own[[60_000, 80_000]].mean(axis=1), each=True)
-        row["at 60,000, 80,000 and 100,000"] = _over_runs(planned, each=True)
-        row["training episodes, 80,000 to 97,000 env steps"] = _over_runs(last, each=True)
+    for name, own in evaluations(task):
+        row = {task: name, "runs": len(own)}
+        row |= {k: _over_runs(own[at].mean(axis=1, skipna=False), each=True) for k, at in columns.items()}
+        row[last_column] = _over_runs(last[last.index.str.startswith(name.strip("`") + "_seed_")], each=True)
         rows.append(row)
     return pd.DataFrame(rows)
 
 
-def _cheetah_evaluations() -> list[tuple[str, pd.DataFrame]]:
-    """Return of cheetah_run by method: a row per run, a column per evaluation."""
-    runs = {path.parent.name: pd.read_csv(path) for path in sorted(CHEETAH_RUNS.glob("*/eval.csv"))}
+def evaluations(task: str) -> list[tuple[str, pd.DataFrame]]:
+    """Return of a task with the paper's settings, ours and published, by method: a row per run, a column each."""
+    runs = {path.parent.name: pd.read_csv(path) for path in sorted((PAPER_SCALE / task).glob("*/eval.csv"))}
     means = pd.concat(runs, names=["run"]).groupby(["run", "env_steps"])["episode_return"].mean().unstack()
-    log = pd.read_csv(RECORDS / "references" / "crptpro_cheetah_run_eval.csv", index_col="env_steps")["episode_return"]
     rows = [(f"`{method}`", own) for method, own in means.groupby(lambda run: run.partition("_seed_")[0])]
-    return [
-        *rows, ("CRPTpro, its authors' log", log.to_frame().T), ("DrQ, its authors' log", _published("cheetah_run"))
-    ]  # fmt: skip
+    for path in RECORDS.glob(f"references/crptpro_{task}_eval.csv"):
+        log = pd.read_csv(path, index_col="env_steps")["episode_return"]
+        rows.append(("CRPTpro, its authors' log", log.to_frame().T))
+    return [*rows, ("DrQ, its authors' log", _published(task))]
 
 
 def pretraining() -> pd.DataFrame:
     """The record of pre-training with the paper's settings."""
-    record = pd.read_csv(RECORDS / "paper_scale" / "pretrain.csv").set_index("updates")
+    record = pd.read_csv(PAPER_SCALE / "pretrain.csv").set_index("updates")
     rows = record.loc[[500, 1_000, 3_000, 5_000, 10_000, 20_000, 30_000, 40_000, 50_000]]
     columns = {"updates": rows.index.map("{:,}".format), "loss": rows["loss_comp"].map("{:.3f}".format)}
     columns |= {f"cosine: {name}": rows[f"cosine/{name}"].map("{:.3f}".format) for name in DOMAINS[:3]}
@@ -210,14 +230,15 @@ def probe_scores(paths: Mapping[int, Path]) -> dict[int, pd.Series]:
 
 
 TABLES = {"quickstart": quickstart, "small scale": small_scale, "controls": controls, "two tasks": two_tasks,
-          "control differences": control_differences, "cheetah_run": cheetah_run,
-          "cheetah_run means": cheetah_run_means, "pre-training": pretraining, "probes": probes}  # fmt: skip
+          "control differences": control_differences, "cheetah_run": partial(paper_scale, "cheetah_run"),
+          "cheetah_run means": cheetah_run_means, "finger_spin": partial(paper_scale, "finger_spin"),
+          "finger_spin means": finger_spin_means, "pre-training": pretraining, "probes": probes}  # fmt: skip
 
 
 def draw() -> None:
     """Draw the loss and the probes along pre-training, and the training returns of the controls."""
     figure, (loss, gain, learning) = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")
-    record = pd.read_csv(RECORDS / "paper_scale" / "pretrain.csv")
+    record = pd.read_csv(PAPER_SCALE / "pretrain.csv")
     loss.plot(record["updates"], record["loss_comp"], label="paper's settings, group A")
     loss.axhline(math.log(512), color="grey", linestyle=":", label="ln 512: uniform predictions")
     loss.set(title="Pre-training (1 run)", xlabel="updates", ylabel="comparative loss")
@@ -241,28 +262,28 @@ def draw() -> None:
     figure.savefig(FIGURE, dpi=110, metadata={"Software": None})
 
 
-def draw_cheetah() -> None:
-    """Draw cheetah_run's training returns beside what others published."""
+def draw_task(task: str) -> None:
+    """Draw a task's training returns with the paper's settings beside what others published."""
+    end = ENV_STEPS[task]
     figure, axes = plt.subplots(figsize=(7.4, 3.8), layout="constrained")
-    drq = _published("cheetah_run").agg(["mean", "std"]).T
-    drq = drq[drq.index <= 100_000]
+    drq = _published(task).agg(["mean", "std"]).T
+    drq = drq[drq.index <= end]
     axes.plot(drq.index, drq["mean"], color="#8a7bd8", label="DrQ, its authors' log: evaluations, mean ± sd of 10 runs")
     axes.fill_between(drq.index, drq["mean"] - drq["std"], drq["mean"] + drq["std"], color="#8a7bd8", alpha=0.15)
-    curves = [
-        (RECORDS / "references" / "crptpro_cheetah_run_train.csv", "CRPTpro, its authors' log (1 run)", "#5d6672")
-    ]
+    log = RECORDS.glob(f"references/crptpro_{task}_train.csv")
+    curves = [(path, "CRPTpro, its authors' log (1 run)", "#5d6672") for path in log]
     for method, color in {"crptpro": "#0b80c3", "crptpro-no-bonus": "#109e77", "random-encoder": "#d9640a"}.items():
-        runs = sorted(CHEETAH_RUNS.glob(f"{method}_seed_*/episodes.csv"))
+        runs = sorted((PAPER_SCALE / task).glob(f"{method}_seed_*/episodes.csv"))
         label = f"{method}, this library ({len(runs)} run{'s' * (len(runs) > 1)})"
         curves += [(path, None if place else label, color) for place, path in enumerate(runs)]
     for path, label, color in curves:
         episodes = pd.read_csv(path)
-        episodes = episodes[episodes["env_steps"] <= 100_000].set_index("env_steps")["episode_return"]
+        episodes = episodes[episodes["env_steps"] <= end].set_index("env_steps")["episode_return"]
         axes.plot(episodes.rolling(5, min_periods=1).mean(), color=color, label=label, linewidth=1.2)
-    axes.set(title="cheetah_run", xlabel="env steps", ylabel="return, mean of 5 training episodes")
+    axes.set(title=task, xlabel="env steps", ylabel="return, mean of 5 training episodes")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8)
-    figure.savefig(CHEETAH, dpi=110, metadata={"Software": None})
+    figure.savefig(ROOT / "docs" / f"{task}.png", dpi=110, metadata={"Software": None})
 
 
 def filled(page: str) -> str:
@@ -300,4 +321,5 @@ if __name__ == "__main__":
     for path in PAGES:
         path.write_text(filled(path.read_text()))
     draw()
-    draw_cheetah()
+    for task in ENV_STEPS:
+        draw_task(task)

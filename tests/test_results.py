@@ -52,7 +52,7 @@ def sentences() -> Iterator[str]:
     each = means.str.findall(r"[(, ](\d+)").map(lambda runs: " and ".join(", ".join(runs).rsplit(", ", 1)))
     yield f"{each['`crptpro-no-bonus`']} on the pre-trained encoder, {each['`random-encoder`']} on untrained ones"
     trained, untrained = (
-        dict(RESULTS["_cheetah_evaluations"]())[name][[60_000, 80_000, 100_000]].mean(axis=1)
+        dict(RESULTS["evaluations"]("cheetah_run"))[name][[60_000, 80_000, 100_000]].mean(axis=1)
         for name in ("`crptpro-no-bonus`", "`random-encoder`")
     )
     helps = trained.mean() - untrained.mean() >= 100 and trained.min() > untrained.max()
@@ -61,18 +61,27 @@ def sentences() -> Iterator[str]:
     both = RESULTS["cheetah_run_means"]().set_index("cheetah_run")["evaluations at 60,000 and 80,000 env steps"]
     bonus, none = (both[name].split()[0] for name in ("`crptpro`", "`crptpro-no-bonus`"))
     yield f"the runs with bonus average {bonus}, those without {none}"
-    at = RESULTS["cheetah_run"]().set_index("cheetah_run").map(lambda cell: cell.split(" ")[0])
+    at = RESULTS["TABLES"]["cheetah_run"]().set_index("cheetah_run").map(lambda cell: cell.split(" ")[0])
     ours, log = (at.loc[name, ["60,000 env steps", "80,000 env steps"]] for name in ("`crptpro`", AUTHORS))
     yield "{} and {} after 60,000 and 80,000 env steps".format(*ours)
     yield "log](#a-task-with-the-settings-of-the-paper) {} and {}".format(*log)
-    runs = {path.parent.name: pd.read_csv(path) for path in sorted(RESULTS["CHEETAH_RUNS"].glob("*/train.csv"))}
+    files = sorted(RESULTS["PAPER_SCALE"].glob("cheetah_run/*/train.csv"))
+    runs = {path.parent.name: pd.read_csv(path) for path in files}
     near = pd.Series({name: run["env_steps"][run["entropy"] >= 3].max() for name, run in runs.items()})
     is_trained = near.index.str.startswith("crptpro")
     yield "falls below 3 nats (uniform: 4.16) after {:,}, {:,} and {:,} env steps".format(*near[~is_trained])
     yield f"it does so after {near[is_trained].min():,} to {near[is_trained].max():,}"
-    runs = RESULTS["CHEETAH_RUNS"].glob("crptpro_seed_*/episodes.csv")
+    runs = RESULTS["PAPER_SCALE"].glob("cheetah_run/crptpro_seed_*/episodes.csv")
     ends = [pd.read_csv(path)["env_steps"].max() for path in runs]
     yield f"cut off after {min(ends):,} to {max(ends):,} env steps"
+
+    finger = dict(RESULTS["evaluations"]("finger_spin"))
+    ours, drq = finger["`crptpro`"].mean(), finger["DrQ, its authors' log"]
+    yield f"is: {ours[60_000]:.0f} after 60,000 env steps"
+    yield f"DrQ's runs have {RESULTS['_spread'](drq[60_000])}"
+    more = [("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "all ten")[count]
+            for count in (drq[[20_000, 60_000]] > ours[[20_000, 60_000]]).sum()]  # fmt: skip
+    yield "of its ten runs {} returned more at 20,000 env steps, and {} at 60,000".format(*more)
 
     returns = RESULTS["_control_returns"]()[0][20_000].unstack("run")
     bonus = returns.loc["crptpro"] - returns.loc["crptpro-no-bonus"]
