@@ -56,19 +56,20 @@ class Loop:
         of: the laps that count; all by default. ``laps`` holds all of the last call.
         source: checkout whose ``src`` is imported; this one by default.
         python: interpreter.
+        environment: variables of the process.
         **settings: of the item.
     """
 
     def __init__(
         self, item: str, *, of: Sequence[str] = (), source: Path = ROOT, python: Path | str = sys.executable,
-        **settings: Any,
+        environment: Mapping[str, str] | None = None, **settings: Any,
     ) -> None:  # fmt: skip
         self.item, self.of = item, of
         path = os.pathsep.join(filter(None, [f"{source / 'src'}", f"{ROOT}", os.environ.get("PYTHONPATH")]))
-        environment = {**os.environ, "PYTHONPATH": path}
+        variables = {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
         self.process = subprocess.Popen(
             [python, "-m", "benchmarks.loops", item, json.dumps(settings, default=str)], cwd=ROOT, text=True,
-            env={**environment, "PYTHONDONTWRITEBYTECODE": "1"}, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            env={**os.environ, **variables, **(environment or {})}, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         )  # fmt: skip
         self.laps = self._read()
 
