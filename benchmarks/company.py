@@ -1,7 +1,8 @@
 """One update, alone and beside a busy process, by how OpenMP's threads wait for each other.
 
-``python -m benchmarks.company`` compares how often they spin before they sleep: libgomp's default, never, and what the
-library sets, ``GOMP_SPINCOUNT=3000``. The environment is a drifting picture, so that the library is what is timed.
+``python -m benchmarks.company`` compares how long they spin before they sleep: libgomp's default, not at all, and
+what the library sets, ``GOMP_SPINCOUNT=3000``. The environment is a drifting picture: the
+library is what is timed.
 """
 
 from __future__ import annotations
