@@ -20,7 +20,7 @@ from benchmarks.synthetic import drifting_dataset, make_drifting
 from torch import nn
 from torchrl.data import LazyMemmapStorage
 
-from benchmarks import collection, company, gpu, loops, memory, revisions, sampling, synthetic, updates
+from benchmarks import collection, contention, gpu, loops, memory, revisions, sampling, synthetic, updates
 from crptpro.data import FrameDataset
 from crptpro.domains import Domain
 from crptpro.envs import make_env
@@ -65,7 +65,7 @@ class LoopInThisProcess(Loop):
 
 @pytest.fixture
 def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (company, gpu, memory, revisions, updates):
+    for module in (contention, gpu, memory, revisions, updates):
         monkeypatch.setattr(module, "Loop", LoopInThisProcess)
     monkeypatch.setattr("benchmarks.measure.Loop", LoopInThisProcess)
     monkeypatch.setattr(synthetic, "LENGTH", 10)
@@ -227,13 +227,13 @@ def test_fast_updates_that_leave_other_weights_fail_their_check(
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_both_ways_to_wait_take_turns_with_and_without_company(
+def test_both_ways_to_wait_take_turns_with_and_without_a_busy_process(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sizes: dict[str, Any] = {"batch_size": 8, "transitions": 30, "image_size": 16, "prototypes": 8}
-    company.main(company.Settings(rounds=1, out=tmp_path, **sizes))
-    for loop in written(tmp_path / "company.json").values():
-        assert {busy: set(one["timings"]) for busy, one in loop.items()} == {key: set(company.WAITS) for key in "01"}
+    contention.main(contention.Settings(rounds=1, out=tmp_path, **sizes))
+    for loop in written(tmp_path / "contention.json").values():
+        assert {busy: set(one["timings"]) for busy, one in loop.items()} == {key: set(contention.WAITS) for key in "01"}
     assert "busy processes beside it: 1 | median ms" in capsys.readouterr().out
 
 

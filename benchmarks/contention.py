@@ -1,6 +1,6 @@
 """One update, alone and beside a busy process, by how OpenMP's threads wait for each other.
 
-``python -m benchmarks.company`` compares how long they spin before they sleep: libgomp's default, not at all, and
+``python -m benchmarks.contention`` compares how long they spin before they sleep: libgomp's default, not at all, and
 what the library sets, ``GOMP_SPINCOUNT=3000``. The environment is a drifting picture: the
 library is what is timed.
 """
@@ -45,7 +45,7 @@ class Settings(UpdateSettings):
 
 def main(settings: Settings) -> None:
     learned: dict[str, Any] = {**settings.sizes, "batch_size": settings.batch_size, "threads": settings.threads}
-    with tempfile.TemporaryDirectory(prefix="crptpro-company-", dir=settings.scratch) as scratch:
+    with tempfile.TemporaryDirectory(prefix="crptpro-contention-", dir=settings.scratch) as scratch:
         path = drifting_dataset(scratch, transitions=settings.transitions, image_size=settings.image_size)
         items: dict[str, tuple[str, dict[str, Any]]] = {
             "pretrain": ("pretraining", {"datasets": [path]}),
@@ -67,7 +67,7 @@ def main(settings: Settings) -> None:
                         print()
             return found
 
-        run_sections("company", settings, {name: functools.partial(measure, name) for name in items})
+        run_sections("contention", settings, {name: functools.partial(measure, name) for name in items})
 
 
 @contextlib.contextmanager
