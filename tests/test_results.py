@@ -76,12 +76,13 @@ def sentences() -> Iterator[str]:
     yield f"cut off after {min(ends):,} to {max(ends):,} env steps"
 
     finger = dict(RESULTS["evaluations"]("finger_spin"))
-    ours, drq = finger["`crptpro`"].mean(), finger["DrQ, its authors' log"]
-    yield f"is: {ours[60_000]:.0f} after 60,000 env steps"
+    ours, untrained = (finger[name].mean() for name in ("`crptpro`", "`random-encoder`"))
+    drq = finger["DrQ, its authors' log"]
+    yield f"is: {ours[60_000]:.0f} after 60,000 env steps, {untrained[60_000]:.0f} on an untrained encoder"
     yield f"DrQ's runs have {RESULTS['_spread'](drq[60_000])}"
     more = [("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "all ten")[count]
             for count in (drq[[20_000, 60_000]] > ours[[20_000, 60_000]]).sum()]  # fmt: skip
-    yield "of its ten runs {} returned more at 20,000 env steps, and {} at 60,000".format(*more)
+    yield "ten runs {} returned more than ours on the pre-trained encoder at 20,000 env steps, and {} at".format(*more)
 
     returns = RESULTS["_control_returns"]()[0][20_000].unstack("run")
     bonus = returns.loc["crptpro"] - returns.loc["crptpro-no-bonus"]
