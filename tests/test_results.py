@@ -82,7 +82,8 @@ def sentences() -> Iterator[str]:
     yield f"DrQ's runs have {RESULTS['_spread'](drq[60_000])}"
     more = [("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "all ten")[count]
             for count in (drq[[20_000, 60_000]] > ours[[20_000, 60_000]]).sum()]  # fmt: skip
-    yield "ten runs {} returned more than ours on the pre-trained encoder at 20,000 env steps, and {} at".format(*more)
+    yield f"its ten runs {more[0]} returned more at 20,000 env steps than the mean of ours"
+    yield f"the mean of ours on the pre-trained encoder, and {more[1]} at 60,000"
 
     returns = RESULTS["_control_returns"]()[0][20_000].unstack("run")
     bonus = returns.loc["crptpro"] - returns.loc["crptpro-no-bonus"]
