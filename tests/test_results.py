@@ -10,6 +10,8 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
+from crptpro.experiments.published import UNSEEN
+
 RESULTS = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "results.py"))
 RECORDS = RESULTS["RECORDS"]
 RUNS = ("paper_scale", "paper_scale_10k")
@@ -75,6 +77,8 @@ def sentences() -> Iterator[str]:
     ends = [pd.read_csv(path)["env_steps"].max() for path in runs]
     yield f"cut off after {min(ends):,} to {max(ends):,} env steps"
 
+    (paper,) = (row.scores["crptpro"] for row in UNSEEN if (row.group, row.task) == ("A", "finger_spin"))
+    yield f"The paper has {paper} after 500,000 env steps"
     finger = dict(RESULTS["evaluations"]("finger_spin"))
     ours, untrained = (finger[name].mean() for name in ("`crptpro`", "`random-encoder`"))
     drq = finger["DrQ, its authors' log"]
