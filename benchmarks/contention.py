@@ -1,8 +1,7 @@
 """One update, alone and beside a busy process, by how OpenMP's threads wait for each other.
 
 ``python -m benchmarks.contention`` compares how long they spin before they sleep: libgomp's default, not at all, and
-what the library sets, ``GOMP_SPINCOUNT=3000``. The environment is a drifting picture: the
-library is what is timed.
+what the library sets, ``GOMP_SPINCOUNT=3000``. The environment is a drifting picture: the library is what is timed.
 """
 
 from __future__ import annotations

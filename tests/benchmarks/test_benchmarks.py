@@ -227,7 +227,7 @@ def test_fast_updates_that_leave_other_weights_fail_their_check(
 
 
 @pytest.mark.usefixtures("in_this_process")
-def test_both_ways_to_wait_take_turns_with_and_without_a_busy_process(
+def test_every_way_to_wait_is_timed_with_and_without_a_busy_process(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sizes: dict[str, Any] = {"batch_size": 8, "transitions": 30, "image_size": 16, "prototypes": 8}
