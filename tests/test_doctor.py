@@ -33,7 +33,7 @@ def have_hardware(
     machine = {"cpu": "x", "cpu_instructions": "AVX2", "cpu_cores": 2, "ram_bytes": 16e9, "gpus": gpus}
     monkeypatch.setattr(doctor.provenance, "hardware", lambda: machine)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=disk))
-    monkeypatch.setattr(doctor.psutil, "virtual_memory", lambda: SimpleNamespace(available=ram))
+    monkeypatch.setattr(doctor, "free_bytes", lambda _: ram)
 
 
 @pytest.fixture(autouse=True)
@@ -72,6 +72,16 @@ def test_a_domain_that_fails_is_an_error_with_its_remedy(monkeypatch: pytest.Mon
     report = run_doctor(["cartpole"])
     assert not report.ok
     assert "cartpole with egl: boom\n  what to do: Try another backend" in report.text()
+
+
+def test_domains_that_do_not_need_gl_are_checked_on_a_machine_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rendering, "select_backend", lambda: pytest.fail("GL was tested"))
+    asked = answers(monkeypatch, error="boom", remedy="Try another backend")
+    text = run_doctor(["gymnasium:Pendulum-v1"]).text()
+    assert asked == ["gymnasium:Pendulum-v1"]
+    assert "rendering without GL" in text
+    assert "error: gymnasium:Pendulum-v1: boom\n" in text
+    assert "another backend" not in text
 
 
 def test_group_letters_are_domains_and_unknown_names_are_refused_before_rendering(

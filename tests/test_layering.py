@@ -12,7 +12,7 @@ import crptpro
 PACKAGE = Path(crptpro.__file__).parent
 FOUNDATION = [
     "errors", "values", "seeding", "provenance", "artifact", "directory_lock", "console", "logging",
-    "plugins", "workers", "progress",
+    "plugins", "workers", "progress", "free_memory",
 ]  # fmt: skip
 ORDER = [
     "domains", "transforms.base", "transforms.color_swap", "envs", "data", "modules", "objectives", "transforms",

@@ -19,13 +19,14 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Literal
 
-import psutil
+import torch
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from crptpro import provenance
 from crptpro.domains import PAPER_DOMAINS, expand_groups
 from crptpro.errors import CRPTproError, EnvCrashedError, RenderingError
+from crptpro.free_memory import free_bytes
 from crptpro.plugins import FLAG, load_plugins, loaded_plugins
 
 _BREAKING = ("mujoco", "dm-control", "torchrl", "tensordict")
@@ -77,7 +78,7 @@ def run_doctor(domains: Iterable[str] | None = None) -> DoctorReport:
     names = expand_groups(PAPER_DOMAINS if domains is None else domains)
     machine = provenance.hardware()
     gpus = machine["gpus"]
-    free_disk, free_ram = shutil.disk_usage(Path.cwd()).free, psutil.virtual_memory().available
+    free_disk, free_ram = shutil.disk_usage(Path.cwd()).free, free_bytes(torch.device("cpu"))
     facts = [
         "versions",
         *(f"  {name:<12}{version}" for name, version in provenance.versions().items()),
@@ -146,16 +147,16 @@ def _check_machine(free_ram: int, free_disk: int, gpus: Sequence[str]) -> list[F
 
 def _check_rendering(names: Sequence[str], *, has_gpu: bool) -> tuple[list[str], list[Finding]]:
     try:
-        from crptpro.envs import rendering  # the import itself refuses a wrong MUJOCO_GL
+        from crptpro.envs import needs_gl, rendering  # the import itself refuses a wrong MUJOCO_GL
 
-        backend = rendering.select_backend()
+        backend = rendering.select_backend() if any(map(needs_gl, names)) else None
     except RenderingError as reason:
         remedy = "Unset MUJOCO_GL, or repair that backend." if "MUJOCO_GL" in os.environ else ""
         return ["rendering: nothing renders"], [Finding("error", str(reason), remedy)]
-    gl = rendering.backend_card()
-    title = f"rendering with {backend} ({gl['gl_renderer']}, {gl['gl_kind']})"
-    facts, findings = [f"{title}, milliseconds per agent step (physics and one image)"], []
-    if has_gpu and gl["gl_kind"] == "software":
+    gl = rendering.backend_card() if backend else {}
+    place = f"with {backend} ({gl['gl_renderer']}, {gl['gl_kind']})" if backend else "without GL"
+    facts, findings = [f"rendering {place}, milliseconds per agent step (physics and one image)"], []
+    if has_gpu and gl.get("gl_kind") == "software":
         what = f"There is a GPU, but {backend} renders in software, about twenty times slower."
         remedy = "Install the GL parts of the GPU's driver; in a container set NVIDIA_DRIVER_CAPABILITIES=all."
         findings.append(Finding("warning", what, remedy))
@@ -164,11 +165,12 @@ def _check_rendering(names: Sequence[str], *, has_gpu: bool) -> tuple[list[str],
         times = "   failed" if error else f"{entry['agent_step_ms']:>8.1f}   reset {entry['reset_ms']:.0f}"
         facts.append(f"  {name:<24}{times}")
         if error:
-            findings.append(Finding("error", f"{name} with {backend}: {error}", entry["remedy"]))
+            what = f"{name} with {backend}: {error}" if needs_gl(name) else f"{name}: {error}"
+            findings.append(Finding("error", what, entry["remedy"] if needs_gl(name) else ""))
     return facts, findings
 
 
-def render_domains(names: Sequence[str], backend: str, timeout_s: float) -> list[dict[str, Any]]:
+def render_domains(names: Sequence[str], backend: str | None, timeout_s: float) -> list[dict[str, Any]]:
     """Return :func:`check_domain` of each name, one by one in processes with a time limit."""
     from crptpro.envs.rendering import run_isolated
 

@@ -220,6 +220,7 @@ def test_windows_and_their_returns_are_those_of_the_published_loop(n: int, lengt
             reward, discount = expected[float(row["action"])]
             assert row["next", "reward"].item() == pytest.approx(reward, rel=1e-6)
             assert row["next", "discount"].item() == pytest.approx(discount, rel=1e-6)
+            assert row["steps_to_next_obs"].item() == n
         assert torch.equal(batch["next", "number"], batch["number"] + n)
         assert torch.equal(replay.observations(batch["next", "number"]), batch["next", "pixels"])
         driver.check()  # indexing reads single transitions

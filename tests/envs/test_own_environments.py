@@ -103,9 +103,10 @@ def test_an_option_that_make_does_not_take_is_said_to_do_nothing(caplog: pytest.
     with caplog.at_level(logging.WARNING):
         make_env(own(make_chw), seed=0, image_size=8, action_repeat=1)
         assert caplog.text == ""
-        make_env(own(make_chw), seed=0, image_size=8, action_repeat=4, quality="fast")
+        make_env(own(make_chw), seed=0, image_size=8, action_repeat=4, quality="fast", camera="top")
     assert "a decision is 1 env step(s), not 4" in caplog.text
     assert "takes no quality" in caplog.text
+    assert "takes no camera: camera='top' changes nothing" in caplog.text
 
 
 @each_stack

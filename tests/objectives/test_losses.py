@@ -142,6 +142,21 @@ def test_copies_are_equal_and_independent_and_their_networks_hold_their_paramete
 
 
 @each
+def test_networks_of_a_loss_that_was_cast_or_moved_hold_its_parameters_and_buffers(case: LossCase) -> None:
+    loss = case.make()
+    statistics = torch.nn.BatchNorm1d(3)
+    loss._convert(extra=statistics)
+    held = {id(parameter) for parameter in loss.parameters()}
+    loss.to(torch.float64)
+    assert {id(parameter) for parameter in loss.parameters()} == held
+    assert {id(parameter) for parameter in statistics.parameters()} <= held
+    with loss._holding("extra"):
+        statistics(torch.ones(2, 3, dtype=torch.float64))
+    assert statistics.running_mean.tolist() == pytest.approx([0.1] * 3)
+    assert torch.equal(loss.extra_params["running_mean"], statistics.running_mean)
+
+
+@each
 def test_soft_update_moves_targets_by_tau(case: LossCase) -> None:
     loss = case.make()
     update_targets = keep_targets(case, loss)

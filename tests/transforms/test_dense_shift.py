@@ -176,6 +176,21 @@ def test_threads_that_sample_side_by_side_get_each_their_own():
         assert all(threads.map(sample, range(60)))
 
 
+@pytest.mark.parametrize("prefetch", [1, 2])
+def test_a_replay_that_prefetches_leaves_the_features_of_earlier_batches_alone(prefetch):
+    encoder, frames = small_encoder(strides=(1, 1)), torch.randint(0, 256, (31, 3, SIZE, SIZE), dtype=torch.uint8)
+    replay = FrameReplay(
+        40, frame_shape=(3, SIZE, SIZE), action_dim=1, returns_pixels=False, batch_size=6, prefetch=prefetch
+    )
+    replay.extend(rollout_of(frames))
+    replay.append_transform(dense_of(encoder, replay, pad=0))
+    for batch in [replay.sample() for _ in range(8)]:
+        for key in ("number", "features"), (("next", "number"), ("next", "features")):
+            with torch.no_grad():
+                expected = encoder(replay.observations(batch[key[0]]))
+            torch.testing.assert_close(batch[key[1]], expected, rtol=0, atol=1e-6 * float(expected.abs().max()))
+
+
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x)), lambda x: x.clone()])
 def test_copies_hold_no_maps_and_no_state_give_the_same_and_leave_the_features_of_the_original_alone(duplicate):
     dense = dense_of()

@@ -328,6 +328,7 @@ class RingStorage(StackStorage):
             window = (row.unsqueeze(-1) + torch.arange(n_step, device="cpu")) % self.rows
             rewards, ended = self.content["reward"][window], self.content["terminated"][window]
             following["reward"], following["discount"] = n_step_return(rewards, ended, self.discount)
+            root["steps_to_next_obs"] = torch.full((*index.shape, 1), n_step, device="cpu")
         return TensorDict({**root, "next": TensorDict(following, index.shape)}, index.shape)
 
     def has_window(self, index: Tensor) -> Tensor:

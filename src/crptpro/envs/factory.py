@@ -193,10 +193,11 @@ def _own(domain: Domain, **settings: Any) -> EnvBase:
     if make is None:
         raise CRPTproError(f"Domain {domain.name!r} has no make, the function that builds its environment.")
     named = _named_by(make, settings)
-    if settings["quality"] != "exact" and "quality" not in named:
-        logger.warning(
-            "The make of domain %r takes no quality: quality=%r changes nothing.", domain.name, settings["quality"]
-        )
+    for name, usual in (("quality", "exact"), ("camera", domain.camera)):
+        if settings[name] != usual and name not in named:
+            logger.warning(
+                "The make of domain %r takes no %s: %s=%r changes nothing.", domain.name, name, name, settings[name]
+            )
     with passed_on(domain.task, "make"):
         env = make(**named)
     if broken := _broken_contract(env, settings["image_size"]):

@@ -209,14 +209,14 @@ def first_frame_timeout_s() -> float:
 
 
 def run_isolated(
-    commands: list[tuple[str, ...]], backend: str, *, timeout_s: float
+    commands: list[tuple[str, ...]], backend: str | None, *, timeout_s: float
 ) -> list[tuple[int | None, str, str]]:
-    """Run commands simultaneously with ``MUJOCO_GL=backend``, and kill those that exceed the time limit.
+    """Run commands simultaneously with ``MUJOCO_GL=backend`` if given, and kill those that exceed the time limit.
 
     Returns exit status (``None``: killed), standard output and standard error of each. Output goes to files, not pipes,
     and a killed process is waited for only shortly, because one that hangs in the kernel cannot be reaped.
     """
-    environment = {**os.environ, "MUJOCO_GL": backend}
+    environment = {**os.environ, **({"MUJOCO_GL": backend} if backend else {})}
     if "OpenGL" in sys.modules:  # dm_control or mujoco has set it for the backend of this process
         environment.pop("PYOPENGL_PLATFORM", None)
     results: list[tuple[int | None, str, str]] = []

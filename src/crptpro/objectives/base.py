@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Self
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -55,6 +55,15 @@ class NetworkLoss(LossModule):
         """Restore from a pickle or a deep copy; the networks hold the copied parameters."""
         super().__setstate__(state)
         self._erase_cache()  # detached views of the original's parameters
+        self._tie_networks()
+
+    def _apply(self, *args: Any, **kwargs: Any) -> Self:
+        """Move or cast the loss; the networks hold the buffers that were moved."""
+        super()._apply(*args, **kwargs)
+        self._tie_networks()
+        return self
+
+    def _tie_networks(self) -> None:
         for name in self.network_names:
             getattr(self, f"{name}_params").to_module(getattr(self, name), preserve_module_state=False)
 

@@ -10,7 +10,7 @@ import functools
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from torch import nn
 from torchrl.objectives import LossModule
@@ -21,18 +21,25 @@ from crptpro.objectives.contrastive import ATCLoss, BeCLLoss, SimCLRLoss
 from crptpro.objectives.proto import ProtoLoss
 from crptpro.values import check_numbers
 
+RewardName = Literal["prototype", "particle", "skill-contrast"]
+AgentName = Literal["rad-sac", "averaged-sac", "skill-ddpg"]
+
+#: Downstream settings of CRPTpro that another method may replace.
+DOWNSTREAM = {"env_steps": 500_000, "replay_capacity": 40_000, "learning_rate": 1e-4, "intrinsic_reward_coef": 0.2}
+
 
 @dataclass(frozen=True)
 class Exploration:
     """How a method explores while it pre-trains; the defaults are Proto-RL's.
 
-    Every interval counts the agent steps of one domain. A number out of its range is a ``ValueError``.
+    Every interval counts the agent steps of one domain. A number out of its range, an unknown name, or skills that do
+    not fit agent and reward are a ``ValueError``.
     """
 
     #: The agent's only reward: ``"prototype"``, ``"particle"``, ``"skill-contrast"``, or a function of the loss and a
     #: ``torch.Generator`` that returns a transform writing ``("next", "intrinsic_reward")``.
-    reward: str | Callable[..., Any] = "prototype"
-    agent: str = "rad-sac"  #: or ``"averaged-sac"`` (DrQ's K = M = 2 on detached features), or ``"skill-ddpg"``
+    reward: RewardName | Callable[..., Any] = "prototype"
+    agent: AgentName = "rad-sac"  #: or ``"averaged-sac"`` (DrQ's K = M = 2 on detached features), or ``"skill-ddpg"``
     env_steps: int = 200_000  #: over all domains, random phases included
     is_single_domain: bool = False  #: the (S) variants: pre-trained on one domain only
     encoder_update_interval: int = 2  #: agent steps between two encoder updates
@@ -41,18 +48,24 @@ class Exploration:
     encodes_before_update: bool = False  #: reward and agent see features from before the encoder update of the step
     transfers_actor: bool = False  #: the downstream agent starts from the exploring actor
     n_step: int = 1  #: agent steps from an observation to the "next" one in batches of the agent and the encoder
-    skill_dim: int | None = None  #: number of skills, at least two; None for an agent without skills
+    skill_dim: int | None = None  #: number of skills of skill-ddpg, at least two; None for the other agents
     skill_agent_steps: int = 50  #: agent steps between two changes of the skill
     replay_capacity: int = 100_000  #: transitions kept per domain
     random_agent_steps: int = 1_000  #: agent steps of uniformly random actions per domain, before its updates start
 
     def __post_init__(self) -> None:
         check_numbers(self, minima={"random_agent_steps": 0, "skill_dim": 2}, maxima={})
+        for name, kind in (("agent", AgentName), ("reward", RewardName)):
+            if (value := getattr(self, name)) not in get_args(kind) and not (name == "reward" and callable(value)):
+                raise ValueError(f"`{name}` must be one of {', '.join(get_args(kind))}, got {value!r}.")
+        has_skills = self.agent == "skill-ddpg"
+        if has_skills != (self.skill_dim is not None) or (self.reward == "skill-contrast" and not has_skills):
+            raise ValueError("The agent skill-ddpg, and no other, needs `skill_dim`; reward skill-contrast needs both.")
 
 
 @dataclass(frozen=True)
 class Method:
-    """A row of the table; the defaults are CRPTpro's. A number out of its range is a ``ValueError``."""
+    """A row of the table; the defaults are CRPTpro's. Numbers out of range and unknown names are a ``ValueError``."""
 
     name: str
     loss_class: type[LossModule] | None  #: built as ``loss_class(encoder, **loss_options)``; None without pre-training
@@ -67,7 +80,7 @@ class Method:
     warmup_updates: int = 0  #: length of the linear warm-up of the learning rate from 0
     grad_clip: float | None = None  #: largest gradient norm; None for no clipping
     exploration: Exploration | None = None  #: None for a method that does not explore
-    downstream: Mapping[str, Any] = field(default_factory=dict)  #: downstream settings other than CRPTpro's
+    downstream: Mapping[str, Any] = field(default_factory=dict)  #: values that replace those of :data:`DOWNSTREAM`
     starts_from: str | None = None  #: method whose encoder it takes, to train it further for ``updates``
     is_preset: bool = False  #: a variant of another method, which :func:`method_names` and :func:`method_of` skip
     is_builtin: bool = False  #: part of the library
@@ -76,6 +89,8 @@ class Method:
         check_numbers(self, minima={"updates": 0, "warmup_updates": 0}, maxima={"encoder_tau": 1})
         if self.schedule not in ("constant", "warmup_cosine"):
             raise ValueError(f"`schedule` must be 'constant' or 'warmup_cosine', got {self.schedule!r}.")
+        if unknown := sorted(self.downstream.keys() - DOWNSTREAM.keys()):
+            raise ValueError(f"A method has the downstream settings {', '.join(DOWNSTREAM)}, not {', '.join(unknown)}.")
 
     def build_encoder(self, in_channels: int = 9, image_size: int = 84, **options: Any) -> PixelEncoder:
         """Build the encoder that the method trains; ``options`` override the method's own."""

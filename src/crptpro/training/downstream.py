@@ -21,10 +21,12 @@ from crptpro.data import FrameReplay
 from crptpro.domains import Domain
 from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CheckpointError, PretrainedError
+from crptpro.free_memory import free_bytes
 from crptpro.logging import RunLogger
 from crptpro.modules import SquashedGaussianActor, TwinCritic, resolve_precision, set_compute_dtype, usable_device
 from crptpro.modules.precision import PRECISION_NAMES, Precision
 from crptpro.objectives import DrQLoss, RADSACLoss, get_method, method_names
+from crptpro.objectives.methods import DOWNSTREAM
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import derive_seed, seed_everything
@@ -34,7 +36,6 @@ from crptpro.training.evaluate import WORKER_BYTES, Episode, Evaluator, summariz
 from crptpro.training.pretrain import SHIFT_PAD
 from crptpro.training.run import Generators, Run
 from crptpro.transforms import DenseShiftFeatures, FrozenEncoder, PrototypeReward, RandomShift, choose_feature_mode
-from crptpro.transforms.free_memory import free_bytes
 from crptpro.transforms.rewards import warn_if_mostly_zero
 from crptpro.values import Colors, Quality, check_numbers
 from crptpro.workers import can_be_sent
@@ -116,17 +117,13 @@ class DownstreamConfig:
     def resolved(self, task: str | Domain, pretrained: Pretrained) -> Any:
         """Return the settings with the method's and the domain's values where they were left open."""
         known = pretrained.method in method_names(presets=True)
-        own = DEFAULTS | dict(get_method(pretrained.method).downstream if known else {})
-        values: dict[str, Any] = {name: value for name, value in own.items() if getattr(self, name, self) is None}
+        own = DOWNSTREAM | dict(get_method(pretrained.method).downstream if known else {})
+        values: dict[str, Any] = {name: value for name, value in own.items() if getattr(self, name) is None}
         if "replay_capacity" in values:
             values["replay_capacity"] = max(values["replay_capacity"], self.random_agent_steps)
         if self.action_repeat is None:
             values["action_repeat"] = resolve_action_repeat(task)
         return dataclasses.replace(self, **values)
-
-
-# Settings of a method unless its row in the table says otherwise.
-DEFAULTS = {"env_steps": 500_000, "replay_capacity": 40_000, "learning_rate": 1e-4, "intrinsic_reward_coef": 0.2}
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ import psutil
 import pytest
 import torch
 
-from crptpro.transforms import free_memory
-from crptpro.transforms.free_memory import cgroup_free_bytes, free_bytes
+from crptpro import free_memory
+from crptpro.free_memory import cgroup_free_bytes, free_bytes
 
 
 def v2(limit: object, used: int, **more: object) -> dict[str, object]:
