@@ -115,6 +115,10 @@ def test_what_is_of_another_kind_is_neither_replaced_nor_read(tmp_path: Path) ->
         read(other)
     (tmp_path / "empty").mkdir()
     assert read(write(tmp_path / "empty"))[0]["task"] == "walker"
+    (tmp_path / "empty" / "run").mkdir()  # what lies beside an artifact would be lost
+    with pytest.raises(CRPTproError, match="holds run beside the 'test' that would be replaced, so it was left unch"):
+        write(tmp_path / "empty")
+    assert (tmp_path / "empty" / "run").is_dir()
 
 
 def test_what_was_written_is_read_back_before_it_replaces_anything(

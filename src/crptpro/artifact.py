@@ -72,7 +72,7 @@ def require_disk(path: str | Path, needed_bytes: int, what: str) -> None:
     if needed_bytes * 1.05 > free:
         raise DiskSpaceError(
             f"{what} needs {needed_bytes / 1e9:.2f} GB, but {probe} has {free / 1e9:.2f} GB free. "
-            "Free space, choose another directory, or request fewer transitions."
+            "Free space, choose another directory, or request less."
         )
 
 
@@ -94,7 +94,8 @@ def write_artifact(
     and ``weights_sha256`` are added to the plain facts of ``card``. Returns ``path``.
 
     Raises:
-        CRPTproError: there is something else at ``path``, or it is the working directory; it is left alone.
+        CRPTproError: there is something else at ``path``, or in it beside an artifact, or it is the working directory;
+            it is left alone.
         ValueError: a fact that cannot be stored as JSON.
         DiskSpaceError: the disk is full; an artifact there is kept.
     """
@@ -109,6 +110,12 @@ def write_artifact(
         raise CRPTproError(
             f"{path} exists and is not a {format_name!r}, so it was left unchanged. Choose another directory, such "
             f"as {path / 'encoder'}."
+        )
+    names = sorted(each.name for each in path.glob("[!.]*")) if not is_free else []
+    if other := [name for name in names if name not in (CARD_FILE, WEIGHTS_FILE)]:
+        raise CRPTproError(
+            f"{path} holds {', '.join(other)} beside the {format_name!r} that would be replaced, so it was left "
+            f"unchanged. Move that, or choose another directory, such as {path / 'encoder'}."
         )
     tensors = {}
     for name, module in modules.items():

@@ -22,11 +22,11 @@ SPAWN = multiprocessing.get_context("spawn")
 """Forked processes would share a GL context."""
 
 
-def can_be_sent(function: Callable[..., Any]) -> bool:
-    """Whether another process can import a function; it cannot import one of a notebook's cell."""
+def can_be_sent(content: Any) -> bool:
+    """Whether another process can import a function, or an object's class; it cannot import those of a notebook."""
     main_file = getattr(sys.modules.get("__main__"), "__file__", None)
     try:
-        return b"__main__" not in pickle.dumps(function) or bool(main_file and Path(main_file).exists())
+        return b"__main__" not in pickle.dumps(content) or bool(main_file and Path(main_file).exists())
     except Exception:  # objects may raise anything
         return False
 

@@ -226,6 +226,17 @@ def test_windows_and_their_returns_are_those_of_the_published_loop(n: int, lengt
         driver.check()  # indexing reads single transitions
 
 
+def test_a_ring_that_has_lost_a_file_is_refused_instead_of_filled_with_zeros(tmp_path: Path) -> None:
+    Driver(small(path=tmp_path), 4).write(12)
+    for name in ("pixels", "reward"):
+        (tmp_path / f"{name}.memmap").rename(tmp_path / "elsewhere")
+        for _ in range(2):
+            with pytest.raises(CheckpointError, match=rf"{name}\.memmap of the replay in .* is missing"):
+                small(path=tmp_path)
+        (tmp_path / "elsewhere").rename(tmp_path / f"{name}.memmap")
+    small(path=tmp_path)
+
+
 def test_a_window_longer_than_every_episode_is_refused_in_words() -> None:
     replay = small(n_step=5)
     with pytest.raises(RuntimeError):

@@ -120,6 +120,15 @@ def test_a_kill_during_the_last_evaluation_repeats_that_evaluation_alone(tmp_pat
     assert len(steps) == 2 * EPISODE
 
 
+def test_a_budget_that_the_action_repeat_does_not_divide_is_rounded_up_and_can_be_asked_for_again(
+    tmp_path: Path,
+) -> None:
+    first = train(tmp_path, env_steps=41)
+    assert first.env_steps == 42
+    again = train(tmp_path, env_steps=41)
+    assert (again.env_steps, again.evaluations) == (42, first.evaluations)
+
+
 def test_a_run_that_has_ended_keeps_no_dense_maps() -> None:
     gc.collect()
     gc.disable()
@@ -189,6 +198,10 @@ def test_an_actor_that_explored_the_task_is_where_learning_begins(tmp_path: Path
     train(tmp_path / "random", env_steps=20)
     explored, random = (record(tmp_path / name / "episodes.csv")[0] for name in ("explored", "random"))
     assert explored["episode_return"] != random["episode_return"]
+    with_actor.card["training"] = {"datasets": [{"domain": "elsewhere"}]}
+    assert not same_state(train(None, with_actor, env_steps=20).agent.actor, actor)
+    with_actor.card["training"]["datasets"] += [{"domain": "toy"}]
+    assert same_state(train(None, with_actor, env_steps=20).agent.actor, actor)
 
 
 class OwnEncoder(nn.Module):
@@ -233,6 +246,9 @@ def test_what_does_not_fit_a_run_is_refused_by_name(tmp_path: Path) -> None:
         train(tmp_path, make_pretrained("proto-rl-c"))
     with pytest.raises(PretrainedError, match="cannot be built in another process"):
         train(None, task=signalling("toy", -1, signal.SIGTERM), eval_workers=2)
+    for name, value in (("intrinsic_reward_coef", 0.1), ("features", "dense")):
+        with pytest.raises(ValueError, match="drq trains its encoder: it has no bonus"):
+            train(None, make_pretrained("drq"), **{name: value})
     (tmp_path / "replay").rename(tmp_path / "elsewhere")
     with pytest.raises(CheckpointError, match=r"to continue it needs its frames, and .* is gone"):
         train(tmp_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import multiprocessing
 import os
 import time
 from typing import Any
@@ -128,8 +129,35 @@ def test_lost_workers_are_replaced_by_this_process(
     lost.close()
 
 
-def test_an_environment_that_no_worker_can_build_is_evaluated_here() -> None:
-    alone, results = evaluator(2, lambda: make_toy_env())
+def test_workers_that_die_between_two_evaluations_are_replaced_by_this_process(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    lost, results = evaluator(1)
+    lost.start(env_steps=0)
+    lost.finish()
+    for process in multiprocessing.active_children():
+        process.kill()
+        process.join()
+    with caplog.at_level("WARNING", logger="crptpro"):
+        lost.start(env_steps=40)
+        lost.finish()
+    assert [counters for _, counters in results] == [{"env_steps": 0}, {"env_steps": 40}]
+    assert "evaluating in this process from here on" in caplog.text
+    lost.close()
+
+
+@pytest.mark.parametrize("make", [make_toy_env, lambda: make_toy_env()])
+def test_what_no_worker_can_build_is_evaluated_here(make: Any) -> None:
+    class LocalActor(SquashedGaussianActor):
+        """As in a notebook: no other process can import it."""
+
+    alone, results = evaluator(0, make)
+    if make is make_toy_env:
+        alone.agent.actor.__class__ = LocalActor
+    alone = Evaluator(
+        make, alone.agent, episodes=2, seed=1, workers=2, progress=False,
+        on_result=lambda episodes, counters: results.append(episodes),
+    )  # fmt: skip
     alone.start(env_steps=0)
     assert len(results) == 1
     alone.close()

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import errno
+import shutil
 import signal
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from torch import nn
+from torchrl.checkpoint import GlobalRNGState
 from toy_runs import python, record
 
 from crptpro.errors import CheckpointError, DiskSpaceError, NonFiniteError
 from crptpro.training import DownstreamConfig, PretrainConfig, Run
+from crptpro.training.run import SIGNALS, _GlobalRNG
 
 SETTINGS = {"batch_size": 8, "loss": {"class": "Proto", "sizes": [3, 4]}}
 
@@ -103,6 +107,37 @@ def test_a_crash_costs_the_updates_since_the_last_checkpoint_and_what_precedes_a
     assert [row["updates"] for row in record(tmp_path / "early" / "train.csv")] == ["4", "8"]
 
 
+def test_the_record_of_a_run_whose_checkpoints_were_removed_is_set_aside(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    walk(tmp_path, 10)
+    before = (tmp_path / "metrics.jsonl").read_text()
+    shutil.rmtree(tmp_path / "checkpoints")
+    with caplog.at_level("WARNING", logger="crptpro"):
+        assert first_update(tmp_path) == 0
+    assert "has no checkpoint: it begins again" in caplog.text
+    assert (tmp_path / "metrics.before.jsonl").read_text() == before
+
+
+def test_what_a_process_that_was_killed_while_it_wrote_a_checkpoint_left_is_removed(tmp_path: Path) -> None:
+    walk(tmp_path, 5)
+    stale = tmp_path / "checkpoints" / ".checkpoint-000000000010.torchrl.stage-0"
+    (stale / "walker").mkdir(parents=True)
+    assert first_update(tmp_path) == 5
+    assert not stale.exists()
+
+
+def test_a_checkpoint_of_more_gpus_is_continued_with_fewer() -> None:
+    state = {**GlobalRNGState().state_dict(), "torch_cuda": [torch.zeros(16, dtype=torch.uint8)] * 2}
+    restored: list[int] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.cuda, "is_available", lambda: True)
+        patch.setattr(torch.cuda, "device_count", lambda: 1)
+        patch.setattr(torch.cuda, "set_rng_state_all", lambda states: restored.append(len(states)))
+        _GlobalRNG().load_state_dict(state)
+    assert restored == [1]
+
+
 def test_the_global_generators_are_left_as_they_were(tmp_path: Path) -> None:
     torch.manual_seed(3)
     expected = torch.rand(3)
@@ -169,7 +204,17 @@ def test_two_processes_in_one_directory_are_refused(tmp_path: Path) -> None:
     assert "CheckpointError: Another process is writing" in found.stderr
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1])
+@pytest.fixture
+def usual_signals() -> Iterator[None]:
+    """Signals as a program in the foreground has them: under nohup, and in the background, some are ignored."""
+    before = {number: signal.signal(number, signal.default_int_handler) for number in SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("usual_signals")
+@pytest.mark.parametrize("number", SIGNALS)
 def test_every_signal_that_asks_a_run_to_stop_leaves_a_checkpoint_first(tmp_path: Path, number: signal.Signals) -> None:
     before = signal.getsignal(number)
     with pytest.raises((KeyboardInterrupt, SystemExit)) as left:
@@ -180,6 +225,27 @@ def test_every_signal_that_asks_a_run_to_stop_leaves_a_checkpoint_first(tmp_path
     assert first_update(tmp_path) == 3
 
 
+@pytest.mark.usefixtures("usual_signals")
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_in_the_last_update_ends_the_program_and_the_run_is_complete(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    with pytest.raises((KeyboardInterrupt, SystemExit)) as left:
+        walk(tmp_path, 6, on_update=lambda update: update == 5 and signal.raise_signal(number))
+    assert getattr(left.value, "code", 128 + number) == 128 + number
+    assert torch.equal(walk(tmp_path, 6).place, walk(None, 6).place)
+
+
+def test_a_signal_that_is_ignored_as_under_nohup_stops_nothing(tmp_path: Path) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        walk(tmp_path, 6, on_update=lambda _: signal.raise_signal(signal.SIGHUP))
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert [row["updates"] for row in record(tmp_path / "train.csv")] == ["4", "6"]
+
+
+@pytest.mark.usefixtures("usual_signals")
 def test_a_second_interrupt_stops_at_once(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         walk(tmp_path, 18, on_update=lambda _: [signal.raise_signal(signal.SIGINT) for _ in range(2)])
@@ -230,6 +296,11 @@ def test_a_full_disk_is_one_clear_error_and_keeps_earlier_checkpoints(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     walk(tmp_path, 5)
+    with monkeypatch.context() as patch:
+        # As little as makes TorchRL's mapped files end the process by a bus error.
+        patch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=1_000))
+        with pytest.raises(DiskSpaceError, match="A checkpoint needs"):
+            walk(tmp_path, 12)
     with monkeypatch.context() as patch:
         patch.setattr("torchrl.checkpoint.Checkpoint.save", full)
         with pytest.raises(DiskSpaceError, match=r"No checkpoint .* the disk is full. Earlier ones are kept"):

@@ -230,13 +230,20 @@ class RingStorage(StackStorage):
         if self.path is not None and not (self.path / "pixels.memmap").exists():
             row_bytes = sum(math.prod(shape) * dtype.itemsize for shape, dtype in columns.values())
             require_disk(self.path, self.rows * row_bytes, f"A replay of {self.max_size} transitions")
-        # Counters only grow; modulo the number of rows they are slots. `oldest` is the first valid transition.
-        self.frames = self.transitions = self.oldest = self.episode_step = self.branch = 0
-        self.is_open = self._is_continued = False
         # ``number`` is one more than the row's counter, 0 if it was never written; ``row_of`` is by transition. Whoever
         # opens or loads begins a ``branch`` with its first row: what it overwrites is lost to states of earlier ones.
         own = {"step": torch.int32, "number": torch.int64, "row_of": torch.int64, "branch": torch.int32}
         specs = {**columns, **{name: ((), dtype) for name, dtype in own.items()}}
+        if self.path is not None and (numbers := self.path / "number.memmap").exists():
+            missing = [f"{name}.memmap" for name in specs if not (self.path / f"{name}.memmap").exists()]
+            if missing and map_rows(numbers, torch.int64, ()).any():  # otherwise it was being made
+                raise CheckpointError(
+                    f"{', '.join(missing)} of the replay in {self.path} is missing. Put it back, or remove the "
+                    "directory to begin again."
+                )
+        # Counters only grow; modulo the number of rows they are slots. `oldest` is the first valid transition.
+        self.frames = self.transitions = self.oldest = self.episode_step = self.branch = 0
+        self.is_open = self._is_continued = False
         self.content: dict[NestedKey, Tensor] = {
             name: torch.zeros(self.rows, *shape, dtype=dtype, device="cpu")
             if self.path is None

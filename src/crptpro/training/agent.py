@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import functools
-import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -105,9 +104,9 @@ def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[P
 class SACLearner:
     """Steps critic, actor and temperature, and moves the target critic, on the reference schedule.
 
-    Each of the three has its own Adam, as in Proto-RL's and CRPTpro's released agents. ``actor_interval`` counts agent
-    steps between two steps of actor and temperature, ``target_interval`` between two moves of the target, whose EMA
-    rate is ``critic_tau``; both are 1 in the source of ``SkillDDPGLoss``, which has no temperature.
+    Each of the three has its own Adam, as in Proto-RL's and CRPTpro's released agents. Actor, temperature and target,
+    whose EMA rate is ``critic_tau``, move every ``interval`` agent steps; it is 1 in the source of ``SkillDDPGLoss``,
+    which has no temperature.
     """
 
     def __init__(
@@ -116,13 +115,12 @@ class SACLearner:
         *,
         learning_rate: float = 1e-4,
         critic_tau: float = 0.01,
-        actor_interval: int = 2,
-        target_interval: int = 2,
+        interval: int = 2,
         compile: bool = False,
         cuda_graph: bool = False,
     ) -> None:
         self.loss, self.targets = loss, SoftUpdate(loss, tau=critic_tau)
-        self.actor_interval, self.target_interval = actor_interval, target_interval
+        self.interval = interval
         groups = {"critic": [*loss.critic.parameters()], "actor": [*loss.actor.parameters()]}
         if isinstance(loss, RADSACLoss):
             groups["temperature"] = [loss.log_alpha]
@@ -133,27 +131,24 @@ class SACLearner:
         self._critic_loss = accelerate(loss.critic_loss, compile=compile)
         self._actor_loss = accelerate(loss.actor_and_temperature_loss, compile=compile)
         recording: dict[str, Any] = {"cuda_graph": cuda_graph, "device": groups["critic"][0].device}
-        # By what they do beside the critic's step.
-        self._updates: dict[tuple[bool, bool], Update] = {
-            (actor, target): accelerate(functools.partial(self._update, actor, target), **recording)
-            for actor, target in itertools.product((False, True), repeat=2)
+        # By whether they move the critic alone.
+        self._updates: dict[bool, Update] = {
+            alone: accelerate(functools.partial(self._update, alone), **recording) for alone in (True, False)
         }
 
     def update(self, batch: TensorDictBase, *, agent_step: int) -> TensorDictBase:
         """Do one update on a batch with features and rewards; returns detached scalars."""
-        also = agent_step % self.actor_interval == 0, agent_step % self.target_interval == 0
-        return self._updates[also](batch)
+        return self._updates[agent_step % self.interval != 0](batch)
 
-    def _update(self, moves_actor: bool, moves_target: bool, batch: TensorDictBase) -> TensorDictBase:
+    def _update(self, is_alone: bool, batch: TensorDictBase) -> TensorDictBase:
         critic, *others = self.optimizers.values()
         losses = self._critic_loss(batch)
         _step(losses["loss_qvalue"], critic)
-        if moves_actor:
+        if not is_alone:
             actor_losses = self._actor_loss(batch)
             terms = [value for name, value in actor_losses.items() if name.startswith("loss")]
             _step(torch.stack(terms).sum(), *others)
             losses = losses.update(actor_losses)
-        if moves_target:
             self.targets.step()
         return losses.detach()
 

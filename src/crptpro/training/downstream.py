@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
 from crptpro.data import FrameReplay
-from crptpro.domains import Domain
+from crptpro.domains import Domain, get_domain
 from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CheckpointError, PretrainedError
 from crptpro.free_memory import free_bytes
@@ -169,6 +169,8 @@ def train_downstream(
         source, is_control = str(pretrained), str(pretrained) in ("drq", "random-encoder")
         pretrained = random_pretrained(settings.seed, method=source) if is_control else load_pretrained(source)
     settings = settings.resolved(task, pretrained)
+    if pretrained.method == "drq" and (settings.intrinsic_reward_coef > 0 or settings.features != "auto"):
+        raise ValueError("drq trains its encoder: it has no bonus (`intrinsic_reward_coef`) and no kept `features`.")
     name = task if isinstance(task, str) else task.task
     what = {"task": name, "pretrained": pretrained.identity()}
     device = usable_device(settings.device)
@@ -191,7 +193,9 @@ def train_downstream(
         encoder = _frozen_copy(pretrained.encoder, device, dtype)
         actor, action_dim = pretrained.actor, env.env.action_spec.shape[-1]
         # Proto-RL(S): it begins as the actor that explored the task's own domain.
+        domains = [each["domain"] for each in (pretrained.card.get("training") or {}).get("datasets", ())]
         has_explored = isinstance(actor, SquashedGaussianActor) and actor.config["action_dim"] == action_dim
+        has_explored = has_explored and (not domains or get_domain(task).name in domains)
         learner, agent = _make_agent(pretrained, encoder, action_dim, settings, generators["policy"], has_explored)
         set_compute_dtype(learner.loss, dtype)
         evaluator = Evaluator(env.make_env, agent, episodes=settings.eval_episodes, seed=settings.seed,
@@ -216,7 +220,8 @@ def train_downstream(
             counters["last_evaluation"] = run.position
 
         interval = settings.eval_interval_env_steps
-        for first in run.until(settings.env_steps, checkpoint_interval=settings.checkpoint_interval_env_steps):
+        budget = -(-settings.env_steps // repeat) * repeat
+        for first in run.until(budget, checkpoint_interval=settings.checkpoint_interval_env_steps):
             evaluator.poll()
             if first // interval > counters["last_evaluation"] // interval:
                 start_evaluation()

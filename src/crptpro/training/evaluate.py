@@ -30,6 +30,8 @@ logger = logging.getLogger(__name__)
 Policy = Callable[[Tensor], Tensor]
 """Maps one observation, uint8 ``[C, H, W]``, to one action, float32 ``[A]`` in ``[-1, 1]``."""
 WORKER_BYTES = 500_000_000
+LOST = (BrokenProcessPool, pickle.PicklingError, OSError)
+"""What a call of a worker raises if the process has died, or cannot be started."""
 
 
 @dataclass(frozen=True)
@@ -124,8 +126,8 @@ class Evaluator:
     """Evaluates snapshots of an agent in worker processes during training, or at once in this process.
 
     ``on_result`` gets the episodes and the counters of an evaluation, called by :meth:`poll` once it has ended, or by
-    :meth:`finish`. Without ``workers``, or where none can import ``make_env``, this process evaluates. One CPU thread
-    computes every decision either way.
+    :meth:`finish`. Without ``workers``, or where none can import ``make_env`` or the encoder's class, this process
+    evaluates. One CPU thread computes every decision either way.
     """
 
     def __init__(
@@ -140,7 +142,7 @@ class Evaluator:
         progress: bool = True,
     ) -> None:
         self.make_env, self.agent, self.episodes, self.seed = make_env, agent, episodes, seed
-        self.workers = min(workers, episodes) if can_be_sent(make_env) else 0
+        self.workers = min(workers, episodes) if can_be_sent(make_env) and can_be_sent(agent) else 0
         self.on_result, self.progress = on_result, progress
         self._pool: WorkerPool | None = None
         self._env: EnvBase | None = None
@@ -160,7 +162,10 @@ class Evaluator:
             self._pool = self._pool or WorkerPool(self.workers, _prepare, self.make_env)
             sent = pickle.dumps(copy.deepcopy(agent).cpu())
             seeds = [episode_seed(seed, episode) for episode in range(self.episodes)]
-            futures = [self._pool.submit(_evaluate, sent, *numbered) for numbered in enumerate(seeds)]
+            try:
+                futures = [self._pool.submit(_evaluate, sent, *numbered) for numbered in enumerate(seeds)]
+            except LOST as reason:  # since the evaluation before
+                self._give_up(reason)
         self._pending = (agent, counters, seed, futures)
 
     def poll(self) -> None:
@@ -175,9 +180,9 @@ class Evaluator:
         agent, counters, seed, futures = self._pending
         try:
             episodes = [future.result() for future in futures]
-        except (BrokenProcessPool, pickle.PicklingError, OSError) as reason:
-            logger.warning("The evaluating processes are lost (%s); evaluating in this process from here on.", reason)
-            self.workers, futures = 0, []
+        except LOST as reason:
+            self._give_up(reason)
+            futures = []
         if not futures:
             self._env = self._env or self.make_env()
             threads = torch.get_num_threads()
@@ -188,6 +193,10 @@ class Evaluator:
                 torch.set_num_threads(threads)
         self._pending = None
         self.on_result(episodes, counters)
+
+    def _give_up(self, reason: Exception) -> None:
+        logger.warning("The evaluating processes are lost (%s); evaluating in this process from here on.", reason)
+        self.workers = 0
 
     def state_dict(self) -> dict[str, Any]:
         """Return the evaluation that is under way: its episodes are not in the record yet."""

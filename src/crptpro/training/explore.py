@@ -391,7 +391,7 @@ class Explorer:
             policy = DeterministicActor(feature_dim, action_dim, skill_dim=skills, hidden_dim=hidden_dim)
             critic = TwinCritic(feature_dim + skills, action_dim, hidden_dim=hidden_dim, has_tanh=True)
             ddpg = SkillDDPGLoss(policy.to(self.device), critic.to(self.device), generator=generator)
-            return SACLearner(ddpg, actor_interval=1, target_interval=1)
+            return SACLearner(ddpg, interval=1)
         sac_class = {"rad-sac": RADSACLoss, "averaged-sac": AveragedSACLoss}[self.exploration.agent]
         actor = SquashedGaussianActor(feature_dim, action_dim, hidden_dim=hidden_dim)
         critic = TwinCritic(feature_dim, action_dim, hidden_dim=hidden_dim)

@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import logging
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -20,6 +21,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 
+from crptpro.artifact import require_disk, write_whole
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import CheckpointError, DiskSpaceError, NonFiniteError, is_disk_full
 from crptpro.logging import RunLogger
@@ -73,6 +75,12 @@ class _Means:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.sums, self.counts = dict(state["sums"]), dict(state["counts"])
+
+
+class _GlobalRNG(GlobalRNGState):
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        cuda = state_dict.get("torch_cuda")  # of all GPUs; another node may have fewer
+        super().load_state_dict({**state_dict, "torch_cuda": cuda[: torch.cuda.device_count()]} if cuda else state_dict)
 
 
 class Run:
@@ -161,6 +169,8 @@ class Run:
     def __exit__(self, *exception: object) -> None:
         self._progress.close()
         self._stack.close()
+        if self._signal is not None and exception[0] is None:  # it came after the last checkpoint that was due
+            raise self._ended()
 
     @property
     def seconds(self) -> float:
@@ -189,11 +199,11 @@ class Run:
     def keep(self, **components: Any) -> None:
         """Make objects with ``state_dict`` and ``load_state_dict`` part of every checkpoint, and restore them.
 
-        ``None`` is left out. The rows of an attempt that was killed before its first checkpoint are removed.
+        ``None`` is left out. Without a checkpoint the run begins again; rows of an earlier attempt are set aside.
         """
         self._modules = [value for value in components.values() if isinstance(value, nn.Module)]
         means = {f"means_{stream}": value for stream, value in self._means.items()}
-        for name, component in {**components, **means, "global_rng": GlobalRNGState()}.items():
+        for name, component in {**components, **means, "global_rng": _GlobalRNG()}.items():
             if component is not None:
                 self._checkpoint.register(name, component)
         if self.saved:
@@ -207,6 +217,10 @@ class Run:
                 self.records.load_state_dict(self.saved["record"])
             logger.info("Continues from %s %s.", f"{self.position:,}", self.unit)
         elif self.records is not None and self.run_dir is not None and self.records.writes_into(self.run_dir):
+            if any(map(self.records.rows, self.streams)):
+                kept = self.records.path.with_suffix(".before.jsonl")
+                write_whole(kept, self.records.path.read_bytes())
+                logger.warning("%s has no checkpoint: it begins again; its earlier rows are in %s.", self.run_dir, kept)
             self.records.load_state_dict(dict.fromkeys(self.streams, 0))
         self._saved_time = self._row_time = time.monotonic()
         self._started = self._row_time - self.saved.get("seconds", 0.0)
@@ -225,6 +239,8 @@ class Run:
         self._progress = Progress(total, self.position, self.unit, is_shown=self._is_shown)
         if threading.current_thread() is threading.main_thread():  # the only one that receives signals
             for number in SIGNALS:
+                if signal.getsignal(number) == signal.SIG_IGN:  # under nohup, or in the background
+                    continue
                 self._stack.callback(signal.signal, number, signal.signal(number, self._receive))
         while self.position < total:
             before = self.position
@@ -240,7 +256,10 @@ class Run:
             if self._signal is not None:
                 kept = "a checkpoint was written" if self.run_dir else "nothing is kept without run_dir"
                 logger.warning("Stopped at %s of %s %s; %s.", f"{self.position:,}", f"{total:,}", self.unit, kept)
-                raise KeyboardInterrupt if self._signal == signal.SIGINT else SystemExit(128 + self._signal)
+                raise self._ended()
+
+    def _ended(self) -> BaseException:
+        return KeyboardInterrupt() if self._signal == signal.SIGINT else SystemExit(128 + (self._signal or 0))
 
     def _receive(self, number: int, frame: object) -> None:
         if self._signal is not None and number == signal.SIGINT:
@@ -340,6 +359,11 @@ class Run:
         self._saved_time = time.monotonic()
         if self.run_dir is None:
             return
+        # Checked before, because TorchRL maps the files that it writes: a disk that fills up would end the process by a
+        # bus error. It holds the new checkpoint twice for a moment; the first has the parameters and Adam's moments.
+        sizes = [path.stat().st_size for path in self._rotation.directory.glob("checkpoint-*")]
+        first = 3 * sum(parameter.nbytes for module in self._modules for parameter in module.parameters())
+        require_disk(self.run_dir, 2 * max(sizes, default=first), "A checkpoint")
         self.saved = {
             "settings": self.settings,
             "position": self.position,
@@ -363,6 +387,8 @@ class Run:
     def _find_checkpoint(self) -> None:
         """Read the newest checkpoint that is whole; damaged newer ones are removed, since they would outrank it."""
         damaged: list[Path] = []
+        for stale in self._rotation.directory.glob(".checkpoint-*"):  # of a process that was killed while it wrote
+            shutil.rmtree(stale) if stale.is_dir() else stale.unlink()
         for path in sorted(self._rotation.directory.glob("checkpoint-*"), reverse=True):
             try:
                 with zipfile.ZipFile(path) as archive:
