@@ -50,3 +50,8 @@ def test_free_memory_is_the_least_of_machine_and_groups(monkeypatch: pytest.Monk
     assert free_bytes(torch.device("cpu")) == 1234
     monkeypatch.setattr(free_memory, "cgroup_free_bytes", lambda: iter([]))
     assert free_bytes(torch.device("cpu")) > 1234
+    monkeypatch.setenv("CRPTPRO_JOB_BYTES", "1000")  # of a job that shares the machine with others
+    assert free_bytes(torch.device("cpu")) == 1000
+    monkeypatch.setenv("CRPTPRO_JOBS_PER_GPU", "2")
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (7_000, 8_000))
+    assert free_bytes(torch.device("cuda")) == 4_000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,11 +17,18 @@ _FILES = (
 )
 
 
+# Environment variables of jobs that share a machine. A job's dense maps grow while it runs, so that the memory which is
+# free at its start is not its own.
+JOB_BYTES, JOBS_PER_GPU = "CRPTPRO_JOB_BYTES", "CRPTPRO_JOBS_PER_GPU"
+
+
 def free_bytes(device: torch.device) -> int:
-    """Return the free memory of a device in bytes; on the CPU at most what the process's cgroups allow."""
+    """Return the free memory of a device in bytes, at most what the process's cgroups allow, or the job's share."""
     if device.type == "cuda":
-        return int(torch.cuda.mem_get_info(device)[0])
-    return min([int(psutil.virtual_memory().available), *cgroup_free_bytes()])
+        free, total = torch.cuda.mem_get_info(device)
+        return min(free, total // int(os.environ.get(JOBS_PER_GPU, 1)))
+    share = [int(os.environ[JOB_BYTES])] if JOB_BYTES in os.environ else []
+    return min([int(psutil.virtual_memory().available), *cgroup_free_bytes(), *share])
 
 
 def cgroup_free_bytes(own: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> Iterator[int]:

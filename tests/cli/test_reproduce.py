@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
@@ -47,6 +48,35 @@ def test_a_dry_run_prints_the_plan_and_writes_nothing(call: Call) -> None:
     assert numbers(out, "downstream runs") == ["12", "0", "12"]
     assert "Runs behind" not in out
     assert list(Path().iterdir()) == []
+
+
+@pytest.mark.parametrize(("experiment", "request_", "named"), [
+    ("unseen", ("--methods", "crptpro", "proto-rl-s"), "proto-rl-s"),
+    ("seen", ("--groups", "A", "--tasks", "walker_run", "hopper_hop"), "hopper_hop"),
+    ("prototypes", ("--methods", "crptpro", "atc"), "atc"),
+    ("efficiency", ("--groups", "A", "--methods", "crptpro", "drq"), "drq"),
+    ("probe", ("--groups", "A", "--methods", "crptpro", "--tasks", "hopper_hop"), ""),
+    ("ablation", ("--groups", "A", "--methods", "crptpro", "--tasks", "walker_run"), ""),
+    ("sensitivity", ("--groups", "A", "--methods", "crptpro", "--tasks", "walker_run"), ""),
+])  # fmt: skip
+def test_a_plan_names_what_was_requested_and_is_no_part_of_an_experiment(
+    call: Call, experiment: str, request_: tuple[str, ...], named: str
+) -> None:
+    status, out, _ = call("reproduce", experiment, *request_, "--scale", "tiny", "--dry-run")
+    assert status == 0
+    assert (f"Not part of {experiment}, and left out: {named}." in out) == bool(named)
+    assert ("left out" in out) == bool(named)
+
+
+def test_a_plan_says_when_fewer_jobs_would_leave_room_for_dense_maps(
+    call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("crptpro.cli.reproduce.free_bytes", lambda _: 96e9)
+    for jobs, has_hint in ((16, True), (1, False)):
+        plan = ("--methods", "crptpro", "--jobs", jobs, "--scale", "paper", "--dry-run")
+        _, out, _ = call("reproduce", "seen", *plan)
+        assert ("Each job may take 6.0 GB of memory" in out) == has_hint
+        assert bool(re.search("several times slower; with --jobs [1-9] it would", out)) == has_hint
 
 
 def test_all_means_the_experiments_with_requested_cells(call: Call) -> None:

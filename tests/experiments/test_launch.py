@@ -223,13 +223,15 @@ def test_a_machine_is_divided_among_jobs(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_gpus_are_shared_evenly_and_jobs_have_their_threads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     started = Mock(return_value=Mock(poll=Mock(return_value=None)))
     monkeypatch.setattr(subprocess, "Popen", started)
-    launcher = launch.LocalLauncher(("0", "1"))
+    monkeypatch.setattr(launch, "free_bytes", lambda _: 8_000)
+    launcher = launch.LocalLauncher(("0", "1"), jobs=4)
     for name in "abcd":
         describe(tmp_path, make_plan([job(name)], tmp_path))
         launcher.start(Work(str(tmp_path), job(name).key, threads=3), is_exclusive=False)
     environments = [call.kwargs["env"] for call in started.call_args_list]
     assert sorted(each["CUDA_VISIBLE_DEVICES"] for each in environments) == ["0", "0", "1", "1"]
     assert {each["OMP_NUM_THREADS"] for each in environments} == {"3"}
+    assert {(each["CRPTPRO_JOB_BYTES"], each["CRPTPRO_JOBS_PER_GPU"]) for each in environments} == {("2000", "2")}
 
 
 def test_a_slurm_job_requests_its_cores_and_a_refusal_is_reported(

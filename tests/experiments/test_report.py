@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from crptpro.artifact import write_json
@@ -355,6 +356,7 @@ def test_unplanned_runs_are_labelled_by_the_settings_that_differ(tmp_path: Path)
     for seed, rate in enumerate([1e-3, 1e-3, 1e-4]):
         folder = tmp_path / "mine" / str(seed)
         settings = {"seed": seed, "env_steps": 500_000, "learning_rate": rate, "device": f"cuda:{seed}"}
+        settings |= {"cuda_graph": seed == 1, "pretrained": f"crptpro:{seed}"}
         write_json(folder / "config.json", {"config": {"task": "walker_run", **settings}, "versions": {}})
         write_rows(folder / "eval.csv", evaluations(100.0 + seed))
     write_rows(tmp_path / "broken" / "eval.csv", evaluations(1.0))
@@ -363,11 +365,46 @@ def test_unplanned_runs_are_labelled_by_the_settings_that_differ(tmp_path: Path)
     assert row["task"] == "walker_run"
     assert row["crptpro, learning_rate 0.001"] == "100 ± 1 (n = 2)"
     assert row["crptpro, learning_rate 0.0001"] == "102 (n = 1)"
-    assert report.cell("Budgets beside", "here", "downstream runs per encoder") == "1 or 2"
+    assert report.cell("Budgets beside", "here", "downstream runs per encoder") == "1"
+    assert "Runs on several encoders count as one method: crptpro, learning_rate 0.001 (2)." in report.text
+    assert "This scale does not show" in report.text  # a learning rate is not the paper's
     # What is not known is not there.
     assert list(report.table("run: 3 jobs")) == ["job", "state"]
     assert "h of work" not in report.text
     assert "Machines, as tables" not in report.text
+
+
+def test_runs_with_the_papers_budgets_are_not_said_to_have_less_and_runs_on_one_encoder_are_not_warned_of(
+    tmp_path: Path,
+) -> None:
+    for seed in range(2):
+        settings = {"seed": seed, "env_steps": 500_000, "batch_size": 512, "learning_rate": 1e-4}
+        settings |= {"task": "walker_run", "replay_capacity": 40_000, "pretrained": "crptpro:1"}
+        write_json(tmp_path / str(seed) / "config.json", {"config": settings, "versions": {}})
+        write_rows(tmp_path / str(seed) / "eval.csv", evaluations(100.0 + seed))
+    report = Report(build_report(tmp_path, out=tmp_path / "page"))
+    assert report.cell("Budgets beside", "here", "downstream batch") == "512"
+    assert report.cell("Budgets beside", "here", "downstream runs per encoder") == "2"
+    assert "This scale does not show" not in report.text
+    assert "Runs on several encoders" not in report.text
+
+
+def test_a_curve_has_every_evaluation_of_runs_that_evaluate_at_other_env_steps(
+    made: Reproduction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cells = made.runs("crptpro", "cheetah_run", [500, 600])
+    for seed, (_, job, _) in enumerate(cells):
+        rows = evaluations(500.0)
+        for row in rows[2:-2]:
+            row["env_steps"] += 20 * seed
+        write_rows(made.root / "jobs" / job / "eval.csv", rows)
+    made.ask("seen", cells)
+    drawn: list[pd.DataFrame] = []
+    monkeypatch.setattr("crptpro.experiments.report.draw", lambda points, *_, **__: drawn.append(points) or Figure())
+    made.report()
+    [curves] = [points for points in drawn if "line" in points]
+    mean = curves[curves["line"] == "mean"]
+    assert mean["x"].tolist() == [0, *(50_000 * n + 10 for n in range(1, 10)), 500_000]
 
 
 def test_a_full_disk_is_reported_and_the_older_page_kept(tmp_path: Path) -> None:

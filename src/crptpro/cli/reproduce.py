@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import torch
 from tyro.conf import Positional, arg
 
 from crptpro.artifact import read_json, require_disk
+from crptpro.domains import get_domain
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.experiments import launch
 from crptpro.experiments.jobs import DONE, JOBS, KINDS, Plan, bytes_of, make_plan, write_cells
 from crptpro.experiments.matrix import EXPERIMENTS, SCALES, Cell, Request
-from crptpro.modules import usable_device
+from crptpro.free_memory import free_bytes
+from crptpro.modules import PixelEncoder, resolve_precision, usable_device
 from crptpro.values import as_path
 
 ALL = "all"
@@ -103,14 +107,20 @@ class Reproduce:
         disk = sum(after for after, _ in sizes) + sum(working)
         print(f"{', '.join(wanted)} at scale {self.scale} in {root}\n")
         print(plan_text(plan, root, disk, jobs), flush=True)
+        if self.launcher == "local" and self.device == "cpu" and (hint := memory_text(plan, jobs)):
+            print(hint, flush=True)
         runs = len(request.encoder_seeds) * len(request.seeds)
         if any(job.kind == "run" for job in plan.jobs) and runs < PAPER_RUNS:
             paper = f"the paper has at least {PAPER_RUNS} for CRPTpro (--seeds, --encoder-seeds)"
             print(f"\nRuns behind each score: {runs}; {paper}.")
+        for name in () if ALL in self.experiments else wanted:
+            if names := left_out(request, wanted[name]):
+                print(f"\nNot part of {name}, and left out: {', '.join(names)}.")
         if self.dry_run:
             return
         require_disk(root, disk, "What this plan has yet to make")
-        launcher = self._launcher(slurm, gpus) if plan.missing else None  # it may fail, and nothing is written yet
+        # It may fail, and nothing is written yet.
+        launcher = self._launcher(slurm, gpus, jobs) if plan.missing else None
         asked = {**dataclasses.asdict(request), "scale": self.scale}
         for name, cells in wanted.items():
             write_cells(root, name, self.scale, asked, [(cell.label, cell.job.key, cell.place) for cell in cells])
@@ -164,12 +174,22 @@ class Reproduce:
             )
         return {name: cells for name, cells in wanted.items() if cells}
 
-    def _launcher(self, slurm: dict[str, Any], gpus: Sequence[str]) -> Any:
+    def _launcher(self, slurm: dict[str, Any], gpus: Sequence[str], jobs: int) -> Any:
         if self.launcher == "slurm":
             return launch.SlurmLauncher(slurm)
         if self.launcher == "ray":
             return launch.RayLauncher(self.ray_address, gpus=self.device.startswith("cuda") / self.jobs_per_gpu)
-        return launch.LocalLauncher(gpus)
+        return launch.LocalLauncher(gpus, jobs=jobs)
+
+
+def left_out(request: Request, cells: Sequence[Cell]) -> list[str]:
+    """Return the requested methods, groups and tasks that no cell has: an experiment may have no place for them."""
+    found = {re.split("[ ,]", cell.label)[0] for cell in cells}
+    for cell in cells:
+        found |= {cell.place.get(name) for name in ("group", "task", "domain")}
+        found |= {*str(cell.place.get("domains", "")).split("+"), *cell.job.facts.get("domains", ())}
+    tasks = [task for task in request.tasks if get_domain(task).name not in found]
+    return [name for name in (*request.methods, *request.groups, *tasks) if name not in found]
 
 
 def plan_text(plan: Plan, root: Path, disk: int, jobs: int) -> str:
@@ -194,6 +214,24 @@ def plan_text(plan: Plan, root: Path, disk: int, jobs: int) -> str:
         if done:
             text += "\nThe last column is the median of what finished jobs in this directory took."
     return text
+
+
+def memory_text(plan: Plan, jobs: int) -> str:
+    """Return why fewer jobs at a time may be faster: their runs could keep dense maps. Empty if they can as it is."""
+    from crptpro.transforms.dense_shift import dense_maps_bytes  # late, as it imports TorchRL
+
+    runs = [job.facts for job in plan.missing if job.kind == "run" and job.needs]  # without DrQ's
+    slots = max((min(facts.get("replay_capacity", 40_000), facts["env_steps"]) for facts in runs), default=0)
+    needed = dense_maps_bytes(PixelEncoder(), slots, resolve_precision("auto", "cpu"), latent_dim=128)
+    free = free_bytes(torch.device("cpu"))
+    if needed <= 0.8 * free / jobs:
+        return ""
+    fitting = int(0.8 * free / needed)
+    advice = f"with --jobs {fitting} it would" if fitting else "this machine has too little for one"
+    return (
+        f"Each job may take {free / jobs / 1e9:.1f} GB of memory. A run whose dense maps ({needed / 1e9:.1f} GB) do "
+        f"not fit encodes again at every update, which is several times slower; {advice}."
+    )
 
 
 def failures_text(failures: Sequence[launch.Failure]) -> str:

@@ -34,6 +34,7 @@ from filelock import FileLock
 from crptpro.artifact import read_json, write_json
 from crptpro.errors import CRPTproError, RecordError, SubmissionError
 from crptpro.experiments.jobs import CLOCK, DESCRIPTION, DONE, LOCK, LOG, OWN, Job, Plan, describe, directory_of
+from crptpro.free_memory import JOB_BYTES, JOBS_PER_GPU, free_bytes
 from crptpro.plugins import loaded_plugins
 from crptpro.provenance import cpu_cores, provenance
 
@@ -160,12 +161,15 @@ def _run_here(work: Work) -> None:
 
 
 class LocalLauncher:
-    """Processes of this machine, which share its GPUs evenly (indices or UUIDs)."""
+    """Processes of this machine, which share its memory, and its GPUs (indices or UUIDs), evenly."""
 
     is_one_machine = True
 
-    def __init__(self, gpus: Sequence[str] = ()) -> None:
+    def __init__(self, gpus: Sequence[str] = (), *, jobs: int = 1) -> None:
         self.gpus = tuple(gpus)
+        per_gpu = math.ceil(jobs / max(1, len(gpus)))
+        self.job_bytes = free_bytes(torch.device("cpu")) // jobs
+        self._shares = {JOB_BYTES: str(self.job_bytes), JOBS_PER_GPU: str(per_gpu)}
         self._running: list[_Process] = []
 
     def start(self, work: Work, *, is_exclusive: bool) -> _Process:
@@ -173,7 +177,7 @@ class LocalLauncher:
         self._running = [each for each in self._running if each.process.poll() is None]
         loads = Counter(each.gpu for each in self._running)
         gpu = min(self.gpus, key=lambda name: loads[name], default="")
-        process = work.process(**({"CUDA_VISIBLE_DEVICES": gpu} if gpu else {}))
+        process = work.process(**self._shares, **({"CUDA_VISIBLE_DEVICES": gpu} if gpu else {}))
         self._running.append(_Process(process, gpu))
         return self._running[-1]
 

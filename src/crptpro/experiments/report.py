@@ -174,7 +174,7 @@ def _needed(keys: Iterable[str], jobs: pd.DataFrame, *kinds: str) -> list[str]:
 
 
 NOT_IN_LABELS = [
-    "seed", "task", "pretrained", "colors", "device", "precision", "compile", "eval_workers", "features",
+    "seed", "task", "pretrained", "colors", "device", "precision", "compile", "cuda_graph", "eval_workers", "features",
     "eval_episodes", "checkpoint_interval_env_steps", "log_interval_env_steps", "eval_interval_env_steps",
 ]  # fmt: skip
 """Settings that do not distinguish methods: seed, task and encoder, how a run computes, and when it writes."""
@@ -289,12 +289,15 @@ def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     for scale, own in cells[cells["scale"] != "paper"].groupby("scale", sort=False):
         here = jobs.loc[_needed(own["job"], jobs)]
         runs = own[own["job"].map(jobs["kind"]) == "run"].drop_duplicates("job")
-        of_runs = _or(runs.groupby(["label", *PLACES]).size())
+        encoders = jobs.loc[runs["job"], "facts"].str.get("pretrained").fillna("").to_numpy()
+        of_runs = _or(runs.groupby(["label", *PLACES, encoders]).size())
         table[scale or "here"] = [*(_budget(here, *where) for _, _, *where in BUDGETS), of_runs]
+    differs = any(not _is_papers(value, printed) for name, printed, *_ in BUDGETS for value in table.loc[name])
     is_known = (table != "").any(axis=1)
     if is_known.any():
         table["the paper's"] = [*(printed for _, printed, *_ in BUDGETS), "not printed, at least 6 evaluations"]
         page.table("Budgets beside the paper's.", table[is_known].reset_index())
+    if differs:
         page.text(
             "This scale does not show which method is ahead after the full budget: methods that learn late look worse "
             "here. It does not show what an encoder learns after the plateau near ln M, which lasts for over a "
@@ -302,6 +305,10 @@ def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
             f"Fewer than {stats.MIN_RUNS} runs on a task give no interval, and two or three runs rank nothing.",
             "warning",
         )
+
+
+def _is_papers(budget: str, printed: str) -> bool:
+    return budget in ("", "the paper's") or re.match(rf"{re.escape(budget)}(?!,?\d)", printed) is not None
 
 
 def _budget(jobs: pd.DataFrame, fact: str, kinds: str, methods: str) -> str:
@@ -384,6 +391,15 @@ def _scores(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> N
         "with that of a smaller budget.",
         "note",
     )
+    if jobs["command"].isna().all():  # no experiment says how its encoders were trained
+        trained = runs[~runs["label"].str.startswith(("random-encoder", "drq"))]
+        encoders = trained.groupby("label", sort=False)["encoder"].nunique()
+        if several := [f"{label} ({count})" for label, count in encoders.items() if count > 1]:
+            page.text(
+                f"Runs on several encoders count as one method: {', '.join(several)}. Whether these encoders were "
+                "trained alike is not recorded here.",
+                "warning",
+            )
     for varied, part in runs.groupby("varied", sort=False):
         of = f", mean ± standard deviation over runs (n).{f' {varied} varied.' if varied else ''}"
         _score_table(page, part, f"Episode return at the final evaluation{of}")
@@ -418,8 +434,7 @@ def _encoder(run: str, jobs: pd.DataFrame) -> str:
     """
     if encoders := _needed([run], jobs, "encoder", "explored", "finetuned", "untrained"):
         return encoders[-1]
-    card = jobs.loc[run, "path"] / "agent" / "card.json"
-    return read_json(card, error=RecordError).get("pretrained") or run if card.exists() else run
+    return jobs.loc[run, "facts"].get("pretrained") or run
 
 
 def _score_table(page: Page, runs: pd.DataFrame, caption: str) -> None:
@@ -534,7 +549,11 @@ def _estimated(found: stats.Estimate, **columns: Any) -> pd.DataFrame:
 def _learning_curves(page: Page, name: str, evaluations: pd.DataFrame) -> None:
     drawn = []
     for (task, label), own in evaluations.groupby(["task", "label"], sort=False):
-        runs = own.pivot_table("score", ["task", "encoder", "run"], "env_steps").dropna(axis=1)
+        # A task that ends early is evaluated at other env steps in each run.
+        rank = own.groupby("run")["env_steps"].rank()
+        is_whole = own.groupby("run").size().nunique() == 1
+        at = own["env_steps"].groupby(rank).transform("mean") if is_whole else own["env_steps"]
+        runs = own.assign(at=at).pivot_table("score", ["task", "encoder", "run"], "at").dropna(axis=1)
         if runs.empty:  # no evaluation that all runs have
             continue
         found = stats.estimate(stats.mean, runs.reset_index(), columns=list(runs))
