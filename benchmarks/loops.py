@@ -32,7 +32,6 @@ from crptpro.pretrained import Pretrained
 from crptpro.training import pretrain, train_downstream
 
 Hold = Callable[[dict[str, float]], None]
-STORE = "append" if hasattr(FrameReplay, "begin_episode") else "extend"  # the former in revision 40d9ae0
 
 
 def fresh_loss(*, image_size: int, prototypes: int, seed: int = 0) -> ProtoLoss:
@@ -124,7 +123,7 @@ def downstream(
             fill(replay, count, image_size, encodes=settings.get("features") != "reencode")
         laps.begin("act")
 
-    store = laps.clock(FrameReplay, STORE, lambda *_: laps.lap("update", waits=True), after="store")
+    store = laps.clock(FrameReplay, "extend", lambda *_: laps.lap("update", waits=True), after="store")
     with laps.clock(FrameReplay, "sample", begin), store:
         train_downstream(
             task or "drifting", fresh_pretrained(image_size=image_size, prototypes=prototypes), progress=False,

@@ -29,7 +29,7 @@ class Settings:
     """height and width in pixels"""
     scratch: Path | None = None
     """where frames are written for the time being, not a RAM disk; the system's temporary directory by default"""
-    out: Path = ROOT / "benchmarks" / "results"
+    out: Path = ROOT / "build" / "benchmarks"
     """directory of the JSON file"""
 
 

@@ -1,9 +1,8 @@
 """Another revision of the library beside this one, in turns: updates, a decision, sampling, opening, collecting.
 
 ``python -m benchmarks.revisions --old DIR`` runs every item of :mod:`benchmarks.loops` in one process per revision, one
-round here and one round there. DIR is a checkout; its own ``.venv``, where it has one, is used. It may have the
-interface of today or that of revision 40d9ae0. The environment is a drifting picture, whose steps cost next to nothing,
-so that the library is what is timed.
+round here and one round there. DIR is a checkout with the same interface; its own ``.venv``, where it has one, is used.
+The environment is a drifting picture, whose steps cost next to nothing, so that the library is what is timed.
 """
 
 from __future__ import annotations

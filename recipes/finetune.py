@@ -27,7 +27,7 @@ class Config:
     """Encoder, domain and task; the numbers of a stage are below --pretrain.* and --downstream.*."""
 
     pretrained: tyro.conf.Positional[str]
-    """directory of the pretrained encoder, or the name of one that ships"""
+    """directory of the pretrained encoder; the one that ships is slim, and cannot be trained further"""
     domain: str = "pendulum"
     """domain to fine-tune on"""
     task: str | None = None
@@ -53,6 +53,7 @@ def main(config: Config) -> None:
     task = config.task or get_domain(config.domain).task
     get_domain(task)  # an unknown name ends the recipe here, not hours later
     pretrained = load_pretrained(config.pretrained)
+    pretrained.build_loss()  # what cannot be trained further ends it here, too
     dataset = collect_random(
         config.domain,
         config.out / "data",

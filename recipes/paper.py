@@ -21,6 +21,7 @@ import tyro
 from crptpro.console import run_main
 from crptpro.data import collect_group
 from crptpro.domains import GROUPS, get_domain
+from crptpro.errors import CRPTproError
 from crptpro.objectives import get_method
 from crptpro.pretrained import load_pretrained, random_pretrained, save_pretrained
 from crptpro.seeding import derive_seed, seed_everything
@@ -61,6 +62,8 @@ def main(config: Config) -> None:
     for task in tasks:
         get_domain(task)  # an unknown name ends the recipe here, not hours later
     method = get_method(config.method)
+    if config.method == "drq" or method.exploration or method.starts_from:
+        raise CRPTproError(f"{config.method} needs more or less than random data: see explore.py, finetune.py, drq.py.")
     name = f"{config.method}_group_{config.group}_seed_{config.seed}"
     datasets = {}
     if config.method != "random-encoder":

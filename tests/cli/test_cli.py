@@ -140,6 +140,8 @@ def test_an_untrained_encoder_is_written_like_any_other(call: Call, dataset: Pat
     assert call(*other, "--encoder", "init=kaiming")[0] == 0
     assert load_pretrained("other/encoder").encoder.config["init"] == "kaiming"
     assert "is not trained and has no loss" in refused(call(*other, "--loss", "num_prototypes=8"))
+    for ignored in (("--updates", 7), ("--device", "cuda"), ("--logging.wandb", "online")):
+        assert "only --seed and --encoder apply" in refused(call(*other, *ignored))
 
 
 def test_a_real_process_ends_with_the_same_line(tmp_path: Path) -> None:
@@ -254,6 +256,8 @@ def test_mirrors_begin_with_the_run(call: Call, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("wandb.init", lambda **_: pytest.fail("W&B was asked for a run"))
     refusal = ("downstream", TASK, "--pretrained", "random-encoder", "--discount", "2", "--out", "out")
     refused(call(*refusal, "--logging.wandb", "offline", "--logging.tensorboard"))
+    named = (*refusal[:4], "--out", "out", "--logging.wandb-project", "mine")
+    assert "needs --logging.wandb" in refused(call(*named))
     assert not Path("out").exists()
 
 

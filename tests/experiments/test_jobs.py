@@ -77,6 +77,13 @@ def test_a_job_whose_weights_were_removed_runs_again_only_if_another_job_needs_t
     assert json.loads((directory / "job.json").read_text())["kind"] == "encoder"
 
 
+def test_a_job_that_another_command_finished_after_it_was_planned_is_left_alone(tmp_path: Path) -> None:
+    plan = make_plan([trained()], tmp_path)
+    finish(tmp_path, trained())
+    describe(tmp_path, plan)
+    assert is_finished(tmp_path, trained())
+
+
 def test_the_disk_space_of_a_job_follows_its_frames() -> None:
     assert bytes_of(dataset(SCALE, "walker", 0, 2_000))[0] == 2_000 * 3 * 84 * 84
     after, during = bytes_of(learned())

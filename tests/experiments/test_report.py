@@ -64,7 +64,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Report:
 
 
 def test_every_experiment_is_counted_and_every_job(seen: Report) -> None:
-    counts = seen.table("Experiments: requested and finished numbers").set_index("experiment")
+    counts = seen.table("Experiments: requested and finished results").set_index("experiment")
     assert list(counts["finished"].items()) == [
         ("seen", "22"), ("efficiency", "24"), ("prototypes", "7"), ("coverage", "1"), ("stability", "4"),
         ("visualize", "1"), ("probe", "90"),
@@ -241,19 +241,19 @@ def test_a_partial_reproduction_says_what_is_missing(made: Reproduction) -> None
     made.ask("seen", cells)
     made.ask("unseen", [("atc", "run-other", {"group": "A", "task": "finger_spin", "encoder_seed": 0})])
     report = made.report()
-    assert "1 of 3 numbers are finished." in report.text
-    assert "Missing: crptpro 1, atc 1. Missing numbers are left out, not replaced." in report.text
-    assert report.table("The 2 missing numbers")["job"].tolist() == ["run-begun", "run-none"]
+    assert "1 of 3 results are finished." in report.text
+    assert "Missing: crptpro 1, atc 1. Missing results are left out, not replaced." in report.text
+    assert report.table("The 2 missing results")["job"].tolist() == ["run-begun", "run-none"]
     states = report.table("run: 2 jobs").set_index("job")["state"]
     assert states.tolist() == ["begun", "finished"]
-    assert "Nothing is finished yet: 1 number requested." in report.text
+    assert "Nothing is finished yet: 1 result requested." in report.text
     final = report.cell("Episode return at the final", "crptpro", "A walker_run")
     assert final == "500 (n = 1) · paper 513 ± 33"
 
 
 def test_a_reproduction_without_any_job_is_reported(made: Reproduction) -> None:
     made.ask("seen", [("atc", "run-none", {"group": "A", "task": "walker_run"})], scale="small")
-    assert "Nothing is finished yet: 1 number requested." in made.report().text
+    assert "Nothing is finished yet: 1 result requested." in made.report().text
 
 
 def test_methods_are_compared_on_the_tasks_that_all_have(made: Reproduction) -> None:

@@ -202,13 +202,16 @@ def test_the_pieces_of_the_quickstart_run_in_the_cells_of_a_notebook(tmp_path: P
     ("recipe", "changes", "message"),
     [
         ("paper", {"tasks": ("walkr_run",)}, "Nearest: walker"),
+        ("paper", {"method": "proto-rl-c"}, "needs more or less than random data: see explore.py"),
+        ("paper", {"method": "drq"}, "needs more or less than random data"),
+        ("finetune", {"pretrained": "group-a", "domain": "walker"}, "slim"),
         ("finetune", {"pretrained": "absent", "domain": "walker"}, "absent does not exist"),
         ("finetune", {"pretrained": "absent", "domain": "walkr"}, "Nearest: walker"),
         ("quickstart", {"task": "walkr"}, "Nearest: walker"),
         ("drq", {"tasks": ("walkr",)}, "Nearest: walker"),
     ],
 )
-def test_a_wrong_name_ends_a_recipe_before_it_collects(
+def test_what_a_recipe_cannot_do_ends_it_before_it_collects(
     recipe: str, changes: dict[str, object], message: str, tmp_path: Path
 ) -> None:
     module = import_module(f"recipes.{recipe}")

@@ -68,6 +68,8 @@ class Logging:
     @contextlib.contextmanager
     def records(self, run_dir: Path) -> Iterator[RunLogger | None]:
         """Open the record of a run with its mirrors; without mirrors the run makes its own."""
+        if self.wandb == "off" and (self.wandb_project or self.wandb_group or self.wandb_tags):
+            raise CRPTproError("A W&B project, group or tag needs --logging.wandb: auto, offline or online.")
         if self.wandb == "off" and not self.tensorboard:
             yield None
             return
@@ -136,7 +138,7 @@ class EncoderRun:
     out: Path
     """run directory: records and checkpoints, and the encoder in OUT/encoder"""
     logging: Logging = field(default_factory=Logging)
-    """mirrors"""
+    """Weights & Biases and TensorBoard"""
 
     def keep(self, result: Any, records: RunLogger | None) -> None:
         """Write the encoder, and copy it to the mirrors."""
@@ -176,6 +178,8 @@ class Pretraining(EncoderRun):
         if method.loss_class is None:
             if self.loss:
                 raise CRPTproError(f"{self.method} is not trained and has no loss; leave out --loss.")
+            if self.config != type(self.config)(seed=self.config.seed) or self.logging != Logging():
+                raise CRPTproError(f"{self.method} is not trained: of the settings only --seed and --encoder apply.")
             encoder_options = images | named_values("--encoder", self.encoder)
             untrained = random_pretrained(self.config.seed, method=self.method, datasets=sources, **encoder_options)
             logger.info("untrained encoder: %s", save_pretrained(untrained, self.out / "encoder"))
@@ -209,7 +213,7 @@ class Finetune(EncoderRun):
     """Continue pre-training on one domain from a pretrained encoder."""
 
     pretrained: Positional[str]
-    """directory of the pretrained encoder, or the name of one that ships"""
+    """directory of the pretrained encoder; the one that ships is slim, and cannot be trained further"""
     dataset: Positional[Path]
     """dataset directory of the one domain"""
     config: Annotated[training.PretrainConfig, arg(name="")] = field(default_factory=training.PretrainConfig)
@@ -238,7 +242,7 @@ class Downstream:
     config: Annotated[training.DownstreamConfig, arg(name="")] = field(default_factory=training.DownstreamConfig)
     """every number of the stage"""
     logging: Logging = field(default_factory=Logging)
-    """mirrors"""
+    """Weights & Biases and TensorBoard"""
 
     def run(self) -> None:
         get_domain(self.task)  # an unknown name is refused before the run directory is made

@@ -50,7 +50,7 @@ class Reproduce:
     scale: Literal["tiny", "small", "paper"]
     """tiny shows in minutes that everything runs; small fits two CPU cores; paper has the paper's numbers"""
     methods: Annotated[tuple[str, ...], _ITS_OWN] = ()
-    """only these systems, e.g. `crptpro drq random-encoder`"""
+    """only these methods, e.g. `crptpro drq random-encoder`"""
     groups: Annotated[tuple[str, ...], _ITS_OWN] = ()
     """only these pre-training groups, of A B C D"""
     tasks: Annotated[tuple[str, ...], _ITS_OWN] = ()

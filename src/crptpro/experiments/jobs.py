@@ -125,6 +125,7 @@ class Plan:
 
     jobs: tuple[Job, ...]
     missing: tuple[Job, ...]
+    incomplete: tuple[Job, ...] = ()  # missing ones that were finished, and whose outputs were removed
 
 
 def make_plan(wanted: Iterable[Job], root: Path) -> Plan:
@@ -147,20 +148,23 @@ def make_plan(wanted: Iterable[Job], root: Path) -> Plan:
     for job in wanted:
         require(job)
     kept = [job for key, job in finished.items() if key not in missing]
-    return Plan((*kept, *missing.values()), tuple(missing.values()))
+    incomplete = [job for job in missing.values() if is_finished(root, job)]
+    return Plan((*kept, *missing.values()), tuple(missing.values()), tuple(incomplete))
 
 
 def describe(root: Path, plan: Plan) -> None:
-    """Write ``job.json`` of every job, and empty the directory of a finished job that has to run again."""
-    for job in plan.missing:
+    """Write ``job.json`` of every job, and empty the directory of a finished job that has to run again.
+
+    A job that another command has finished since it was planned is left alone.
+    """
+    for job in plan.incomplete:
         directory = directory_of(root, job.key)
-        if is_finished(root, job):
-            with FileLock(directory / LOCK):
-                for entry in directory.iterdir():
-                    if entry.is_dir():
-                        shutil.rmtree(entry)
-                    elif entry.name != LOCK:
-                        entry.unlink()
+        with FileLock(directory / LOCK):
+            for entry in directory.iterdir():
+                if entry.is_dir():
+                    shutil.rmtree(entry)
+                elif entry.name != LOCK:
+                    entry.unlink()
     for job in plan.jobs:
         path = directory_of(root, job.key) / DESCRIPTION
         if not path.exists():

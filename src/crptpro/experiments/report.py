@@ -256,7 +256,7 @@ def _spread(values: pd.Series, digits: int, n: bool = True) -> str:
 def _contents(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     page.section("What is here", "contents")
     numbers = cells.groupby(["experiment", "scale"], sort=False)["done"].agg(requested="size", finished="sum")
-    page.table("Experiments: requested and finished numbers.", numbers.reset_index())
+    page.table("Experiments: requested and finished results.", numbers.reset_index())
     counts = jobs.groupby("kind")["done"].agg(["sum", "size"])
     finished = ", ".join(f"{done} of {count} {kind}" for kind, done, count in counts.itertuples())
     seconds = jobs.loc[jobs["done"], "seconds"].dropna()
@@ -362,15 +362,15 @@ def _experiment(page: Page, experiment: str, scale: str, cells: pd.DataFrame, jo
         page.text(known.summary)
     missing = cells[~cells["done"]]
     if len(missing) == len(cells):
-        page.text(f"Nothing is finished yet: {_count(len(cells), 'number')} requested.", "warning")
+        page.text(f"Nothing is finished yet: {_count(len(cells), 'result')} requested.", "warning")
         return
-    page.text(f"{len(cells) - len(missing)} of {len(cells)} numbers are finished.")
+    page.text(f"{len(cells) - len(missing)} of {len(cells)} results are finished.")
     if len(missing):
         counts = missing["label"].value_counts(sort=False)
         names = ", ".join(f"{label} {count}" for label, count in counts.items())
-        page.text(f"Missing: {names}. Missing numbers are left out, not replaced.", "warning")
+        page.text(f"Missing: {names}. Missing results are left out, not replaced.", "warning")
         places = missing.drop(columns=["experiment", "scale", "done"])
-        page.table(f"The {len(missing)} missing numbers", places, fold=True)
+        page.table(f"The {len(missing)} missing results", places, fold=True)
     _measurements(page, name, cells, jobs)
     _efficiency(page, name, cells, jobs)
     _scores(page, name, cells, jobs)

@@ -194,11 +194,11 @@ def finetune(pretrained: Pretrained | str | Path, datasets: Any, **options: Any)
     """Train a pretrained artifact further, e.g. on the random data of one more domain.
 
     All networks continue from what was saved, targets and prototypes included; Adam starts anew. ``pretrained`` is an
-    artifact, its directory, or the name of one that ships; ``datasets`` and ``options`` are those of :func:`pretrain`.
-    The result's card also says how the artifact was trained before.
+    artifact or its directory; ``datasets`` and ``options`` are those of :func:`pretrain`. The result's card also says
+    how the artifact was trained before.
 
     Raises:
-        PretrainedError: the artifact cannot be read, or its loss cannot be built again.
+        PretrainedError: the artifact cannot be read, or its loss cannot be built again, as that of a slim one.
     """
     if not isinstance(pretrained, Pretrained):
         pretrained = load_pretrained(pretrained)
