@@ -82,7 +82,7 @@ def sentences() -> Iterator[str]:
     finger = dict(RESULTS["evaluations"]("finger_spin"))
     ours, untrained = (finger[name].mean() for name in ("`crptpro`", "`random-encoder`"))
     drq = finger["DrQ, its authors' log"]
-    yield f"is: {ours[60_000]:.0f} after 60,000 env steps, {untrained[60_000]:.0f} on an untrained encoder"
+    yield f"is: {ours[60_000]:.0f} after 60,000 env steps, {untrained[60_000]:.0f} on untrained encoders"
     yield f"DrQ's runs have {RESULTS['_spread'](drq[60_000])}"
     more = [("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "all ten")[count]
             for count in (drq[[20_000, 60_000]] > ours[[20_000, 60_000]]).sum()]  # fmt: skip
