@@ -94,7 +94,7 @@ def test_results_are_frames_of_cells_and_jobs(tmp_path: Path) -> None:
     finish(tmp_path, *trained().needs, trained())
     describe(tmp_path, make_plan([learned()], tmp_path))
     place = {"group": "A", "task": "walker_run", "encoder_seed": 0, "seed": 1}
-    write_cells(tmp_path, "seen", "tiny", {"groups": ["A"]}, [("crptpro", learned().key, place)])
+    write_cells(tmp_path, "seen", "tiny", [("crptpro", learned().key, place)])
     results = load_results(tmp_path)
     [cell] = results.cells.to_dict("records")
     about = {"experiment": "seen", "scale": "tiny", "label": "crptpro", "job": learned().key, "done": False}
@@ -110,8 +110,8 @@ def test_results_are_frames_of_cells_and_jobs(tmp_path: Path) -> None:
 
 
 def test_a_later_request_adds_cells_and_replaces_those_of_the_same_place(tmp_path: Path) -> None:
-    write_cells(tmp_path, "seen", "tiny", {}, [("a", "old", {"seed": 0}), ("b", "kept", {"seed": 0})])
-    write_cells(tmp_path, "seen", "tiny", {}, [("a", "new", {"seed": 0}), ("a", "more", {"seed": 1})])
+    write_cells(tmp_path, "seen", "tiny", [("a", "old", {"seed": 0}), ("b", "kept", {"seed": 0})])
+    write_cells(tmp_path, "seen", "tiny", [("a", "new", {"seed": 0}), ("a", "more", {"seed": 1})])
     cells = load_results(tmp_path).cells
     assert list(zip(cells.label, cells.job)) == [("a", "new"), ("a", "more"), ("b", "kept")]
 

@@ -31,7 +31,7 @@ from crptpro.errors import CheckpointError, PretrainedError
 from crptpro.modules import SquashedGaussianActor
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import load_pretrained, save_pretrained
-from crptpro.training import DownstreamConfig, DownstreamResult, load_agent, pretrain, train_downstream
+from crptpro.training import DownstreamConfig, DownstreamResult, PixelAgent, load_agent, pretrain, train_downstream
 from crptpro.training.agent import save_agent
 
 SMALL = DownstreamConfig(
@@ -202,6 +202,14 @@ def test_an_actor_that_explored_the_task_is_where_learning_begins(tmp_path: Path
     assert not same_state(train(None, with_actor, env_steps=20).agent.actor, actor)
     with_actor.card["training"]["datasets"] += [{"domain": "toy"}]
     assert same_state(train(None, with_actor, env_steps=20).agent.actor, actor)
+
+
+def test_an_agent_acts_in_evaluation_mode_and_leaves_the_training_of_its_encoder_alone() -> None:
+    encoder = nn.Sequential(nn.BatchNorm2d(9), nn.Flatten())
+    actor = SquashedGaussianActor(9 * SIZE * SIZE, 2, hidden_dim=16)
+    PixelAgent(encoder, actor)(torch.randint(0, 256, (9, SIZE, SIZE)).float())
+    assert encoder.training
+    assert not encoder[0].running_mean.any()
 
 
 class OwnEncoder(nn.Module):

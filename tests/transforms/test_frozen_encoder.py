@@ -34,6 +34,7 @@ def test_any_module_is_an_encoder_for_any_batch_and_stays_frozen(make, lead):
     keys = {"in_keys": ["pixels", ("next", "pixels")], "out_keys": ["features", ("next", "features")]}
     td = TensorDict({"pixels": images(*lead), "next": {"pixels": images(*lead)}}, batch_size=lead)
     FrozenEncoder(encoder, **keys).train()(td)
+    assert encoder.training  # whoever trains it goes on
     for part in (td, td["next"]):
         with torch.no_grad():
             direct = encoder.eval()(part["pixels"].reshape(-1, 9, SIZE, SIZE))

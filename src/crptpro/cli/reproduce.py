@@ -121,9 +121,8 @@ class Reproduce:
         require_disk(root, disk, "What this plan has yet to make")
         # It may fail, and nothing is written yet.
         launcher = self._launcher(slurm, gpus, jobs) if plan.missing else None
-        asked = {**dataclasses.asdict(request), "scale": self.scale}
         for name, cells in wanted.items():
-            write_cells(root, name, self.scale, asked, [(cell.label, cell.job.key, cell.place) for cell in cells])
+            write_cells(root, name, self.scale, [(cell.label, cell.job.key, cell.place) for cell in cells])
         if launcher is not None:
             failures = launch.run_jobs(
                 plan, root, launcher, jobs=jobs, cores=cores, device=self.device, attempts=self.attempts

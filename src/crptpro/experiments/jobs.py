@@ -193,13 +193,7 @@ def bytes_of(job: Job) -> tuple[int, int]:
     return 1_000_000, 0
 
 
-def write_cells(
-    root: Path,
-    experiment: str,
-    scale: str,
-    request: dict[str, Any],
-    cells: Iterable[tuple[str, str, Mapping[str, Any]]],
-) -> None:
+def write_cells(root: Path, experiment: str, scale: str, cells: Iterable[tuple[str, str, Mapping[str, Any]]]) -> None:
     """Record the cells of an experiment: label, key of the job and place of each number.
 
     They are added to earlier cells, and replace those with the same label and place. An earlier file that cannot be
@@ -212,8 +206,7 @@ def write_cells(
         before = read_json(path, error=RecordError).get("cells", []) if path.exists() else []
         taken = [(cell["label"], cell["place"]) for cell in new]
         kept = [cell for cell in before if (cell["label"], cell["place"]) not in taken]
-        about = {"experiment": experiment, "scale": scale, "request": request}
-        write_json(path, {**about, "cells": [*new, *kept]})
+        write_json(path, {"experiment": experiment, "scale": scale, "cells": [*new, *kept]})
 
 
 @dataclass(frozen=True)

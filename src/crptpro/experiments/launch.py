@@ -314,7 +314,8 @@ class _RayJob:
         try:
             self.ray.get(self.task)
         except self.ray.exceptions.RayError as reason:  # its worker or its node is gone, or it was stopped
-            return f"the job was lost ({type(reason).__name__})"
+            last = (str(reason).strip().splitlines() or [""])[-1]
+            return f"the job was lost ({type(reason).__name__}: {last})"
         return ""
 
     def stop(self, at_once: bool) -> None:

@@ -92,6 +92,19 @@ def linear_in(inputs: Tensor, layer: nn.Linear, compute_dtype: torch.dtype) -> T
     return product if bias is None else product + bias
 
 
+@contextlib.contextmanager
+def evaluating(module: nn.Module) -> Iterator[None]:
+    """Let a network compute in evaluation mode in the block: one that is being trained may normalise or drop out."""
+    was_training = module.training
+    if was_training:
+        module.eval()
+    try:
+        yield
+    finally:
+        if was_training:
+            module.train()
+
+
 def device_of(module: nn.Module) -> torch.device | None:
     """Return the device of a network's first parameter or buffer, or None."""
     return next((tensor.device for tensor in chain(module.parameters(), module.buffers())), None)

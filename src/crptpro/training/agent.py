@@ -16,6 +16,7 @@ from torchrl.objectives import SoftUpdate
 from crptpro.artifact import read_artifact, write_artifact
 from crptpro.errors import CheckpointError, NonFiniteError
 from crptpro.modules import PixelEncoder, SquashedGaussianActor, resolve_precision, set_compute_dtype
+from crptpro.modules.precision import evaluating
 from crptpro.objectives import RADSACLoss, SkillDDPGLoss
 from crptpro.provenance import provenance
 from crptpro.training.compile import Update, accelerate
@@ -42,7 +43,8 @@ class PixelAgent(nn.Module):
     def encode(self, pixels: Tensor) -> Tensor:
         """Return the features, ``[1, feature_dim]`` on the actor's device, of uint8 ``[C, H, W]``."""
         device = next(self.actor.parameters()).device
-        return self.encoder(pixels.unsqueeze(0).to(device))
+        with evaluating(self.encoder):
+            return self.encoder(pixels.unsqueeze(0).to(device))
 
     @torch.no_grad()
     def explore(

@@ -8,16 +8,16 @@ import torch
 from torch import Tensor, nn
 from torchrl.data.tensor_specs import Unbounded
 
-from crptpro.modules.precision import device_of
+from crptpro.modules.precision import device_of, evaluating
 from crptpro.transforms.base import Keys, PixelTransform
 
 
 class FrozenEncoder(PixelTransform):
     """Encode images ``[*, C, H, W]`` without gradient, on environments (single and batched) and in replay buffers.
 
-    The encoder is any ``nn.Module`` from ``[N, C, H, W]`` to features ``[N, ...]``. It gets the images unscaled, is in
-    evaluation mode, and not copied: training it changes the features. Images are moved to its device, and the features,
-    in its output dtype, back to the device of the images.
+    The encoder is any ``nn.Module`` from ``[N, C, H, W]`` to features ``[N, ...]``. It gets the images unscaled and
+    computes in evaluation mode. It is not copied: training it changes the features. Images are moved to its device, and
+    the features, in its output dtype, back to the device of the images.
 
     Examples:
         >>> from crptpro.modules import PixelEncoder
@@ -29,17 +29,14 @@ class FrozenEncoder(PixelTransform):
 
     def __init__(self, encoder: nn.Module, *, in_keys: Keys = "pixels", out_keys: Keys = "features") -> None:
         super().__init__(in_keys, out_keys)
-        self.encoder = encoder.eval()
-
-    def train(self, mode: bool = True) -> FrozenEncoder:
-        self.training = mode  # and the encoder stays in evaluation mode
-        return self
+        self.encoder = encoder
 
     @torch.no_grad()
     def _apply_transform(self, obs: Tensor) -> Tensor:
         lead = obs.shape[:-3]
         device = device_of(self.encoder) or obs.device
-        features = self.encoder(obs.reshape(-1, *obs.shape[-3:]).to(device))
+        with evaluating(self.encoder):
+            features = self.encoder(obs.reshape(-1, *obs.shape[-3:]).to(device))
         if not isinstance(features, Tensor):
             raise TypeError(
                 f"The encoder {type(self.encoder).__name__} returned {type(features).__name__}, not a tensor of "
