@@ -22,8 +22,8 @@ def main(task="walker_walk", *, transitions=2_000, updates=200, batch_size=64, a
     # Random data, every frame stored once; a sample is stacked, then shifted.
     data = FrameReplay(transitions, action_dim=action_dim, transform=RandomShift(in_keys=views))
     policy = RandomPolicy(env.full_action_spec)
-    for rollout in Collector(env, policy, frames_per_batch=100, total_frames=transitions):
-        data.extend(rollout)
+    for rollout in Collector(make_env(task, seed=1), policy, frames_per_batch=100, total_frames=transitions):
+        data.extend(rollout)  # and the collector closes its environment at the end
 
     # Pre-training: a LossModule, an optimiser, an EMA of the targets.
     loss = ProtoLoss(PixelEncoder(), num_prototypes=64)

@@ -201,8 +201,9 @@ def test_rows_of_another_shape_or_without_a_reset_are_refused_and_leave_no_trace
     with pytest.raises(DatasetError, match="Collect it into another directory"):
         dataset.extend(random_episode(5, size=8, action_dim=3))
     late = random_episode(3, size=8)
-    for part in (late, late["next"]):
-        part["pixels"] = torch.randint(0, 256, (3, 9, 8, 8), dtype=torch.uint8)
+    frames = torch.randint(0, 256, (6, 3, 8, 8), dtype=torch.uint8)
+    for first, part in enumerate((late, late["next"])):
+        part["pixels"] = torch.stack([frames[i : i + 3].flatten(0, 1) for i in range(first, first + 3)])
     with pytest.raises(ValueError, match="begins at its reset"):
         dataset.extend(late)
     dataset.writer.close()

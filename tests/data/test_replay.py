@@ -15,9 +15,11 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
-from torchrl.envs import CatFrames, TransformedEnv
+from torchrl.data import SamplerWithoutReplacement
+from torchrl.envs import CatFrames, Transform, TransformedEnv
+from torchrl.modules import RandomPolicy
 from toy_env import ToyEnv, rollout_of, variable_length
 
 from crptpro.data import FrameDataset, FrameReplay, StoredReplay, storage
@@ -32,6 +34,18 @@ def frame(number: int) -> torch.Tensor:
 
 def small(capacity: int = 20, **options: Any) -> FrameReplay:
     return FrameReplay(capacity, frame_shape=(3, 2, 2), action_dim=1, **options)
+
+
+class RunningMean(Transform):
+    """Has a state that every sample changes."""
+
+    def __init__(self) -> None:
+        super().__init__(in_keys=["action"])
+        self.register_buffer("mean", torch.zeros(()))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.mean.lerp_(tensordict["action"].mean(), 0.5)
+        return tensordict
 
 
 class Driver:
@@ -235,6 +249,38 @@ def test_a_ring_that_has_lost_a_file_is_refused_instead_of_filled_with_zeros(tmp
                 small(path=tmp_path)
         (tmp_path / "elsewhere").rename(tmp_path / f"{name}.memmap")
     small(path=tmp_path)
+
+
+def test_what_a_frame_replay_would_store_wrongly_is_refused() -> None:
+    stacks = torch.stack([torch.cat([frame(max(0, i - k)) for k in (2, 1, 0)]) for i in range(8)])
+    small().extend(rollout_of(stacks))
+    skipped = rollout_of(stacks[::2])
+    with pytest.raises(ValueError, match="its observation moved on by one frame"):
+        small().extend(skipped)
+    ahead = rollout_of(stacks).set("steps_to_next_obs", torch.full((7, 1), 3))
+    with pytest.raises(ValueError, match=r"takes single transitions; n_step="):
+        small().extend(ahead)
+    with pytest.raises(ValueError, match="leave out `sampler`"):
+        small(n_step=2, sampler=SamplerWithoutReplacement())
+    with pytest.raises(DatasetError, match="belongs to one process"):
+        small().share()
+
+
+def test_a_collector_may_fill_a_replay_and_count_what_it_wrote() -> None:
+    env = ToyEnv(lambda seed: 5, image_size=6)
+    replay = FrameReplay(40, frame_shape=(3, 6, 6), action_dim=env.action_spec.shape[-1])
+    collected = {"frames_per_batch": 4, "total_frames": 12, "init_random_frames": 4, "replay_buffer": replay}
+    counts = [replay.write_count for _ in Collector(env, RandomPolicy(env.full_action_spec), **collected)]
+    assert counts == [4, 8, 12]
+    assert len(replay) == 12
+
+
+def test_its_transforms_are_part_of_its_state() -> None:
+    replay, again = (small(transform=RunningMean()) for _ in range(2))
+    Driver(replay, 4).write(12)
+    replay.sample(8)
+    again.load_state_dict(replay.state_dict())
+    assert again.transform[0].mean == replay.transform[0].mean > 0
 
 
 def test_a_window_longer_than_every_episode_is_refused_in_words() -> None:

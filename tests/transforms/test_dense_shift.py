@@ -176,8 +176,8 @@ def test_threads_that_sample_side_by_side_get_each_their_own():
         assert all(threads.map(sample, range(60)))
 
 
-@pytest.mark.parametrize("prefetch", [1, 2])
-def test_a_replay_that_prefetches_leaves_the_features_of_earlier_batches_alone(prefetch):
+@pytest.mark.parametrize("prefetch", [None, 1, 2])
+def test_later_batches_leave_the_features_of_earlier_ones_alone(prefetch):
     encoder, frames = small_encoder(strides=(1, 1)), torch.randint(0, 256, (31, 3, SIZE, SIZE), dtype=torch.uint8)
     replay = FrameReplay(
         40, frame_shape=(3, SIZE, SIZE), action_dim=1, returns_pixels=False, batch_size=6, prefetch=prefetch
@@ -205,6 +205,23 @@ def test_copies_hold_no_maps_and_no_state_give_the_same_and_leave_the_features_o
     twin(dense.replay.batch(6))
     assert torch.equal(features, kept)
     assert not dense.state_dict()
+
+
+@pytest.mark.parametrize("way", ["load_state_dict", "loads"])
+def test_a_replay_that_goes_back_encodes_its_numbers_anew(way, tmp_path):
+    replay = FrameReplay(20, frame_shape=(3, SIZE, SIZE), action_dim=1)
+    dense = dense_of(small_encoder(strides=(1, 1)), replay, pad=0)
+    replay.append_transform(dense)
+    episodes = [rollout_of(torch.randint(0, 256, (6, 3, SIZE, SIZE), dtype=torch.uint8)) for _ in range(2)]
+    state = replay.state_dict()
+    replay.dumps(tmp_path)
+    for episode in episodes:
+        replay.load_state_dict(state) if way == "load_state_dict" else replay.loads(tmp_path)
+        replay.extend(episode)
+        batch = replay[:]
+        with torch.no_grad():
+            expected = dense.encoder(replay.observations(batch["number"]))
+        torch.testing.assert_close(batch["features"], expected, rtol=0, atol=1e-6 * float(expected.abs().max()))
 
 
 def test_numbers_that_go_back_are_encoded_anew_after_forget():

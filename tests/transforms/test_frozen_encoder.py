@@ -5,6 +5,7 @@ import torch
 from fake_pixel_env import SIZE, FakePixelEnv, small_encoder
 from tensordict import TensorDict
 from torch import nn
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import TransformedEnv
 
 from crptpro.transforms import FrozenEncoder
@@ -43,6 +44,16 @@ def test_any_module_is_an_encoder_for_any_batch_and_stays_frozen(make, lead):
         assert not part["features"].requires_grad
     assert all(parameter.requires_grad for parameter in encoder.parameters())
     assert all(torch.equal(value, state[name]) for name, value in encoder.state_dict().items())
+
+
+def test_who_attaches_it_changes_no_mode_of_the_encoder():
+    encoder = OwnNetwork()
+    encoder.layers[1].eval()  # somebody keeps these statistics
+    modes = [module.training for module in encoder.modules()]
+    replay = ReplayBuffer(storage=LazyTensorStorage(4), transform=FrozenEncoder(encoder), batch_size=2)
+    replay.extend(TensorDict({"pixels": images(4)}, [4]))
+    replay.sample()
+    assert [module.training for module in encoder.modules()] == modes
 
 
 def test_the_spec_says_what_reset_and_step_return():

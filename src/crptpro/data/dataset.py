@@ -129,6 +129,11 @@ class FrameDataset(ReplayBuffer):
         return self._storage.frame_stack
 
     @property
+    def window(self) -> int:
+        """Frames that it holds; their numbers are below it."""
+        return len(self._storage.pixels)
+
+    @property
     def image_size(self) -> int:
         """H = W of a frame, pixels."""
         return self._storage.pixels.shape[-1]
@@ -241,6 +246,10 @@ class EpisodeWriter(ImmutableDatasetWriter):
     @property
     def transitions(self) -> int:
         return self.state["transitions"]
+
+    @property
+    def _write_count(self) -> int:  # which TorchRL's collectors read
+        return self.transitions
 
     @property
     def episodes(self) -> int:

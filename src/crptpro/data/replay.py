@@ -99,6 +99,8 @@ class FrameReplay(ReplayBuffer):
         own = {"branch", "discount", "index", "next", "number", "row_of", "step", "steps_to_next_obs"}
         if taken := sorted({*columns, *own} & extra.keys()):
             raise ValueError(f"extra_columns may not be named {taken}: a sample has those; choose other names.")
+        if "sampler" in options and n_step > 1:
+            raise ValueError("With n_step above 1 a FrameReplay has its own sampler; leave out `sampler`.")
         storage = RingStorage(
             capacity, columns | extra, slack=slack, frame_stack=frame_stack, n_step=n_step, discount=discount, path=path
         )
@@ -122,14 +124,29 @@ class FrameReplay(ReplayBuffer):
             return self._storage.observations(numbers)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return a few counters (ring on disk) or the whole content (ring in RAM), without the generator."""
+        """Return a few counters (ring on disk) or the whole content (ring in RAM), and the transforms' state.
+
+        The generator is not part of it.
+        """
         with self._replay_lock:
-            return {"ring": self._storage.state_dict()}
+            return {"ring": self._storage.state_dict(), "transforms": self._transform.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the content of the moment the state was taken, or raise a CheckpointError."""
         with self._replay_lock:
             self._storage.load_state_dict(state_dict["ring"])
+            self._transform.load_state_dict(state_dict["transforms"])
+
+    def loads(self, path: str | Path) -> None:
+        """Restore what TorchRL's ``dumps`` wrote."""
+        super().loads(path)
+        self._transform.load_state_dict(self._transform.state_dict())  # features of the numbers before are dropped
+
+    def share(self, shared: bool = True) -> FrameReplay:
+        """Refuse to be shared: other processes would fill copies of it."""
+        if shared:
+            raise DatasetError("A FrameReplay belongs to one process: extend it with what the collector yields.")
+        return super().share(False)
 
 
 class StoredReplay(StackStorage):
@@ -186,6 +203,10 @@ class _RingWriter(ImmutableDatasetWriter):
         return ring.write(rows)
 
     add = extend
+
+    @property
+    def _write_count(self) -> int:  # which TorchRL's collectors read
+        return self._storage.transitions
 
     def _empty(self, empty_write_count: bool = True) -> None:
         pass

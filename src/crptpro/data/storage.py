@@ -126,6 +126,15 @@ def read_rows(
                 f"{what} takes uint8 pixels [{channels} or {frame_stack * channels}, H, W], got {pixels.dtype} "
                 f"{tuple(pixels.shape[1:])}."
             )
+    if data.get("steps_to_next_obs", None) is not None:
+        raise ValueError(f"{what} takes single transitions; n_step= of a FrameReplay makes n-step ones of them.")
+    if stacks.shape[1] == next_stacks.shape[1] > channels and not torch.equal(
+        next_stacks[:, :-channels], stacks[:, channels:]
+    ):
+        raise ValueError(
+            f"{what} stores each frame once: a next observation must be its observation moved on by one frame. Skip "
+            "frames below the frame stack (`action_repeat` of make_env), and augment samples instead of environments."
+        )
     columns = {"action": entry("action"), "reward": column("reward"), "done": (done := column("done"))}
     for name in ("reward", "action"):
         finite = torch.isfinite(columns[name])

@@ -185,11 +185,12 @@ class SimulatorEnv(CheckedEnv, GymLikeEnv):
         if not self._has_state:
             return {}
         data = self._simulation()
-        return {name: torch.tensor(getattr(data, name)) for name in ("qpos", "qvel") if hasattr(data, name)}
+        found = {name: getattr(data, name) for name in ("qpos", "qvel") if hasattr(data, name)}
+        return {name: torch.tensor(value, device="cpu") for name, value in found.items()}
 
     def _draw(self) -> Tensor:
         if not self._renders:
-            return torch.zeros(3, self._image_size, self._image_size, dtype=torch.uint8)
+            return torch.zeros(3, self._image_size, self._image_size, dtype=torch.uint8, device="cpu")
         with passed_on(self._name, "render"):
             image = self._render()
         return resize(self._read_frame(image), self._image_size)

@@ -95,14 +95,14 @@ def linear_in(inputs: Tensor, layer: nn.Linear, compute_dtype: torch.dtype) -> T
 @contextlib.contextmanager
 def evaluating(module: nn.Module) -> Iterator[None]:
     """Let a network compute in evaluation mode in the block: one that is being trained may normalise or drop out."""
-    was_training = module.training
-    if was_training:
-        module.eval()
+    training = [each for each in module.modules() if each.training]
+    for each in training:
+        each.training = False
     try:
         yield
     finally:
-        if was_training:
-            module.train()
+        for each in training:
+            each.training = True
 
 
 def device_of(module: nn.Module) -> torch.device | None:

@@ -166,6 +166,9 @@ def train_downstream(
     """
     settings: Any = dataclasses.replace(config or DownstreamConfig(), **overrides)
     if not isinstance(pretrained, Pretrained):
+        if not isinstance(pretrained, (str, Path)):
+            kind = type(pretrained).__name__
+            raise PretrainedError(f"A {kind} is no saved encoder: give what save_pretrained(result, path) returns.")
         source, is_control = str(pretrained), str(pretrained) in ("drq", "random-encoder")
         pretrained = random_pretrained(settings.seed, method=source) if is_control else load_pretrained(source)
     settings = settings.resolved(task, pretrained)

@@ -62,7 +62,7 @@ class EnvThread:
 
     def uniform_action(self, generator: torch.Generator) -> Tensor:
         """Return a uniformly random action in ``[-1, 1]^A``."""
-        return 2 * torch.rand(self.env.action_spec.shape, generator=generator) - 1
+        return 2 * torch.rand(self.env.action_spec.shape, generator=generator, device="cpu") - 1
 
     def close(self) -> None:
         with self._thread:

@@ -112,7 +112,7 @@ def uniform_policy(env: EnvBase, *, seed: int) -> Policy:
     """Return the uniform random policy on ``[-1, 1]^A``, the control that every result is read against."""
     generator = torch.Generator().manual_seed(derive_seed(seed, "uniform_policy"))
     action_dim = env.action_spec.shape[-1]
-    return lambda pixels: torch.rand(action_dim, generator=generator) * 2 - 1
+    return lambda pixels: torch.rand(action_dim, generator=generator, device="cpu") * 2 - 1
 
 
 def summarize(episodes: Sequence[Episode]) -> dict[str, float]:

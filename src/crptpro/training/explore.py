@@ -315,8 +315,8 @@ class Explorer:
         skills = self.exploration.skill_dim
         if skills is not None:
             if len(self.actions) % self.exploration.skill_agent_steps == 0:
-                self.skill = int(torch.randint(skills, (), generator=self.generators["skill"]))
-            td["skill"] = nn.functional.one_hot(torch.tensor(self.skill), skills).float()
+                self.skill = int(torch.randint(skills, (), generator=self.generators["skill"], device="cpu"))
+            td["skill"] = nn.functional.one_hot(torch.tensor(self.skill, device="cpu"), skills).float()
         if self.agent_steps < self.config.random_agent_steps:
             td["action"] = self.env.uniform_action(self.generators["random_actions"])
         else:
@@ -372,7 +372,7 @@ class Explorer:
         for action in state["actions"]:
             self._td["action"] = action
             self._take(self.env.step(self._td).result())
-        newest = self.replay.observations(torch.tensor([self.replay.frames_written - 1]))[0]
+        newest = self.replay.observations(torch.tensor([self.replay.frames_written - 1], device="cpu"))[0]
         if not torch.equal(newest, self._td["pixels"]):
             logger.warning("%s does not repeat its episode: this run will differ from an uninterrupted one.", self.name)
 

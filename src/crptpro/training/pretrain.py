@@ -145,7 +145,9 @@ def pretrain(
                                       progress=progress))  # fmt: skip
         dtype = resolve_precision(run.saved_setting("precision", settings.precision), device)
         stack.enter_context(computing(loss, dtype))
-        buffers, generators = stack.enter_context(_opened(datasets, loss, seed=settings.seed, device=device))
+        buffers, generators = stack.enter_context(
+            _opened(datasets, loss, batch_size=settings.batch_size, seed=settings.seed, device=device)
+        )
         torch.manual_seed(settings.seed)
         recipe = dataclasses.replace(recipe, **{name: getattr(settings, name) for name in METHOD_FIELDS})
         optimizer, schedule, targets = make_optimizer(loss, recipe, cuda_graph=settings.cuda_graph)
@@ -344,7 +346,7 @@ def ending(
 
 @contextlib.contextmanager
 def _opened(
-    datasets: Any, loss: LossModule, *, seed: int, device: torch.device
+    datasets: Any, loss: LossModule, *, batch_size: int, seed: int, device: torch.device
 ) -> Iterator[tuple[dict[str, ReplayBuffer], Generators]]:
     """Yield buffers by domain, with the random shift that the loss wants, and the generators that they draw from."""
     if isinstance(datasets, (str, Path)) or hasattr(datasets, "sample"):
@@ -367,15 +369,21 @@ def _opened(
     generators = Generators(seed, "shift", *devices, devices=devices)
     with contextlib.ExitStack() as stack:
         for name, buffer in buffers.items():
+            if getattr(buffer, "_prefetch", False):
+                raise DatasetError(f"The dataset {name!r} prefetches: its threads would reorder the run's batches.")
+            stack.callback(buffer.set_rng, buffer._rng)
             buffer.set_rng(generators[f"sample/{name}"])
-            buffer.append_transform(_shift_for(loss, name, buffer, generators["shift"]))
+            buffer.append_transform(_shift_for(loss, name, buffer, generators["shift"], batch_size))
             stack.callback(buffer.transform.pop, -1)
         yield buffers, generators
 
 
-def _shift_for(loss: LossModule, name: str, buffer: ReplayBuffer, generator: torch.Generator) -> RandomShift:
+def _shift_for(
+    loss: LossModule, name: str, buffer: ReplayBuffer, generator: torch.Generator, batch_size: int
+) -> RandomShift:
     """Return the shift of every image that a loss reads: each entry, and each second view of one, has its own."""
-    sample = buffer.sample(1)
+    # Other samplers may not draw single rows.
+    sample = buffer.sample(1 if type(buffer.sampler) is RandomSampler else batch_size)
     views: Mapping[NestedKey, NestedKey] = getattr(loss, "views", {})
     wanted = list(dict.fromkeys(views.get(key, key) for key in loss.in_keys))
     held = set(sample.keys(True, True))

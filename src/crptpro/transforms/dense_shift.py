@@ -126,8 +126,7 @@ class DenseShiftFeatures(Transform):
     Its dense maps are kept until the replay has overwritten it; no state dictionary, copy or pickle holds them. Where
     the replay's numbers go back (``load_state_dict`` on the one in use), call :meth:`forget`.
 
-    The features of a call are valid until the next call in the same thread, those of a replay that prefetches for ever;
-    threads may sample side by side. On an environment use :class:`~crptpro.transforms.FrozenEncoder`.
+    Threads may sample side by side. On an environment use :class:`~crptpro.transforms.FrozenEncoder`.
 
     Args:
         encoder: frozen, see :func:`dense_shift_geometry`; its weights must not change from now on.
@@ -188,8 +187,7 @@ class DenseShiftFeatures(Transform):
     def forget(self) -> None:
         """Drop all maps, and give their memory back."""
         self._lock = threading.Lock()
-        self._outputs = threading.local()
-        self._held = torch.full((self.observations,), -1, dtype=torch.int64)
+        self._held = torch.full((self.observations,), -1, dtype=torch.int64, device="cpu")
         self._maps: Tensor | None = None
         self._embeddings: Tensor | None = None
 
@@ -202,7 +200,7 @@ class DenseShiftFeatures(Transform):
             for (flat, lead), out_key in zip(numbers, self.out_keys):
                 offsets = draw_offsets(flat.shape[0], self.pad, self.generator)
                 rows = flat % self.observations
-                features = crop_features(maps, rows, offsets, self._output(out_key, len(flat)), pad=self.pad)
+                features = crop_features(maps, rows, offsets, self._new_output(len(flat)), pad=self.pad)
                 tensordict.set(out_key, self.encoder.standardised(features).reshape(*lead, -1))
             if embeddings is not None:
                 shifts = offsets[:, 0] * (2 * self.pad + 1) + offsets[:, 1]
@@ -213,7 +211,7 @@ class DenseShiftFeatures(Transform):
     @torch.no_grad()
     def unshifted(self, number: int) -> Tensor:
         """Return an observation's features ``[1, feature_dim]`` without a shift, for a policy; its maps are kept."""
-        numbers, centre = torch.tensor([number]), torch.full((1, 2), self.pad)
+        numbers, centre = torch.tensor([number], device="cpu"), torch.full((1, 2), self.pad, device="cpu")
         with self._lock:
             maps, _ = self._encode_missing(numbers)
             features = crop_features(maps, numbers % self.observations, centre, self._new_output(1), pad=self.pad)
@@ -233,7 +231,7 @@ class DenseShiftFeatures(Transform):
         missing = numbers[self._held[numbers % self.observations] != numbers].unique()
         for number in missing.tolist():
             # One by one: a convolution may round differently in a batch, and then a resumed run would, too.
-            pixels = self.replay.observations(torch.tensor([number])).to(self._maps.device)
+            pixels = self.replay.observations(torch.tensor([number], device="cpu")).to(self._maps.device)
             maps = dense_shift_maps(self.encoder, pixels, pad=self.pad, dtype=self.dtype)
             slot = number % self.observations
             self._maps[slot] = maps[0]
@@ -251,20 +249,11 @@ class DenseShiftFeatures(Transform):
         return self._maps, self._embeddings
 
     def _embed_all_shifts(self, projector: nn.Module, maps: Tensor) -> Tensor:
-        side = torch.arange(2 * self.pad + 1)
+        side = torch.arange(2 * self.pad + 1, device="cpu")
         offsets = torch.cartesian_prod(side, side)
-        rows = torch.zeros(len(offsets), dtype=torch.int64)
+        rows = torch.zeros(len(offsets), dtype=torch.int64, device="cpu")
         features = crop_features(maps, rows, offsets, self._new_output(len(offsets)), pad=self.pad)
         return projector(self.encoder.standardised(features)).float()
-
-    def _output(self, key: NestedKey, count: int) -> Tensor:
-        if getattr(self.replay, "_prefetch", False):  # its threads fill the next batches while this one is being used
-            return self._new_output(count)
-        # Used again: 512 float32 crops into fresh memory took 70 to 74 ms on a CPU, into memory in use 23 to 44 ms.
-        kept: dict[str, Tensor] = self._outputs.__dict__
-        if len(kept.get(str(key), ())) != count:
-            kept[str(key)] = self._new_output(count)
-        return kept[str(key)]
 
     def _new_output(self, count: int) -> Tensor:
         dtype, device = self.encoder.compute_dtype, device_of(self.encoder)
@@ -276,7 +265,7 @@ class DenseShiftFeatures(Transform):
         return copy
 
     def __getstate__(self) -> dict[str, Any]:
-        derived = ("_lock", "_outputs", "_held", "_maps", "_embeddings")
+        derived = ("_lock", "_held", "_maps", "_embeddings")
         return {key: value for key, value in super().__getstate__().items() if key not in derived}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

@@ -31,6 +31,10 @@ class FrozenEncoder(PixelTransform):
         super().__init__(in_keys, out_keys)
         self.encoder = encoder
 
+    def train(self, mode: bool = True) -> FrozenEncoder:
+        self.training = mode  # not the encoder's: it may be somebody's who trains it
+        return self
+
     @torch.no_grad()
     def _apply_transform(self, obs: Tensor) -> Tensor:
         lead = obs.shape[:-3]

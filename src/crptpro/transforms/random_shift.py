@@ -70,7 +70,7 @@ def _shift_by_gather(pixels: Tensor, offsets: Tensor, pad: int) -> Tensor:
 
 
 def _shift_by_slices(pixels: Tensor, offsets: Tensor, pad: int) -> Tensor:
-    shifted = torch.empty(pixels.shape, dtype=pixels.dtype)
+    shifted = torch.empty(pixels.shape, dtype=pixels.dtype, device=pixels.device)
     source, target = as_numpy_bits(pixels.detach()), as_numpy_bits(shifted)
     for image, view, offset in zip(source, target, (offsets - pad).tolist()):
         _copy_shifted(view, image, *offset)
