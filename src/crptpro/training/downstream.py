@@ -207,14 +207,14 @@ def train_downstream(
         stack.callback(evaluator.close)
         is_complete = bool(run.saved.get("is_finished")) and run.saved["position"] >= settings.env_steps
         replay = _make_replay(run, env.env, settings, generators["replay"], is_complete=is_complete)
-        memory = attach_transforms(replay, pretrained, encoder, settings, generators, run, dtype=dtype,
-                                   reserved_bytes=evaluator.workers * WORKER_BYTES)  # fmt: skip
+        attach_transforms(replay, pretrained, encoder, settings, generators, run, dtype=dtype,
+                          reserved_bytes=evaluator.workers * WORKER_BYTES)  # fmt: skip
         dense = next((each for each in replay.transform if isinstance(each, DenseShiftFeatures)), None)
         if dense is not None:  # its replay refers to it, too: the maps would stay until cycles are collected
             stack.callback(dense.forget)
         counters = run.tally
         counters.update(updates=0, episodes=0, last_evaluation=-1)
-        run.keep(**learner.components(), **memory, generators=generators, evaluator=evaluator,
+        run.keep(**learner.components(), generators=generators, evaluator=evaluator,
                  replay=None if is_complete else replay)  # fmt: skip
 
         def start_evaluation() -> None:
@@ -326,8 +326,8 @@ def attach_transforms(
     *,
     dtype: torch.dtype,
     reserved_bytes: int,
-) -> dict[str, Any]:
-    """Attach to the replay what turns a sample into the learner's batch; returns what a checkpoint must hold of it.
+) -> None:
+    """Attach to the replay what turns a sample into the learner's batch.
 
     DrQ reads two shifts of every image. SAC on a frozen encoder reads features under a random shift: crops of dense
     maps, or the shifted image encoded again. The bonus is added to the sampled reward.
@@ -338,7 +338,7 @@ def attach_transforms(
     if pretrained.method == "drq":
         views = ["pixels_view", ("next", "pixels_view")]
         replay.append_transform(RandomShift(in_keys=[*pixels, *pixels], out_keys=[*views, *pixels], **shift))
-        return {}
+        return
     projector: Any = pretrained.projector
     prototypes: Any = pretrained.prototypes
     has_bonus = prototypes is not None and projector is not None and config.intrinsic_reward_coef > 0
@@ -371,7 +371,7 @@ def attach_transforms(
             DenseShiftFeatures(encoder, replay, projector=kept, dtype=map_dtype, observations=slots, **shift)
         )
     if not has_bonus:
-        return {}
+        return
     warn_if_mostly_zero(len(prototypes.weight), config.batch_size, config.knn_k)
     bonus = PrototypeReward(
         None if keeps_projections else projector,
@@ -384,7 +384,6 @@ def attach_transforms(
         generator=generators["bonus"],
     )
     replay.append_transform(bonus)
-    return {"bonus": bonus}
 
 
 def _eval_workers(task: str, make_this_env: Callable[[], EnvBase], config: Any) -> int:
