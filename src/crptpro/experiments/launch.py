@@ -168,8 +168,7 @@ class LocalLauncher:
     def __init__(self, gpus: Sequence[str] = (), *, jobs: int = 1) -> None:
         self.gpus = tuple(gpus)
         per_gpu = math.ceil(jobs / max(1, len(gpus)))
-        self.job_bytes = free_bytes(torch.device("cpu")) // jobs
-        self._shares = {JOB_BYTES: str(self.job_bytes), JOBS_PER_GPU: str(per_gpu)}
+        self._shares = {JOB_BYTES: str(free_bytes(torch.device("cpu")) // jobs), JOBS_PER_GPU: str(per_gpu)}
         self._running: list[_Process] = []
 
     def start(self, work: Work, *, is_exclusive: bool) -> _Process:
