@@ -1,8 +1,9 @@
-"""Tests marked `gpu` are left out without a CUDA device; `--precision` decides what `auto` means on a CPU."""
+"""What every test begins with; `--precision` decides what `auto` means on a CPU."""
 
 from __future__ import annotations
 
 import logging
+import signal
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -10,7 +11,6 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
-import torch
 
 from crptpro.modules import precision
 
@@ -25,6 +25,16 @@ def _log_is_as_a_library_has_it() -> None:
     library.handlers.clear()
     library.setLevel(logging.NOTSET)
     library.propagate = True
+
+
+@pytest.fixture(autouse=True)
+def _signals_are_as_in_the_foreground() -> Iterator[None]:
+    """Under nohup, and in the background, some are ignored."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture
@@ -52,12 +62,3 @@ def pytest_configure(config: pytest.Config) -> None:
     if (forced := config.getoption("--precision")) is not None:
         precision.CPUINFO = Path(tempfile.mkdtemp()) / "cpuinfo"
         precision.CPUINFO.write_text("flags: amx_bf16" if forced == "bf16" else "flags:")
-
-
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if torch.cuda.is_available():
-        return
-    left_out = [item for item in items if item.get_closest_marker("gpu")]
-    if left_out:
-        config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if not item.get_closest_marker("gpu")]

@@ -328,10 +328,12 @@ def test_an_unreachable_server_means_offline(
 
 
 def test_an_offline_wandb_run_and_event_files_are_really_written_and_resumed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_account: None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, no_account: None
 ) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+    for name in ("WANDB_DATA_DIR", "WANDB_CACHE_DIR"):
+        monkeypatch.setenv(name, str(tmp_path / "elsewhere"))
     (tmp_path / "note.txt").write_text("an artifact")
     for updates in (1, 2):
         with RunLogger(tmp_path, wandb=WandbOptions(), tensorboard=True) as logger:
@@ -345,3 +347,4 @@ def test_an_offline_wandb_run_and_event_files_are_really_written_and_resumed(
     events = EventAccumulator(str(tmp_path / "tensorboard"))
     events.Reload()
     assert [(e.step, e.value) for e in events.Scalars("train/loss")] == [(10, 1.0), (20, 0.5)]
+    assert not [each for each in caplog.records if each.name.startswith("crptpro")]  # no mirror failed

@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from crptpro.pretrained import load_pretrained, shipped_encoders
 
 ROOT = Path(__file__).parents[1]
@@ -24,6 +26,7 @@ print(json.dumps([crptpro.__file__, {name: [each.identity(), each.encoder(pixels
 """
 
 
+@pytest.mark.gl
 def test_a_wheel_brings_the_encoders_that_ship(tmp_path: Path) -> None:
     sources = tmp_path / "sources"  # building writes into them
     shutil.copytree(ROOT / "src", sources / "src", ignore=shutil.ignore_patterns("*.egg-info", "__pycache__"))

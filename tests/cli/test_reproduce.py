@@ -144,7 +144,7 @@ class InProcess:
 
     is_one_machine = True
 
-    def __init__(self, gpus: tuple[str, ...]) -> None: ...
+    def __init__(self, gpus: tuple[str, ...], *, jobs: int) -> None: ...
 
     def start(self, work: Work, *, is_exclusive: bool) -> Any:
         log = open(work.directory / "log.txt", "a", buffering=1)  # noqa: SIM115

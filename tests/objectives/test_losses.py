@@ -7,9 +7,11 @@ import pickle
 
 import pytest
 import torch
-from loss_cases import CASES, LossCase, assert_same, disturb, keep_targets, leaves, run, total
+from loss_cases import CASES, LossCase, assert_same, disturb, keep_targets, leaves, run, total, view_batch
 from tensordict import TensorDictBase
 from tensordict.utils import unravel_key
+
+from crptpro.objectives import SimCLRLoss
 
 pytestmark = pytest.mark.filterwarnings("ignore:No target network updater")
 each = pytest.mark.parametrize("case", CASES, ids=str)
@@ -141,19 +143,27 @@ def test_copies_are_equal_and_independent_and_their_networks_hold_their_paramete
     assert_same(run(twin, td), run(fresh, td))
 
 
-@each
-def test_networks_of_a_loss_that_was_cast_or_moved_hold_its_parameters_and_buffers(case: LossCase) -> None:
-    loss = case.make()
-    statistics = torch.nn.BatchNorm1d(3)
-    loss._convert(extra=statistics)
-    held = {id(parameter) for parameter in loss.parameters()}
+class Normalising(torch.nn.Sequential):
+    """An encoder with statistics of its batches."""
+
+    feature_dim = 3 * 15 * 15
+
+    def __init__(self) -> None:
+        super().__init__(torch.nn.BatchNorm2d(3), torch.nn.Flatten())
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        return super().forward(pixels.to(self[0].weight.dtype))
+
+
+def test_the_encoder_of_a_loss_that_was_cast_has_its_parameters_and_its_statistics() -> None:
+    loss = SimCLRLoss(Normalising(), latent_dim=4)
+    held = [*loss.parameters()]
     loss.to(torch.float64)
-    assert {id(parameter) for parameter in loss.parameters()} == held
-    assert {id(parameter) for parameter in statistics.parameters()} <= held
-    with loss._holding("extra"):
-        statistics(torch.ones(2, 3, dtype=torch.float64))
-    assert statistics.running_mean.tolist() == pytest.approx([0.1] * 3)
-    assert torch.equal(loss.extra_params["running_mean"], statistics.running_mean)
+    assert {id(parameter) for parameter in loss.parameters()} == {id(parameter) for parameter in held}
+    assert {id(parameter) for parameter in loss.encoder.parameters()} <= {id(parameter) for parameter in held}
+    loss(view_batch())
+    assert loss.encoder[0].running_mean.all()
+    assert loss.encoder(view_batch()["pixels"]).dtype == torch.float64
 
 
 @each

@@ -133,7 +133,7 @@ def test_a_run_that_has_ended_keeps_no_dense_maps() -> None:
     gc.collect()
     gc.disable()
     try:
-        result = train(None, env_steps=40)
+        result = train(None, env_steps=40, features="dense")
         maps = [each for each in gc.get_objects() if type(each) is Tensor and each.ndim == 5]
     finally:
         gc.enable()
@@ -280,3 +280,42 @@ def test_what_is_left_open_is_the_methods_own(methods: list[str], own: dict[str,
         resolved = dataclasses.asdict(DownstreamConfig().resolved("walker_run", make_pretrained(method)))
         assert resolved == {**resolved, **own}
     assert DownstreamConfig(env_steps=10).resolved("walker_run", make_pretrained("drq")).env_steps == 10
+
+
+def returns(run_dir: Path) -> list[str]:
+    return [row["episode_return"] for row in record(run_dir / "episodes.csv")]
+
+
+def test_an_agent_acts_by_its_policy_after_the_random_decisions(tmp_path: Path) -> None:
+    for rate in (1e-4, 1e-1):
+        train(tmp_path / f"{rate}", learning_rate=rate, env_steps=80)
+    slow, fast = (returns(tmp_path / f"{rate}") for rate in (1e-4, 1e-1))
+    assert slow[0] == fast[0]  # ten of the twelve random decisions
+    assert slow[2:] != fast[2:]
+
+
+CHANGED = {
+    "discount": 0.5,
+    "initial_temperature": 1.0,
+    "critic_tau": 0.9,
+    "learning_rate": 1e-2,
+    "knn_k": 2,
+    "queue_size": 8,
+    "intrinsic_reward_coef": 0.7,
+    "batch_size": 4,
+    "hidden_dim": 8,
+    "random_agent_steps": 14,
+    "replay_capacity": 20,
+    "seed": 1,
+}
+
+
+@pytest.fixture(scope="module")
+def usual() -> Any:
+    return train(None, env_steps=80, eval_interval_env_steps=80).agent.actor.state_dict()
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_a_setting_reaches_the_run(usual: Any, name: str) -> None:
+    found = train(None, env_steps=80, eval_interval_env_steps=80, **{name: CHANGED[name]}).agent.actor.state_dict()
+    assert not all(a.shape == b.shape and torch.equal(a, b) for a, b in zip(found.values(), usual.values()))

@@ -107,7 +107,6 @@ def test_an_evaluation_that_has_ended_is_delivered_once_when_the_run_asks() -> N
     while not results and time.monotonic() < deadline:
         time.sleep(0.05)
         running.poll()
-    running.finish()
     assert [counters for _, counters in results] == [{"env_steps": 40}]
     running.close()
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from torchrl.objectives import LossModule
+from toy_env import ToyEnv
 from toy_runs import EPISODE, kill, make_encoder, record, same_state, signalling, toy_domain
 
 from crptpro.errors import CheckpointError, CRPTproError
@@ -76,12 +77,30 @@ def test_a_killed_run_continues_with_the_same_command(tmp_path: Path) -> None:
     assert record(tmp_path / "parts" / "pretrain.csv") == record(tmp_path / "whole" / "pretrain.csv")
 
 
-def test_the_agents_never_move_the_encoder() -> None:
-    # Without an encoder update the loss stays as it was, whatever the agents learn.
-    loss = build("proto-rl-c")
-    before = {key: value.clone() for key, value in loss.state_dict().items() if "encoder" in key}
-    moved = run("proto-rl-c", loss=loss, learning_rate=0.0, env_steps=60).loss.state_dict()
-    assert all(torch.equal(value, moved[key]) for key, value in before.items())
+def returns(run_dir: Path) -> list[str]:
+    return [row["episode_return"] for row in record(run_dir / "episodes.csv")]
+
+
+class Paid(ToyEnv):
+    """Its pictures do not show what it pays."""
+
+    def _step(self, tensordict: Any) -> Any:
+        found = super()._step(tensordict)
+        return found.set("reward", 100 + 7 * found["reward"])
+
+
+def test_an_explorer_learns_from_the_intrinsic_reward_alone_and_acts_by_it(tmp_path: Path) -> None:
+    for method in ("apt-s", "proto-rl-s"):
+        one = run(method, tmp_path / method, [toy_domain("left")])
+        two = run(method, tmp_path / f"paid-{method}", [toy_domain("left", Paid)])
+        assert same_state(one.loss, two.loss)
+        assert record(tmp_path / method / "explore.csv") == record(tmp_path / f"paid-{method}" / "explore.csv")
+        assert returns(tmp_path / method) != returns(tmp_path / f"paid-{method}")
+    for width in (8, 16):  # other networks: the same random decisions, and others afterwards
+        run("apt-s", tmp_path / f"{width}", [toy_domain("left")], hidden_dim=width, random_agent_steps=10)
+    narrow, wide = returns(tmp_path / "8"), returns(tmp_path / "16")
+    assert narrow[0] == wide[0]
+    assert narrow[1:] != wide[1:]
 
 
 def test_a_domains_agent_does_not_depend_on_its_company(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import errno
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -138,6 +138,26 @@ def test_a_checkpoint_of_more_gpus_is_continued_with_fewer() -> None:
     assert restored == [1]
 
 
+def test_without_an_interval_checkpoints_are_written_by_the_clock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("crptpro.training.run.CHECKPOINT_SECONDS", 0.0)
+
+    def go(crash: int) -> int:
+        with begin(tmp_path) as run:
+            run.require_same({})
+            run.keep()
+            for update in run.until(9):
+                if update == crash:
+                    raise RuntimeError("power cut")
+                run.advance(1)
+            return run.resumed_from
+
+    with pytest.raises(RuntimeError):
+        go(4)
+    assert go(-1) == 4
+
+
 def test_the_global_generators_are_left_as_they_were(tmp_path: Path) -> None:
     torch.manual_seed(3)
     expected = torch.rand(3)
@@ -204,16 +224,6 @@ def test_two_processes_in_one_directory_are_refused(tmp_path: Path) -> None:
     assert "CheckpointError: Another process is writing" in found.stderr
 
 
-@pytest.fixture
-def usual_signals() -> Iterator[None]:
-    """Signals as a program in the foreground has them: under nohup, and in the background, some are ignored."""
-    before = {number: signal.signal(number, signal.default_int_handler) for number in SIGNALS}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
-@pytest.mark.usefixtures("usual_signals")
 @pytest.mark.parametrize("number", SIGNALS)
 def test_every_signal_that_asks_a_run_to_stop_leaves_a_checkpoint_first(tmp_path: Path, number: signal.Signals) -> None:
     before = signal.getsignal(number)
@@ -225,7 +235,6 @@ def test_every_signal_that_asks_a_run_to_stop_leaves_a_checkpoint_first(tmp_path
     assert first_update(tmp_path) == 3
 
 
-@pytest.mark.usefixtures("usual_signals")
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_in_the_last_update_ends_the_program_and_the_run_is_complete(
     tmp_path: Path, number: signal.Signals
@@ -245,7 +254,6 @@ def test_a_signal_that_is_ignored_as_under_nohup_stops_nothing(tmp_path: Path) -
     assert [row["updates"] for row in record(tmp_path / "train.csv")] == ["4", "6"]
 
 
-@pytest.mark.usefixtures("usual_signals")
 def test_a_second_interrupt_stops_at_once(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         walk(tmp_path, 18, on_update=lambda _: [signal.raise_signal(signal.SIGINT) for _ in range(2)])

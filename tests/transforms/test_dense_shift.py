@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -164,16 +165,21 @@ def test_projections_of_every_shift_are_kept_and_written_for_the_next_observatio
 
 
 def test_threads_that_sample_side_by_side_get_each_their_own():
-    dense = dense_of(generator=None)
+    dense = dense_of(generator=None, observations=2)  # each needs the places of the others
     plain = {n: crops_and_features(dense.encoder, dense.replay.frames[n])[1] for n in range(12)}
 
     def sample(_) -> bool:
-        td = dense(dense.replay.batch(6))
+        td = dense(dense.replay.batch(1))
         found = zip(td["number"].tolist(), td["features"])
         return all(((plain[number] - features).abs().amax(-1) < 1e-5).any() for number, features in found)
 
-    with ThreadPoolExecutor(3) as threads:
-        assert all(threads.map(sample, range(60)))
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(3) as threads:
+            assert all(threads.map(sample, range(300)))
+    finally:
+        sys.setswitchinterval(before)
 
 
 @pytest.mark.parametrize("prefetch", [None, 1, 2])
