@@ -80,6 +80,9 @@ def test_a_plugins_environment_is_collected_and_learned_with_evaluation_workers(
     assert status == 0, err
     assert "MUJOCO" not in err
     assert {row["episode_agent_steps"] for row in rows("run/eval.csv")} == {"5"}
+    status, _, err = call("evaluate", "run/agent", "--plugin", ENVIRONMENT, "--episodes", 1, "--csv", "again.csv")
+    assert status == 0, err
+    assert {row["agent_steps"] for row in rows("again.csv")} == {"5"}  # with the agent's own action repeat
     status, _, err = call("evaluate", "run/agent", "--task", TASK, "--episodes", 1)
     assert status == 1
     assert f"trained for 1 actions ({task}), {TASK} has 2" in err
