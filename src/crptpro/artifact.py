@@ -63,7 +63,12 @@ def read_json(path: str | Path, *, error: type[CRPTproError] = CRPTproError) -> 
     return content
 
 
-def require_disk(path: str | Path, needed_bytes: int, what: str) -> None:
+def require_disk(
+    path: str | Path,
+    needed_bytes: int,
+    what: str,
+    remedy: str = "Free space, choose another directory, or request less.",
+) -> None:
     """Raise a DiskSpaceError if the disk under ``path`` cannot hold something with 5 % to spare."""
     probe = as_path(path).absolute()
     while not probe.exists():
@@ -71,8 +76,7 @@ def require_disk(path: str | Path, needed_bytes: int, what: str) -> None:
     free = shutil.disk_usage(probe).free
     if needed_bytes * 1.05 > free:
         raise DiskSpaceError(
-            f"{what} needs {needed_bytes / 1e9:.2f} GB, but {probe} has {free / 1e9:.2f} GB free. "
-            "Free space, choose another directory, or request less."
+            f"{what} needs {needed_bytes / 1e9:.2f} GB, but {probe} has {free / 1e9:.2f} GB free. {remedy}"
         )
 
 

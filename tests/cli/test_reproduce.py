@@ -76,7 +76,7 @@ def test_a_plan_says_when_fewer_jobs_would_leave_room_for_dense_maps(
         plan = ("--methods", "crptpro", "--jobs", jobs, "--scale", "paper", "--dry-run")
         _, out, _ = call("reproduce", "seen", *plan)
         assert ("Each job may take 6.0 GB of memory" in out) == has_hint
-        assert bool(re.search("several times slower; with --jobs [1-9] it would", out)) == has_hint
+        assert bool(re.search("several times slower; they fit with --jobs [1-9]", out)) == has_hint
 
 
 def test_all_means_the_experiments_with_requested_cells(call: Call) -> None:

@@ -82,6 +82,12 @@ def test_a_job_that_another_command_finished_after_it_was_planned_is_left_alone(
     finish(tmp_path, trained())
     describe(tmp_path, plan)
     assert is_finished(tmp_path, trained())
+    (tmp_path / "jobs" / trained().key / "encoder" / "weights.safetensors").unlink()
+    plans = [make_plan([learned()], tmp_path) for _ in range(2)]
+    describe(tmp_path, plans[0])
+    finish(tmp_path, trained())
+    describe(tmp_path, plans[1])  # of a command that has waited
+    assert is_finished(tmp_path, trained())
 
 
 def test_the_disk_space_of_a_job_follows_its_frames() -> None:

@@ -393,17 +393,20 @@ def test_a_curve_has_every_evaluation_of_runs_that_evaluate_at_other_env_steps(
     made: Reproduction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cells = made.runs("crptpro", "cheetah_run", [500, 600])
-    for seed, (_, job, _) in enumerate(cells):
+    others = made.runs("crptpro", "walker_run", [500, 600])  # evaluated at other intervals: only what both have
+    for seed, (_, job, place) in enumerate(cells + others):
         rows = evaluations(500.0)
         for row in rows[2:-2]:
-            row["env_steps"] += 20 * seed
+            row["env_steps"] += (20 if place["task"] == "cheetah_run" else 20_000) * (seed % 2)
         write_rows(made.root / "jobs" / job / "eval.csv", rows)
-    made.ask("seen", cells)
+    made.ask("seen", cells + others)
     drawn: list[pd.DataFrame] = []
     monkeypatch.setattr("crptpro.experiments.report.draw", lambda points, *_, **__: drawn.append(points) or Figure())
     made.report()
     [curves] = [points for points in drawn if "line" in points]
-    mean = curves[curves["line"] == "mean"]
+    mean = curves[(curves["line"] == "mean") & curves["panel"].str.contains("walker_run")]
+    assert mean["x"].tolist() == [0, 500_000]
+    mean = curves[(curves["line"] == "mean") & curves["panel"].str.contains("cheetah_run")]
     assert mean["x"].tolist() == [0, *(50_000 * n + 10 for n in range(1, 10)), 500_000]
 
 

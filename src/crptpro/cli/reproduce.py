@@ -20,6 +20,7 @@ from crptpro.experiments.jobs import DONE, JOBS, KINDS, Plan, bytes_of, make_pla
 from crptpro.experiments.matrix import EXPERIMENTS, SCALES, Cell, Request
 from crptpro.free_memory import free_bytes
 from crptpro.modules import PixelEncoder, resolve_precision, usable_device
+from crptpro.objectives.methods import DOWNSTREAM, get_method
 from crptpro.values import as_path
 
 ALL = "all"
@@ -107,7 +108,9 @@ class Reproduce:
         disk = sum(after for after, _ in sizes) + sum(working)
         print(f"{', '.join(wanted)} at scale {self.scale} in {root}\n")
         print(plan_text(plan, root, disk, jobs), flush=True)
-        if self.launcher == "local" and self.device == "cpu" and (hint := memory_text(plan, jobs)):
+        # As many runs, which keep dense maps, are there at a time.
+        sharing = min(jobs, max(1, sum(job.kind == "run" for job in plan.missing)))
+        if self.launcher == "local" and self.device == "cpu" and (hint := memory_text(plan, sharing)):
             print(hint, flush=True)
         runs = len(request.encoder_seeds) * len(request.seeds)
         if any(job.kind == "run" for job in plan.jobs) and runs < PAPER_RUNS:
@@ -120,7 +123,7 @@ class Reproduce:
             return
         require_disk(root, disk, "What this plan has yet to make")
         # It may fail, and nothing is written yet.
-        launcher = self._launcher(slurm, gpus, jobs) if plan.missing else None
+        launcher = self._launcher(slurm, gpus, sharing) if plan.missing else None
         for name, cells in wanted.items():
             write_cells(root, name, self.scale, [(cell.label, cell.job.key, cell.place) for cell in cells])
         if launcher is not None:
@@ -173,12 +176,12 @@ class Reproduce:
             )
         return {name: cells for name, cells in wanted.items() if cells}
 
-    def _launcher(self, slurm: dict[str, Any], gpus: Sequence[str], jobs: int) -> Any:
+    def _launcher(self, slurm: dict[str, Any], gpus: Sequence[str], sharing: int) -> Any:
         if self.launcher == "slurm":
             return launch.SlurmLauncher(slurm)
         if self.launcher == "ray":
             return launch.RayLauncher(self.ray_address, gpus=self.device.startswith("cuda") / self.jobs_per_gpu)
-        return launch.LocalLauncher(gpus, jobs=jobs)
+        return launch.LocalLauncher(gpus, jobs=sharing)
 
 
 def left_out(request: Request, cells: Sequence[Cell]) -> list[str]:
@@ -219,14 +222,16 @@ def memory_text(plan: Plan, jobs: int) -> str:
     """Return why fewer jobs at a time may be faster: their runs could keep dense maps. Empty if they can as it is."""
     from crptpro.transforms.dense_shift import dense_maps_bytes  # late, as it imports TorchRL
 
-    runs = [job.facts for job in plan.missing if job.kind == "run" and job.needs]  # without DrQ's
-    slots = max((min(facts.get("replay_capacity", 40_000), facts["env_steps"]) for facts in runs), default=0)
+    slots = 0
+    for facts in (job.facts for job in plan.missing if job.kind == "run" and job.needs):  # without DrQ's
+        usual = DOWNSTREAM | dict(get_method(facts["method"]).downstream)
+        slots = max(slots, min(facts.get("replay_capacity", usual["replay_capacity"]), facts["env_steps"]))
     needed = dense_maps_bytes(PixelEncoder(), slots, resolve_precision("auto", "cpu"), latent_dim=128)
     free = free_bytes(torch.device("cpu"))
     if needed <= 0.8 * free / jobs:
         return ""
     fitting = int(0.8 * free / needed)
-    advice = f"with --jobs {fitting} it would" if fitting else "this machine has too little for one"
+    advice = f"they fit with --jobs {fitting}" if fitting else "this machine has too little for one"
     return (
         f"Each job may take {free / jobs / 1e9:.1f} GB of memory. A run whose dense maps ({needed / 1e9:.1f} GB) do "
         f"not fit encodes again at every update, which is several times slower; {advice}."

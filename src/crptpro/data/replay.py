@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
 
 from crptpro.data.storage import RingStorage, StackStorage, map_rows, read_rows
-from crptpro.errors import DatasetError
+from crptpro.errors import CheckpointError, DatasetError
 from crptpro.values import as_int, as_path
 
 # Redraws before the admissible transitions are listed, which costs 50 times a redraw for 100,000 transitions. Only
@@ -134,8 +134,11 @@ class FrameReplay(ReplayBuffer):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the content of the moment the state was taken, or raise a CheckpointError."""
         with self._replay_lock:
+            try:
+                self._transform.load_state_dict(state_dict["transforms"])
+            except RuntimeError as reason:
+                raise CheckpointError(f"The state is of a replay with other transforms: {reason}") from reason
             self._storage.load_state_dict(state_dict["ring"])
-            self._transform.load_state_dict(state_dict["transforms"])
 
     def loads(self, path: str | Path) -> None:
         """Restore what TorchRL's ``dumps`` wrote."""

@@ -247,8 +247,8 @@ class RingStorage(StackStorage):
             missing = [f"{name}.memmap" for name in specs if not (self.path / f"{name}.memmap").exists()]
             if missing and map_rows(numbers, torch.int64, ()).any():  # otherwise it was being made
                 raise CheckpointError(
-                    f"{', '.join(missing)} of the replay in {self.path} is missing. Put it back, or remove the "
-                    "directory to begin again."
+                    f"{', '.join(missing)} of the replay in {self.path} is missing. Put it back, ask for the "
+                    "same columns, or remove the directory to begin again."
                 )
         # Counters only grow; modulo the number of rows they are slots. `oldest` is the first valid transition.
         self.frames = self.transitions = self.oldest = self.episode_step = self.branch = 0

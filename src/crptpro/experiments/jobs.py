@@ -7,6 +7,7 @@ number makes another job. ``ROOT/experiments`` lists the jobs of each experiment
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import re
@@ -18,7 +19,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from filelock import FileLock
+from filelock import FileLock, Timeout
 
 from crptpro.artifact import CARD_FILE, WEIGHTS_FILE, read_json, write_json
 from crptpro.data.storage import PIXELS_FILE
@@ -125,7 +126,8 @@ class Plan:
 
     jobs: tuple[Job, ...]
     missing: tuple[Job, ...]
-    incomplete: tuple[Job, ...] = ()  # missing ones that were finished, and whose outputs were removed
+    #: Missing ones that were finished, and whose outputs were removed: when each was finished.
+    incomplete: Mapping[Job, int] = field(default_factory=dict)
 
 
 def make_plan(wanted: Iterable[Job], root: Path) -> Plan:
@@ -148,19 +150,24 @@ def make_plan(wanted: Iterable[Job], root: Path) -> Plan:
     for job in wanted:
         require(job)
     kept = [job for key, job in finished.items() if key not in missing]
-    incomplete = [job for job in missing.values() if is_finished(root, job)]
-    return Plan((*kept, *missing.values()), tuple(missing.values()), tuple(incomplete))
+    incomplete = {job: _finished_at(root, job) for job in missing.values() if is_finished(root, job)}
+    return Plan((*kept, *missing.values()), tuple(missing.values()), incomplete)
+
+
+def _finished_at(root: Path, job: Job) -> int:
+    path = directory_of(root, job.key) / DONE
+    return path.stat().st_mtime_ns if path.exists() else 0
 
 
 def describe(root: Path, plan: Plan) -> None:
     """Write ``job.json`` of every job, and empty the directory of a finished job that has to run again.
 
-    A job that another command has finished since it was planned is left alone.
+    A job that another command runs, or has finished since it was planned, is left alone.
     """
-    for job in plan.incomplete:
+    for job, finished_at in plan.incomplete.items():
         directory = directory_of(root, job.key)
-        with FileLock(directory / LOCK):
-            for entry in directory.iterdir():
+        with contextlib.suppress(Timeout), FileLock(directory / LOCK, timeout=0):
+            for entry in directory.iterdir() if _finished_at(root, job) == finished_at else ():
                 if entry.is_dir():
                     shutil.rmtree(entry)
                 elif entry.name != LOCK:

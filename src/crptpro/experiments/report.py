@@ -550,9 +550,10 @@ def _learning_curves(page: Page, name: str, evaluations: pd.DataFrame) -> None:
     drawn = []
     for (task, label), own in evaluations.groupby(["task", "label"], sort=False):
         # A task that ends early is evaluated at other env steps in each run.
-        rank = own.groupby("run")["env_steps"].rank()
-        is_whole = own.groupby("run").size().nunique() == 1
-        at = own["env_steps"].groupby(rank).transform("mean") if is_whole else own["env_steps"]
+        ranks = own["env_steps"].groupby(own.groupby("run")["env_steps"].rank())
+        spread, interval = (ranks.max() - ranks.min()).max(), ranks.mean().diff().min()
+        is_alike = own.groupby("run").size().nunique() == 1 and spread < 0.15 * interval
+        at = ranks.transform("mean") if is_alike else own["env_steps"]
         runs = own.assign(at=at).pivot_table("score", ["task", "encoder", "run"], "at").dropna(axis=1)
         if runs.empty:  # no evaluation that all runs have
             continue

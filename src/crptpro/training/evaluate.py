@@ -142,7 +142,10 @@ class Evaluator:
         progress: bool = True,
     ) -> None:
         self.make_env, self.agent, self.episodes, self.seed = make_env, agent, episodes, seed
-        self.workers = min(workers, episodes) if can_be_sent(make_env) and can_be_sent(agent) else 0
+        is_sent = can_be_sent(make_env) and can_be_sent(agent)
+        self.workers = min(workers, episodes) if is_sent else 0
+        if workers and not is_sent:
+            logger.info("Evaluating in this process: no other one can import the environment or the encoder.")
         self.on_result, self.progress = on_result, progress
         self._pool: WorkerPool | None = None
         self._env: EnvBase | None = None

@@ -219,7 +219,8 @@ class Run:
         elif self.records is not None and self.run_dir is not None and self.records.writes_into(self.run_dir):
             if any(map(self.records.rows, self.streams)):
                 kept = self.records.path.with_suffix(".before.jsonl")
-                write_whole(kept, self.records.path.read_bytes())
+                before = kept.read_bytes() if kept.exists() else b""
+                write_whole(kept, before + self.records.path.read_bytes())
                 logger.warning("%s has no checkpoint: it begins again; its earlier rows are in %s.", self.run_dir, kept)
             self.records.load_state_dict(dict.fromkeys(self.streams, 0))
         self._saved_time = self._row_time = time.monotonic()
@@ -363,7 +364,8 @@ class Run:
         # bus error. It holds the new checkpoint twice for a moment; the first has the parameters and Adam's moments.
         sizes = [path.stat().st_size for path in self._rotation.directory.glob("checkpoint-*")]
         first = 3 * sum(parameter.nbytes for module in self._modules for parameter in module.parameters())
-        require_disk(self.run_dir, 2 * max(sizes, default=first), "A checkpoint")
+        remedy = "Earlier ones are kept; free space and run the same command again."
+        require_disk(self.run_dir, 2 * max(sizes, default=first), "A checkpoint", remedy)
         self.saved = {
             "settings": self.settings,
             "position": self.position,

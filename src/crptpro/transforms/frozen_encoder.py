@@ -27,13 +27,12 @@ class FrozenEncoder(PixelTransform):
         torch.Size([2, 100])
     """
 
+    encoder: nn.Module
+
     def __init__(self, encoder: nn.Module, *, in_keys: Keys = "pixels", out_keys: Keys = "features") -> None:
         super().__init__(in_keys, out_keys)
-        self.encoder = encoder
-
-    def train(self, mode: bool = True) -> FrozenEncoder:
-        self.training = mode  # not the encoder's: it may be somebody's who trains it
-        return self
+        # Hidden from nn.Module: the network is somebody else's, and no part of a replay's state.
+        self.__dict__["encoder"] = encoder
 
     @torch.no_grad()
     def _apply_transform(self, obs: Tensor) -> Tensor:
