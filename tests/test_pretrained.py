@@ -276,12 +276,15 @@ def test_a_control_that_does_not_exist_is_refused_with_those_that_do(method: str
 
 
 @pytest.mark.parametrize("frame_stack", [3, 2])
-def test_a_standardised_control_depends_on_stored_frames_alone_and_leaves_the_dataset_as_it_is(
-    data: Path, frame_stack: int
+def test_a_standardised_control_depends_on_stored_frames_alone_names_them_and_leaves_the_dataset_as_it_is(
+    data: Path, tmp_path: Path, frame_stack: int
 ) -> None:
     options: dict[str, Any] = {**TINY, "method": "random-encoder-standardised", "in_channels": 3 * frame_stack}
     dataset = FrameDataset.open(data, frame_stack=frame_stack)
-    plain = random_pretrained(datasets=[dataset], **options).identity()
+    control = random_pretrained(datasets=[dataset], **options)
+    plain = control.identity()
+    (named,) = load_pretrained(save_pretrained(control, tmp_path / "control")).card["standardised_on"]
+    assert (named["domain"], named["transitions"]) == ("walker", 40)
     for path in (data, str(data)):
         assert random_pretrained(datasets=path, **options).identity() == plain
     dataset.append_transform(RandomShift(pad=4, in_keys=["pixels"]))

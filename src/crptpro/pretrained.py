@@ -7,7 +7,7 @@ import hashlib
 import inspect
 import logging
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -160,23 +160,30 @@ def random_pretrained(
         torch.manual_seed(derive_seed(seed, "random_pretrained"))
         encoder = PixelEncoder(**encoder_config)
     encoder.requires_grad_(False).eval()
+    card: dict[str, Any] = {"method": method, "training": None, "seed": seed}
     if method == "random-encoder-standardised":
-        encoder.standardise(*_feature_moments(encoder, datasets, seed))
-    return Pretrained(encoder, card={"method": method, "training": None, "seed": seed})
+        opened = _opened(datasets, encoder.in_channels // 3)
+        encoder.standardise(*_feature_moments(encoder, opened, seed))
+        shown = ("domain", "transitions", "seed", "quality", "colors")
+        card["standardised_on"] = [{name: data.card[name] for name in shown if name in data.card} for data in opened]
+    return Pretrained(encoder, card=card)
+
+
+def _opened(datasets: Iterable[Any], frame_stack: int) -> list[FrameDataset]:
+    several = [datasets] if isinstance(datasets, (str, Path, FrameDataset)) else datasets
+    opened = [FrameDataset.open(d, frame_stack=frame_stack) if isinstance(d, (str, Path)) else d for d in several]
+    if not opened:
+        raise PretrainedError("random-encoder-standardised needs datasets to standardise its features on.")
+    return opened
 
 
 @torch.no_grad()
-def _feature_moments(encoder: PixelEncoder, datasets: Iterable[Any], seed: int) -> tuple[Tensor, Tensor]:
+def _feature_moments(encoder: PixelEncoder, datasets: Sequence[FrameDataset], seed: int) -> tuple[Tensor, Tensor]:
     """Return mean and deviation of every feature over 2048 random observations, as many of each dataset."""
-    several = [datasets] if isinstance(datasets, (str, Path, FrameDataset)) else datasets
-    stack = encoder.in_channels // 3
-    opened = [FrameDataset.open(d, frame_stack=stack) if isinstance(d, (str, Path)) else d for d in several]
-    if not opened:
-        raise PretrainedError("random-encoder-standardised needs datasets to standardise its features on.")
     features = []
-    for index, dataset in enumerate(opened):
+    for index, dataset in enumerate(datasets):
         generator = torch.Generator("cpu").manual_seed(derive_seed(seed, "standardise", index))
-        drawn = torch.randint(len(dataset), (-(-2048 // len(opened)),), generator=generator, device="cpu")
+        drawn = torch.randint(len(dataset), (-(-2048 // len(datasets)),), generator=generator, device="cpu")
         pixels = dataset.storage.get(drawn)["pixels"]  # without the transforms of samples
         features += [encoder(chunk) for chunk in pixels.split(64)]
     deviation, mean = torch.std_mean(torch.cat(features), dim=0, correction=0)
