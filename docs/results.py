@@ -272,7 +272,8 @@ def draw_task(task: str) -> None:
     axes.fill_between(drq.index, drq["mean"] - drq["std"], drq["mean"] + drq["std"], color="#8a7bd8", alpha=0.15)
     log = RECORDS.glob(f"references/crptpro_{task}_train.csv")
     curves = [(path, "CRPTpro, its authors' log (1 run)", "#5d6672") for path in log]
-    for method, color in {"crptpro": "#0b80c3", "crptpro-no-bonus": "#109e77", "random-encoder": "#d9640a"}.items():
+    for method, color in {"crptpro": "#0b80c3", "crptpro-no-bonus": "#109e77", "random-encoder": "#d9640a",
+                          "random-encoder-standardised": "#b03a78"}.items():  # fmt: skip
         runs = sorted((PAPER_SCALE / task).glob(f"{method}_seed_*/episodes.csv"))
         label = f"{method}, this library ({len(runs)} run{'s' * (len(runs) > 1)})"
         curves += [(path, None if place else label, color) for place, path in enumerate(runs)]
