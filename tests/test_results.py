@@ -95,6 +95,7 @@ def sentences() -> Iterator[str]:
     yield from verdict("finger_spin", "`crptpro`", [40_000, 60_000])
     more = [("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "all ten")[count]
             for count in (drq[[20_000, 60_000]] > ours[[20_000, 60_000]]).sum()]  # fmt: skip
+    yield f"at 40,000 env steps they average {ours[40_000]:.0f}, the others {untrained[40_000]:.0f}"
     comparison = "more" if best_untrained > best else "less"
     yield f"one on an untrained encoder returned {best_untrained:.0f}, {comparison} than any on the pre-trained one"
     yield f"its ten runs {more[0]} returned more at 20,000 env steps than the mean of ours"
