@@ -134,6 +134,21 @@ def test_separate_steps_use_the_critic_just_stepped() -> None:
     assert set(loss.critic_loss(td).keys()) == {"loss_qvalue", "q_mean", "target_q_mean", "td_error"}
 
 
+@pytest.mark.parametrize(("make", "batch"), [(rad_sac, transition_batch), (drq, pixel_batch)])
+def test_the_losses_have_the_names_and_results_of_torchrl(make, batch) -> None:
+    td = batch()
+    expected = make(generator=generator())(td)
+    loss = make(generator=generator())
+    loss_qvalue, diagnostics = loss.qvalue_v2_loss(td)
+    loss_actor, drawn = loss.actor_loss(td)
+    loss_alpha = loss.alpha_loss(drawn["log_prob"])
+    assert drawn["log_prob"].shape == loss_alpha.shape == td.shape
+    found = {"loss_qvalue": loss_qvalue, "loss_actor": loss_actor, "loss_alpha": loss_alpha.mean(), **diagnostics}
+    for name, value in found.items():
+        torch.testing.assert_close(value, expected[name], msg=name)
+    assert {*found, "alpha", "entropy"} == set(expected.keys())
+
+
 def test_target_entropy_and_discount_are_options_and_the_discount_is_raised_to_the_n_of_n_step_transitions() -> None:
     td = transition_batch()
     assert rad_sac(target_entropy=-100.0).target_entropy == -100

@@ -127,19 +127,33 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
     def actor_and_temperature_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """``loss_actor`` and ``loss_alpha`` of one action draw, with ``alpha`` and ``entropy``."""
+        loss_actor, drawn = self.actor_loss(tensordict)
+        out = {
+            "loss_actor": loss_actor,
+            "loss_alpha": self.alpha_loss(drawn["log_prob"]).mean(),
+            "alpha": self._alpha,
+            "entropy": -drawn["log_prob"].mean(),
+        }
+        return TensorDict(out, batch_size=[])
+
+    # Under SACLoss' own names, with its results.
+
+    def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """``loss_qvalue``, and the diagnostics of :meth:`critic_loss`."""
+        out = dict(self.critic_loss(tensordict).items())
+        return out.pop("loss_qvalue"), out
+
+    def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """``loss_actor``, and the detached ``log_prob`` ``[B]`` of its actions."""
         features = self._policy_features(self._views(tensordict)[0])
         action, log_prob = self._act(features)
         # Detached weights: the gradient passes through Q to the action and to nothing else.
         with self._cached_detached_qvalue_params.to_module(self.qvalue_network, preserve_module_state=False):
             value = self._q_values_on_features(features, action).amin(-1)
-        entropy = -log_prob.detach()
-        out = {
-            "loss_actor": (self._alpha * log_prob - value).mean(),
-            "loss_alpha": (self.log_alpha.exp() * (entropy - self.target_entropy)).mean(),
-            "alpha": self._alpha,
-            "entropy": entropy.mean(),
-        }
-        return TensorDict(out, batch_size=[])
+        return (self._alpha * log_prob - value).mean(), {"log_prob": log_prob.detach()}
+
+    def _alpha_loss(self, log_prob: Tensor) -> Tensor:
+        return self.log_alpha.exp() * (-log_prob - self.target_entropy)
 
     @torch.no_grad()
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
