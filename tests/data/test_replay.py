@@ -18,7 +18,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.data import SamplerWithoutReplacement
-from torchrl.envs import CatFrames, Transform, TransformedEnv
+from torchrl.envs import CatFrames, SerialEnv, Transform, TransformedEnv
 from torchrl.modules import RandomPolicy
 from toy_env import ToyEnv, rollout_of, variable_length
 
@@ -136,6 +136,19 @@ def test_what_a_collector_hands_out_is_sampled_as_catframes_showed_it(frame_stac
         assert torch.equal(everything[key], expected[key]), key
 
 
+def test_rollouts_of_several_environments_are_stored_one_after_another() -> None:
+    catframes = CatFrames(N=3, dim=-3, in_keys=["pixels"], padding="same")
+    envs = [lambda seed=seed: TransformedEnv(ToyEnv(variable_length, seed=seed), catframes.clone()) for seed in (4, 5)]
+    replay, seen = FrameReplay(100, frame_shape=(3, 8, 8), action_dim=2), []
+    for rollout in Collector(SerialEnv(2, envs), frames_per_batch=20, total_frames=60):
+        assert rollout.shape == (2, 10)
+        seen.append(rollout.reshape(-1).clone())
+        replay.extend(seen[-1])
+    expected, everything = torch.cat(seen), replay[:]
+    for key in ("pixels", ("next", "pixels"), "action", ("next", "reward"), ("next", "done")):
+        assert torch.equal(everything[key], expected[key]), key
+
+
 def test_what_does_not_continue_begins_an_episode() -> None:
     replay = small()
     replay.extend(rollout_of(torch.stack([frame(1), frame(2)]), end=""))
@@ -156,7 +169,7 @@ def test_misuse_is_refused_in_words_and_stores_nothing() -> None:
         (good.clone().set("pixels", good["pixels"].float()), "takes uint8 pixels"),
         (good.clone().set("action", torch.zeros(1, 2)), r"action of shape \(1,\), got \(2,\)"),
         (good.exclude("action"), "needs 'action' with every transition"),
-        (good.unsqueeze(0), "one environment in temporal order"),
+        (good.unsqueeze(0), r"one environment in temporal order, got TensorDict \[1, 1\]; .*reshape\(-1\)"),
         (good.clone().set("pixels", torch.zeros(1, 12, 2, 2, dtype=torch.uint8)), "takes uint8 pixels"),
         (rollout_of(torch.zeros(2, 3, 4, 4, dtype=torch.uint8)), "holds pixels of shape"),
     ]

@@ -36,7 +36,8 @@ class FrameReplay(ReplayBuffer):
     ``pixels`` and ``("next", "pixels")`` uint8 (stacks of ``frame_stack`` frames, or single ones), ``action``,
     ``("next", "reward" | "done" | "terminated" | "truncated")`` and the ``extra_columns``. A transition continues the
     one before if that one was not done and led to its observation; otherwise it begins an episode. They return the
-    observations' numbers.
+    observations' numbers. Rollouts ``[N, T]`` of several environments are stored by ``extend(rollout.reshape(-1))``:
+    each begins an episode, which costs up to ``frame_stack`` further frames, so that T should not be small.
 
     A sample ``[B]`` is drawn uniformly, with replacement, and has
 

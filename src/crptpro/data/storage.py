@@ -104,7 +104,10 @@ def read_rows(
     """Read what a TorchRL environment, rollout or collector returns, ``[T]`` or ``[]``; errors name ``what``."""
     if not is_tensor_collection(data) or data.ndim > 1:
         got = f"{type(data).__name__} {list(getattr(data, 'shape', ()))}"
-        raise ValueError(f"{what} takes a TensorDict [T] or [] of one environment in temporal order, got {got}.")
+        raise ValueError(
+            f"{what} takes a TensorDict [T] or [] of one environment in temporal order, got {got}; rollouts [N, T] of "
+            "several environments as rollout.reshape(-1)."
+        )
 
     def entry(key: NestedKey, default: Tensor | None = None) -> Tensor:
         value = data.get(key, default)
