@@ -306,12 +306,19 @@ def _list(returns: pd.Series) -> str:
 
 
 def _over_runs(returns: pd.Series, *, each: bool = False) -> str:
-    """Mean over runs, with the standard deviation from five runs up, below it the extremes or each run."""
-    returns = returns.dropna()
-    if len(returns) >= 5:
-        return _spread(returns)
-    runs = _list(returns) if each else f"{returns.min():.0f} to {returns.max():.0f}"
-    return "" if returns.empty else f"{returns.mean():.0f}" + (f" ({runs})" if len(returns) > 1 else "")
+    """Mean over runs, with the standard deviation from five runs up, below it the extremes or each run.
+
+    The number of runs is said where some of them have no value.
+    """
+    known = returns.dropna()
+    if known.empty:
+        return ""
+    count = [f"{len(known)} of {len(returns)} runs"] * (len(known) < len(returns))
+    if len(known) >= 5:
+        return _spread(known) + "".join(f" ({text})" for text in count)
+    runs = _list(known) if each else f"{known.min():.0f} to {known.max():.0f}"
+    details = "; ".join([runs] * (len(known) > 1) + count)
+    return f"{known.mean():.0f}" + (f" ({details})" if details else "")
 
 
 def _spread(returns: pd.Series) -> str:

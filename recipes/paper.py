@@ -62,6 +62,8 @@ def main(config: Config) -> None:
     for task in tasks:
         get_domain(task)  # an unknown name ends the recipe here, not hours later
     method = get_method(config.method)
+    if config.method == "crptpro-no-bonus":
+        raise CRPTproError("crptpro-no-bonus is crptpro with --downstream.intrinsic-reward-coef 0.")
     if config.method == "drq" or method.exploration or method.starts_from:
         raise CRPTproError(f"{config.method} needs more or less than random data: see explore.py, finetune.py, drq.py.")
     name = f"{config.method}_group_{config.group}_seed_{config.seed}"

@@ -215,6 +215,7 @@ def test_an_encoder_and_the_control_are_probed_with_table_and_csv(call: Call, da
     (("evaluate", "random-policy"), r"name one, e\.g\. --task"),
     (("evaluate", "absent"), r"absent does not exist"),
     (("evaluate", "random-policy", "--task", TASK, "--episodes", "0"), r"at least 1, got 0"),
+    (("evaluate", "random-policy", "--task", TASK, "--action-repeat", "0"), r"`action_repeat` must be at"),
     (("evaluate", "random-policy", "--task", TASK, "--colors", "reversed_background"), r"colors='reversed_image'"),
     (("probe", "random-encoder", "absent"), r"absent is not a directory"),
     (("probe", "random-encoder", "absent", "--samples", "0"), r"at least 1, got 0"),

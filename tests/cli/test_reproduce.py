@@ -207,7 +207,7 @@ def test_every_cell_of_a_reproduction_is_filled_and_reported(tiny: Path, tmp_pat
     assert [{*rows.env_steps} for rows in runs] == [{0, 24}] * 3
     assert {method for rows in runs for method in rows.method} == {"crptpro-finetune", "drq", "random-encoder"}
     text = build_report(tiny, out=tmp_path).with_name("report.md").read_text()
-    assert text.count(" results are finished.") == 6
+    assert text.count("\nFinished: ") == 6
     assert "Missing" not in text
     assert "Left out" not in text
 

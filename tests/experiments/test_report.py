@@ -85,8 +85,8 @@ def test_budgets_are_shown_beside_the_papers(seen: Report) -> None:
         "random transitions per domain": "20,000", "encoder updates on datasets": "3,000", "pre-training batch": "128",
         "prototypes": "128", "env steps of exploration (C)": "40,000", "decisions per encoder update (C)": "6",
         "downstream env steps": "20,000", "DrQ's env steps": "20,000", "downstream batch": "128",
-        "downstream learning rate": "0.001", "downstream replay": "12,000", "render quality": "exact",
-        "downstream runs per encoder": "2",
+        "downstream learning rate": "0.001", "DrQ's learning rate": "0.001", "downstream replay": "12,000",
+        "replay of DrQ and Proto-RL": "12,000", "render quality": "exact", "downstream runs per encoder": "2",
     }  # fmt: skip
     assert "This scale does not show" in seen.text
 
@@ -241,9 +241,9 @@ def test_a_partial_reproduction_says_what_is_missing(made: Reproduction) -> None
     made.ask("seen", cells)
     made.ask("unseen", [("atc", "run-other", {"group": "A", "task": "finger_spin", "encoder_seed": 0})])
     report = made.report()
-    assert "1 of 3 results are finished." in report.text
+    assert "Finished: 1 of 3 results." in report.text
     assert "Missing: crptpro 1, atc 1. Missing results are left out, not replaced." in report.text
-    assert report.table("The 2 missing results")["job"].tolist() == ["run-begun", "run-none"]
+    assert report.table("2 missing results")["job"].tolist() == ["run-begun", "run-none"]
     states = report.table("run: 2 jobs").set_index("job")["state"]
     assert states.tolist() == ["begun", "finished"]
     assert "Nothing is finished yet: 1 result requested." in report.text
@@ -387,6 +387,38 @@ def test_runs_with_the_papers_budgets_are_not_said_to_have_less_and_runs_on_one_
     assert report.cell("Budgets beside", "here", "downstream runs per encoder") == "2"
     assert "This scale does not show" not in report.text
     assert "Runs on several encoders" not in report.text
+
+
+def test_unplanned_runs_of_every_method_are_held_against_its_own_budgets_and_show_their_state_and_versions(
+    tmp_path: Path,
+) -> None:
+    budgets = {
+        "drq": (1_000_000, 100_000, 1e-3),
+        "proto-rl-c": (500_000, 100_000, 1e-4),
+        "crptpro": (500_000, 40_000, 1e-4),
+    }
+    for number, (method, (env_steps, capacity, rate)) in enumerate(budgets.items()):
+        settings = {"seed": 0, "env_steps": env_steps, "replay_capacity": capacity, "learning_rate": rate}
+        settings |= {"task": "walker_run", "batch_size": 512, "pretrained": method}
+        for end in (env_steps, env_steps - 1):  # the second is unfinished
+            folder = tmp_path / f"{method} {end}"
+            write_json(folder / "config.json", {"config": settings, "versions": {"torch": f"2.1{number}"}})
+            rows = evaluations(100.0, method=method)
+            write_rows(folder / "eval.csv", [row | {"env_steps": row["env_steps"] * end // 500_000} for row in rows])
+    report = Report(build_report(tmp_path, out=tmp_path / "page"))
+    assert "This scale does not show" not in report.text
+    assert report.cell("Budgets beside", "here", "DrQ's env steps") == "1,000,000"
+    assert report.cell("Budgets beside", "here", "replay of DrQ and Proto-RL") == "100,000"
+    assert sorted(report.table("run: 6 jobs")["state"]) == ["begun"] * 3 + ["finished"] * 3
+    assert sorted(report.table("Versions").iloc[0]) == ["2.10", "2.11", "2.12", "torch"]
+
+
+def test_a_damaged_record_of_embeddings_is_left_out_and_named(made: Reproduction) -> None:
+    points = [{"source": "walker random", "pc1": 0.0, "pc2": 1.0, "pc3": 2.0}] * 3
+    job = made.job("embeddings-1", "embeddings", embeddings=points)
+    made.ask("visualize", [("proto-rl-s", job, {"group": "B", "encoder_seed": 0})])
+    text = made.report().text
+    assert re.search(r"Left out: .*explained\.json cannot be read", text)
 
 
 def test_a_curve_has_every_evaluation_of_runs_that_evaluate_at_other_env_steps(

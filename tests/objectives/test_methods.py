@@ -119,6 +119,7 @@ def test_how_each_active_method_explores() -> None:
         (lambda: register_method("crptpro", OwnLoss), ValueError, "already registered for ProtoLoss"),
         (lambda: register_method("drq", OwnLoss), ValueError, "'drq' is already registered for no loss"),
         (lambda: register_method("typo", OwnLoss, learn_rate=1.0), TypeError, "learn_rate"),
+        (lambda: register_method("x", OwnLoss, starts_from="crptpro"), ValueError, "must pre-train its own encoder"),
         (lambda: Exploration(env_steps=0), ValueError, "`env_steps` must be at least 1, got 0"),
         (lambda: Exploration(skill_dim=1), ValueError, "`skill_dim` must be at least 2"),
         (lambda: Exploration(agent="sac"), ValueError, "`agent` must be one of rad-sac, averaged-sac, skill-ddpg, got"),

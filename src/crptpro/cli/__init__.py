@@ -210,15 +210,17 @@ class Explore(Pretraining):
 
 @dataclass(frozen=True, kw_only=True)
 class Finetune(EncoderRun):
-    """Continue pre-training on one domain from a pretrained encoder."""
+    """Continue pre-training on one domain from a pretrained encoder.
+
+    The paper's --updates: pendulum and manipulation 2,000, cartpole 3,000, cheetah 1,000, walker 500.
+    """
 
     pretrained: Positional[str]
     """directory of the pretrained encoder; the one that ships is slim, and cannot be trained further"""
     dataset: Positional[Path]
     """dataset directory of the one domain"""
     config: Annotated[training.PretrainConfig, arg(name="")] = field(default_factory=training.PretrainConfig)
-    """every number of the stage; the paper's updates: pendulum and manipulation 2,000, cartpole 3,000, cheetah 1,000,
-    walker 500"""
+    """every number of the stage"""
 
     def run(self) -> None:
         image_size, frame_stack = image_format([self.dataset])
@@ -286,7 +288,8 @@ class Evaluate:
         task = self.task or card["task"]
         usual = {"quality": "exact", "colors": "normal", "action_repeat": None} | card.get("config", {})
         names = ("quality", "colors", "action_repeat")
-        settings: dict[str, Any] = {name: getattr(self, name) or usual[name] for name in names}
+        given = {name: getattr(self, name) for name in names}
+        settings: dict[str, Any] = {name: usual[name] if given[name] is None else given[name] for name in names}
         settings["render"] = not is_random or self.video is not None  # the random policy needs no pixels
         if agent is not None:
             encoder: Any = agent.encoder

@@ -100,9 +100,9 @@ def _untrained_projector(pretrained: Pretrained) -> Projector:
 
 
 def domains_seen(card: Mapping[str, Any]) -> set[str]:
-    """Return the domains that an encoder, and the encoder it started from, were trained on."""
+    """Return the domains that an encoder, and the encoder it started from, were trained or standardised on."""
     training: Any = card.get("training")
-    seen: set[str] = set()
+    seen = {str(dataset.get("domain")) for dataset in card.get("standardised_on") or ()}
     while isinstance(training, Mapping):
         seen |= {str(dataset.get("domain")) for dataset in training.get("datasets") or ()}
         training = training.get("previous_training")

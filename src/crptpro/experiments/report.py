@@ -191,9 +191,9 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     for path in sorted(path.parent for path in root.rglob("eval.csv")):
         try:
             content = read_json(path / "config.json", error=RecordError)
-            facts = content["config"]
             episodes = _read(path / "eval.csv", *EPISODES)
             label = episodes["method"].iloc[0]
+            facts = content["config"] | {"method": label}
             is_done = bool(episodes["env_steps"].max() >= facts["env_steps"])
         except (RecordError, KeyError, TypeError, AttributeError) as reason:
             logger.warning("Left out: %s is no downstream run that can be read (%s).", path, reason)
@@ -274,8 +274,10 @@ BUDGETS = (
     ("downstream env steps", "500,000", "env_steps", "run", "(?!drq)"),
     ("DrQ's env steps", "1,000,000", "env_steps", "run", "drq"),
     ("downstream batch", "512", "batch_size", "run", ""),
-    ("downstream learning rate", "0.0001", "learning_rate", "run", ""),
-    ("downstream replay", "40,000 (Proto-RL 100,000)", "replay_capacity", "run", ""),
+    ("downstream learning rate", "0.0001", "learning_rate", "run", "(?!drq)"),
+    ("DrQ's learning rate", "0.001", "learning_rate", "run", "drq"),
+    ("downstream replay", "40,000", "replay_capacity", "run", "(?!drq|proto-rl)"),
+    ("replay of DrQ and Proto-RL", "100,000", "replay_capacity", "run", "drq|proto-rl"),
     ("render quality", "exact", "quality", "dataset", ""),
 )
 """Budget, the paper's, and where it is found: fact, and patterns of the jobs' kinds and methods."""
@@ -337,10 +339,14 @@ def _provenance(page: Page, jobs: pd.DataFrame) -> None:
         costs.reset_index(),
     )
     sets = done["versions"].dropna().map(lambda versions: tuple(sorted(versions.items()))).value_counts()
-    versions = pd.DataFrame({f"version ({_count(count, 'job')})": dict(each) for each, count in sets.items()})
+    headings = ["version"] if len(sets) == 1 else [f"version, set {number}" for number in range(1, len(sets) + 1)]
+    versions = pd.DataFrame({
+        f"{heading} ({_count(count, 'job')})": dict(each) for heading, (each, count) in zip(headings, sets.items())
+    })  # fmt: skip
     page.table("Versions", versions.rename_axis("package").reset_index())
     page.section("Jobs", "jobs")
-    has_begun = np.array([(path / records.LOG).exists() for path in jobs["path"]], bool)
+    marks = (records.LOG, "eval.csv")
+    has_begun = np.array([any((path / name).exists() for name in marks) for path in jobs["path"]], bool)
     table = pd.DataFrame({
         "job": jobs.index, "state": np.select([jobs["done"], has_begun], ["finished", "begun"], "not begun"),
         "wall clock": jobs["seconds"].map(duration, na_action="ignore"), "attempts": jobs["attempts"],
@@ -364,13 +370,13 @@ def _experiment(page: Page, experiment: str, scale: str, cells: pd.DataFrame, jo
     if len(missing) == len(cells):
         page.text(f"Nothing is finished yet: {_count(len(cells), 'result')} requested.", "warning")
         return
-    page.text(f"{len(cells) - len(missing)} of {len(cells)} results are finished.")
+    page.text(f"Finished: {len(cells) - len(missing)} of {_count(len(cells), 'result')}.")
     if len(missing):
         counts = missing["label"].value_counts(sort=False)
         names = ", ".join(f"{label} {count}" for label, count in counts.items())
         page.text(f"Missing: {names}. Missing results are left out, not replaced.", "warning")
         places = missing.drop(columns=["experiment", "scale", "done"])
-        page.table(f"The {len(missing)} missing results", places, fold=True)
+        page.table(_count(len(missing), "missing result"), places, fold=True)
     _measurements(page, name, cells, jobs)
     _efficiency(page, name, cells, jobs)
     _scores(page, name, cells, jobs)
@@ -703,7 +709,12 @@ def _coverage(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> 
 
 def _embeddings(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> None:
     for place, (job, own) in enumerate(rows.groupby("job", sort=False), 1):
-        shares = read_json(jobs.loc[job, "path"] / "explained.json", error=RecordError)["explained_variance_ratio"]
+        path = jobs.loc[job, "path"] / "explained.json"
+        try:
+            shares = read_json(path, error=RecordError)["explained_variance_ratio"]
+        except (RecordError, KeyError) as reason:
+            page.text(f"Left out: {path} cannot be read ({reason}).", "warning")
+            continue
         axes = {f"pc{i}": f"component {i} ({share:.0%})" for i, share in enumerate(shares, 1)}
         points = pd.DataFrame({"label": own["source"]})
         pairs = [points.assign(x=own[x], y=own[y], panel=f"{axes[y]} over {axes[x]}") for x, y in combinations(axes, 2)]

@@ -68,7 +68,6 @@ class Estimate(NamedTuple):
     low: Array | None
     high: Array | None
     runs: int
-    encoders: int
 
     def __format__(self, spec: str) -> str:
         """Return the first number and its interval, if it has one: ``f"{estimate:.2f}"`` is ``0.43 [0.31, 0.52]``."""
@@ -109,9 +108,9 @@ def estimate(
     arrays = [[task[list(columns)].to_numpy(float).T for task in sample.values()] for sample in samples]
     value = np.asarray(statistic(*arrays))
     tables = [task for sample in samples for task in sample.values()]
-    runs, encoders = (pd.concat(tables)[name].nunique() for name in ("run", "encoder"))
+    runs = pd.concat(tables)["run"].nunique()
     if min(map(len, tables)) < MIN_RUNS:
-        return Estimate(value, None, None, runs, encoders)
+        return Estimate(value, None, None, runs)
     rng = np.random.default_rng(seed)
     redrawn = []
     for sample, scores in zip(samples, arrays):
@@ -119,7 +118,7 @@ def estimate(
         redrawn.append([task[:, index] for task, index in zip(scores, indices)])  # [K, B, R_t] each
     tail = 50 * (1 - CONFIDENCE)
     low, high = np.percentile(statistic(*redrawn), [tail, 100 - tail], axis=-1)
-    return Estimate(value, low, high, runs, encoders)
+    return Estimate(value, low, high, runs)
 
 
 def _resample(tasks: Sequence[pd.DataFrame], replicates: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:

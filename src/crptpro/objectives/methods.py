@@ -175,9 +175,11 @@ _METHODS: dict[str, Method] = {row.name: replace(row, is_builtin=True) for row i
 def register_method(name: str, loss_class: type[LossModule], **fields: Any) -> Method:
     """Make a method available by name, on the command line too.
 
-    ``fields`` are further fields of :class:`Method`, such as ``updates=10_000`` or ``exploration=Exploration()``. A
-    name that is registered for another class, or a number out of its range, is a ``ValueError``.
+    ``fields`` are further fields of :class:`Method`, such as ``updates=10_000`` or ``exploration=Exploration()``, but
+    not ``starts_from``. A name that is registered for another class, or a number out of its range, is a ``ValueError``.
     """
+    if "starts_from" in fields:
+        raise ValueError(f"The method {name!r} must pre-train its own encoder: `starts_from` is for built-in methods.")
     taken = _METHODS.get(name)
     if taken is not None and taken.loss_class is not loss_class:
         owner = "no loss" if taken.loss_class is None else taken.loss_class.__name__
