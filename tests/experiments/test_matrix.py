@@ -61,7 +61,7 @@ def test_the_committed_records_are_those_of_the_same_commands() -> None:
     assert len(paths) == 7
     for path in paths:
         name = path.stem.removesuffix("-small")
-        tasks = {"tasks": ("walker_run",)} if name == "seen" else {}
+        tasks = {"tasks": ("walker_run",)} if name in ("seen", "prototypes") else {}
         asked = cells(name, SMALL, threads=2, groups=("A",), **tasks)
         missing = {cell.label for cell in asked if not is_finished(RESULTS / "seen_small", cell.job)}
         # Controls that have not been run yet.
@@ -126,6 +126,8 @@ def test_the_ablation_has_the_papers_weights_and_budgets() -> None:
     without = of(found, "crptpro without dispersion")[0].needs[0]
     assert option(without, "--loss") == "intr_loss_coef=0.0"
     assert of(found, "proto-rl-c with dispersion")[0].needs[0].facts["loss"] == {"intr_loss_coef": 5e-3}
+    measured = {cell.job.needs[0] for cell in cells("prototypes", PAPER, groups=("A", "C"))}
+    assert measured <= {needed for cell in found for needed in cell.job.needs}
 
 
 @pytest.mark.parametrize("colors", ["reversed_background", "reversed_image"])

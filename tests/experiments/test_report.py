@@ -413,6 +413,24 @@ def test_unplanned_runs_of_every_method_are_held_against_its_own_budgets_and_sho
     assert sorted(report.table("Versions").iloc[0]) == ["2.10", "2.11", "2.12", "torch"]
 
 
+def test_long_runs_have_the_mean_of_their_last_ten_evaluations_too(made: Reproduction) -> None:
+    cells = made.runs("crptpro", "walker_run", [500.0, 600.0])
+    made.ask("seen", cells)
+    assert "of the last 10 evaluations" not in made.report().text
+    for score, (_, job, _) in zip((500, 600), cells):
+        rows = [
+            {
+                "env_steps": 10_000 * number,
+                "episode_return": score + (number if number > 40 else -99),
+                "method": "crptpro",
+            }
+            for number in range(51)
+        ]
+        write_rows(made.root / "jobs" / job / "eval.csv", rows)
+    late = made.report().cell("Episode return, mean of the last 10 evaluations", "crptpro", "A walker_run")
+    assert late == "596 ± 71 (n = 2) · paper 513 ± 33"
+
+
 def test_a_damaged_record_of_embeddings_is_left_out_and_named(made: Reproduction) -> None:
     points = [{"source": "walker random", "pc1": 0.0, "pc2": 1.0, "pc3": 2.0}] * 3
     job = made.job("embeddings-1", "embeddings", embeddings=points)

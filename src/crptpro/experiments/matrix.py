@@ -68,7 +68,8 @@ class Scale:
     # settings of exploring, with the encoder update interval of a method that makes one update each time
     explore: Settings = field(default_factory=dict)
     explore_single: Settings = field(default_factory=dict)  # further ones of the (S) methods
-    single_ablation: Settings = field(default_factory=dict)  # further ones of the (S) methods in ``ablation``
+    # further ones of the (S) methods in ``ablation`` and ``prototypes``
+    single_ablation: Settings = field(default_factory=dict)
     run: Settings = field(default_factory=dict)  # settings of every downstream run
     seeds: int = 3  # downstream runs on each encoder by default
     alphas: tuple[float, ...] = (5e-4, 5e-2, 5e-1)  # of ``sensitivity``, besides none and the method's own
@@ -456,22 +457,30 @@ def _finetune(request: Request) -> Iterator[Cell]:
     return _table(request, tasks, request.methods or ("crptpro", FAST, FINETUNE, "proto-rl-s", "apt-s", DRQ))
 
 
+def _ablated(request: Request) -> Request:
+    """Return the request with the budgets that the (S) methods have in the paper's ablation."""
+    scale = request.scale
+    return replace(request, scale=replace(scale, explore_single={**scale.explore_single, **scale.single_ablation}))
+
+
+def _variants(system: str, domain: str) -> Iterator[tuple[str, Settings]]:
+    """Yield label and options of a system's variants; the dispersion loss of an (S) method is weighted by domain."""
+    for label, loss in VARIANTS.get(system, ((system, NONE),)):
+        if loss == DISPERSION and is_single_domain(system):
+            loss = {"intr_loss_coef": SINGLE_DISPERSION.get(domain, DISPERSION["intr_loss_coef"])}
+        yield label, loss
+
+
 @_experiment("Ablation: dispersion loss, decoupled collection")
 def _ablation(request: Request) -> Iterator[Cell]:
     """With and without the dispersion loss, with and without decoupled collection (section IV.F)."""
     # Proto-RL(C) with the dispersion loss is CRPTpro without its decoupled collection.
-    scale = request.scale
-    request = replace(request, scale=replace(scale, explore_single={**scale.explore_single, **scale.single_ablation}))
     for (group, task), system in product(request.seen_tasks("AC"), request.methods or VARIANTS):
-        weight = DISPERSION["intr_loss_coef"]
-        if is_single_domain(system):
-            domain = get_domain(task).name
-            if domain not in SINGLE_DISPERSION and not request.tasks:
-                continue  # the paper has two domains
-            weight = SINGLE_DISPERSION.get(domain, weight)
-        for label, loss in VARIANTS.get(system, ((system, NONE),)):
-            own = {"intr_loss_coef": weight} if loss == DISPERSION else loss
-            yield from _scores(request, group, task, system, label=label, loss=own)
+        domain = get_domain(task).name
+        if is_single_domain(system) and domain not in SINGLE_DISPERSION and not request.tasks:
+            continue  # the paper has two domains
+        for label, loss in _variants(system, domain):
+            yield from _scores(_ablated(request), group, task, system, label=label, loss=loss)
 
 
 @_experiment("Sensitivity: weight of the dispersion loss, amount of data")
@@ -505,24 +514,16 @@ def _efficiency(request: Request) -> Iterator[Cell]:
                 yield Cell(system, timing(request, system, sets, seed), place)
 
 
-def _trained(
-    request: Request, variants: Mapping[str, Sequence[tuple[str, Settings]]], measure: Callable[[Job], Job]
-) -> Iterator[Cell]:
-    """Yield a measurement of each encoder of methods with prototypes."""
-    for system, domains, place in request.encoders(variants):
-        for label, loss in variants.get(system, ()):
-            trained = encoder(request.scale, system, domains, place["encoder_seed"], loss=loss)
-            yield Cell(label, measure(trained), place)
-
-
 @_experiment("Spread of the prototypes")
 def _prototypes(request: Request) -> Iterator[Cell]:
     """How far prototypes spread, along pre-training and at its end, with and without the dispersion loss (IV.G)."""
-
-    def spread(base: Job) -> Job:
-        return _measurement("prototypes", base, ["measure", "prototypes", _encoder_of(base), "--out", OWN], [base])
-
-    return _trained(request, VARIANTS, spread)
+    # The encoders of the ablation: those of an (S) method are trained on its domains.
+    tasks = request.tasks or tuple(get_domain(domain).task for domain in SINGLE_DISPERSION)
+    for system, domains, place in replace(request, tasks=tasks).encoders(VARIANTS):
+        for label, loss in _variants(system, domains[0]) if system in VARIANTS else ():
+            base = encoder(_ablated(request).scale, system, domains, place["encoder_seed"], loss=loss)
+            command = ["measure", "prototypes", _encoder_of(base), "--out", OWN]
+            yield Cell(label, _measurement("prototypes", base, command, [base]), place)
 
 
 def _compared(request: Request, kind: str, groups: str, system: str, samples: int) -> Iterator[Cell]:
@@ -548,7 +549,9 @@ def _stability(request: Request) -> Iterator[Cell]:
     """The comparative loss along pre-training on random data and on an explorer's (section IV.H)."""
     # Without the dispersion loss CRPTpro differs from Proto-RL(C) in its data alone.
     variants = {"crptpro": VARIANTS["crptpro"], FAST: VARIANTS[FAST], "proto-rl-c": (("proto-rl-c", NONE),)}
-    return _trained(request, variants, lambda trained: trained)
+    for system, domains, place in request.encoders(variants):
+        for label, loss in variants.get(system, ()):
+            yield Cell(label, encoder(request.scale, system, domains, place["encoder_seed"], loss=loss), place)
 
 
 @_experiment("Embeddings of random data and of an explorer's")

@@ -188,7 +188,10 @@ def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
 
 
 def embeddings(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
-    """Write principal components of random data and of an explorer's last quarter: OUT/embeddings.csv."""
+    """Write principal components of random data and of an explorer's last quarter: OUT/embeddings.csv.
+
+    Deviation: the paper collects the explorer's data after its training.
+    """
     from sklearn.decomposition import PCA
 
     pretrained = of.load()

@@ -406,9 +406,13 @@ def _scores(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> N
                 "trained alike is not recorded here.",
                 "warning",
             )
+    late = _late(evaluations)
     for varied, part in runs.groupby("varied", sort=False):
         of = f", mean ± standard deviation over runs (n).{f' {varied} varied.' if varied else ''}"
         _score_table(page, part, f"Episode return at the final evaluation{of}")
+        if len(late):
+            own = late[late["varied"] == varied]
+            _score_table(page, own, f"Episode return, mean of the last {LATE} evaluations of each run{of}")
         if varied:
             _sensitivity(page, f"{name}-{varied}", part, str(varied))
     _aggregates(page, runs)
@@ -431,6 +435,19 @@ def _evaluations(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> pd.Data
     columns = ["task", "task_name", "colors", "varied", "value", "encoder", "env_steps"]
     scores = rows.groupby(["group", "label", "run", *columns], sort=False)["episode_return"].mean()
     return scores.reset_index(name="score")
+
+
+LATE = 10  # evaluations at the end of a run, whose mean is less noisy than one of them
+
+
+def _late(evaluations: pd.DataFrame) -> pd.DataFrame:
+    """Return each run's mean of its last evaluations; empty if they are more than a quarter of any run."""
+    run = ["group", "label", "run"]
+    if evaluations.groupby(run).size().min() < 4 * LATE:
+        return evaluations[:0]
+    last = evaluations.sort_values("env_steps", kind="stable").groupby(run).tail(LATE)
+    about = last.columns.difference(["env_steps", "score"], sort=False).tolist()
+    return last.groupby(about, sort=False)["score"].mean().reset_index()
 
 
 def _encoder(run: str, jobs: pd.DataFrame) -> str:
