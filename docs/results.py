@@ -1,7 +1,7 @@
 """Compute the tables of the README, docs/start.md and docs/results.md from the records in results/.
 
 ``python docs/results.py`` writes each table between its markers, ``<!-- table: name -->`` and ``<!-- end -->``, and
-draws the figure. :func:`filled` is what a test compares the pages with.
+draws the figures. :func:`filled` is what a test compares the pages with.
 """
 
 from __future__ import annotations

@@ -132,7 +132,7 @@ _PROTO_RL_C = Method(
     downstream={"replay_capacity": 100_000},
 )  # fmt: skip
 
-# Three encoder updates for each update of the agent, every second agent step: 150,000 for 50,000.
+# Three encoder updates for each update of the agent, every second agent step.
 _BECL_EXPLORES = Exploration(
     reward="skill-contrast", agent="skill-ddpg", encoder_updates_each=3, encodes_before_update=True,
     agent_update_interval=2, n_step=3, skill_dim=16, random_agent_steps=2_000,

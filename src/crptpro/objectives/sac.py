@@ -225,7 +225,7 @@ class DrQLoss(AveragedSACLoss):
 
     Actor and critic share the convolutions, which learn from ``loss_qvalue`` alone; the target critic copies
     convolutions and head. In DrQ, actor and critic have ``has_tanh=True``. ``options`` are those of
-    :class:`RADSACLoss`, with its deviation; a critic that does not fit the encoder is a ``ValueError``.
+    :class:`RADSACLoss`; a critic that does not fit the encoder is a ``ValueError``.
     """
 
     @dataclass

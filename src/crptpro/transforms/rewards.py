@@ -84,7 +84,7 @@ class IntrinsicReward(Transform):
 
 
 class PrototypeReward(IntrinsicReward):
-    r"""Add the prototype-kNN exploration bonus, :math:`r = r_\mathrm{ext} + \beta \hat r` (CRPTpro, Eq. 10-11).
+    r"""Add the prototype-kNN exploration bonus, :math:`r = r_\mathrm{ext} + \beta \hat r` (CRPTpro, Eq. 11).
 
     With :math:`z_i` the l2-normalised projections of a batch of next observations and :math:`c_j` the
     l2-normalised prototypes, each call
@@ -96,7 +96,8 @@ class PrototypeReward(IntrinsicReward):
     As in the released agent (liuxin0824/CRPTpro ``proto.py``), a sample drawn k times or more gets exactly 0, because
     its copies in Q are its neighbours: about 8 % of a batch of 512 with 512 prototypes and k = 3. Empty rows of Q are
     at distance 1. Rows that are not finite are never drawn.
-    Deviation: the released pre-training hands its Q over; here Q starts from zeros unless ``queue`` is given.
+    Deviation: Eq. 11 prints projections without normalisation; they are normalised here, as in the released agent,
+    whose pre-training also hands its Q over. Here Q starts from zeros unless ``queue`` is given.
 
     Args:
         projector: frozen map from features to latents; None if ``in_keys`` already names projections.
