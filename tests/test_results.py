@@ -27,7 +27,7 @@ def test_every_table_is_the_one_that_the_records_give(page: Path) -> None:
 
 def test_the_readme_quotes_the_returns_of_the_quickstart() -> None:
     readme = " ".join(RESULTS["PAGES"][0].read_text().split())
-    ours = r"returned (\d+) on the pre-trained encoder, (\d+) on the untrained one, and (\d+) with random actions"
+    ours = r"the returns were (\d+) \(pre-trained\), (\d+) \(untrained\) and (\d+) \(random actions\)"
     quoted = re.search(ours, readme)
     assert quoted is not None
     assert list(quoted.groups()) == [cell.split()[0] for cell in RESULTS["quickstart"]().iloc[-1, -3:]]
@@ -98,8 +98,8 @@ def sentences() -> Iterator[str]:
     yield f"at 40,000 env steps they average {ours[40_000]:.0f}, the others {untrained[40_000]:.0f}"
     comparison = "more" if best_untrained > best else "less"
     yield f"one on an untrained encoder returned {best_untrained:.0f}, {comparison} than any on the pre-trained one"
-    yield f"its ten runs {more[0]} returned more at 20,000 env steps than the mean of ours"
-    yield f"the mean of ours on the pre-trained encoder, and {more[1]} at 60,000"
+    yield f"At 20,000 env steps {more[0]} of its ten runs returned more than the mean of ours"
+    yield f"than the mean of ours on the pre-trained encoder, at 60,000 {more[1]}."
 
     returns = RESULTS["_control_returns"]()[0][20_000].unstack("run")
     bonus = returns.loc["crptpro"] - returns.loc["crptpro-no-bonus"]
