@@ -110,6 +110,7 @@ class RunLogger:
             raise ValueError(f"A stream is named by lower-case letters, digits and _, got {stream!r}.")
         if not counters:
             raise ValueError(f"A row of {stream!r} needs a counter, such as updates=100.")
+        metrics = dict(metrics.items())  # a TensorDict iterates over its rows
         for key in (*counters, *metrics):
             is_taken = key in ("stream", "unix_time_s") or (key in counters and key in metrics)
             if is_taken or not key or not key.isprintable() or re.search('[,"]', key):

@@ -291,7 +291,10 @@ def _as_pretrained(trained: Any) -> Pretrained:
         )
     encoder: Any = _unwrapped(getattr(loss, "encoder", None))
     if encoder is None:
-        raise PretrainedError(f"{type(loss).__name__} has no `.encoder`; a pre-training loss exposes it.")
+        raise PretrainedError(
+            f"{type(loss).__name__} has no `.encoder`, which a pre-training loss exposes. An encoder alone: "
+            "Pretrained(encoder)."
+        )
     heads = {role: _unwrapped(getattr(loss, role, None)) for role in HEADS}
     targets = {}
     for target, online in zip(TARGETS, (encoder, heads["projector"])):

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
+from torchrl.data import ImmutableDatasetWriter, PrioritizedSampler, RandomSampler, ReplayBuffer
 
 from crptpro.data.storage import RingStorage, StackStorage, map_rows, read_rows
 from crptpro.errors import CheckpointError, DatasetError
@@ -102,6 +102,8 @@ class FrameReplay(ReplayBuffer):
             raise ValueError(f"extra_columns may not be named {taken}: a sample has those; choose other names.")
         if "sampler" in options and n_step > 1:
             raise ValueError("With n_step above 1 a FrameReplay has its own sampler; leave out `sampler`.")
+        if isinstance(options.get("sampler"), PrioritizedSampler):
+            raise ValueError("A FrameReplay keeps no priorities: the index of a transition changes as others leave.")
         storage = RingStorage(
             capacity, columns | extra, slack=slack, frame_stack=frame_stack, n_step=n_step, discount=discount, path=path
         )
@@ -124,6 +126,10 @@ class FrameReplay(ReplayBuffer):
         with self._replay_lock:
             return self._storage.observations(numbers)
 
+    def _sample(self, batch_size: int) -> tuple[Any, dict]:
+        with self._replay_lock:  # a transform may read observations by number: none is overwritten meanwhile
+            return super()._sample(batch_size)
+
     def state_dict(self) -> dict[str, Any]:
         """Return a few counters (ring on disk) or the whole content (ring in RAM), and the transforms' state.
 
@@ -135,11 +141,19 @@ class FrameReplay(ReplayBuffer):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the content of the moment the state was taken, or raise a CheckpointError."""
         with self._replay_lock:
+            if not {"ring", "transforms"} <= state_dict.keys():
+                raise CheckpointError(f"The state is of another kind of replay: it has {sorted(state_dict)}.")
             try:
                 self._transform.load_state_dict(state_dict["transforms"])
             except RuntimeError as reason:
                 raise CheckpointError(f"The state is of a replay with other transforms: {reason}") from reason
             self._storage.load_state_dict(state_dict["ring"])
+
+    def dumps(self, path: str | Path) -> None:
+        """Save the content, or the counters of a ring on disk, for :meth:`loads`, also on a machine with other GPUs."""
+        super().dumps(path)
+        if (file := Path(path) / "transform.t").exists():
+            torch.save({name: value.cpu() for name, value in self._transform.state_dict().items()}, file)
 
     def loads(self, path: str | Path) -> None:
         """Restore what TorchRL's ``dumps`` wrote."""

@@ -109,6 +109,10 @@ def read_rows(
             "several environments as rollout.reshape(-1)."
         )
 
+    for mask in ("mask", ("collector", "mask")):
+        if (kept := data.get(mask, None)) is not None and not kept.all():
+            raise ValueError(f"{what} takes no padding: extend it by rollout[rollout[{mask!r}]].")
+
     def entry(key: NestedKey, default: Tensor | None = None) -> Tensor:
         value = data.get(key, default)
         if value is None:
@@ -140,7 +144,7 @@ def read_rows(
         )
     columns = {"action": entry("action"), "reward": column("reward"), "done": (done := column("done"))}
     for name in ("reward", "action"):
-        finite = torch.isfinite(columns[name])
+        finite = torch.isfinite(columns[name].float())  # as it is stored
         if not finite.all():
             row = int((~finite).flatten(1).any(1).nonzero()[0])
             raise NonFiniteError(

@@ -59,6 +59,7 @@ class CheckedEnv:
         return dict(self._card)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        self._require_open()
         if self._agent_step >= LONG_EPISODE:
             self._report_still_frames()
         self._episode, self._agent_step = self._episode + 1, 0
@@ -70,6 +71,7 @@ class CheckedEnv:
         return found
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._require_open()
         self._agent_step += 1
         self._require_finite(tensordict, "received the", "action")
         with passed_on(self._name, "step"):
@@ -82,6 +84,12 @@ class CheckedEnv:
         if self._is_still and found.get("done").any():
             self._report_still_frames()
         return found
+
+    def _require_open(self) -> None:
+        if self._was_closed:
+            raise CRPTproError(
+                f"The environment {self._name!r} is closed (a Collector closes its own when it ends); make another."
+            )
 
     def _require_finite(self, td: TensorDictBase, verb: str, *keys: str) -> None:
         for key in keys:

@@ -72,6 +72,12 @@ class NetworkLoss(LossModule):
         params = getattr(self, f"target_{name}_params" if target else f"{name}_params")
         return params.to_module(getattr(self, name), preserve_module_state=False)
 
+    def _entry(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+        value: Tensor | None = tensordict.get(key, None)
+        if value is None:
+            raise KeyError(f"{type(self).__name__} needs the entry {key!r}; set_keys() names another one.")
+        return value
+
     def _set_in_keys(self) -> None:
         self._in_keys = [getattr(self.tensor_keys, field.name) for field in fields(self.tensor_keys)]
 
@@ -112,9 +118,7 @@ class PretrainingLoss(NetworkLoss):
 
     def _read(self, tensordict: TensorDictBase, key: NestedKey, *, event_dims: int = 3) -> Tensor:
         """Return an entry with one batch dimension before its last ``event_dims``."""
-        value = tensordict.get(key, None)
-        if value is None:
-            raise KeyError(f"{type(self).__name__} needs the entry {key!r}; set_keys() names another one.")
+        value = self._entry(tensordict, key)
         return value.reshape(-1, *value.shape[value.ndim - event_dims :])
 
 

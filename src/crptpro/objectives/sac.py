@@ -46,8 +46,8 @@ class RADSACLoss(NetworkLoss, SACLoss):
     * ``loss_actor`` = mean(alpha log pi(a|h) - min(Q1, Q2)(h, a)), gradient to the actor only;
     * ``loss_alpha`` = mean(exp(log_alpha) * sg(-log pi - target_entropy)), gradient to ``log_alpha`` only.
 
-    With the ``steps_to_next_obs`` of TorchRL's ``MultiStepTransform``, gamma is raised to the number n of steps.
-    Features never receive a gradient. Differences from ``SACLoss``: squared error; alpha in place of its logarithm in
+    With the ``steps_to_next_obs`` of TorchRL's ``MultiStepTransform`` in the batch, gamma is raised to the number n of
+    steps; it is no in key. Features never receive a gradient. Differences from ``SACLoss``: squared error; alpha in place of its logarithm in
     the temperature loss; the log-std squash and pre-tanh log-probability of
     :class:`~crptpro.modules.SquashedGaussianActor`; one critic network with two outputs and a shared trunk; and
     separate :meth:`critic_loss` and :meth:`actor_and_temperature_loss`, because the actor learns every second time,
@@ -83,6 +83,12 @@ class RADSACLoss(NetworkLoss, SACLoss):
         target_entropy: float | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
+        for network, kinds in ((actor, SquashedGaussianActor), (critic, (TwinCritic, PixelCritic))):
+            if not isinstance(network, kinds):
+                expected = "a SquashedGaussianActor, then a TwinCritic"
+                raise TypeError(f"{type(self).__name__} takes {expected}; got a {type(network).__name__}.")
+        if target_entropy is not None:
+            target_entropy = as_float(target_entropy, "target_entropy")
         gamma = as_float(gamma, "gamma", minimum=0, maximum=1)
         require_positive(alpha_init=alpha_init)
         views = [self.default_keys().observation]
@@ -98,7 +104,7 @@ class RADSACLoss(NetworkLoss, SACLoss):
             num_qvalue_nets=0,
             loss_function="l2",
             alpha_init=float(alpha_init),
-            target_entropy=-float(actor.action_dim) if target_entropy is None else float(target_entropy),
+            target_entropy=-float(actor.action_dim) if target_entropy is None else target_entropy,
             scalar_output_mode="exclude",
         )
         self.num_qvalue_nets = 2
@@ -119,6 +125,8 @@ class RADSACLoss(NetworkLoss, SACLoss):
 
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not changed."""
+        for key in self.in_keys:
+            self._entry(tensordict, key)
         target = self._compute_target_v2(tensordict)  # (B,)
         action = tensordict.get(self.tensor_keys.action)
         with self._holding("qvalue_network"):
@@ -179,7 +187,7 @@ class RADSACLoss(NetworkLoss, SACLoss):
             return self.actor.sample(features, noise=noise)
 
     def _views(self, tensordict: TensorDictBase) -> list[Tensor]:
-        return [tensordict.get(getattr(self.tensor_keys, name)).detach() for name in self.view_names]
+        return [self._entry(tensordict, getattr(self.tensor_keys, name)).detach() for name in self.view_names]
 
     # DrQ overrides these two, because its views are images.
 
@@ -224,8 +232,9 @@ class DrQLoss(AveragedSACLoss):
     """DrQ (arXiv 2004.13649; denisyarats/drq ``drq.py``): :class:`AveragedSACLoss` with the encoder inside.
 
     Actor and critic share the convolutions, which learn from ``loss_qvalue`` alone; the target critic copies
-    convolutions and head. In DrQ, actor and critic have ``has_tanh=True``. ``options`` are those of
-    :class:`RADSACLoss`; a critic that does not fit the encoder is a ``ValueError``.
+    convolutions and head. In DrQ, actor and critic have ``has_tanh=True``. The actor acts on features: a policy is
+    ``actor.sample(encoder(pixels))``. ``options`` are those of :class:`RADSACLoss`; a critic that does not fit the
+    encoder is a ``ValueError``.
     """
 
     @dataclass
@@ -321,6 +330,8 @@ class SkillDDPGLoss(NetworkLoss):
 
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not changed."""
+        for key in self.in_keys:
+            self._entry(tensordict, key)
         target = self._target(tensordict)  # (B,)
         inputs = self._inputs(tensordict, tensordict)
         with self._holding("qvalue_network"):
@@ -352,5 +363,5 @@ class SkillDDPGLoss(NetworkLoss):
             return self.actor_network.sample(inputs, noise_clip=self.noise_clip, generator=self.generator)
 
     def _inputs(self, observed: TensorDictBase, root: TensorDictBase) -> Tensor:
-        features = observed.get(self.tensor_keys.observation).detach()
-        return torch.cat([features, root.get(self.tensor_keys.skill).to(features.dtype)], dim=-1)
+        features = self._entry(observed, self.tensor_keys.observation).detach()
+        return torch.cat([features, self._entry(root, self.tensor_keys.skill).to(features.dtype)], dim=-1)

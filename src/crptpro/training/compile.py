@@ -40,7 +40,7 @@ def accelerate(
         logging.getLogger("tensordict").setLevel(logging.WARNING)  # it announces every recording
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Tensordict is registered in PyTree")  # it takes care of that itself
-            fast = CudaGraphModule(fast, warmup=3)
+            fast = CudaGraphModule(fast, warmup=3, device=torch.device(device))
 
     def call(batch: TensorDictBase) -> TensorDictBase:
         try:

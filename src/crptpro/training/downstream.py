@@ -13,13 +13,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from tensordict import TensorDictBase
 from torch import nn
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, Transform
 from torchrl.envs.utils import step_mdp
 
 from crptpro.data import FrameReplay
-from crptpro.domains import Domain, get_domain
+from crptpro.domains import LONGEST_EPISODE_AGENT_STEPS, Domain, get_domain
 from crptpro.envs import resolve_action_repeat
+from crptpro.envs.factory import episode_length
 from crptpro.errors import CheckpointError, PretrainedError
 from crptpro.free_memory import free_bytes
 from crptpro.logging import RunLogger
@@ -168,7 +170,10 @@ def train_downstream(
     if not isinstance(pretrained, Pretrained):
         if not isinstance(pretrained, (str, Path)):
             kind = type(pretrained).__name__
-            raise PretrainedError(f"A {kind} is no saved encoder: give what save_pretrained(result, path) returns.")
+            raise PretrainedError(
+                f"A {kind} is no saved encoder: give what save_pretrained(result, path) returns, or "
+                "Pretrained(encoder)."
+            )
         source, is_control = str(pretrained), str(pretrained) in ("drq", "random-encoder")
         pretrained = random_pretrained(settings.seed, method=source) if is_control else load_pretrained(source)
     settings = settings.resolved(task, pretrained)
@@ -206,7 +211,7 @@ def train_downstream(
                               on_result=functools.partial(_record_evaluation, run, name, pretrained.label))  # fmt: skip
         stack.callback(evaluator.close)
         is_complete = bool(run.saved.get("is_finished")) and run.saved["position"] >= settings.env_steps
-        replay = _make_replay(run, env.env, settings, generators["replay"], is_complete=is_complete)
+        replay = _make_replay(run, task, env.env, settings, generators["replay"], is_complete=is_complete)
         attach_transforms(replay, pretrained, encoder, settings, generators, run, dtype=dtype,
                           reserved_bytes=evaluator.workers * WORKER_BYTES)  # fmt: skip
         dense = next((each for each in replay.transform if isinstance(each, DenseShiftFeatures)), None)
@@ -303,7 +308,9 @@ def _make_agent(
     return learner, PixelAgent(encoder, loss.actor)
 
 
-def _make_replay(run: Run, env: EnvBase, config: Any, generator: torch.Generator, *, is_complete: bool) -> FrameReplay:
+def _make_replay(
+    run: Run, task: str | Domain, env: EnvBase, config: Any, generator: torch.Generator, *, is_complete: bool
+) -> FrameReplay:
     """Return the replay below the run's directory; a complete run needs none."""
     path = None if run.run_dir is None or is_complete else run.run_dir / "replay"
     if path is not None and run.saved and not path.exists():
@@ -311,8 +318,10 @@ def _make_replay(run: Run, env: EnvBase, config: Any, generator: torch.Generator
             f"{run.run_dir} has done {run.saved['position']:,} env steps; to continue it needs its frames, and {path} "
             "is gone. Put it back, or start in another run directory."
         )
-    # A checkpoint holds counters and no frames: the frames of the last two must outlive the next one.
-    slack = 2 * (config.checkpoint_interval_env_steps // config.action_repeat) + SPARE_FRAMES
+    # A checkpoint holds counters and no frames: the frames of the last two must outlive the next one, which comes with
+    # the end of an episode.
+    longest = episode_length(task, action_repeat=config.action_repeat) or LONGEST_EPISODE_AGENT_STEPS
+    slack = 2 * (config.checkpoint_interval_env_steps // config.action_repeat + longest) + SPARE_FRAMES
     return make_replay(run, path, env, config.replay_capacity, slack=slack, generator=generator)
 
 
@@ -362,6 +371,7 @@ def attach_transforms(
     run.settings["features"] = setting if is_rounded else mode
     if mode == "reencode":
         keeps_projections = False
+        replay.append_transform(_OnDevice(device))  # features, 40 times as large as a frame, need not move
         replay.append_transform(RandomShift(in_keys=pixels, **shift))
         replay.append_transform(FrozenEncoder(encoder, in_keys=pixels, out_keys=features))
     else:
@@ -384,6 +394,17 @@ def attach_transforms(
         generator=generators["bonus"],
     )
     replay.append_transform(bonus)
+
+
+class _OnDevice(Transform):
+    """Moves samples of a replay to the device of the networks."""
+
+    def __init__(self, device: torch.device) -> None:
+        super().__init__(in_keys=[], out_keys=[])
+        self.target = device
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return tensordict.to(self.target)
 
 
 def _eval_workers(task: str, make_this_env: Callable[[], EnvBase], config: Any) -> int:

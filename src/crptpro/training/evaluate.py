@@ -14,9 +14,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
+from torchrl.modules import RandomPolicy
 from tqdm.auto import tqdm
 
 from crptpro.errors import NonFiniteError
@@ -27,8 +29,8 @@ from crptpro.workers import WorkerPool, can_be_sent
 
 logger = logging.getLogger(__name__)
 
-Policy = Callable[[Tensor], Tensor]
-"""Maps one observation, uint8 ``[C, H, W]``, to one action, float32 ``[A]`` in ``[-1, 1]``."""
+Policy = Callable[[Any], Any]
+"""Maps one observation, uint8 ``[C, H, W]``, to one action, float32 ``[A]`` in ``[-1, 1]``; or a policy of TorchRL."""
 WORKER_BYTES = 500_000_000
 LOST = (BrokenProcessPool, pickle.PicklingError, OSError)
 """What a call of a worker raises if the process has died, or cannot be started."""
@@ -89,8 +91,16 @@ def run_episode(
     while not done:
         if on_frame is not None:
             on_frame(td["pixels"][-3:].clone())
-        td["action"] = policy(td["pixels"])
         where = f"Evaluation episode {episode}, decision {agent_steps}"
+        is_torchrls = isinstance(policy, (TensorDictModuleBase, RandomPolicy))
+        action = policy(td.copy()).get("action") if is_torchrls else policy(td["pixels"])
+        if not isinstance(action, Tensor) or action.shape != env.action_spec.shape:
+            got = tuple(action.shape) if isinstance(action, Tensor) else type(action).__name__
+            raise ValueError(
+                f"{where}: the policy returned {got} for an action of shape {tuple(env.action_spec.shape)}. A policy "
+                'maps pixels to one action, or is a TorchRL module that writes "action" into a TensorDict.'
+            )
+        td["action"] = action.detach()
         if not torch.isfinite(td["action"]).all():
             raise NonFiniteError(f"{where}: the policy acts {td['action'].tolist()}.")
         transition = env.step(td)
@@ -191,6 +201,7 @@ class Evaluator:
             threads = torch.get_num_threads()
             torch.set_num_threads(1)  # as in the workers: sums of another order may round another way
             try:
+                agent = copy.deepcopy(agent).cpu()  # a GPU may round otherwise than the workers
                 episodes = evaluate(agent, self._env, episodes=self.episodes, seed=seed, progress=self.progress)
             finally:
                 torch.set_num_threads(threads)

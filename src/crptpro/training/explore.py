@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -204,11 +205,10 @@ def pretrain_active(
                                       records=records, config=settings, progress=progress))  # fmt: skip
         dtype = resolve_precision(run.saved_setting("precision", settings.precision), device)
         stack.enter_context(computing(loss, dtype))
-        reward = getattr(exploration.reward, "__qualname__", exploration.reward)
         run.require_same({
             **{k: v for k, v in dataclasses.asdict(settings).items() if k not in ("device", "log_interval")},
             "domains": list(named), "precision": PRECISION_NAMES[dtype], "loss": describe_loss(loss),
-            "exploration": {**dataclasses.asdict(exploration), "reward": reward},
+            "exploration": {**dataclasses.asdict(exploration), "reward": _described(exploration.reward)},
         })  # fmt: skip
         torch.manual_seed(derive_seed(settings.seed, "active", "loss"))
         capacity = min(settings.replay_capacity, plan.agent_steps)
@@ -231,6 +231,8 @@ def pretrain_active(
         done["updates"] = 0
         run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor,
                  **{f"explorer_{index}": explorer for index, explorer in enumerate(explorers)})  # fmt: skip
+        if done["updates"]:
+            run.counters["updates"] = done["updates"]
 
         update_encoder = make_update(loss, optimizer, targets, grad_clip=recipe.grad_clip)
         for _ in run.until(plan.env_steps, checkpoint_interval=settings.checkpoint_interval_env_steps):
@@ -277,6 +279,13 @@ def pretrain_active(
         )  # fmt: skip
 
 
+def _described(reward: Any) -> Any:
+    """Return the name of a reward, or of a function that makes one, with the arguments of a partial one."""
+    if isinstance(reward, functools.partial):
+        return {"function": _described(reward.func), "args": list(reward.args), "keywords": reward.keywords}
+    return reward if isinstance(reward, str) else getattr(reward, "__qualname__", type(reward).__qualname__)
+
+
 class Explorer:
     """One domain of an active pre-training: its environment, replay, agent and intrinsic reward.
 
@@ -299,6 +308,7 @@ class Explorer:
         self.learner = self._make_learner(loss.encoder.feature_dim, self.env.env.action_spec.shape[-1])
         set_compute_dtype(self.learner.loss, dtype)
         self.agent = PixelAgent(loss.encoder, self.learner.loss.actor)
+        self.networks = [self.learner.loss]
         self.reward = self._make_reward() if reward is None else reward
         path = None if run.run_dir is None else run.run_dir / "replay" / name.replace("/", "-")
         self.replay = self._make_replay(run, path, capacity, slack)

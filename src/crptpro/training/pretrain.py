@@ -21,7 +21,7 @@ from crptpro.data import FrameDataset
 from crptpro.errors import CRPTproError, DatasetError
 from crptpro.logging import RunLogger
 from crptpro.modules import computing, resolve_precision, usable_device
-from crptpro.modules.precision import PRECISION_NAMES, Precision
+from crptpro.modules.precision import PRECISION_NAMES, Precision, evaluating
 from crptpro.objectives import Method, get_method, method_of
 from crptpro.objectives.functional import mean_pairwise_cosine, prototype_metrics
 from crptpro.pretrained import Pretrained, class_name, load_pretrained, loss_options
@@ -281,7 +281,7 @@ def total_loss(losses: TensorDictBase) -> Tensor:
 
 def scalars(losses: TensorDictBase, domain: str) -> dict[str, Tensor]:
     """Return what a row shows of an update: every scalar, their sum, and loss and cosine by domain."""
-    values = {name: value.reshape(()) for name, value in losses.items() if value.numel() == 1}
+    values = {n: v.reshape(()) for n, v in losses.items() if isinstance(v, Tensor) and v.numel() == 1}
     values["loss"] = values[f"loss/{domain}"] = total_loss(losses)
     if "embedding_cosine" in values:
         values[f"cosine/{domain}"] = values["embedding_cosine"]
@@ -302,9 +302,11 @@ def write_row(run: Run, loss: LossModule, monitor: CollapseMonitor, batch: Tenso
             measured = prototype_metrics(weight.detach(), offset=float(getattr(loss, "offset", 1.5)))
             extra |= {name: float(value) for name, value in measured.items()}
     if "embedding_cosine" not in means and "pixels" in batch and isinstance(getattr(loss, "encoder", None), nn.Module):
-        embeddings = loss.encoder(batch["pixels"][:128])
+        with evaluating(loss.encoder):  # measuring must not change what is trained
+            embeddings = loss.encoder(batch["pixels"][:128])
         if isinstance(getattr(loss, "projector", None), nn.Module):
-            embeddings = loss.projector(embeddings)
+            with evaluating(loss.projector):
+                embeddings = loss.projector(embeddings)
         if isinstance(embeddings, Tensor) and embeddings.ndim == 2:
             extra[f"cosine/{domain}"] = float(mean_pairwise_cosine(F.normalize(embeddings.float(), dim=-1)))
     row = run.write("pretrain", extra=extra)
@@ -362,7 +364,11 @@ def _opened(
             raise DatasetError(
                 f"Dataset {index} is a {type(dataset).__name__}; give a directory, a FrameDataset or a ReplayBuffer."
             )
+        if any(dataset is other for other in buffers.values()):
+            raise DatasetError(f"Dataset {index} is given twice as one object; open its directory again for each.")
         name = name or getattr(dataset, "card", {}).get("domain") or f"dataset_{index}"
+        if not name.isprintable() or {",", '"'} & set(name):
+            raise DatasetError(f"The dataset {name!r} cannot name columns of a record; rename it.")
         buffers[name if name not in buffers else f"{name}_{index}"] = dataset
     # TorchRL draws indices where the storage is, and its generator must be there, too.
     devices = {f"sample/{name}": getattr(buffer.storage, "device", None) for name, buffer in buffers.items()}

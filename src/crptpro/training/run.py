@@ -18,6 +18,7 @@ from typing import Any
 
 import psutil
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 
@@ -28,7 +29,7 @@ from crptpro.logging import RunLogger
 from crptpro.progress import Progress
 from crptpro.provenance import provenance
 from crptpro.seeding import derive_seed, kept_global_rng
-from crptpro.values import as_path
+from crptpro.values import as_path, as_plain
 
 logger = logging.getLogger(__name__)
 
@@ -182,8 +183,11 @@ class Run:
         return self.saved.get("settings", {}).get(name, value) if value == "auto" else value
 
     def require_same(self, settings: Mapping[str, Any]) -> None:
-        """Name everything that decides the numbers of the run; a run of other settings is refused by name."""
-        self.settings = dict(settings)
+        """Name everything that decides the numbers of the run; a run of other settings is refused by name.
+
+        What a checkpoint could not store is a ``ValueError`` that names it.
+        """
+        self.settings = as_plain(settings, "settings")
         if not self.saved:
             return
         before, now = _flat(self.saved["settings"]), _flat(self.settings)
@@ -201,14 +205,16 @@ class Run:
 
         ``None`` is left out. Without a checkpoint the run begins again; rows of an earlier attempt are set aside.
         """
+        # Those whose parameters must be finite: components, and the ``networks`` of other components.
         self._modules = [value for value in components.values() if isinstance(value, nn.Module)]
+        self._modules += [network for value in components.values() for network in getattr(value, "networks", ())]
         means = {f"means_{stream}": value for stream, value in self._means.items()}
         for name, component in {**components, **means, "global_rng": _GlobalRNG()}.items():
             if component is not None:
                 self._checkpoint.register(name, component)
         if self.saved:
             try:
-                self._checkpoint.load(self._latest)
+                self._checkpoint.load(self._latest, map_location="cpu")  # its GPU may have another number here
             except Exception as reason:
                 raise CheckpointError(f"The checkpoint {self._latest} does not fit this run: {reason}") from reason
             self.position = self.resumed_from = self._row_position = self.saved["position"]
@@ -286,16 +292,17 @@ class Run:
         if not (self.saved.get("is_finished") and self.saved["position"] == self.position):
             self.save(is_finished=True)
 
-    def log(self, values: Mapping[str, Tensor], stream: str | None = None) -> None:
+    def log(self, values: Mapping[str, Tensor | float] | TensorDictBase, stream: str | None = None) -> None:
         """Take scalars of one update into the means of a stream's next row; the first stream's by default.
 
         On a CPU, a loss that is not finite ends the run at once with a NonFiniteError; on a GPU the next row or
         checkpoint does, without a host synchronisation here.
         """
-        for name, value in values.items():
+        found = {name: torch.as_tensor(value) for name, value in values.items()}
+        for name, value in found.items():
             if name.startswith("loss") and value.device.type == "cpu" and not torch.isfinite(value).all():
                 raise _not_finite(f"After {self.position:,} {self.unit}, {name} is {value.item()}")
-        self._means[stream or self.streams[0]].add(values)
+        self._means[stream or self.streams[0]].add(found)
 
     def means(self, stream: str) -> dict[str, float]:
         """Return the means since the last row of a stream, empty if nothing was logged; losses must be finite."""

@@ -126,7 +126,7 @@ class DenseShiftFeatures(Transform):
     Its dense maps are kept until the replay has overwritten it; no state dictionary, copy or pickle holds them. Where
     the replay's numbers go back (``load_state_dict`` on the one in use), call :meth:`forget`.
 
-    Threads may sample side by side. On an environment use :class:`~crptpro.transforms.FrozenEncoder`.
+    Threads may share it. On an environment use :class:`~crptpro.transforms.FrozenEncoder`.
 
     Args:
         encoder: frozen, see :func:`dense_shift_geometry`; its weights must not change from now on.
@@ -177,6 +177,11 @@ class DenseShiftFeatures(Transform):
         # Hidden from nn.Module: the networks are somebody else's, and no part of a replay's state.
         self.__dict__["encoder"] = encoder
         self.__dict__["projector"] = projector
+        if not hasattr(replay, "observations") or (observations is None and not hasattr(replay, "window")):
+            raise ValueError(
+                f"A {type(replay).__name__} has no observations by number: store them in a FrameReplay, or use "
+                "RandomShift and FrozenEncoder."
+            )
         self.replay = replay
         slots = replay.window if observations is None else observations
         self.observations = as_int(slots, "observations", minimum=1)
@@ -186,7 +191,8 @@ class DenseShiftFeatures(Transform):
 
     def forget(self) -> None:
         """Drop all maps, and give their memory back."""
-        self._lock = threading.Lock()
+        # That of the replay, so that no observation is overwritten between its draw and its use.
+        self._lock = getattr(self.replay, "_replay_lock", None) or threading.RLock()
         self._held = torch.full((self.observations,), -1, dtype=torch.int64, device="cpu")
         self._maps: Tensor | None = None
         self._embeddings: Tensor | None = None

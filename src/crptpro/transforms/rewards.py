@@ -14,7 +14,7 @@ from torchrl.data.tensor_specs import TensorSpec
 from torchrl.envs.transforms import Transform
 
 from crptpro.modules.heads import latent_dim_of
-from crptpro.modules.precision import device_of
+from crptpro.modules.precision import device_of, evaluating
 from crptpro.objectives.base import require_positive
 from crptpro.objectives.functional import becl_loss, knn_distance, knn_distances, particle_entropy
 from crptpro.transforms.base import Keys, read_entry
@@ -56,17 +56,24 @@ class IntrinsicReward(Transform):
         raise NotImplementedError
 
     def _project(self, features: Tensor) -> Tensor:
-        return (features if self.projector is None else self.projector(features)).float()
+        if self.projector is None:
+            return features.float()
+        with evaluating(self.projector):  # it may be in training
+            projected: Tensor = self.projector(features)
+        return projected.float()
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         features = read_entry(self, tensordict, self.in_keys[0])
-        rows = features.reshape(-1, features.shape[-1])
-        extra = [read_entry(self, tensordict, key).reshape(len(rows), -1) for key in self.extra_keys]
+        # A sample may be on the CPU, and the networks on a GPU.
+        where = next((tensor.device for tensor in self.buffers()), None)
+        where = where or (None if self.projector is None else device_of(self.projector)) or features.device
+        rows = features.reshape(-1, features.shape[-1]).to(where)
+        extra = [read_entry(self, tensordict, key).reshape(len(rows), -1).to(where) for key in self.extra_keys]
         intrinsic = self.intrinsic_reward(rows, *extra)
         if self.coef is None:
             return tensordict.set(self.out_keys[0], intrinsic.reshape(*features.shape[:-1], 1))
-        # The result is on the features' device: that of a GPU goes on without being waited for.
+        # The result is on the networks' device: that of a GPU goes on without being waited for.
         reward = read_entry(self, tensordict, self.reward_key).to(intrinsic.device)
         intrinsic = intrinsic.to(reward.dtype).view_as(reward)
         tensordict.set(self.out_keys[0], intrinsic)
