@@ -17,7 +17,7 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
-from torchrl.data import SamplerWithoutReplacement
+from torchrl.data import PrioritizedSampler, SamplerWithoutReplacement
 from torchrl.envs import CatFrames, SerialEnv, Transform, TransformedEnv
 from torchrl.modules import RandomPolicy
 from toy_env import ToyEnv, rollout_of, variable_length
@@ -172,6 +172,7 @@ def test_misuse_is_refused_in_words_and_stores_nothing() -> None:
         (good.unsqueeze(0), r"one environment in temporal order, got TensorDict \[1, 1\]; .*reshape\(-1\)"),
         (good.clone().set("pixels", torch.zeros(1, 12, 2, 2, dtype=torch.uint8)), "takes uint8 pixels"),
         (rollout_of(torch.zeros(2, 3, 4, 4, dtype=torch.uint8)), "holds pixels of shape"),
+        (good.clone().set(("collector", "mask"), torch.tensor([False])), "takes no padding: extend it by rollout"),
     ]
     for data, message in refusals:
         with pytest.raises(ValueError, match=message):
@@ -181,17 +182,22 @@ def test_misuse_is_refused_in_words_and_stores_nothing() -> None:
     for options in ({"capacity": 0}, {"slack": -1}, {"n_step": 0}, {"frame_stack": 0}, {"discount": 2}):
         with pytest.raises(ValueError, match=next(iter(options))):
             small(**options)
+    with pytest.raises(ValueError, match="keeps no priorities"):
+        small(sampler=PrioritizedSampler.__new__(PrioritizedSampler))
+    with pytest.raises(CheckpointError, match="of another kind of replay"):
+        replay.load_state_dict({"_storage": {}})
     for name in ("reward", "next", "row_of", "discount"):
         with pytest.raises(ValueError, match=name):
             small(extra_columns={name: ((1,), torch.float32)})
     assert len(replay) == 0
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e39])
 def test_numbers_that_are_not_finite_never_enter_a_replay_or_a_dataset(tmp_path: Path, value: float) -> None:
     replay, dataset = small(), FrameDataset.create(tmp_path, domain="mine", transitions=3)
     for name, key in {"reward": ("next", "reward"), "action": "action"}.items():
         rows = rollout_of(torch.stack([frame(number) for number in range(4)]))
+        rows[key] = rows[key].double()  # 1e39 is no float32
         rows[key][1] = value
         for store in (replay, dataset):
             with pytest.raises(NonFiniteError, match=f"The {name} of transition 1 is "):

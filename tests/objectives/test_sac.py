@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 
 import pytest
 import torch
@@ -149,6 +150,16 @@ def test_the_losses_have_the_names_and_results_of_torchrl(make, batch) -> None:
     assert {*found, "alpha", "entropy"} == set(expected.keys())
 
 
+@pytest.mark.parametrize(("make", "batch"), [
+    (rad_sac, transition_batch), (drq, pixel_batch), (skill_ddpg, skill_batch),
+])  # fmt: skip
+def test_a_missing_entry_is_named(make, batch) -> None:
+    loss = make()
+    for key in loss.in_keys:
+        with pytest.raises(KeyError, match=re.escape(f"{type(loss).__name__} needs the entry {key!r}")):
+            loss(batch().exclude(key))
+
+
 def test_target_entropy_and_discount_are_options_and_the_discount_is_raised_to_the_n_of_n_step_transitions() -> None:
     td = transition_batch()
     assert rad_sac(target_entropy=-100.0).target_entropy == -100
@@ -230,6 +241,7 @@ def test_skill_ddpg_equals_the_released_update_in_value_and_gradients() -> None:
     ("make", "message"),
     [
         (lambda: rad_sac(alpha_init=0.0), "`alpha_init` must be positive, got 0.0"),
+        (lambda: rad_sac(target_entropy="auto"), "`target_entropy`"),
         (lambda: rad_sac(gamma=1.01), "`gamma` must be at most 1, got 1.01"),
         (lambda: rad_sac(gamma=-0.5), "`gamma` must be at least 0"),
         (

@@ -10,11 +10,13 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
+from torchrl.modules import RandomPolicy
 from toy_env import PoisonedEnv, fixed_length
 from toy_runs import EPISODE, SIZE, make_encoder, toy_domain
 
 from crptpro.envs import make_env
-from crptpro.errors import NonFiniteError
+from crptpro.errors import CRPTproError, NonFiniteError
 from crptpro.modules import SquashedGaussianActor
 from crptpro.training import PixelAgent, evaluate, summarize, uniform_policy
 from crptpro.training.evaluate import Episode, Evaluator
@@ -48,6 +50,30 @@ def test_a_summary_has_the_unbiased_deviation() -> None:
     episodes = [Episode(index, value, 10, 0) for index, value in enumerate((1.0, 2.0, 6.0))]
     assert summarize(episodes) == {"mean": 3.0, "std": pytest.approx(7.0**0.5), "min": 1.0, "max": 6.0}
     assert summarize(episodes[:1])["std"] == 0.0
+
+
+def test_a_policy_of_torchrl_acts_as_the_function_that_it_wraps() -> None:
+    env, agent = make_toy_env(), make_agent()
+    expected = evaluate(agent, env, episodes=1, seed=5, progress=False)
+    wrapped = TensorDictModule(agent, ["pixels"], ["action"])
+    assert evaluate(wrapped, env, episodes=1, seed=5, progress=False) == expected
+    assert len(evaluate(RandomPolicy(env.full_action_spec), env, episodes=1, progress=False)) == 1
+
+
+@pytest.mark.parametrize(("policy", "got"), [
+    (lambda pixels: torch.zeros(3), r"\(3,\)"), (lambda pixels: torch.zeros(1, 2), r"\(1, 2\)"),
+    (lambda pixels: [0.0, 0.0], "list"), (TensorDictModule(torch.nn.Identity(), ["pixels"], ["features"]), "NoneType"),
+])  # fmt: skip
+def test_a_policy_that_returns_no_action_of_the_environment_is_refused(policy: Any, got: str) -> None:
+    with pytest.raises(ValueError, match=rf"decision 0: the policy returned {got} for an action of shape \(2,\)"):
+        evaluate(policy, make_toy_env(), episodes=1, progress=False)
+
+
+def test_an_environment_that_was_closed_says_so() -> None:
+    env = make_toy_env()
+    env.close()
+    with pytest.raises(CRPTproError, match="'toy_go' is closed"):
+        evaluate(make_agent(), env, episodes=1, progress=False)
 
 
 def test_a_non_finite_action_names_the_episode_and_the_decision() -> None:

@@ -231,6 +231,33 @@ def test_both_views_are_of_one_image_under_shifts_of_up_to_four_pixels() -> None
     assert sum(a == b for a, b in zip(first, second)) < 30
 
 
+class NormalisedBrightness(Brightness):
+    """Its encoder has batch statistics, and draws from the global generator."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = nn.Sequential(make_encoder(), nn.BatchNorm1d(self.encoder.feature_dim), nn.Dropout(0.5))
+        self.encoder.feature_dim = self.head.in_features
+
+
+def test_the_record_measures_embeddings_without_changing_what_is_trained() -> None:
+    states = []
+    for interval in (1, 3):
+        torch.manual_seed(0)
+        loss = NormalisedBrightness()
+        run(loss, 6, config=dataclasses.replace(SETTINGS, log_interval=interval))
+        states.append(loss)
+    assert same_state(*states)
+
+
+def test_one_buffer_given_twice_and_names_unfit_for_columns_are_refused() -> None:
+    dataset = make_dataset(0)
+    with pytest.raises(DatasetError, match="Dataset 1 is given twice as one object"):
+        run(Brightness(), 2, datasets=[dataset, dataset])
+    with pytest.raises(DatasetError, match="'dark, fast' cannot name columns"):
+        run(Brightness(), 2, datasets={"dark, fast": dataset})
+
+
 def test_datasets_are_left_as_they_were() -> None:
     datasets = make_datasets()
     before = [len(buffer.transform) for buffer in datasets.values()]

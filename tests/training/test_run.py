@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import nn
 from torchrl.checkpoint import GlobalRNGState
 from toy_runs import python, record
@@ -189,6 +190,44 @@ def test_other_settings_or_fewer_updates_than_were_done_are_refused_by_name(tmp_
 def test_an_impossible_setting_is_refused_by_name(config: type, setting: str, value: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         config(**{setting: value})
+
+
+def test_settings_are_compared_and_stored_as_plain_values_and_others_are_refused_before_the_work(
+    tmp_path: Path,
+) -> None:
+    settings = {
+        "data": Path("data"),
+        "weights": torch.ones(2),
+        "config": PretrainConfig(updates=3),
+        "kind": torch.float32,
+    }
+    walk(tmp_path / "plain", 5, settings=settings)
+    walk(tmp_path / "plain", 6, settings=settings)
+    with pytest.raises(ValueError, match=r"`settings\.loss\.act` cannot be stored"):
+        walk(tmp_path / "other", 5, settings={"loss": {"act": torch.nn.ReLU}})
+
+
+def test_numbers_are_logged_like_tensors() -> None:
+    with begin(None) as run:
+        run.keep()
+        for _ in run.until(2):
+            run.log({"loss": 0.5, "count": 3})
+            run.log(TensorDict({"loss": torch.tensor(1.5)}))
+            run.advance(1)
+        assert run.means("train") == {"loss": 1.0, "count": 3.0}
+        with pytest.raises(NonFiniteError):
+            run.log({"loss": float("nan")})
+
+
+def test_networks_of_a_component_must_be_finite_too(tmp_path: Path) -> None:
+    class Explorer(Walk):
+        networks = (torch.nn.Linear(1, 1),)
+
+    torch.nn.init.constant_(Explorer.networks[0].weight, float("nan"))
+    with begin(tmp_path) as run:
+        run.keep(explorer=Explorer())
+        with pytest.raises(NonFiniteError, match="the parameter weight is not finite"):
+            run.save()
 
 
 def test_a_damaged_checkpoint_costs_the_updates_since_the_one_before(

@@ -197,6 +197,19 @@ def test_later_batches_leave_the_features_of_earlier_ones_alone(prefetch):
             torch.testing.assert_close(batch[key[1]], expected, rtol=0, atol=1e-6 * float(expected.abs().max()))
 
 
+def test_batches_that_are_prefetched_while_the_ring_goes_round_hold_what_was_drawn():
+    encoder = small_encoder(strides=(1, 1))
+    replay = FrameReplay(
+        100, frame_shape=(3, SIZE, SIZE), action_dim=1, returns_pixels=False, batch_size=32, prefetch=3
+    )
+    replay.append_transform(dense_of(encoder, replay, pad=0))
+    for round_number in range(30):
+        frames = torch.full((51, 3, SIZE, SIZE), round_number, dtype=torch.uint8)
+        frames[:, 0, 0, 0] = torch.arange(51)
+        replay.extend(rollout_of(frames))
+        assert replay.sample()["features"].isfinite().all()
+
+
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x)), lambda x: x.clone()])
 def test_copies_hold_no_maps_and_no_state_give_the_same_and_leave_the_features_of_the_original_alone(duplicate):
     dense = dense_of()

@@ -72,6 +72,24 @@ def test_the_prototype_reward_equals_the_formula_typed_again():
         assert int(transform.queue_pointer) == pointer
 
 
+@pytest.mark.parametrize("make", [
+    lambda net: PrototypeReward(net, prototypes_of().to("meta"), queue_size=32), ParticleReward, ContrastiveReward,
+])  # fmt: skip
+def test_features_on_the_cpu_go_to_the_device_of_the_networks(make):
+    transform = make(nn.Linear(D, D, device="meta"))
+    assert transform(batch())["next", "intrinsic_reward"].device.type == "meta"
+
+
+@pytest.mark.parametrize("kind", [ParticleReward, ContrastiveReward])
+def test_a_reward_leaves_a_network_in_training_as_it_is(kind):
+    projector = nn.Sequential(nn.Linear(D, D), nn.BatchNorm1d(D), nn.Dropout(0.5)).train()
+    before = copy.deepcopy(projector.state_dict())
+    first, second = (kind(projector)(batch())["next", "intrinsic_reward"] for _ in range(2))
+    assert torch.equal(first, second)
+    assert projector.training
+    torch.testing.assert_close(projector.state_dict(), before, rtol=0, atol=0)
+
+
 def test_candidates_follow_the_softmax_over_the_batch():
     logits = torch.tensor([[0.0, 1.0, -1.0, 0.5], [2.0, 0.0, 0.0, 0.0]]).repeat_interleave(20_000, 0)
     drawn = draw_candidates(logits, seeded()).view(2, -1)

@@ -47,8 +47,10 @@ class RADSACLoss(NetworkLoss, SACLoss):
     * ``loss_alpha`` = mean(exp(log_alpha) * sg(-log pi - target_entropy)), gradient to ``log_alpha`` only.
 
     With the ``steps_to_next_obs`` of TorchRL's ``MultiStepTransform`` in the batch, gamma is raised to the number n of
-    steps; it is no in key. Features never receive a gradient. Differences from ``SACLoss``: squared error; alpha in place of its logarithm in
-    the temperature loss; the log-std squash and pre-tanh log-probability of
+    steps; it is no in key. Features never receive a gradient.
+
+    Differences from ``SACLoss``: squared error; alpha in place of its logarithm in the temperature loss; the log-std
+    squash and pre-tanh log-probability of
     :class:`~crptpro.modules.SquashedGaussianActor`; one critic network with two outputs and a shared trunk; and
     separate :meth:`critic_loss` and :meth:`actor_and_temperature_loss`, because the actor learns every second time,
     against the updated critic.
