@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+
+import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.transforms import Transform
@@ -31,9 +34,13 @@ class SlownessLoss(LossModule):
 class Activity(Transform):
     """Pays for features that differ from each other."""
 
+    def __init__(self, loss: LossModule, generator: torch.Generator, *, scale: float) -> None:
+        super().__init__()
+        self.scale = scale
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         features = tensordict["next", "features"].float()
-        return tensordict.set(("next", "intrinsic_reward"), features.std(dim=-1, keepdim=True))
+        return tensordict.set(("next", "intrinsic_reward"), self.scale * features.std(dim=-1, keepdim=True))
 
 
 DEFAULTS = {"updates": 2, "batch_size": 4, "encoder_tau": None}
@@ -47,6 +54,6 @@ register_method(
     loss_options={"margin": 0.5},
     encoder_options=SMALL,
     exploration=Exploration(
-        reward=lambda loss, generator: Activity(), env_steps=60, encoder_update_interval=5, random_agent_steps=10
+        reward=functools.partial(Activity, scale=2.0), env_steps=60, encoder_update_interval=5, random_agent_steps=10
     ),
 )

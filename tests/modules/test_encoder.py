@@ -168,3 +168,17 @@ def test_a_standardised_encoder_gives_features_of_mean_zero_and_deviation_one(dt
     twin.compute_dtype = dtype
     assert torch.equal(twin(pixels()), encoder(pixels()))
     assert torch.equal(copy.deepcopy(encoder)(pixels()), encoder(pixels()))
+
+
+def test_gradients_per_sample_by_functional_transforms_equal_those_one_by_one() -> None:
+    encoder, images = small(), pixels(3)
+    parameters = dict(encoder.named_parameters())
+
+    def loss(values: dict[str, Tensor], image: Tensor) -> Tensor:
+        return torch.func.functional_call(encoder, values, (image,)).square().sum()
+
+    found = torch.func.vmap(torch.func.grad(loss), (None, 0))(parameters, images)
+    for index, image in enumerate(images):
+        expected = torch.autograd.grad(loss(parameters, image), list(parameters.values()))
+        for gradient, one in zip(found.values(), expected, strict=True):
+            torch.testing.assert_close(gradient[index], one, rtol=1e-3, atol=1e-4)

@@ -242,6 +242,10 @@ def test_skill_ddpg_equals_the_released_update_in_value_and_gradients() -> None:
     [
         (lambda: rad_sac(alpha_init=0.0), "`alpha_init` must be positive, got 0.0"),
         (lambda: rad_sac(target_entropy="auto"), "`target_entropy`"),
+        (
+            lambda: RADSACLoss(SquashedGaussianActor(FEATURES, 3), TwinCritic(FEATURES, 2)),
+            "The actor was built with action_dim=3, the critic with 2",
+        ),
         (lambda: rad_sac(gamma=1.01), "`gamma` must be at most 1, got 1.01"),
         (lambda: rad_sac(gamma=-0.5), "`gamma` must be at least 0"),
         (

@@ -131,23 +131,25 @@ class FrameReplay(ReplayBuffer):
             return super()._sample(batch_size)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return a few counters (ring on disk) or the whole content (ring in RAM), and the transforms' state.
+        """Return a few counters (ring on disk) or the whole content (ring in RAM), and sampler's and transforms' state.
 
         The generator is not part of it.
         """
         with self._replay_lock:
-            return {"ring": self._storage.state_dict(), "transforms": self._transform.state_dict()}
+            parts = {"ring": self._storage, "transforms": self._transform, "sampler": self._sampler}
+            return {name: part.state_dict() for name, part in parts.items()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restore the content of the moment the state was taken, or raise a CheckpointError."""
         with self._replay_lock:
-            if not {"ring", "transforms"} <= state_dict.keys():
+            if not {"ring", "transforms", "sampler"} <= state_dict.keys():
                 raise CheckpointError(f"The state is of another kind of replay: it has {sorted(state_dict)}.")
             try:
                 self._transform.load_state_dict(state_dict["transforms"])
             except RuntimeError as reason:
                 raise CheckpointError(f"The state is of a replay with other transforms: {reason}") from reason
             self._storage.load_state_dict(state_dict["ring"])
+            self._sampler.load_state_dict(state_dict["sampler"])
 
     def dumps(self, path: str | Path) -> None:
         """Save the content, or the counters of a ring on disk, for :meth:`loads`, also on a machine with other GPUs."""

@@ -169,7 +169,8 @@ class PixelEncoder(nn.Module):
             x = x - offset
         # Forward and backward pass of 512 images in bfloat16 were 3 and 15 % faster than in PyTorch's usual layout on
         # two CPUs with AVX512-BF16, and a third faster on one with AMX.
-        x = x.contiguous(memory_format=torch.channels_last)
+        if torch.compiler.is_compiling() or not torch._C._are_functorch_transforms_active():  # vmap has no layouts
+            x = x.contiguous(memory_format=torch.channels_last)
         for weight, bias, stride in zip(weights, biases, self.strides):
             x = F.relu(F.conv2d(x, weight.to(x.dtype), bias.to(x.dtype), stride=stride), inplace=True)
         return x.contiguous()

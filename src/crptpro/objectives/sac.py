@@ -89,6 +89,12 @@ class RADSACLoss(NetworkLoss, SACLoss):
             if not isinstance(network, kinds):
                 expected = "a SquashedGaussianActor, then a TwinCritic"
                 raise TypeError(f"{type(self).__name__} takes {expected}; got a {type(network).__name__}.")
+        head = critic.head if isinstance(critic, PixelCritic) else critic
+        for name in ("feature_dim", "action_dim"):
+            if actor.config[name] != head.config[name]:
+                raise ValueError(
+                    f"The actor was built with {name}={actor.config[name]}, the critic with {head.config[name]}."
+                )
         if target_entropy is not None:
             target_entropy = as_float(target_entropy, "target_entropy")
         gamma = as_float(gamma, "gamma", minimum=0, maximum=1)

@@ -158,9 +158,9 @@ class PrototypeReward(IntrinsicReward):
         candidates = draw_candidates(F.normalize(weight.float(), dim=-1) @ latents.T, self.generator)
         count = candidates.shape[0]
         rows = (self.queue_pointer + torch.arange(count, device=latents.device)) % self.queue.shape[0]
-        self.queue.index_copy_(0, rows, latents[candidates])
+        self.queue.index_copy_(0, rows, latents[candidates].to(self.queue.dtype))
         self.queue_pointer.add_(count).remainder_(self.queue.shape[0])
-        return knn_distance(latents, self.queue, k=self.knn_k)
+        return knn_distance(latents, self.queue.to(latents.dtype), k=self.knn_k)
 
 
 def _check_latents(length: int, expected: int) -> None:
