@@ -19,6 +19,7 @@ from loss_cases import (
     rad_sac,
     skill_batch,
     skill_ddpg,
+    small_encoder,
     target_state,
     total,
     transition_batch,
@@ -160,6 +161,11 @@ def test_a_missing_entry_is_named(make, batch) -> None:
             loss(batch().exclude(key))
 
 
+def test_networks_in_the_wrong_order_are_refused() -> None:
+    with pytest.raises(TypeError, match=r"takes an actor such as .* got a TwinCritic as the actor"):
+        RADSACLoss(TwinCritic(FEATURES, 2), SquashedGaussianActor(FEATURES, 2))
+
+
 def test_target_entropy_and_discount_are_options_and_the_discount_is_raised_to_the_n_of_n_step_transitions() -> None:
     td = transition_batch()
     assert rad_sac(target_entropy=-100.0).target_entropy == -100
@@ -245,6 +251,10 @@ def test_skill_ddpg_equals_the_released_update_in_value_and_gradients() -> None:
         (
             lambda: RADSACLoss(SquashedGaussianActor(FEATURES, 3), TwinCritic(FEATURES, 2)),
             "The actor was built with action_dim=3, the critic with 2",
+        ),
+        (
+            lambda: DrQLoss(small_encoder(), SquashedGaussianActor(1, 2), TwinCritic(small_encoder().feature_dim, 2)),
+            "The actor was built with feature_dim=1",
         ),
         (lambda: rad_sac(gamma=1.01), "`gamma` must be at most 1, got 1.01"),
         (lambda: rad_sac(gamma=-0.5), "`gamma` must be at least 0"),

@@ -155,7 +155,8 @@ class FrameReplay(ReplayBuffer):
         """Save the content, or the counters of a ring on disk, for :meth:`loads`, also on a machine with other GPUs."""
         super().dumps(path)
         if (file := Path(path) / "transform.t").exists():
-            torch.save({name: value.cpu() for name, value in self._transform.state_dict().items()}, file)
+            state = self._transform.state_dict().items()
+            torch.save({name: value.cpu() if isinstance(value, Tensor) else value for name, value in state}, file)
 
     def loads(self, path: str | Path) -> None:
         """Restore what TorchRL's ``dumps`` wrote."""

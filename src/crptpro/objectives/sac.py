@@ -85,16 +85,14 @@ class RADSACLoss(NetworkLoss, SACLoss):
         target_entropy: float | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
-        for network, kinds in ((actor, SquashedGaussianActor), (critic, (TwinCritic, PixelCritic))):
-            if not isinstance(network, kinds):
-                expected = "a SquashedGaussianActor, then a TwinCritic"
-                raise TypeError(f"{type(self).__name__} takes {expected}; got a {type(network).__name__}.")
-        head = critic.head if isinstance(critic, PixelCritic) else critic
+        if not (hasattr(actor, "sample") and hasattr(actor, "action_dim")):
+            expected = "an actor such as SquashedGaussianActor, then a critic such as TwinCritic"
+            raise TypeError(f"{type(self).__name__} takes {expected}; got a {type(actor).__name__} as the actor.")
+        configs = [getattr(network, "config", {}) for network in (actor, getattr(critic, "head", critic))]
         for name in ("feature_dim", "action_dim"):
-            if actor.config[name] != head.config[name]:
-                raise ValueError(
-                    f"The actor was built with {name}={actor.config[name]}, the critic with {head.config[name]}."
-                )
+            given, other = (config.get(name) for config in configs)
+            if None not in (given, other) and given != other:
+                raise ValueError(f"The actor was built with {name}={given}, the critic with {other}.")
         if target_entropy is not None:
             target_entropy = as_float(target_entropy, "target_entropy")
         gamma = as_float(gamma, "gamma", minimum=0, maximum=1)
