@@ -306,19 +306,22 @@ def _list(returns: pd.Series) -> str:
 
 
 def _over_runs(returns: pd.Series, *, each: bool = False) -> str:
-    """Mean over runs, with the standard deviation from five runs up, below it the extremes or each run.
+    """Mean over runs, with the standard deviation from five runs up; the extremes below five, or each of up to nine.
 
     The number of runs is said where some of them have no value.
     """
     known = returns.dropna()
     if known.empty:
         return ""
-    count = [f"{len(known)} of {len(returns)} runs"] * (len(known) < len(returns))
-    if len(known) >= 5:
-        return _spread(known) + "".join(f" ({text})" for text in count)
-    runs = _list(known) if each else f"{known.min():.0f} to {known.max():.0f}"
-    details = "; ".join([runs] * (len(known) > 1) + count)
-    return f"{known.mean():.0f}" + (f" ({details})" if details else "")
+    details = []
+    if each and 1 < len(known) < 10:
+        details.append(_list(known))
+    elif 1 < len(known) < 5:
+        details.append(f"{known.min():.0f} to {known.max():.0f}")
+    if len(known) < len(returns):
+        details.append(f"{len(known)} of {len(returns)} runs")
+    mean = _spread(known) if len(known) >= 5 else f"{known.mean():.0f}"
+    return mean + (f" ({'; '.join(details)})" if details else "")
 
 
 def _spread(returns: pd.Series) -> str:
