@@ -14,3 +14,14 @@ os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 # 2 to 7 times as long. Without other work this costs nothing (`python -m benchmarks.contention`).
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")
+
+# TorchRL imports MuJoCo, whose import fails if it cannot load the backend that MUJOCO_GL names. Only rendering needs
+# one: `select_backend` tests it, and says what is wrong.
+if _named := os.environ.get("MUJOCO_GL"):
+    try:
+        import mujoco
+    except Exception:
+        os.environ["MUJOCO_GL"] = "off"
+        import mujoco  # noqa: F401
+
+        os.environ["MUJOCO_GL"] = _named

@@ -147,7 +147,7 @@ def _check_machine(free_ram: int, free_disk: int, gpus: Sequence[str]) -> list[F
 
 def _check_rendering(names: Sequence[str], *, has_gpu: bool) -> tuple[list[str], list[Finding]]:
     try:
-        from crptpro.envs import needs_gl, rendering  # the import itself refuses a wrong MUJOCO_GL
+        from crptpro.envs import needs_gl, rendering
 
         backend = rendering.select_backend() if any(map(needs_gl, names)) else None
     except RenderingError as reason:

@@ -1,9 +1,9 @@
 from __future__ import annotations
 
-import importlib
 import json
 import logging
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -12,7 +12,6 @@ from unittest import mock
 
 import pytest
 
-import crptpro.envs
 from crptpro.envs import rendering
 from crptpro.envs.rendering import PROOF_VARIABLE, TIMEOUT_VARIABLE, backend_card, first_frame_watchdog, select_backend
 from crptpro.errors import RenderingError
@@ -89,7 +88,7 @@ def test_a_users_mujoco_gl_is_kept_and_proven(probe: Probe, spelling: str) -> No
         # A user's choice is kept even if it does not render.
         ({"MUJOCO_GL": "egl"}, "sys.exit('no EGL display')", r"=egl was set by you.*\n.*no EGL display", ["egl"]),
         ({"MUJOCO_GL": "nonsense"}, ANSWER, r"MUJOCO_GL=nonsense .*egl.*osmesa.*glfw", []),
-        ({"MUJOCO_GL": "off"}, ANSWER, "switches rendering off", []),
+        ({"MUJOCO_GL": "off"}, ANSWER, "MUJOCO_GL=off is not a GL backend", []),
         # When nothing renders every reason is given; GLFW is only tried with a display.
         ({}, "sys.exit(f'{b} is broken')", r"(?s)No GL.*egl is broken.*osmesa is broken", ["egl", "osmesa"]),
         ({"DISPLAY": ":0"}, "sys.exit(1)", "glfw", ["egl", "osmesa", "glfw"]),
@@ -175,11 +174,30 @@ def test_the_watchdog_names_a_slow_first_frame_and_no_quick_one(caplog: pytest.L
     assert "MUJOCO_GL=osmesa" in caplog.text
 
 
-def test_a_backend_that_cannot_be_loaded_is_one_error_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    os.environ["MUJOCO_GL"] = "osmesa"
-    monkeypatch.setitem(sys.modules, "torchrl.envs", None)  # makes its import fail, as MuJoCo's failure does
-    with pytest.raises(RenderingError, match=r"MUJOCO_GL=osmesa is set, and cannot be loaded.*libosmesa6"):
-        importlib.reload(crptpro.envs)
+def test_an_empty_mujoco_gl_is_none(probe: Probe) -> None:
+    os.environ["MUJOCO_GL"] = ""
+    started = probe(f"if b == 'egl': sys.exit('no EGL')\n{ANSWER}")
+    assert select_backend() == os.environ["MUJOCO_GL"] == "osmesa"
+    assert started() == ["egl", "osmesa"]
+
+
+@pytest.mark.parametrize(("backend", "is_loaded"), [("nonsense", False), ("egl", True)])
+def test_a_backend_that_cannot_be_loaded_stops_nothing_but_rendering(backend: str, is_loaded: bool) -> None:
+    """MuJoCo, which TorchRL imports, fails at its import."""
+    code = "import crptpro.data, mujoco, os; print(os.environ['MUJOCO_GL'], hasattr(mujoco, 'GLContext'))"
+    environment = {**os.environ, "MUJOCO_GL": backend}
+    ran = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stdout, ran.stderr) == (0, f"{backend} {is_loaded}\n", "")
+
+
+def test_a_command_that_renders_says_in_one_line_that_mujoco_gl_is_wrong(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "crptpro", "collect", "pendulum", "--out", str(tmp_path)]
+    environment = {**os.environ, "MUJOCO_GL": "nonsense"}
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert ran.returncode == 1
+    (line,) = [line for line in ran.stderr.splitlines() if "MUJOCO_GL" in line]
+    assert "MUJOCO_GL=nonsense is not a GL backend. Set it to egl" in line
+    assert "Traceback" not in ran.stderr
 
 
 @pytest.mark.parametrize("text", ["inf", "nan", "0", "-1", "1e300", "soon"])

@@ -42,12 +42,6 @@ REMEDIES = {
     "glfw": "GLFW needs a display; on a machine without one use MUJOCO_GL=egl or MUJOCO_GL=osmesa.",
 }
 
-#: Other values of MUJOCO_GL that MuJoCo accepts.
-_SYNONYMS = {
-    **dict.fromkeys(("on", "enable", "enabled", "true", "1", ""), "glfw"),
-    **dict.fromkeys(("disable", "disabled", "false", "0"), "off"),
-}
-
 #: Renders one small scene with the backend of MUJOCO_GL and describes it as JSON. It runs in a separate process,
 #: because a broken GL driver may hang or crash, and imports MuJoCo alone, to take a second or two.
 _PROBE = """
@@ -74,18 +68,6 @@ renderer.close()
 print(json.dumps(answer))
 """
 PROBE_COMMAND = (sys.executable, "-c", _PROBE)
-
-
-def canonical_backend(text: str) -> str:
-    """Return ``"egl"``, ``"osmesa"``, ``"glfw"`` or ``"off"`` for a value of ``MUJOCO_GL``."""
-    name = text.strip().lower()
-    backend = _SYNONYMS.get(name, name)
-    if backend not in (*BACKENDS, "off"):
-        raise RenderingError(
-            f"MUJOCO_GL={text} is not a GL backend. Set it to egl (GPU or Mesa), osmesa (software) or glfw "
-            "(needs a display), or unset it and the first that renders is taken."
-        )
-    return backend
 
 
 def select_backend(*, processes: int = 1) -> str:
@@ -281,12 +263,15 @@ def _platform_candidates() -> tuple[str, ...]:
 
 def _requested_backend(proof: dict[str, Any]) -> str | None:
     """Return the backend of a MUJOCO_GL that the user set, and not an earlier call, perhaps on another machine."""
-    text = os.environ.get("MUJOCO_GL")
-    if text is None or (proof.get("chosen_by") == "crptpro" and text == proof["backend"]):
+    text = os.environ.get("MUJOCO_GL", "")
+    backend = text.strip().lower()
+    if not backend or (proof.get("chosen_by") == "crptpro" and backend == proof["backend"]):
         return None
-    backend = canonical_backend(text)
-    if backend == "off":
-        raise RenderingError(f"MUJOCO_GL={text} switches rendering off; unset it, or set it to egl or osmesa.")
+    if backend not in BACKENDS:
+        raise RenderingError(
+            f"MUJOCO_GL={text} is not a GL backend. Set it to egl (GPU or Mesa), osmesa (software) or glfw "
+            "(needs a display), or unset it and the first that renders is taken."
+        )
     return backend
 
 
