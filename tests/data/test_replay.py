@@ -498,6 +498,10 @@ def test_what_is_no_stored_replay_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no transition"):
         StoredReplay(tmp_path / "new")
     driver.write(5)
+    (tmp_path / "new" / "pixels.memmap").rename(tmp_path / "elsewhere")
+    with pytest.raises(DatasetError, match=r"pixels.memmap is missing"):
+        StoredReplay(tmp_path / "new")
+    (tmp_path / "elsewhere").rename(tmp_path / "new" / "pixels.memmap")
     with open(tmp_path / "new" / "pixels.memmap", "ab") as file:
         file.write(b"x")
     with pytest.raises(DatasetError, match=r"pixels.memmap is longer"):

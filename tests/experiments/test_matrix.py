@@ -11,6 +11,7 @@ import pytest
 import crptpro.objectives.methods as registry
 from crptpro import plugins
 from crptpro.domains import GROUPS
+from crptpro.experiments import matrix
 from crptpro.experiments.jobs import KINDS, Job, is_finished, make_plan
 from crptpro.experiments.matrix import EXPERIMENTS, METHODS, PAPER, SMALL, TINY, Cell, Request
 from crptpro.objectives import ProtoLoss, register_method
@@ -147,6 +148,13 @@ def test_timings_count_every_encoder_of_a_single_domain_method_and_need_only_dat
     # Device and threads are a part of what is measured, and of nothing else.
     assert several not in [c.job for c in cells("efficiency", SMALL, groups=("A",), threads=1)]
     assert cells("seen", SMALL, threads=1) == cells("seen", SMALL, threads=2)
+
+
+def test_an_explorers_replay_is_read_from_the_directory_that_its_domains_name_becomes() -> None:
+    name = "gymnasium:HalfCheetah-v5"
+    explorer = matrix.encoder(SMALL, "apt-c", [name], 0)
+    job = matrix.comparison("coverage", explorer, explorer, [], samples=1, seed=0)
+    assert option(job, "--replays") == f"{{{explorer.key}}}/replay/gymnasium-HalfCheetah-v5"
 
 
 def test_a_tiny_reproduction_needs_few_jobs_of_every_kind() -> None:

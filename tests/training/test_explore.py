@@ -113,10 +113,10 @@ def test_a_domains_agent_does_not_depend_on_its_company(tmp_path: Path) -> None:
     assert [row["episode_return"] for row in apart] == [row["episode_return"] for row in together]
 
 
-def test_a_domain_whose_name_has_a_slash_is_explored_and_resumed(tmp_path: Path) -> None:
-    run("apt-s", tmp_path, [toy_domain("a/b")], env_steps=20)
-    assert (tmp_path / "replay" / "a-b").is_dir()
-    assert run("apt-s", tmp_path, [toy_domain("a/b")], env_steps=20).training["datasets"][0]["domain"] == "a/b"
+def test_a_domain_whose_name_is_no_path_is_explored_and_resumed(tmp_path: Path) -> None:
+    run("apt-s", tmp_path, [toy_domain("a/b:c")], env_steps=20)
+    assert (tmp_path / "replay" / "a-b-c").is_dir()
+    assert run("apt-s", tmp_path, [toy_domain("a/b:c")], env_steps=20).training["datasets"][0]["domain"] == "a/b:c"
 
 
 def test_a_run_of_other_settings_is_refused_by_name(tmp_path: Path) -> None:

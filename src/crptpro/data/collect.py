@@ -139,7 +139,7 @@ def collect_group(
 
 
 def dataset_path(root: str | Path, domain_name: str) -> Path:
-    """Return the directory of a domain's dataset: its name, ``-`` for what a file system may refuse."""
+    """Return the directory of a domain's dataset or replay: its name, ``-`` for what a file system may refuse."""
     return Path(root) / re.sub(r"[^\w.+-]+", "-", domain_name)
 
 

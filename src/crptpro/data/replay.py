@@ -183,7 +183,7 @@ class StoredReplay(StackStorage):
         number, row_of = (map_rows(path / f"{name}.memmap", torch.int64, ()) for name in ("number", "row_of"))
         self.step = map_rows(path / "step.memmap", torch.int32, ())
         rows = len(number)
-        size = math.isqrt((path / "pixels.memmap").stat().st_size // (3 * rows))
+        size = math.isqrt(len(map_rows(path / "pixels.memmap", torch.uint8, ())) // (3 * rows))
         self.pixels = map_rows(path / "pixels.memmap", torch.uint8, (3, size, size), rows)
         # `number` counts from 1. Transitions that were overwritten, and rows never written (0), point elsewhere.
         end = int(number.max())

@@ -347,7 +347,7 @@ def _measurement(kind: str, trained: Job, command: Sequence[str], needs: Iterabl
 
 def comparison(kind: str, base: Job, explorer: Job, datasets: Sequence[Job], *, samples: int, seed: int) -> Job:
     """Return a comparison of an explorer's data with random data: ``coverage`` or ``embeddings``."""
-    replays = [f"{{{explorer.key}}}/replay/{domain}" for domain in explorer.facts["domains"]]
+    replays = [str(dataset_path(f"{{{explorer.key}}}/replay", domain)) for domain in explorer.facts["domains"]]
     command = ["measure", kind, "--encoder", _encoder_of(base), "--explorer", _encoder_of(explorer)]
     command += ["--replays", *replays, "--datasets", *map(_dataset_of, datasets), "--out", OWN]
     command += options(samples=samples, seed=seed)

@@ -20,6 +20,7 @@ from torchrl.objectives import LossModule
 
 from crptpro.artifact import require_disk
 from crptpro.data import FrameReplay
+from crptpro.data.collect import dataset_path
 from crptpro.domains import Domain, get_domain
 from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CRPTproError
@@ -310,7 +311,7 @@ class Explorer:
         self.agent = PixelAgent(loss.encoder, self.learner.loss.actor)
         self.networks = [self.learner.loss]
         self.reward = self._make_reward() if reward is None else reward
-        path = None if run.run_dir is None else run.run_dir / "replay" / name.replace("/", "-")
+        path = None if run.run_dir is None else dataset_path(run.run_dir / "replay", name)
         self.replay = self._make_replay(run, path, capacity, slack)
         self._parts = {**self.learner.components(), "reward": self.reward, "replay": self.replay,
                        "generators": self.generators}  # fmt: skip
