@@ -77,7 +77,7 @@ def make_drifting(
     return DriftingEnv(seed=seed, image_size=image_size, action_dim=action_dim, clock=clock)
 
 
-register_domain(Domain("drifting", "drifting_task", make=make_drifting, episode_env_steps=2 * LENGTH))
+register_domain(Domain("drifting", "drifting_task", make=make_drifting, action_repeat=2, episode_env_steps=2 * LENGTH))
 
 
 def drifting_dataset(
@@ -86,5 +86,5 @@ def drifting_dataset(
 ) -> Path:  # fmt: skip
     """Collect a dataset of the environment in one process, or return it at once where it is complete."""
     make = functools.partial(make_drifting, action_dim, clock=clock)
-    domain = Domain(f"drifting_{seed}", "drifting_go", make=make, episode_env_steps=2 * LENGTH)
+    domain = Domain(f"drifting_{seed}", "drifting_go", make=make, action_repeat=2, episode_env_steps=2 * LENGTH)
     return collect_random(domain, root, seed=seed, progress=False, transitions=transitions, image_size=image_size)

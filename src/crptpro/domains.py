@@ -27,19 +27,18 @@ class Domain:
     The paper pre-trains on domains and evaluates on tasks; tasks of one domain share their pixels.
 
     ``make`` builds your own environment, an unbatched TorchRL one on the CPU. It gets, by keyword, those of ``seed``,
-    ``image_size``, ``action_repeat`` (otherwise an agent step is one env step), ``camera``, ``quality`` and
-    ``physics_state`` that its signature names. ``pixels`` is one RGB image ``[H, W, 3]`` or ``[3, H, W]`` with
-    ``H = W = image_size``, uint8 or floats in [0, 1]; ``action`` is a float vector in [-1, 1]; the reward has shape
-    ``[1]``. Without ``truncated`` in its ``done_spec``, episodes end by termination alone. With ``physics_state`` it
-    may emit ``qpos`` and ``qvel``; entries that its transforms read back (``step_count``) stay, others are dropped. Its
-    ``set_seed`` must make the next ``reset`` reproducible. For worker processes ``make`` must be a function at a
-    module's top level or a ``functools.partial`` of one.
+    ``image_size``, ``action_repeat``, ``camera``, ``quality`` and ``physics_state`` that its signature names.
+    ``pixels`` is one RGB image ``[H, W, 3]`` or ``[3, H, W]`` with ``H = W = image_size``, uint8; ``action`` is a float
+    vector in [-1, 1]; the reward has shape ``[1]``. Without ``truncated`` in its ``done_spec``, episodes end by
+    termination alone. With ``physics_state`` it may emit ``qpos`` and ``qvel``; entries that its transforms read back
+    (``step_count``) stay, others are dropped. Its ``set_seed`` must make the next ``reset`` reproducible. For worker
+    processes ``make`` must be a function at a module's top level or a ``functools.partial`` of one.
     """
 
     name: str  #: of the domain, and of its dataset directory
     task: str  #: used for collection, a name for :func:`crptpro.envs.make_env`
-    action_repeat: int = 2  #: default number of env steps per agent step
-    camera: int | str | None = 0  #: index or name of the default camera; ``None`` leaves it to the environment
+    action_repeat: int = 1  #: env steps per agent step; others can be asked for if ``make`` takes it
+    camera: int | str | None = 0  #: index or name of the camera; ``None`` leaves it to the environment
     make: Callable[..., EnvBase] | None = None
     episode_env_steps: int | None = None  #: of a full episode; if ``None``, the time limit is 1000 agent steps
     source: Literal["suite", "manipulation", "gymnasium", "own"] = "own"  #: library of ``task``
@@ -50,7 +49,7 @@ class Domain:
                 object.__setattr__(self, name, as_int(value, name, minimum=1))
 
 
-_suite = functools.partial(Domain, episode_env_steps=1000, source="suite")
+_suite = functools.partial(Domain, action_repeat=2, episode_env_steps=1000, source="suite")
 
 PAPER_DOMAINS: dict[str, Domain] = {
     domain.name: domain
@@ -62,7 +61,7 @@ PAPER_DOMAINS: dict[str, Domain] = {
         _suite("quadruped", "quadruped_run", camera=2),
         _suite("cartpole", "cartpole_swingup_sparse"),
         _suite("pendulum", "pendulum_swingup"),
-        Domain("manipulation", "reach_duplo", camera="front_close", episode_env_steps=250, source="manipulation"),
+        _suite("manipulation", "reach_duplo", camera="front_close", episode_env_steps=250, source="manipulation"),
         _suite("hopper", "hopper_hop"),
         _suite("finger", "finger_spin"),
     )
@@ -119,7 +118,7 @@ def _built_in() -> dict[str, Domain]:
     found: dict[str, Domain] = {}
     for name, tasks in SUITE_TASKS.items():
         limit = None if name == "lqr" else 1000  # LQR alone has no time limit
-        domain = PAPER_DOMAINS.get(name) or Domain(name, tasks[0], episode_env_steps=limit, source="suite")
+        domain = PAPER_DOMAINS.get(name) or _suite(name, tasks[0], episode_env_steps=limit)
         found[name] = domain
         found |= {task: replace(domain, task=task) for task in tasks}
     found |= {task: replace(PAPER_DOMAINS["manipulation"], task=task) for task in MANIPULATION_TASKS}
@@ -135,10 +134,8 @@ def register_domain(domain: Domain) -> Domain:
 
     A name that several domains share means the one registered last. A worker process starts without registered
     domains: pass the ``Domain`` itself, or call ``register_domain`` at the top level of the module that defines
-    ``make``. A domain without ``make``, or with a name or letter of the paper's, is a ``CRPTproError``.
+    ``make``. A domain with a name or letter of the paper's is a ``CRPTproError``.
     """
-    if domain.make is None and domain.source == "own":
-        raise CRPTproError(f"Domain {domain.name!r} has no make; pass make=<function that builds the environment>.")
     for name in (domain.name, domain.task):
         if name in {*PAPER_DOMAINS, *TASKS, *GROUPS} or name.startswith(GYMNASIUM_PREFIX):
             raise CRPTproError(f"{name!r} is one of the built-in names; register the domain under another one.")
@@ -206,4 +203,5 @@ def _gymnasium_domain(name: str) -> Domain:
         near = difflib.get_close_matches(env_id, gymnasium.registry, n=5, cutoff=0.5)
         hint = f" Nearest: {', '.join(GYMNASIUM_PREFIX + n for n in near)}." if near else ""
         raise UnknownNameError(f"Gymnasium has no environment {env_id!r}.{hint}") from None
-    return Domain(name, name, camera=None, episode_env_steps=spec.max_episode_steps, source="gymnasium")
+    length = spec.max_episode_steps
+    return Domain(name, name, action_repeat=2, camera=None, episode_env_steps=length, source="gymnasium")

@@ -21,12 +21,12 @@ import psutil
 import pytest
 import torch
 from torchrl.modules import RandomPolicy
-from toy_env import DYING, FAILING, FIXED, SLOW, VARIABLE, ToyEnv, data_bytes, make_toy, variable_length
+from toy_env import DYING, FAILING, FIXED, SEEDLESS, SLOW, VARIABLE, ToyEnv, data_bytes, make_toy, variable_length
 
 from crptpro.data import FrameDataset, collect, collect_group, collect_random
 from crptpro.data.collect import dataset_path
 from crptpro.domains import Domain
-from crptpro.envs import make_env, rendering
+from crptpro.envs import factory, make_env
 from crptpro.errors import CRPTproError, DatasetError, DiskSpaceError, EnvCrashedError, RenderingError, WorkerLostError
 from crptpro.seeding import derive_seed
 
@@ -81,7 +81,7 @@ def test_actions_are_uniform_and_physics_is_stored_beside_each_frame(collected: 
 
 
 def test_an_endless_episode_is_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(collect, "LONGEST_EPISODE_AGENT_STEPS", 12)
+    monkeypatch.setattr(factory, "LONGEST_EPISODE_AGENT_STEPS", 12)
     domain = Domain("endless", "endless_go", make=partial(make_toy, lambda seed: 10**9))
     dataset = FrameDataset.open(collect_random(domain, tmp_path, transitions=27, **SMALL))
     assert dataset.transitions["next", "truncated"].squeeze(-1).nonzero().flatten().tolist() == [11, 23, 26]
@@ -146,11 +146,10 @@ def test_domains_are_collected_once_each_into_safe_directories(tmp_path: Path, m
 
 
 def test_the_card_says_with_what_was_collected_without_gl(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rendering, "select_backend", lambda **_: pytest.fail("a GL backend was proven"))
+    monkeypatch.setattr(collect, "select_backend", lambda **_: pytest.fail("a GL backend was proven"))
     card = FrameDataset.open(collect_random(FIXED, tmp_path, transitions=5, quality="fast", **SMALL)).card
-    assert (card["quality"], card["image_size"]) == ("fast", 8)
+    assert (card["quality"], card["image_size"], card["render"]) == ("fast", 8, {})
     assert {"torch", "torchrl", "mujoco", "python"} <= set(card["versions"])
-    assert card["sessions"][0]["versions"] == card["versions"]
 
 
 def test_progress_is_logged_where_the_output_is_no_terminal(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -168,14 +167,19 @@ def test_an_environment_that_fails_is_named_with_its_cause_and_does_not_block_th
     (note,) = failure.value.__notes__
     assert note.startswith("Collecting episode 0 of toy-failing failed. What was collected is kept")
     repaired = Domain(FAILING.name, FAILING.task, make=FIXED.make)
-    card = FrameDataset.open(collect_random(repaired, tmp_path, transitions=5, **SMALL)).card
-    assert len(card["sessions"]) == 1  # the failed one contributed nothing
+    assert len(FrameDataset.open(collect_random(repaired, tmp_path, transitions=5, **SMALL))) == 5
 
 
 @pytest.mark.slow
 def test_a_process_that_dies_gives_one_clear_error(tmp_path: Path) -> None:
-    with pytest.raises(WorkerLostError, match=r"episode 0 of toy-dying.* exited with status 7.*run the same"):
+    with pytest.raises(WorkerLostError, match=r"episode 0 of toy-dying has died.*use fewer workers.*run the same"):
         collect_random(DYING, tmp_path, transitions=50, workers=2, **SMALL)
+
+
+@pytest.mark.slow
+def test_an_exception_that_cannot_leave_its_process_is_reported_by_what_it_says(tmp_path: Path) -> None:
+    with pytest.raises(EnvCrashedError, match=r"no seed \d+ in the catalogue \(UncopiableError in "):
+        collect_random(SEEDLESS, tmp_path, transitions=50, workers=2, **SMALL)
 
 
 def test_an_environment_that_no_other_process_can_import_is_collected_in_this_one_which_is_said(
@@ -285,7 +289,7 @@ def test_processes_that_cannot_be_started_are_an_error_that_says_why(tmp_path: P
     programs = [start(tmp_path / "few", workers=4, limit=few), start(tmp_path / "unguarded", more=unguarded)]
     limited, unguarded_said = (program.communicate(timeout=300)[1] for program in programs)
     assert b"Use fewer workers, or raise the limit of open files (`ulimit -n 4096`)" in limited
-    assert b'needs `if __name__ == "__main__":` around its main program' in unguarded_said
+    assert b'lacks `if __name__ == "__main__":` around its main program' in unguarded_said
 
 
 @pytest.mark.gl

@@ -337,13 +337,13 @@ def test_another_backend_or_renderer_may_not_continue(tmp_path: Path, now: dict[
     rendered = {"backend": "egl", "gl_renderer": "llvmpipe"}
     for renderer in (now, rendered):  # before the first episode any may begin
         dataset = FrameDataset.create(tmp_path, **collection_request())
-        dataset.writer.note_environment(renderer)
+        dataset.writer.note_rendering(renderer)
         dataset.writer.close() if renderer == now else dataset.extend(random_episode(10, size=8))
     dataset.writer.close()
     resumed = FrameDataset.create(tmp_path, **collection_request())
-    resumed.writer.note_environment(rendered)
+    resumed.writer.note_rendering(rendered)
     with pytest.raises(DatasetError, match=message):
-        resumed.writer.note_environment(now)
+        resumed.writer.note_rendering(now)
     resumed.writer.close()
 
 

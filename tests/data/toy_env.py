@@ -86,6 +86,21 @@ class PoisonedEnv(ToyEnv):
         return found.set("reward", torch.full((1,), torch.nan)) if self.steps == 14 else found
 
 
+class UncopiableError(Exception):
+    """Cannot be made again from its message, as unpickling would."""
+
+    def __init__(self, seed: int, place: str):
+        super().__init__(f"no seed {seed} in {place}")
+
+
+class SeedlessEnv(ToyEnv):
+    """Its seeding fails, outside reset and step."""
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed:
+            raise UncopiableError(seed, "the catalogue")
+
+
 def fixed_length(seed: int) -> int:
     return 10
 
@@ -108,8 +123,10 @@ def _fail(count: int) -> None:
         raise ValueError("the simulator exploded")
 
 
-def make_toy(lengths: Any, on_step: Any = None, *, seed: int, image_size: int, physics_state: bool) -> EnvBase:
-    return ToyEnv(lengths, seed=seed, image_size=image_size, physics_state=physics_state, on_step=on_step)
+def make_toy(
+    lengths: Any, on_step: Any = None, kind: type[ToyEnv] = ToyEnv, *, seed: int, image_size: int, physics_state: bool
+) -> EnvBase:
+    return kind(lengths, seed=seed, image_size=image_size, physics_state=physics_state, on_step=on_step)
 
 
 FIXED = Domain("toy-fixed", "toy-fixed_go", make=partial(make_toy, fixed_length), episode_env_steps=10)
@@ -117,6 +134,7 @@ VARIABLE = Domain("toy-variable", "toy-variable_go", make=partial(make_toy, vari
 SLOW = Domain("toy-slow", "toy-slow_go", make=partial(make_toy, variable_length, _pause_like_a_renderer))
 DYING = Domain("toy-dying", "toy-dying_go", make=partial(make_toy, fixed_length, _die))
 FAILING = Domain("toy-failing", "toy-failing_go", make=partial(make_toy, fixed_length, _fail))
+SEEDLESS = Domain("toy-seedless", "toy-seedless_go", make=partial(make_toy, fixed_length, None, SeedlessEnv))
 
 
 def rollout_of(

@@ -64,27 +64,11 @@ def test_frames_outlive_a_buffer_that_is_used_again(library: str, frame_stack: i
     assert shown[:, -1, 0, 0].tolist() == [1, 2, 3]
 
 
-@pytest.mark.parametrize(("library", "size"), [("gymnasium", SIZE), ("gymnasium", 3 * SIZE), ("own", SIZE)])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_floats_are_scaled_once_and_said(library: str, size: int, dtype: Any, caplog: pytest.LogCaptureFixture) -> None:
-    def image(clock: int) -> np.ndarray:  # Gymnasium's are resized
-        return np.full((size, size, 3), clock / 5, dtype)
-
-    with caplog.at_level(logging.WARNING), shows(image, library=library) as env:
-        shown = env.rollout(3)["next", "pixels"]
-    assert shown.dtype == torch.uint8
-    assert shown[:, -1, 0, 0].tolist() == [51, 102, 153]
-    assert caplog.text.count("multiplied by 255") == 1
-
-
 @both
-@pytest.mark.parametrize(("image", "complaint"), [
-    (grey(300, np.uint16), "uint16"), (grey(3, np.int64), "int64"), (grey(True, bool), "bool"),
-    (grey(np.nan, np.float32), "nan"), (grey(200.0, np.float32), "200"), (grey(-0.5, np.float64), "-0.5"),
-])  # fmt: skip
-def test_other_numbers_than_bytes_and_unit_floats_are_refused(library: str, image: np.ndarray, complaint: str) -> None:
-    with pytest.raises(CRPTproError, match=complaint):  # noqa: SIM117
-        with shows(lambda _: image, library=library) as env:
+@pytest.mark.parametrize("dtype", ["uint16", "int64", "bool", "float32", "float64"])
+def test_other_numbers_than_bytes_are_refused_with_the_remedy(library: str, dtype: str) -> None:
+    with pytest.raises(EnvOutputError, match=f"has dtype {dtype}; .*Multiply floats from 0 to 1 by 255"):  # noqa: SIM117
+        with shows(lambda _: grey(1, dtype), library=library) as env:
             env.reset()
 
 
@@ -168,16 +152,15 @@ def test_an_exception_of_an_environments_own_is_passed_on_with_its_name_and_the_
 
 
 def test_an_exception_of_an_environments_own_is_never_taken_for_a_setting() -> None:
-    def picky(render_mode: str = "", camera_id: int = 0) -> Any:
+    def picky(render_mode: str = "") -> Any:
         raise TypeError("unsupported operand type(s) for +: 'int' and 'str'")
 
     picky.metadata = {"render_modes": ["rgb_array"]}  # type: ignore[attr-defined]
     gymnasium.register("CrptproPicky-v0", picky, disable_env_checker=True)
     with pytest.raises(EnvCrashedError, match=r"unsupported operand.*make\(\).*CrptproPicky") as caught:
-        make_env("gymnasium:CrptproPicky-v0", seed=0, camera=0)
+        make_env("gymnasium:CrptproPicky-v0", seed=0)
     del gymnasium.registry["CrptproPicky-v0"]
     assert __file__ in str(caught.value)
-    assert "takes no camera" not in str(caught.value)
 
     def make(quality: str) -> EnvBase:
         raise ValueError("no such quality")
@@ -187,18 +170,18 @@ def test_an_exception_of_an_environments_own_is_never_taken_for_a_setting() -> N
 
 
 @pytest.mark.parametrize("limit", [5, None])
-def test_a_step_of_the_old_api_is_answered_with_what_is_expected(limit: int | None) -> None:
+def test_a_step_of_the_old_api_is_passed_on_with_what_is_expected(limit: int | None) -> None:
     with painter(limit, answer=lambda clock: (np.zeros(1), 0.0, False, {})) as task:
         env = make_env(task, seed=0, image_size=SIZE)
-        with pytest.raises(EnvOutputError, match=rf"{task}.*five values.*got 4"):
+        with pytest.raises(EnvCrashedError, match=rf"expected 5, got 4.*in step\(\) of the environment '{task}'"):
             env.rollout(2)
 
 
 @pytest.mark.parametrize(("space", "complaint"), [
-    (Discrete(3), "Discrete actions"), (Box(0, 10, (2,), np.int64), "actions of int64"),
-    (Box(-1.0, 1.0, (0,)), "empty action"), (Box(-HUGE, HUGE, (2,)), "without bounds"),
-    (Box(-np.inf, np.inf, (2,)), "without bounds"), (Box(0.0, HUGE, (2,)), "one side only"),
-    (Box(1.0, 1.0, (2,)), r"empty action bounds \(low >= high\)"),
+    (Discrete(3), "Discrete actions"), (Box(-HUGE, HUGE, (2,)), "without bounds"),
+    (Box(-np.inf, np.inf, (2,)), "without bounds"), (Box(0, 10, (2,), np.int64), r"int64 from \[0.0, 0.0\]"),
+    (Box(-1.0, 1.0, (0,)), r"from \[\] to \[\]"), (Box(0.0, HUGE, (2,)), "a lower and an upper bound"),
+    (Box(1.0, 1.0, (2,)), r"from \[1.0, 1.0\] to \[1.0, 1.0\]"),
 ])  # fmt: skip
 def test_action_spaces_that_cannot_be_mapped_from_minus_1_to_1_are_refused_by_name(space: Any, complaint: str) -> None:
     with painter(action_space=space) as task, pytest.raises(CRPTproError, match=rf"{task}.*{complaint}"):

@@ -89,24 +89,25 @@ def test_make_is_given_what_it_names_and_what_a_partial_has_bound_is_decided() -
         given.update(image_size=image_size, quality=quality, action_repeat=action_repeat, camera=camera)
         return PlainEnv()
 
-    domain = own(functools.partial(make, action_repeat=4, camera="side"))
-    make_env(domain, seed=0, image_size=8, quality="fast")
+    make_env(own(functools.partial(make, action_repeat=4, camera="side")), seed=0, image_size=8, quality="fast")
     assert given == {"image_size": 8, "quality": "fast", "action_repeat": 4, "camera": "side"}
-    assert resolve_action_repeat(domain) == 4
-    make_env(own(make), seed=0, image_size=8, action_repeat=3, camera="top")
+    make_env(own(make, camera="top"), seed=0, image_size=8, action_repeat=3)
     assert given == {"image_size": 8, "quality": "exact", "action_repeat": 3, "camera": "top"}
     env = make_env(own(PlainEnv), seed=0, image_size=8)  # a class is a function, too
     assert env.rollout(2)["next", "reward"].sum() == 3.0
 
 
-def test_an_option_that_make_does_not_take_is_said_to_do_nothing(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_quality_that_make_does_not_take_does_nothing_and_an_action_repeat_is_refused(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    domain = own(make_chw, action_repeat=3)
     with caplog.at_level(logging.WARNING):
-        make_env(own(make_chw), seed=0, image_size=8, action_repeat=1)
+        make_env(domain, seed=0, image_size=8, action_repeat=3)
         assert caplog.text == ""
-        make_env(own(make_chw), seed=0, image_size=8, action_repeat=4, quality="fast", camera="top")
-    assert "a decision is 1 env step(s), not 4" in caplog.text
-    assert "takes no quality" in caplog.text
-    assert "takes no camera: camera='top' changes nothing" in caplog.text
+        make_env(domain, seed=0, image_size=8, quality="fast")
+    assert "takes no quality: 'fast' changes nothing" in caplog.text
+    with pytest.raises(CRPTproError, match=r"takes no action_repeat: an agent step is 3 env step\(s\), not 4"):
+        make_env(domain, seed=0, image_size=8, action_repeat=4)
 
 
 @each_stack
@@ -131,12 +132,12 @@ def test_an_endless_environment_is_truncated_and_starts_again(truncates: bool, m
     assert make_env(limited, seed=0, image_size=8).rollout(50).shape == (12,)
 
 
-def test_agent_steps_are_counted_by_what_an_environment_repeats() -> None:
-    repeating = own(lambda action_repeat: PlainEnv(), action_repeat=np.int64(4), episode_env_steps=2e1)
-    endless = own(make_chw)
-    assert resolve_action_repeat(endless) == resolve_action_repeat(endless, 4) == 1
+def test_agent_steps_are_counted_by_what_a_domain_repeats() -> None:
+    repeating, endless = own(make_chw, action_repeat=np.int64(4), episode_env_steps=2e1), own(make_chw)
+    assert resolve_action_repeat(endless) == 1
     assert (resolve_action_repeat(repeating), resolve_action_repeat(repeating, 2)) == (4, 2)
-    assert resolve_action_repeat("cheetah") == 2
+    for name in ("cheetah", "acrobot_swingup", "lqr", "reach_site", "gymnasium:HalfCheetah-v5"):
+        assert resolve_action_repeat(name) == 2
     assert repr(episode_length(repeating)) == "5"
     assert episode_length("cheetah") == episode_length("dog_run") == 500
     assert episode_length("reach_duplo") == episode_length("manip_lift_brick") == 125

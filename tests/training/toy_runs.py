@@ -74,7 +74,7 @@ def make_toy(env: type[ToyEnv], on_step: Any, *, seed: int, image_size: int, act
 
 
 def toy_domain(name: str, env: type[ToyEnv] = ToyEnv, on_step: Any = None) -> Domain:
-    return Domain(name, f"{name}_go", make=partial(make_toy, env, on_step))
+    return Domain(name, f"{name}_go", make=partial(make_toy, env, on_step), action_repeat=2)
 
 
 def signalling(name: str, step: int, number: signal.Signals) -> Domain:

@@ -6,13 +6,12 @@ import functools
 import logging
 import pickle
 import re
-import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Future, wait
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +22,10 @@ from torchrl.modules import RandomPolicy
 
 from crptpro.artifact import require_disk
 from crptpro.data.dataset import FrameDataset
-from crptpro.domains import LONGEST_EPISODE_AGENT_STEPS, Domain, expand_groups, get_domain
+from crptpro.domains import Domain, expand_groups, get_domain
+from crptpro.envs import episode_length, make_env, needs_gl, resolve_action_repeat
+from crptpro.envs.base import passed_on
+from crptpro.envs.rendering import backend_card, select_backend
 from crptpro.errors import CRPTproError, DatasetError, RenderingError, WorkerLostError
 from crptpro.progress import Progress
 from crptpro.seeding import derive_seed, kept_global_rng
@@ -52,7 +54,6 @@ def collect_group(
     colors: Colors = "normal",
     image_size: int = 84,
     action_repeat: int | None = None,
-    camera: int | str | None = None,
     progress: bool = True,
 ) -> dict[str, Path]:
     """Collect the datasets of several domains with a uniform random policy, or continue interrupted collections.
@@ -77,8 +78,7 @@ def collect_group(
         quality: as of :func:`crptpro.envs.make_env`.
         colors: likewise; the episodes are the same in all colours.
         image_size: H = W, pixels.
-        action_repeat: env steps per agent step; the domain's (2) if ``None``.
-        camera: the domain's if ``None``.
+        action_repeat: env steps per agent step; the domain's (2; 1 of your own) if ``None``.
         progress: show a progress line per domain (log lines where the output is no terminal).
 
     Returns:
@@ -93,10 +93,6 @@ def collect_group(
         EnvCrashedError: the code of an environment raised an exception; likewise.
         CRPTproError: an environment returned something unusable, or hangs; likewise.
     """
-    # Imported late: nothing that reads datasets needs the simulators.
-    from crptpro.envs import episode_length, make_env, needs_gl, resolve_action_repeat
-    from crptpro.envs.rendering import select_backend
-
     transitions = as_int(transitions, "transitions", minimum=1)
     workers, seed = as_int(workers, "workers", minimum=1), as_int(seed, "seed", minimum=0, maximum=MAX_SEED)
     root, image_size = as_path(root, "root"), as_int(image_size, "image_size", minimum=1)
@@ -110,10 +106,9 @@ def collect_group(
             paths[domain.name] = path
             repeat = resolve_action_repeat(domain, action_repeat)
             settings: dict[str, Any] = {"image_size": image_size, "action_repeat": repeat, "quality": quality}
-            settings |= {"colors": colors, "camera": domain.camera if camera is None else camera}
-            dataset = FrameDataset.create(
-                path, domain=domain.name, transitions=transitions, task=domain.task, seed=seed, **settings
-            )
+            settings["colors"] = colors
+            about = {"task": domain.task, "seed": seed, "camera": domain.camera, **settings}
+            dataset = FrameDataset.create(path, domain=domain.name, transitions=transitions, **about)
             if dataset.is_complete:
                 logger.info("%s: %s is complete", domain.name, path)
                 continue
@@ -132,9 +127,9 @@ def collect_group(
             if any(needs_gl(job.domain) for job in jobs):
                 # Proven here once, for as many renderers as will run: some drivers hang when several start together.
                 select_backend(processes=workers)
-            with closing(_Workers({job.domain.name: job.make for job in jobs}, workers)) as pool:
-                for job in jobs:
-                    _collect(job, seed, pool, progress)
+            for job in jobs:
+                job.writer.note_rendering(backend_card() if needs_gl(job.domain) else {})
+                _collect(job, seed, workers, progress)
     return paths
 
 
@@ -179,133 +174,104 @@ def _announce(jobs: list[_Job], root: Path, image_size: int) -> None:
     require_disk(root, sum(sizes.values()), f"Collecting {', '.join(sizes)}")
 
 
-def _collect(job: _Job, seed: int, pool: _Workers, progress: bool) -> None:
+def _collect(job: _Job, seed: int, workers: int, progress: bool) -> None:
     """Collect one dataset; its episodes are planned, and appended, in the order of their indices."""
     name, dataset, writer, length = job.domain.name, job.dataset, job.writer, job.length
-    longest = max(LONGEST_EPISODE_AGENT_STEPS, length or 0)
     bar = Progress(writer.target, writer.transitions, "transitions", label=name, is_shown=progress, lines=10)
-    queue: deque[tuple[str, Future]] = deque()
-    while not dataset.is_complete:
-        while len(queue) < pool.ahead and writer.missing > len(queue) * (length or 1):
-            index = writer.episodes + len(queue)
-            title = f"episode {index} of {name}"
-            plan = {
-                "env_seed": derive_seed(seed, "collect", name, index),
-                "action_seed": derive_seed(seed, "collect-actions", name, index),
-                "limit": min(writer.missing - len(queue), longest),
-            }
-            queue.append((title, pool.submit(title, name, plan)))
-        title, future = queue.popleft()
-        card, rollout = pickle.loads(pool.result(future, title))
-        length = length or len(rollout)
-        writer.note_environment(card)
-        dataset.extend(rollout)
-        writer.end_episode()
-        bar.reach(writer.transitions)
-        bar.show()
+    steps = SPAWN.RawValue("q", 0)  # of all workers
+    queue: deque[tuple[str, Future[bytes]]] = deque()
+    ahead = 2 * workers if workers > 1 else 1  # episodes under way
+    with ExitStack() as stack:
+        if workers > 1:
+            pool: Executor = WorkerPool(workers, _prepare, job.make, steps)
+            stack.callback(pool.end)  # type: ignore[attr-defined]
+        else:
+            pool = Inline()
+            _prepare(job.make, steps)
+            stack.callback(_close)
+        while not dataset.is_complete:
+            while len(queue) < ahead and writer.missing > len(queue) * (length or 1):
+                index = writer.episodes + len(queue)
+                plan = {
+                    "env_seed": derive_seed(seed, "collect", name, index),
+                    "action_seed": derive_seed(seed, "collect-actions", name, index),
+                    "limit": writer.missing - len(queue),
+                }
+                with _clear_failures(title := f"episode {index} of {name}"):
+                    queue.append((title, pool.submit(_roll, name, plan)))
+            title, future = queue.popleft()
+            _wait(future, title, steps)
+            with _clear_failures(title):
+                rollout = pickle.loads(future.result())
+            length = length or len(rollout)
+            dataset.extend(rollout)
+            writer.end_episode()
+            bar.reach(writer.transitions)
+            bar.show()
     bar.close()
 
 
-class _Workers:
-    """Roll planned episodes out, in this process or in several others."""
-
-    def __init__(self, factories: Mapping[str, Callable[[], EnvBase]], workers: int):
-        self.workers = workers
-        self._steps = SPAWN.RawValue("q", 0)
-        self.ahead = 2 * workers if workers > 1 else 1  # episodes under way
-        self._worker = _Worker(factories, self._steps)
-        self._work = _work if workers > 1 else self._worker.roll
-        self._pool: Any = WorkerPool(workers, _prepare, factories, self._steps) if workers > 1 else Inline()
-
-    def submit(self, title: str, domain: str, plan: dict[str, int]) -> Future:
-        try:
-            return self._pool.submit(self._work, title, domain, plan)
-        except BrokenProcessPool:
-            raise self._lost(title) from None
-        except OSError as reason:
-            raise CRPTproError(
-                f"{self.workers} collecting processes cannot be started: {reason}. Use fewer workers, or raise the "
-                "limit of open files (`ulimit -n 4096`)."
-            ) from reason
-
-    def result(self, future: Future, title: str) -> bytes:
-        """Wait for an episode as long as any worker makes steps."""
-        seen, seen_s = -1, 0.0
-        while not wait([future], 1.0).done:
-            if self._steps.value != seen:
-                seen, seen_s = self._steps.value, time.monotonic()
-            elif time.monotonic() - seen_s > STALL_S:
-                raise RenderingError(
-                    f"The processes that collect {title} have made no step for {STALL_S:.0f} s; a render driver that "
-                    f"hangs is the usual cause. {_AGAIN}, with fewer workers or another backend (MUJOCO_GL=osmesa, or "
-                    "egl)."
-                )
-        try:
-            return future.result()
-        except BrokenProcessPool:
-            raise self._lost(title) from None
-
-    def _lost(self, title: str) -> WorkerLostError:
-        processes = self._pool.processes.values()
-        deadline = time.monotonic() + 2.0
-        # Not `join`: the executor joins them in its thread, and only one of two that wait at once learns the status.
-        while any(process.exitcode is None for process in processes) and time.monotonic() < deadline:
-            time.sleep(0.01)
-        # The executor terminates the others after the first has died.
-        codes = [process.exitcode for process in processes if process.exitcode not in (None, 0, -signal.SIGTERM)]
-        code = codes[0] if codes else -signal.SIGTERM
-        how = f"was killed by signal {-code}" if code < 0 else f"exited with status {code}"
-        hint = "Look at the messages above."
-        if code == -signal.SIGKILL:
-            hint = "Out of memory is the usual cause of signal 9: use fewer workers."
-        elif not self._steps.value:
-            hint += ' A script that collects needs `if __name__ == "__main__":` around its main program.'
-        return WorkerLostError(f"A process that collected {title} {how}. {hint} {_AGAIN}.")
-
-    def close(self) -> None:
-        self._worker.close()
-        if self.workers > 1:
-            self._pool.end()
+@contextmanager
+def _clear_failures(title: str) -> Iterator[None]:
+    """Say of a failure in the body what was collected, and what can be done."""
+    try:
+        yield
+    except BrokenProcessPool:
+        raise WorkerLostError(
+            f"A process that collected {title} has died. Out of memory is the usual cause: use fewer workers. At the "
+            'start it may be a script that lacks `if __name__ == "__main__":` around its main program. '
+            f"{_AGAIN}."
+        ) from None
+    except OSError as reason:
+        raise CRPTproError(
+            f"The process for {title} cannot be started: {reason}. Use fewer workers, or raise the limit of open files "
+            "(`ulimit -n 4096`)."
+        ) from reason
+    except Exception as reason:
+        reason.add_note(f"Collecting {title} failed. {_AGAIN} once the cause is removed.")
+        raise
 
 
-class _Worker:
-    """Rolls out planned episodes, in the environment of one domain at a time, and counts ``steps``."""
-
-    def __init__(self, factories: Mapping[str, Callable[[], EnvBase]], steps: Any):
-        self._factories, self._steps = factories, steps
-        self._domain, self._env = "", None
-
-    def roll(self, title: str, domain: str, plan: Mapping[str, int]) -> bytes:
-        """Return the environment's card and the episode, pickled: torch would send tensors as open files."""
-
-        def count(*_: Any) -> None:
-            self._steps.value += 1
-
-        try:
-            if domain != self._domain:
-                self.close()
-                self._domain, self._env = domain, self._factories[domain]()
-            env: Any = self._env
-            with kept_global_rng():
-                rollout = collect_episode(env, callback=count, **plan)
-        except Exception as reason:
-            reason.add_note(f"Collecting {title} failed. {_AGAIN} once the cause is removed.")
-            raise
-        return pickle.dumps((env.card() if hasattr(env, "card") else {}, rollout))
-
-    def close(self) -> None:
-        if self._env is not None:
-            self._env.close()
-        self._domain, self._env = "", None
+def _wait(future: Future, title: str, steps: Any) -> None:
+    """Wait for an episode as long as any worker makes steps."""
+    seen, seen_s = -1, 0.0
+    while not wait([future], 1.0).done:
+        if steps.value != seen:
+            seen, seen_s = steps.value, time.monotonic()
+        elif time.monotonic() - seen_s > STALL_S:
+            raise RenderingError(
+                f"The processes that collect {title} have made no step for {STALL_S:.0f} s; a render driver that "
+                f"hangs is the usual cause. {_AGAIN}, with fewer workers or another backend (MUJOCO_GL=osmesa, or egl)."
+            )
 
 
-_worker: _Worker
+# --- in a worker, or in the only process ------------------------------------------------------------------------------
+
+_make: Callable[[], EnvBase]
+_steps: Any
+_env: EnvBase | None = None
 
 
-def _prepare(factories: Mapping[str, Callable[[], EnvBase]], steps: Any) -> None:
-    global _worker
-    _worker = _Worker(factories, steps)
+def _prepare(make: Callable[[], EnvBase], steps: Any) -> None:
+    global _make, _steps
+    _make, _steps = make, steps
 
 
-def _work(title: str, domain: str, plan: Mapping[str, int]) -> bytes:
-    return _worker.roll(title, domain, plan)
+def _roll(name: str, plan: dict[str, int]) -> bytes:
+    """Return a planned episode, pickled: torch would send its tensors as open files."""
+    global _env
+    # Exceptions of any class are passed on as one that can be pickled.
+    with passed_on(name, "rollout"), kept_global_rng():
+        _env = _env or _make()  # not in _prepare, whose exceptions a pool only logs
+        return pickle.dumps(collect_episode(_env, callback=_count, **plan))
+
+
+def _count(*_: Any) -> None:
+    _steps.value += 1
+
+
+def _close() -> None:
+    global _env
+    if _env is not None:
+        _env.close()
+    _env = None

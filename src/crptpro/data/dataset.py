@@ -20,7 +20,7 @@ from crptpro.data.replay import as_it_is
 from crptpro.data.storage import Rows, StackStorage, map_rows, read_rows, require_size
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import DatasetError, DiskSpaceError, is_disk_full
-from crptpro.provenance import provenance, versions
+from crptpro.provenance import provenance
 from crptpro.values import as_int, as_path, as_plain
 
 logger = logging.getLogger(__name__)
@@ -229,9 +229,8 @@ class EpisodeWriter(ImmutableDatasetWriter):
         super().__init__()
         self.path, self.request, self.target = path, request, request["transitions"]
         self.state: dict[str, Any] = {"format": FORMAT, "version": VERSION, "request": request, "columns": {}}
-        self.state |= {"transitions": 0, "episodes": 0, "sessions": []}
+        self.state |= {"transitions": 0, "episodes": 0, "render": {}}
         self._pending: list[Rows] = []
-        self._has_noted = False
         # The lock, and half a card, are what a kill at the very start leaves.
         found = [each for each in path.glob("*") if each.name != ".lock" and each.suffix != ".partial"]
         if found and path / CARD_FILE not in found:
@@ -316,22 +315,17 @@ class EpisodeWriter(ImmutableDatasetWriter):
             self.close()
             self._storage.load()  # read back before it is reported as complete
 
-    def note_environment(self, card: Mapping[str, Any]) -> None:
-        """Note what renders the frames for the card; another ``backend`` or ``gl_renderer`` than before is refused."""
-        sessions = self.state["sessions"]
-        before = sessions[-1]["render"] if sessions else {}
+    def note_rendering(self, gl: Mapping[str, Any]) -> None:
+        """Note for the card what renders the frames; another ``backend`` or ``gl_renderer`` than before is refused."""
+        before = self.state["render"]
         for name in ("backend", "gl_renderer"):
-            if before.get(name) is not None and card.get(name, before[name]) != before[name]:
+            if name in before and gl.get(name, before[name]) != before[name]:
                 raise DatasetError(
-                    f"{self.path} was begun with the {name} {before[name]!r}, now it is {card[name]!r}: their pixels "
+                    f"{self.path} was begun with the {name} {before[name]!r}, now it is {gl[name]!r}: their pixels "
                     f"differ. Continue with MUJOCO_GL={before.get('backend')} on that renderer, or remove the "
                     "directory to begin again."
                 )
-        if not self._has_noted:
-            self._has_noted = True
-            if sessions and sessions[-1]["versions"] != versions():
-                logger.warning("%s is continued with other package versions; its card lists both.", self.path)
-            self._save(sessions=[*sessions, {"versions": versions(), "render": dict(card)}])
+        self._save(render=dict(gl))
 
     def close(self) -> None:
         """Free the directory; an unfinished dataset can be continued later."""
@@ -375,7 +369,6 @@ class EpisodeWriter(ImmutableDatasetWriter):
     def _save(self, **changes: Any) -> None:
         state = {**self.state, **changes}
         state["frames"] = state["transitions"] + state["episodes"]
-        state["render"] = state["sessions"][-1]["render"] if state["sessions"] else {}
         if state["columns"]:
             state["image_size"] = state["columns"]["frames/pixels"][1][-1]
         write_json(self.path / CARD_FILE, {**self.request, **state, **provenance()})

@@ -49,14 +49,10 @@ class CheckedEnv:
     _is_still = False
     _was_closed = False
 
-    def watch(self, card: dict[str, Any], *, agent_step_limit: int | None = None, checks_frames: bool = True) -> None:
-        """Set the card, whose ``task`` is the name in messages, and the checks."""
-        self._card, self._name = card, card["task"]
-        self.agent_step_limit, self.checks_frames = agent_step_limit, checks_frames
+    def watch(self, name: str, *, agent_step_limit: int | None = None, checks_frames: bool = True) -> None:
+        """Set the name in messages, and the checks."""
+        self._name, self.agent_step_limit, self.checks_frames = name, agent_step_limit, checks_frames
         _open.add(cast(EnvBase, self))
-
-    def card(self) -> dict[str, Any]:
-        return dict(self._card)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         self._require_open()
@@ -170,7 +166,6 @@ class SimulatorEnv(CheckedEnv, GymLikeEnv):
         self._name, self._image_size, self._renders, self._has_state = name, image_size, render, physics_state
         self._low, self._half = action_range(low, high, dtype, name)
         self._action_dtype = dtype
-        self._read_frame = FrameReader(name)
         super().__init__(env=env, frame_skip=action_repeat, **options)
 
     def _make_specs(self, env: Any) -> None:
@@ -201,7 +196,7 @@ class SimulatorEnv(CheckedEnv, GymLikeEnv):
             return torch.zeros(3, self._image_size, self._image_size, dtype=torch.uint8, device="cpu")
         with passed_on(self._name, "render"):
             image = self._render()
-        return resize(self._read_frame(image), self._image_size)
+        return resize(read_frame(image, self._name), self._image_size)
 
     @abstractmethod
     def _render(self) -> Any: ...
@@ -218,60 +213,43 @@ def resize(frame: Tensor, size: int) -> Tensor:
     return small[0].round_().clamp_(0, 255).to(torch.uint8)
 
 
-class FrameReader:
-    """Copies an image to a frame, uint8 ``[3, H, W]``; floats in [0, 1] are multiplied by 255, which is logged once."""
+def read_frame(image: Any, name: str) -> Tensor:
+    """Copy an RGB image of the environment ``name``, ``[H, W, 3]`` or ``[3, H, W]``, to a frame, uint8 ``[3, H, W]``.
 
-    def __init__(self, name: str):
-        self._name = name
-        self._has_scaled = False
-
-    def __call__(self, image: Any) -> Tensor:
-        """Return the frame of an array or tensor ``[H, W, 3]`` or ``[3, H, W]``; others are an ``EnvOutputError``."""
-        if not isinstance(image, (np.ndarray, Tensor)):
-            raise self._refusal(f"is {type(image).__name__}")
-        if image.ndim != 3 or 3 not in (image.shape[0], image.shape[2]):
-            raise self._refusal(f"has shape {tuple(image.shape)}")
-        dtype = str(image.dtype).removeprefix("torch.")
-        if dtype not in ("uint8", "float16", "float32", "float64"):
-            raise self._refusal(f"has dtype {dtype}")
-        # The copy is for arrays that are read-only or have negative strides.
-        pixels = image if isinstance(image, Tensor) else torch.from_numpy(image.copy())
-        if pixels.shape[2] == 3:
-            pixels = pixels.permute(2, 0, 1)
-        if dtype == "uint8":
-            return pixels.clone(memory_format=torch.contiguous_format)
-        low, high = float(pixels.min()), float(pixels.max())
-        if not (low >= 0.0 and high <= 1.0):  # NaN is neither
-            raise self._refusal(f"holds {dtype} from {low:g} to {high:g}")
-        if not self._has_scaled:
-            self._has_scaled = True
-            logger.warning("Frames of the environment %r are %s in [0, 1], multiplied by 255.", self._name, dtype)
-        return (pixels * 255).round().to(torch.uint8).contiguous()
-
-    def _refusal(self, what: str) -> EnvOutputError:
-        expected = "an RGB array [H, W, 3], uint8 or floats in [0, 1]"
-        return EnvOutputError(f"The image that the environment {self._name!r} renders {what}; it must be {expected}.")
+    Anything else is an ``EnvOutputError``.
+    """
+    wrong = ""
+    if not isinstance(image, (np.ndarray, Tensor)):
+        wrong = f"is {type(image).__name__}"
+    elif image.ndim != 3 or 3 not in (image.shape[0], image.shape[2]):
+        wrong = f"has shape {tuple(image.shape)}"
+    elif (dtype := str(image.dtype).removeprefix("torch.")) != "uint8":
+        wrong = f"has dtype {dtype}"
+    if wrong:
+        raise EnvOutputError(
+            f"The image that the environment {name!r} renders {wrong}; it must be an RGB array [H, W, 3] of uint8. "
+            "Multiply floats from 0 to 1 by 255."
+        )
+    # The copy is for arrays that are read-only or have negative strides.
+    pixels = image if isinstance(image, Tensor) else torch.from_numpy(image.copy())
+    if pixels.shape[2] == 3:
+        pixels = pixels.permute(2, 0, 1)
+    return pixels.clone(memory_format=torch.contiguous_format)
 
 
 def action_range(low: np.ndarray, high: np.ndarray, dtype: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower end and half the width of an environment's action bounds; without bounds they are -1 and 1.
 
-    Integer or empty actions, and bounds in the wrong order or on one side only, raise ``CRPTproError``.
+    Bounds that [-1, 1] cannot be mapped to are a ``CRPTproError``.
     """
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
-    no_low, no_high = ~(np.abs(low) < NO_BOUND), ~(np.abs(high) < NO_BOUND)
-    start = np.where(no_low, -1.0, low)
-    half = (np.where(no_high, 1.0, high) - start) / 2.0
-    bounds = f"low {low.tolist()}, high {high.tolist()}"
-    wrong = ""
-    if not np.issubdtype(dtype, np.floating):
-        wrong = f"has actions of {np.dtype(dtype)}; wrap it in one that takes floats and rounds as it should"
-    elif not low.size:
-        wrong = f"has an empty action, shape {low.shape}: nothing to learn"
-    elif (no_low != no_high).any():
-        wrong = f"bounds an action on one side only ({bounds}), so [-1, 1] cannot be mapped to it"
-    elif not (half > 0).all():
-        wrong = f"has empty action bounds (low >= high): {bounds}"
-    if wrong:
-        raise CRPTproError(f"The environment {name!r} {wrong}.")
-    return start, half
+    is_free = np.minimum(np.abs(low), np.abs(high)) >= NO_BOUND
+    low, high = np.where(is_free, -1.0, low), np.where(is_free, 1.0, high)
+    has_width = (np.maximum(np.abs(low), np.abs(high)) < NO_BOUND) & (low < high)
+    if not (np.issubdtype(dtype, np.floating) and low.size and has_width.all()):
+        raise CRPTproError(
+            f"[-1, 1] cannot be mapped to the actions of the environment {name!r}: {np.dtype(dtype)} from "
+            f"{low.tolist()} to {high.tolist()}. Wrap it in one whose actions are floats, with a lower and an upper "
+            "bound each."
+        )
+    return low, (high - low) / 2.0

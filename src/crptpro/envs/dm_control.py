@@ -14,7 +14,7 @@ from torchrl.envs.libs.dm_control import DMControlWrapper
 from crptpro.domains import Domain
 from crptpro.envs.base import SimulatorEnv
 from crptpro.envs.rendering import render_context
-from crptpro.errors import CRPTproError, UnknownNameError
+from crptpro.errors import UnknownNameError
 from crptpro.values import Quality
 
 logger = logging.getLogger(__name__)
@@ -66,8 +66,7 @@ def reverse_background(model: Any) -> None:
     """Reverse the RGB values of the background of a ``mujoco.MjModel`` in place, before its render context is made.
 
     The paper does not define the background. Here it is the skybox, and the planes and height fields that are fixed to
-    the scenery (floor, walls, terrain), except for materials and textures that something else uses too. A model without
-    one is a ``CRPTproError``.
+    the scenery (floor, walls, terrain), except for materials and textures that something else uses too.
     """
     import mujoco
 
@@ -80,11 +79,6 @@ def reverse_background(model: Any) -> None:
     textures = np.setdiff1d(model.mat_texid[materials][:, roles], model.mat_texid[others])
     skyboxes = np.flatnonzero(model.tex_type == int(mujoco.mjtTexture.mjTEXTURE_SKYBOX))
     textures = np.union1d(textures[textures >= 0], skyboxes)
-    if not (textures.size or is_background.any()):
-        raise CRPTproError(
-            "This model has no background to reverse: no skybox, and no fixed plane or height field. "
-            "colors='reversed_image' works everywhere."
-        )
     for texture in textures:
         first, channels = model.tex_adr[texture], model.tex_nchannel[texture]
         size = model.tex_height[texture] * model.tex_width[texture] * channels
@@ -169,12 +163,6 @@ class DMControlPixelEnv(SimulatorEnv, DMControlWrapper):
     def _build_camera(self) -> None:
         from dm_control.mujoco.engine import Camera
 
-        names = [self._model.id2name(index, "camera") or str(index) for index in range(self._model.ncam)]
-        if self._camera_id not in (*names, *range(-1, self._model.ncam)):
-            raise CRPTproError(
-                f"This model has no camera {self._camera_id!r}. It has {', '.join(names) or 'none'}, or 0 to "
-                f"{self._model.ncam - 1}; -1 is the free camera."
-            )
         self._camera = Camera(self._env.physics, self._image_size, self._image_size, camera_id=self._camera_id)
 
     def close(self, *, raise_if_closed: bool = True) -> None:

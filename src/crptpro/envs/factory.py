@@ -13,8 +13,8 @@ from torchrl.envs import CatFrames, Compose, DoubleToFloat, EnvBase, Transform, 
 from torchrl.envs.transforms import SelectTransform
 
 from crptpro.domains import GYMNASIUM_PREFIX, LONGEST_EPISODE_AGENT_STEPS, Domain, get_domain
-from crptpro.envs.base import CheckedEnv, FrameReader, passed_on
-from crptpro.envs.rendering import backend_card, select_backend
+from crptpro.envs.base import CheckedEnv, passed_on, read_frame
+from crptpro.envs.rendering import select_backend
 from crptpro.errors import CRPTproError
 from crptpro.values import MAX_SEED, Colors, Quality, as_int
 
@@ -28,7 +28,6 @@ def make_env(
     image_size: int = 84,
     action_repeat: int | None = None,
     frame_stack: int = 3,
-    camera: int | str | None = None,
     quality: Quality = "exact",
     colors: Colors = "normal",
     physics_state: bool = False,
@@ -42,16 +41,14 @@ def make_env(
     Keys: ``pixels`` uint8 ``[3 * frame_stack, H, W]``, oldest to newest (a reset repeats its first frame); ``action``
     float32 ``[A]`` in [-1, 1]; ``("next", "reward")`` float32 ``[1]``, summed over the repeated env steps; ``done``,
     ``terminated``, ``truncated`` (by the time limit, or without one after 1000 agent steps). ``env.set_seed(s)`` seeds
-    the next ``reset`` without resetting. ``env.card()`` returns the settings that determine the pixels (only the task
-    for your own environments).
+    the next ``reset`` without resetting.
 
     Args:
         task: a name that :func:`crptpro.domains.get_domain` knows, or a :class:`~crptpro.domains.Domain`.
         seed: of the first episode, from 0 to 2**32 - 1.
         image_size: H = W, pixels.
-        action_repeat: env steps per agent step; ``None`` takes the domain's (2).
+        action_repeat: env steps per agent step; ``None`` takes the domain's (2; 1 of your own).
         frame_stack: frames per observation.
-        camera: index or name; ``None`` takes the domain's.
         quality: ``"fast"`` renders smaller shadow maps, up to twice as fast on software GL, with fewer than 1 % of the
             pixels changed (quadruped_escape: 8 %).
         colors: ``"reversed_background"`` reverses the order of the RGB values of skybox and floor, the paper's unseen
@@ -67,12 +64,9 @@ def make_env(
     domain = get_domain(task)
     seed = as_int(seed, "seed", minimum=0, maximum=MAX_SEED)
     frame_stack = as_int(frame_stack, "frame_stack", minimum=1)
-    camera = domain.camera if camera is None else camera
-    if camera is not None and not isinstance(camera, str):
-        camera = as_int(camera, "camera")
     settings: dict[str, Any] = {
-        "image_size": as_int(image_size, "image_size", minimum=1), "camera": camera, "quality": quality,
-        "action_repeat": resolve_action_repeat(domain, action_repeat),
+        "image_size": as_int(image_size, "image_size", minimum=1), "camera": domain.camera, "quality": quality,
+        "action_repeat": resolve_action_repeat(domain, action_repeat), "physics_state": physics_state,
     }  # fmt: skip
     for name, value, allowed in (("quality", quality, get_args(Quality)), ("colors", colors, get_args(Colors))):
         if value not in allowed:
@@ -84,15 +78,11 @@ def make_env(
             f"The background of {domain.name!r} is not known: only dm_control's environments can have it reversed. "
             "colors='reversed_image' reverses the colours of whole images in any environment."
         )
-    card = {"task": domain.task, "backend": "none", "colors": colors, **settings}
     if needs_gl(domain):
         select_backend()
-        card |= backend_card()
-    settings["physics_state"] = physics_state
     base: Any
     if domain.source == "own":
         base = _own(domain, seed=seed, **settings)
-        card = {"task": domain.task}
     elif is_dm_control:
         from crptpro.envs.dm_control import make_dm_control  # late: dm_control keeps the GL backend of its import
 
@@ -102,7 +92,7 @@ def make_env(
 
         base = make_gymnasium(domain.task, render=render, **settings)
     limit = LONGEST_EPISODE_AGENT_STEPS if domain.episode_env_steps is None else None
-    base.watch(card, agent_step_limit=limit, checks_frames=render or domain.source == "own")
+    base.watch(domain.task, agent_step_limit=limit, checks_frames=render or domain.source == "own")
     transforms: list[Transform] = []
     if colors == "reversed_image":
         from crptpro.transforms.color_swap import ColorSwap  # late: its package imports the networks
@@ -116,23 +106,10 @@ def make_env(
 
 
 def resolve_action_repeat(task: str | Domain, action_repeat: int | None = None) -> int:
-    """Return the env steps of one agent step: ``action_repeat``, or the domain's if None.
-
-    If your own ``make`` does not take it, it is 1, or what a ``partial`` binds; another value is warned about.
-    """
-    if action_repeat is not None:
-        action_repeat = as_int(action_repeat, "action_repeat", minimum=1)
-    domain = get_domain(task)
-    make = domain.make if domain.source == "own" else None
-    if make is None or _named_by(make, {"action_repeat": None}):
-        return action_repeat or domain.action_repeat
-    fixed = as_int(getattr(make, "keywords", {}).get("action_repeat", 1), "action_repeat", minimum=1)
-    if action_repeat not in (None, fixed):
-        logger.warning(
-            "The make of domain %r takes no action_repeat: a decision is %d env step(s), not %d.",
-            domain.name, fixed, action_repeat,
-        )  # fmt: skip
-    return fixed
+    """Return the env steps of one agent step: ``action_repeat``, or the domain's if ``None``."""
+    if action_repeat is None:
+        return get_domain(task).action_repeat
+    return as_int(action_repeat, "action_repeat", minimum=1)
 
 
 def episode_length(task: str | Domain, *, action_repeat: int | None = None) -> int | None:
@@ -158,14 +135,14 @@ class OwnEnv(CheckedEnv, TransformedEnv):
 
 
 class FrameTransform(Transform):
-    """Converts ``pixels`` with :class:`~crptpro.envs.base.FrameReader`, and adds ``truncated`` if it is missing.
+    """Converts ``pixels`` with :func:`~crptpro.envs.base.read_frame`, and adds ``truncated`` if it is missing.
 
     TorchRL's ``PermuteTransform`` returns a view of the environment's buffer, ``ToTensorImage`` divides uint8 by 255.
     """
 
     def __init__(self, name: str, image_size: int):
         super().__init__(in_keys=["pixels"], out_keys=["pixels"])
-        self._read_frame = FrameReader(name)
+        self._name = name
         self._shape = (3, image_size, image_size)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -182,7 +159,7 @@ class FrameTransform(Transform):
         return self._call(tensordict_reset)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        next_tensordict.set("pixels", self._read_frame(next_tensordict.get("pixels")))
+        next_tensordict.set("pixels", read_frame(next_tensordict.get("pixels"), self._name))
         if next_tensordict.get("truncated", None) is None:
             next_tensordict.set("truncated", torch.zeros_like(next_tensordict.get("done")))
         return next_tensordict
@@ -193,11 +170,13 @@ def _own(domain: Domain, **settings: Any) -> EnvBase:
     if make is None:
         raise CRPTproError(f"Domain {domain.name!r} has no make, the function that builds its environment.")
     named = _named_by(make, settings)
-    for name, usual in (("quality", "exact"), ("camera", domain.camera)):
-        if settings[name] != usual and name not in named:
-            logger.warning(
-                "The make of domain %r takes no %s: %s=%r changes nothing.", domain.name, name, name, settings[name]
-            )
+    if settings["quality"] != "exact" and "quality" not in named:
+        logger.warning("The make of domain %r takes no quality: %r changes nothing.", domain.name, settings["quality"])
+    if settings["action_repeat"] != domain.action_repeat and "action_repeat" not in named:
+        raise CRPTproError(
+            f"The make of domain {domain.name!r} takes no action_repeat: an agent step is {domain.action_repeat} env "
+            f"step(s), not {settings['action_repeat']}."
+        )
     with passed_on(domain.task, "make"):
         env = make(**named)
     if broken := _broken_contract(env, settings["image_size"]):

@@ -14,7 +14,7 @@ from crptpro.domains import GYMNASIUM_PREFIX
 from crptpro.envs.base import NO_BOUND, SimulatorEnv, passed_on
 from crptpro.envs.dm_control import FAST_SHADOW_SIZE, route_mujoco_warnings
 from crptpro.envs.rendering import render_context
-from crptpro.errors import CRPTproError, EnvCrashedError, EnvOutputError, RenderingError
+from crptpro.errors import CRPTproError, RenderingError
 from crptpro.values import Quality
 
 
@@ -51,17 +51,6 @@ class GymnasiumPixelEnv(SimulatorEnv, GymWrapper):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         seed, self._episode_seed = self._episode_seed, None
         return super()._reset(tensordict, seed=seed)
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        try:
-            return super()._step(tensordict)
-        except EnvCrashedError as reason:
-            if "expected 5" not in str(reason):
-                raise
-            raise EnvOutputError(
-                f"step() of the environment {self._name!r} does not return Gymnasium's five values (observation, "
-                f"reward, terminated, truncated, info): {reason.__cause__}. The old API ends with `done, info`."
-            ) from reason
 
     def _reset_output_transform(self, reset_data: Any) -> tuple[Any, dict[str, Any]]:
         return reset_data, {}
@@ -104,15 +93,14 @@ def make_gymnasium(
         except TypeError as reason:
             if not any(f"unexpected keyword argument '{option}'" in str(reason) for option in options):
                 raise  # from the environment's code
-            hint = " It takes no camera; leave camera unset." if camera is not None else ""
-            raise CRPTproError(f"{task} cannot be made with rgb_array rendering: {reason}.{hint}") from reason
+            raise CRPTproError(f"{task} cannot be made with rgb_array rendering: {reason}.") from reason
         except (ImportError, gymnasium.error.Error) as reason:
             raise CRPTproError(f"{task} cannot be made: {reason}") from reason
     model: Any = getattr(env.unwrapped, "model", None)
     if camera is not None and hasattr(model, "ncam"):
         names = [model.camera(index).name for index in range(model.ncam)]
-        if not (camera in names if isinstance(camera, str) else -1 <= camera < len(names)):
-            env.close()  # rendering would show the free camera, or end the process
+        if camera not in (*names, *range(-1, len(names))):
+            env.close()  # MuJoCo would end the process for a wrong number, and show the free camera for a wrong name
             raise CRPTproError(f"{task} has no camera {camera!r}; its model has {len(names)}, from 0 on: {names}.")
     _fix_free_camera(env)
     if quality == "fast" and hasattr(model, "vis"):
