@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, PrioritizedSampler, RandomSampler, ReplayBuffer
 
 from crptpro.data.storage import RingStorage, StackStorage, map_rows, read_rows
-from crptpro.errors import CheckpointError, DatasetError
+from crptpro.errors import DatasetError
 from crptpro.values import as_int, as_path
 
 # Redraws before the admissible transitions are listed, which costs 50 times a redraw for 100,000 transitions. Only
@@ -129,27 +129,6 @@ class FrameReplay(ReplayBuffer):
     def _sample(self, batch_size: int) -> tuple[Any, dict]:
         with self._replay_lock:  # a transform may read observations by number: none is overwritten meanwhile
             return super()._sample(batch_size)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return a few counters (ring on disk) or the whole content (ring in RAM), and sampler's and transforms' state.
-
-        The generator is not part of it.
-        """
-        with self._replay_lock:
-            parts = {"ring": self._storage, "transforms": self._transform, "sampler": self._sampler}
-            return {name: part.state_dict() for name, part in parts.items()}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the content of the moment the state was taken, or raise a CheckpointError."""
-        with self._replay_lock:
-            if not {"ring", "transforms", "sampler"} <= state_dict.keys():
-                raise CheckpointError(f"The state is of another kind of replay: it has {sorted(state_dict)}.")
-            try:
-                self._transform.load_state_dict(state_dict["transforms"])
-            except RuntimeError as reason:
-                raise CheckpointError(f"The state is of a replay with other transforms: {reason}") from reason
-            self._storage.load_state_dict(state_dict["ring"])
-            self._sampler.load_state_dict(state_dict["sampler"])
 
     def dumps(self, path: str | Path) -> None:
         """Save the content, or the counters of a ring on disk, for :meth:`loads`, also on a machine with other GPUs."""
