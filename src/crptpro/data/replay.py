@@ -16,10 +16,6 @@ from crptpro.data.storage import RingStorage, StackStorage, map_rows, read_rows
 from crptpro.errors import DatasetError
 from crptpro.values import as_int, as_path
 
-# Redraws before the admissible transitions are listed, which costs 50 times a redraw for 100,000 transitions. Only
-# rings of very short episodes need it.
-_REDRAWS = 8
-
 
 class FrameReplay(ReplayBuffer):
     """TorchRL replay buffer whose frames are stored once, in RAM or on disk.
@@ -213,34 +209,16 @@ class _RingWriter(ImmutableDatasetWriter):
 
 
 class _WindowSampler(RandomSampler):
-    """Draws uniformly, with replacement, from the transitions whose window of n is in one episode.
-
-    A draw that does not fit is redrawn, so that the cost does not grow with the ring.
-    """
+    """Draws uniformly, with replacement, from the transitions whose window of n is in one episode."""
 
     def sample(self, storage: RingStorage, batch_size: int) -> tuple[Tensor, dict]:
-        length = len(storage)
-        if storage.n_step == 1 or length == 0:
+        if storage.n_step == 1 or not len(storage):
             return super().sample(storage, batch_size)
-
-        def draw(among: int, number: int) -> Tensor:
-            return torch.randint(among, (number,), generator=self._rng, device="cpu")
-
-        count = max(0, length - storage.n_step + 1)
-        index = draw(max(1, count), batch_size)
-        for _ in range(_REDRAWS if count else 0):
-            misfits = (~storage.has_window(index)).nonzero().squeeze(-1)
-            if not len(misfits):
-                return index, {}
-            index[misfits] = draw(count, len(misfits))
-        admissible = torch.arange(count, device="cpu")
-        admissible = admissible[storage.has_window(admissible)]
-        if not len(admissible):
+        starts = storage.window_starts()
+        if not len(starts):
             raise DatasetError(
-                f"None of the replay's {length} transitions is followed by enough of its episode for "
+                f"None of the replay's {len(storage)} transitions is followed by enough of its episode for "
                 f"n_step={storage.n_step}: use a smaller n_step, or store more before the first update "
                 "(random_agent_steps)."
             )
-        misfits = (~storage.has_window(index)).nonzero().squeeze(-1)
-        index[misfits] = admissible[draw(len(admissible), len(misfits))]
-        return index, {}
+        return starts[torch.randint(len(starts), (batch_size,), generator=self._rng, device="cpu")], {}
