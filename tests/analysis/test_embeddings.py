@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from crptpro.analysis.embeddings import effective_rank, embed_pixels, sample_pixels
+from crptpro.analysis.embeddings import effective_rank, embed_pixels
 
 
 class Brightness(nn.Module):
@@ -30,15 +28,6 @@ def test_embeddings_are_features_or_projections_computed_in_batches_on_the_encod
     head = nn.Linear(1, 3, dtype=torch.float64)
     assert embed_pixels(Brightness(), pixels, projector=head).shape == (150, 3)
     assert embed_pixels(Brightness().to("meta"), pixels).device.type == "meta"
-
-
-def test_the_seed_chooses_the_observations_whatever_was_sampled_before() -> None:
-    buffer = ReplayBuffer(storage=LazyTensorStorage(10))
-    buffer.extend(TensorDict({"pixels": torch.arange(10).view(10, 1, 1, 1).expand(10, 9, 8, 8).clone()}, [10]))
-    first, second, other = (sample_pixels(buffer, 50, seed=seed) for seed in (1, 1, 2))
-    assert first.shape == (50, 9, 8, 8)
-    assert torch.equal(first, second)
-    assert not torch.equal(first, other)
 
 
 def test_effective_rank_counts_directions_and_changes_nothing() -> None:

@@ -148,9 +148,7 @@ def test_a_missing_or_truncated_file_is_named(duplicate: Path, file: str) -> Non
 @pytest.mark.parametrize(("changes", "message"), [
     ({"format": "safetensors"}, "has format 'safetensors'"),
     ({"version": 99}, "version 99; this release reads"),
-    ({"frames": 5}, "damaged.*frames"),
-    ({"transitions": "many"}, "damaged"),
-    ({"columns": None}, "damaged"),
+    ({"frames": 5}, "pixels.memmap is longer than it should be"),
 ])  # fmt: skip
 def test_a_card_that_cannot_be_is_refused(duplicate: Path, changes: dict[str, Any], message: str) -> None:
     card = json.loads((duplicate / CARD_FILE).read_text())

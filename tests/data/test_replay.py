@@ -465,7 +465,7 @@ def test_what_the_disk_cannot_hold_leaves_nothing(tmp_path: Path, monkeypatch: p
 
     with monkeypatch.context() as patched:
         patched.setattr(storage.os, "posix_fallocate", half)
-        with pytest.raises(DiskSpaceError, match="No space left"):
+        with pytest.raises(DiskSpaceError, match="disk is full"):
             small(path=tmp_path)
     assert not [file for file in tmp_path.iterdir() if file.is_file()]
     small(path=tmp_path)

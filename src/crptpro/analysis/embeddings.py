@@ -5,15 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torchrl.data import ReplayBuffer
 
 from crptpro.modules.precision import device_of
-
-
-def sample_pixels(dataset: ReplayBuffer, samples: int, *, seed: int) -> Tensor:
-    """Draw observations ``[samples, C, H, W]``, which depend on the seed alone, not on earlier samples."""
-    dataset.set_rng(torch.Generator().manual_seed(seed))
-    return dataset.sample(samples)["pixels"]
 
 
 @torch.no_grad()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import itertools
 import math
 import mmap
@@ -17,7 +16,7 @@ from torch import Tensor
 from torchrl.data.replay_buffers.storages import Storage
 
 from crptpro.artifact import require_disk
-from crptpro.errors import CheckpointError, DatasetError, DiskSpaceError, NonFiniteError, is_disk_full, writing_error
+from crptpro.errors import CheckpointError, DatasetError, NonFiniteError, writing_error
 from crptpro.values import as_float, as_int, as_path
 
 PIXELS_FILE = "frames/pixels.memmap"
@@ -447,11 +446,6 @@ def map_file(path: Path, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
                 os.posix_fallocate(file.fileno(), 0, size)
             os.replace(partial, path)
     except OSError as reason:
-        if is_disk_full(reason) or reason.errno == errno.EFBIG:
-            raise DiskSpaceError(
-                f"{path} needs {size / 1e9:.2f} GB: {reason}. Free space, or choose another directory or a smaller "
-                "capacity."
-            ) from reason
         raise writing_error(path, reason) from reason
     finally:
         partial.unlink(missing_ok=True)

@@ -20,7 +20,7 @@ import tyro
 from tyro.conf import Positional, UseAppendAction
 
 from crptpro.analysis.coverage import coverage as particle_estimate
-from crptpro.analysis.embeddings import embed_pixels, sample_pixels
+from crptpro.analysis.embeddings import embed_pixels
 from crptpro.analysis.probe import probe, probe_samples
 from crptpro.artifact import read_json, write_json, write_whole
 from crptpro.data import FrameDataset, StoredReplay
@@ -198,8 +198,9 @@ def embeddings(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
     frame_stack = pretrained.encoder.in_channels // 3
     pixels = {}
     for path in of.datasets:
-        random = FrameDataset.open(path, frame_stack=frame_stack)
-        pixels[f"{random.domain} random"] = sample_pixels(random, of.samples, seed=of.seed)
+        generator = torch.Generator().manual_seed(of.seed)
+        random = FrameDataset.open(path, frame_stack=frame_stack, generator=generator)
+        pixels[f"{random.domain} random"] = random.sample(of.samples)["pixels"]
     for path in of.replays:
         replay = StoredReplay(path, frame_stack=frame_stack)
         chosen = of.draw(int(0.75 * len(replay)), len(replay), of.samples, "embeddings", path.name)
