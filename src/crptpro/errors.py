@@ -19,7 +19,7 @@ class RenderingError(CRPTproError):
 
 
 class EnvOutputError(CRPTproError):
-    """An environment returned an unusable image or step; the message names it."""
+    """An environment returned an unusable image; the message names it."""
 
 
 class EnvCrashedError(RuntimeError):

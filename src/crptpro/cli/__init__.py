@@ -117,7 +117,7 @@ class Collect:
     workers: Annotated[int, arg(help_behavior_hint=lambda cores: f"(default: one per core, {cores} here)")] = field(
         default_factory=cpu_cores
     )
-    """collecting processes, shared by all domains"""
+    """collecting processes"""
     quality: Quality = "exact"
     """render quality; fast uses smaller shadow maps on software GL"""
     colors: Colors = "normal"

@@ -9,7 +9,7 @@ import re
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, Future, wait
+from concurrent.futures import Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -105,8 +105,8 @@ def collect_group(
                 raise DatasetError(f"Two of the domains would be collected into {path}; collect them apart.")
             paths[domain.name] = path
             repeat = resolve_action_repeat(domain, action_repeat)
-            settings: dict[str, Any] = {"image_size": image_size, "action_repeat": repeat, "quality": quality}
-            settings["colors"] = colors
+            sizes = {"image_size": image_size, "action_repeat": repeat}
+            settings: dict[str, Any] = {**sizes, "quality": quality, "colors": colors}
             about = {"task": domain.task, "seed": seed, "camera": domain.camera, **settings}
             dataset = FrameDataset.create(path, domain=domain.name, transitions=transitions, **about)
             if dataset.is_complete:
@@ -117,13 +117,6 @@ def collect_group(
             jobs.append(_Job(domain, dataset, dataset.writer, make, episode_length(domain, action_repeat=repeat)))
         if jobs:
             _announce(jobs, root, image_size)
-            for job in jobs if workers > 1 else ():
-                if not can_be_sent(job.make):
-                    workers = 1
-                    logger.warning(
-                        "%s is collected in this process: no other one can import its `make`, no function of a module.",
-                        job.domain.name,
-                    )
             if any(needs_gl(job.domain) for job in jobs):
                 # Proven here once, for as many renderers as will run: some drivers hang when several start together.
                 select_backend(processes=workers)
@@ -177,14 +170,19 @@ def _announce(jobs: list[_Job], root: Path, image_size: int) -> None:
 def _collect(job: _Job, seed: int, workers: int, progress: bool) -> None:
     """Collect one dataset; its episodes are planned, and appended, in the order of their indices."""
     name, dataset, writer, length = job.domain.name, job.dataset, job.writer, job.length
+    if workers > 1 and not can_be_sent(job.make):
+        workers = 1
+        logger.warning(
+            "%s is collected in this process: no other one can import its `make`, no function of a module.", name
+        )
     bar = Progress(writer.target, writer.transitions, "transitions", label=name, is_shown=progress, lines=10)
     steps = SPAWN.RawValue("q", 0)  # of all workers
     queue: deque[tuple[str, Future[bytes]]] = deque()
     ahead = 2 * workers if workers > 1 else 1  # episodes under way
     with ExitStack() as stack:
         if workers > 1:
-            pool: Executor = WorkerPool(workers, _prepare, job.make, steps)
-            stack.callback(pool.end)  # type: ignore[attr-defined]
+            pool: Any = WorkerPool(workers, _prepare, job.make, steps)
+            stack.callback(pool.end)
         else:
             pool = Inline()
             _prepare(job.make, steps)

@@ -175,7 +175,7 @@ def _own(domain: Domain, **settings: Any) -> EnvBase:
     if settings["action_repeat"] != domain.action_repeat and "action_repeat" not in named:
         raise CRPTproError(
             f"The make of domain {domain.name!r} takes no action_repeat: an agent step is {domain.action_repeat} env "
-            f"step(s), not {settings['action_repeat']}."
+            f"step(s), not {settings['action_repeat']}. Ask for action_repeat={domain.action_repeat}."
         )
     with passed_on(domain.task, "make"):
         env = make(**named)
