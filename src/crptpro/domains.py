@@ -27,17 +27,18 @@ class Domain:
     The paper pre-trains on domains and evaluates on tasks; tasks of one domain share their pixels.
 
     ``make`` builds your own environment, an unbatched TorchRL one on the CPU. It gets, by keyword, those of ``seed``,
-    ``image_size``, ``action_repeat``, ``camera``, ``quality`` and ``physics_state`` that its signature names.
-    ``pixels`` is one RGB image ``[H, W, 3]`` or ``[3, H, W]`` with ``H = W = image_size``, uint8; ``action`` is a float
-    vector in [-1, 1]; the reward has shape ``[1]``. Without ``truncated`` in its ``done_spec``, episodes end by
-    termination alone. With ``physics_state`` it may emit ``qpos`` and ``qvel``; entries that its transforms read back
-    (``step_count``) stay, others are dropped. Its ``set_seed`` must make the next ``reset`` reproducible. For worker
-    processes ``make`` must be a function at a module's top level or a ``functools.partial`` of one.
+    ``image_size``, ``action_repeat``, ``camera``, ``quality`` and ``physics_state`` that its signature names. If
+    it repeats actions by itself, say so by the domain's ``action_repeat``. ``pixels`` is one RGB image ``[H, W, 3]`` or
+    ``[3, H, W]`` with ``H = W = image_size``, uint8; ``action`` is a float vector in [-1, 1]; the reward has shape
+    ``[1]``. Without ``truncated`` in its ``done_spec``, episodes end by termination alone. With ``physics_state`` it
+    may emit ``qpos`` and ``qvel``; entries that its transforms read back (``step_count``) stay, others are dropped. Its
+    ``set_seed`` must make the next ``reset`` reproducible. For worker processes ``make`` must be a function at a
+    module's top level or a ``functools.partial`` of one.
     """
 
     name: str  #: of the domain, and of its dataset directory
     task: str  #: used for collection, a name for :func:`crptpro.envs.make_env`
-    action_repeat: int = 1  #: env steps per agent step; others can be asked for if ``make`` takes it
+    action_repeat: int = 1  #: env steps per agent step; others can be asked for if ``make`` takes it as an argument
     camera: int | str | None = 0  #: index or name of the camera; ``None`` leaves it to the environment
     make: Callable[..., EnvBase] | None = None
     episode_env_steps: int | None = None  #: of a full episode; if ``None``, the time limit is 1000 agent steps

@@ -195,11 +195,11 @@ def _collect(job: _Job, seed: int, workers: int, progress: bool) -> None:
                     "action_seed": derive_seed(seed, "collect-actions", name, index),
                     "limit": writer.missing - len(queue),
                 }
-                with _clear_failures(title := f"episode {index} of {name}"):
+                with _failures_explained(title := f"episode {index} of {name}"):
                     queue.append((title, pool.submit(_roll, name, plan)))
             title, future = queue.popleft()
             _wait(future, title, steps)
-            with _clear_failures(title):
+            with _failures_explained(title):
                 rollout = pickle.loads(future.result())
             length = length or len(rollout)
             dataset.extend(rollout)
@@ -210,15 +210,14 @@ def _collect(job: _Job, seed: int, workers: int, progress: bool) -> None:
 
 
 @contextmanager
-def _clear_failures(title: str) -> Iterator[None]:
+def _failures_explained(title: str) -> Iterator[None]:
     """Say of a failure in the body what was collected, and what can be done."""
     try:
         yield
     except BrokenProcessPool:
         raise WorkerLostError(
-            f"A process that collected {title} has died. Out of memory is the usual cause: use fewer workers. At the "
-            'start it may be a script that lacks `if __name__ == "__main__":` around its main program. '
-            f"{_AGAIN}."
+            f"A process that collected {title} has died. Out of memory is the usual cause: use fewer workers. Or a "
+            f'script lacks `if __name__ == "__main__":` around its main program. {_AGAIN}.'
         ) from None
     except OSError as reason:
         raise CRPTproError(
