@@ -23,6 +23,7 @@ import wandb
 
 from crptpro.errors import DiskSpaceError
 from crptpro.logging import RunLogger, WandbOptions
+from crptpro.training import Run
 
 
 def table(run_dir: Path, stream: str) -> list[dict[str, str]]:
@@ -268,6 +269,19 @@ def test_wandb_gets_metrics_against_their_counter_under_one_identity(tmp_path: P
     assert first.rows[1] == first.rows[2]  # repeated rows come under the same step
     assert second.rows[0][1] == {"step": 2}
     assert first.finished
+
+
+def test_a_run_that_begins_again_begins_another_wandb_run(tmp_path: Path, fake_wandb: list[FakeRun]) -> None:
+    for _ in range(2):  # the first ends without a checkpoint
+        with (
+            RunLogger(tmp_path, wandb=WandbOptions()) as records,
+            Run(tmp_path, unit="updates", streams=("train",), records=records, progress=False) as run,
+        ):
+            run.keep()
+            run.advance(1)
+            run.write("train", {"loss": 1.0})
+    assert [each.rows[0][1] for each in fake_wandb] == [{"step": 0}, {"step": 0}]
+    assert fake_wandb[0].options["id"] != fake_wandb[1].options["id"]
 
 
 @pytest.mark.parametrize(("options", "environment", "netrc", "expected"), [

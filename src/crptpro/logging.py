@@ -28,6 +28,8 @@ from crptpro.values import as_int, as_path, as_plain
 
 _LOG = logging.getLogger(__name__)
 
+WANDB_FILE = "wandb_run.json"  # the id of the directory's W&B run
+
 
 @dataclass(frozen=True)
 class WandbOptions:
@@ -169,6 +171,18 @@ class RunLogger:
         self._rows = kept
         for stream in seen:
             self._write_csv(stream)
+
+    def begin_again(self, streams: Iterable[str]) -> None:
+        """Remove the rows of a run without a checkpoint: ``metrics.before.jsonl`` keeps them, as does their W&B run."""
+        streams = list(streams)
+        if any(map(self.rows, streams)):
+            kept = self.path.with_suffix(".before.jsonl")
+            before = kept.read_bytes() if kept.exists() else b""
+            write_whole(kept, before + self.path.read_bytes())
+            # W&B drops rows below the last index of a run, so the new rows need another run.
+            (self.run_dir / WANDB_FILE).unlink(missing_ok=True)
+            _LOG.warning("%s has no checkpoint: it begins again; its earlier rows are in %s.", self.run_dir, kept)
+        self.load_state_dict(dict.fromkeys(streams, 0))
 
     def writes_into(self, directory: str | Path) -> bool:
         """Whether the record is inside ``directory``: only then all of it belongs to that directory's run."""
@@ -318,7 +332,7 @@ def _wandb_mode() -> str:
 
 def _wandb_id(run_dir: Path) -> str:
     """Return the id of this directory's W&B run, drawn once and kept."""
-    path = run_dir / "wandb_run.json"
+    path = run_dir / WANDB_FILE
     try:
         return str(json.loads(path.read_text())["id"])
     except (OSError, ValueError, KeyError, TypeError):

@@ -142,6 +142,15 @@ def test_a_checkpoint_of_more_gpus_is_continued_with_fewer() -> None:
     assert restored == [1]
 
 
+def test_a_run_of_a_gpu_is_continued_without_one(tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        cuda = [torch.zeros(16, dtype=torch.uint8)]
+        saved = _GlobalRNG.state_dict
+        patch.setattr(_GlobalRNG, "state_dict", lambda self: {**saved(self), "torch_cuda": cuda})
+        walk(tmp_path, 5)
+    assert first_update(tmp_path) == 5
+
+
 def test_without_an_interval_checkpoints_are_written_by_the_clock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,7 +22,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 
-from crptpro.artifact import require_disk, write_whole
+from crptpro.artifact import require_disk
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import CheckpointError, DiskSpaceError, NonFiniteError, is_disk_full
 from crptpro.logging import RunLogger
@@ -80,8 +80,11 @@ class _Means:
 
 class _GlobalRNG(GlobalRNGState):
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        cuda = state_dict.get("torch_cuda")  # of all GPUs; another node may have fewer
-        super().load_state_dict({**state_dict, "torch_cuda": cuda[: torch.cuda.device_count()]} if cuda else state_dict)
+        state = dict(state_dict)
+        # Of all GPUs; another machine may have fewer, or none.
+        if cuda := state.pop("torch_cuda", [])[: torch.cuda.device_count()]:
+            state["torch_cuda"] = cuda
+        super().load_state_dict(state)
 
 
 class Run:
@@ -223,12 +226,7 @@ class Run:
                 self.records.load_state_dict(self.saved["record"])
             logger.info("Continues from %s %s.", f"{self.position:,}", self.unit)
         elif self.records is not None and self.run_dir is not None and self.records.writes_into(self.run_dir):
-            if any(map(self.records.rows, self.streams)):
-                kept = self.records.path.with_suffix(".before.jsonl")
-                before = kept.read_bytes() if kept.exists() else b""
-                write_whole(kept, before + self.records.path.read_bytes())
-                logger.warning("%s has no checkpoint: it begins again; its earlier rows are in %s.", self.run_dir, kept)
-            self.records.load_state_dict(dict.fromkeys(self.streams, 0))
+            self.records.begin_again(self.streams)
         self._saved_time = self._row_time = time.monotonic()
         self._started = self._row_time - self.saved.get("seconds", 0.0)
 
