@@ -22,7 +22,7 @@ from crptpro.data import FrameDataset
 from crptpro.errors import CheckpointError, CRPTproError, DatasetError
 from crptpro.objectives import ATCLoss, SimCLRLoss, get_method
 from crptpro.pretrained import load_pretrained, save_pretrained
-from crptpro.training import PretrainConfig, PretrainResult, finetune, pretrain
+from crptpro.training import PretrainConfig, PretrainResult, Run, finetune, pretrain
 
 SETTINGS = PretrainConfig(
     batch_size=8, learning_rate=1e-3, seed=3, log_interval=4, checkpoint_interval=5, precision="fp32"
@@ -151,6 +151,21 @@ def test_finetuning_takes_the_updates_of_the_method_of_that_name(
     with caplog.at_level("WARNING", logger="crptpro"), pytest.raises(KeyboardInterrupt):
         finetune(before, dataset, batch_size=8, progress=False)
     assert "of 2,000 updates" in caplog.text
+
+
+def test_finetuning_for_no_update_is_refused_as_pre_training_is(tmp_path: Path) -> None:
+    before = load_pretrained(save_pretrained(run(make_loss(), 1), tmp_path))
+    with pytest.raises(ValueError, match="`updates` must be at least 1, got 0"):
+        finetune(before, make_dataset(0), updates=0, progress=False)
+
+
+def test_a_run_is_not_continued_on_another_kind_of_device(tmp_path: Path) -> None:
+    require_same = Run.require_same
+    with pytest.MonkeyPatch.context() as patch:  # as a run on a GPU
+        patch.setattr(Run, "require_same", lambda self, named: require_same(self, {**named, "device": "cuda"}))
+        run(make_loss(), 4, tmp_path)
+    with pytest.raises(CheckpointError, match="device was 'cuda', now 'cpu'"):
+        run(make_loss(), 8, tmp_path)
 
 
 def test_a_schedule_over_the_run_cannot_be_extended(tmp_path: Path) -> None:

@@ -155,6 +155,7 @@ def pretrain(
         datasets_facts = [_facts(name, buffer) for name, buffer in buffers.items()]
         run.require_same({
             **{name: getattr(settings, name) for name in (*METHOD_FIELDS, "seed")},
+            "device": device.type,  # the samplers draw from generators of the device
             # A schedule is stretched over the run, so that a run with one cannot be extended.
             "updates": None if recipe.schedule == "constant" else settings.updates,
             "schedule": recipe.schedule, "grad_clip": recipe.grad_clip, "precision": PRECISION_NAMES[dtype],
@@ -206,7 +207,8 @@ def finetune(pretrained: Pretrained | str | Path, datasets: Any, **options: Any)
         pretrained = load_pretrained(pretrained)
     identity = pretrained.identity()
     config = options.get("config") or PretrainConfig()
-    updates = options.get("updates") or config.updates or get_method("crptpro-finetune").updates
+    if (updates := options.get("updates", config.updates)) is None:
+        updates = get_method("crptpro-finetune").updates
     options |= {"method": pretrained.method, "started_from": identity, "updates": updates}
     result = pretrain(pretrained.build_loss(), datasets, **options)
     before = {"started_from": identity, "previous_training": pretrained.card.get("training")}
