@@ -32,8 +32,6 @@ logger = logging.getLogger(__name__)
 Policy = Callable[[Any], Any]
 """Maps one observation, uint8 ``[C, H, W]``, to one action, float32 ``[A]`` in ``[-1, 1]``; or a policy of TorchRL."""
 WORKER_BYTES = 500_000_000
-LOST = (BrokenProcessPool, pickle.PicklingError, OSError)
-"""What a call of a worker raises if the process has died, or cannot be started."""
 
 
 @dataclass(frozen=True)
@@ -177,7 +175,7 @@ class Evaluator:
             seeds = [episode_seed(seed, episode) for episode in range(self.episodes)]
             try:
                 futures = [self._pool.submit(_evaluate, sent, *numbered) for numbered in enumerate(seeds)]
-            except LOST as reason:  # since the evaluation before
+            except (BrokenProcessPool, OSError) as reason:  # died since the evaluation before, or cannot be started
                 self._give_up(reason)
         self._pending = (agent, counters, seed, futures)
 
@@ -193,7 +191,7 @@ class Evaluator:
         agent, counters, seed, futures = self._pending
         try:
             episodes = [future.result() for future in futures]
-        except LOST as reason:
+        except BrokenProcessPool as reason:
             self._give_up(reason)
             futures = []
         if not futures:
@@ -227,7 +225,7 @@ class Evaluator:
 
     def close(self) -> None:
         if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
+            self._pool.end()
         if self._env is not None:
             self._env.close()
 
