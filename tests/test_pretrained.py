@@ -202,14 +202,6 @@ def test_an_encoder_that_ships_is_loaded_by_name_and_an_unknown_name_lists_them(
     assert load_pretrained("group-a").identity() != load_pretrained(kept).identity()
 
 
-def test_an_artifact_of_a_bare_name_is_found_between_the_two_renames_of_its_replacement(
-    kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    shutil.copytree(kept, ".enc.previous")
-    assert load_pretrained("enc").identity() == load_pretrained(kept).identity()
-
-
 @pytest.mark.gl
 def test_a_task_is_learned_on_every_encoder_that_ships() -> None:
     for name in shipped_encoders():

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from crptpro import modules
-from crptpro.artifact import CARD_FILE, identity_of, previous_of, read_artifact, write_artifact
+from crptpro.artifact import CARD_FILE, identity_of, read_artifact, write_artifact
 from crptpro.data import FrameDataset
 from crptpro.errors import PretrainedError, UnknownNameError
 from crptpro.modules import PixelEncoder
@@ -259,7 +259,7 @@ def load_pretrained(path: str | Path, classes: Mapping[str, type[nn.Module]] | N
         PretrainedError: something is missing, truncated, tampered with, of another kind, or unknown.
     """
     path = as_path(path)
-    if path.name == str(path) and not path.exists() and not previous_of(path).exists():  # a name, not a path
+    if path.name == str(path) and not path.exists():  # a name, not a path
         if not (SHIPPED / path / CARD_FILE).exists():
             raise PretrainedError(
                 f"{path} does not exist, and no encoder of this name ships with crptpro; those that do: "
@@ -292,7 +292,7 @@ def _as_pretrained(trained: Any) -> Pretrained:
             f"{type(loss).__name__} has no `.encoder`, which a pre-training loss exposes. An encoder alone: "
             "Pretrained(encoder)."
         )
-    heads = {role: _unwrapped(getattr(loss, role, None)) for role in HEADS}
+    heads: dict[str, Any] = {role: _unwrapped(getattr(loss, role, None)) for role in HEADS}
     targets = {}
     for target, online in zip(TARGETS, (encoder, heads["projector"])):
         if online is not None and (state := _target_state(loss, target)):
