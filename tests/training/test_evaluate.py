@@ -76,15 +76,15 @@ def test_an_environment_that_was_closed_says_so() -> None:
         evaluate(make_agent(), env, episodes=1, progress=False)
 
 
-def test_a_non_finite_action_names_the_episode_and_the_decision() -> None:
+def test_a_non_finite_action_names_the_environment_the_episode_and_the_step_and_says_what_it_means() -> None:
     actions = iter([0.1] * (EPISODE + 3) + [float("nan")])
-    with pytest.raises(NonFiniteError, match="episode 1, decision 3: the policy acts"):
+    with pytest.raises(NonFiniteError, match=r"'toy_go' .* agent step 4 of episode 1 .* training has diverged"):
         evaluate(lambda _: torch.full((2,), next(actions)), make_toy_env(), episodes=2, progress=False)
 
 
-def test_a_reward_that_is_not_finite_names_the_episode_and_keeps_those_before() -> None:
+def test_a_reward_of_an_unchecked_environment_that_is_not_finite_names_the_episode_and_keeps_those_before() -> None:
     kept: list[Episode] = []
-    with pytest.raises(NonFiniteError, match="episode 1, decision 3: the reward is nan"):
+    with pytest.raises(NonFiniteError, match="episode 1: the rewards sum to nan"):
         evaluate(
             lambda _: torch.zeros(2), PoisonedEnv(fixed_length), episodes=3, progress=False, on_episode=kept.append
         )

@@ -245,8 +245,7 @@ def train_downstream(
                         features = agent.encode(td["pixels"])
                     else:  # encoded once, for the policy and for the batches that will contain it
                         features = dense.unshifted(number)
-                    where = f"{name}, agent step {agent_step}"
-                    td["action"] = agent.explore(features, generators["policy"], where=where)
+                    td["action"] = agent.explore(features, generators["policy"])
                 step = env.step(td)  # the next observation is drawn while the update computes
                 if learns:
                     # The sample has features under random shifts, and the bonus is part of its reward.

@@ -330,9 +330,8 @@ class Explorer:
         if self.agent_steps < self.config.random_agent_steps:
             td["action"] = self.env.uniform_action(self.generators["random_actions"])
         else:
-            where = f"{self.name}, episode {self.episodes}, decision {len(self.actions)}"
             features, skill = self.agent.encode(td["pixels"]), td.get("skill", None)
-            td["action"] = self.agent.explore(features, self.generators["policy"], skill=skill, where=where)
+            td["action"] = self.agent.explore(features, self.generators["policy"], skill=skill)
         self._step = self.env.step(td)
 
     def end_step(self) -> dict[str, float] | None:
