@@ -58,11 +58,10 @@ def watched(loss: LossModule) -> list[TensorDictBase]:
     return batches
 
 
-def test_domains_take_turns_and_their_cosines_are_watched_whatever_the_loss() -> None:
+def test_domains_take_turns() -> None:
     batches = watched(loss := Brightness())
-    result = run(loss, 5)
+    run(loss, 5)
     assert [bool(batch["pixels"].float().mean() > 0.4 * 255) for batch in batches] == [False, True, False, True, False]
-    assert "cosine/dark" in result.metrics or "cosine/bright" in result.metrics
 
 
 def test_a_loss_is_given_what_it_reads_and_nothing_else() -> None:
@@ -244,25 +243,6 @@ def test_both_views_are_of_one_image_under_shifts_of_up_to_four_pixels() -> None
     for found in (first, second):
         assert {row for row, _ in found} == {column for _, column in found} == set(range(-4, 5))
     assert sum(a == b for a, b in zip(first, second)) < 30
-
-
-class NormalisedBrightness(Brightness):
-    """Its encoder has batch statistics, and draws from the global generator."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.encoder = nn.Sequential(make_encoder(), nn.BatchNorm1d(self.encoder.feature_dim), nn.Dropout(0.5))
-        self.encoder.feature_dim = self.head.in_features
-
-
-def test_the_record_measures_embeddings_without_changing_what_is_trained() -> None:
-    states = []
-    for interval in (1, 3):
-        torch.manual_seed(0)
-        loss = NormalisedBrightness()
-        run(loss, 6, config=dataclasses.replace(SETTINGS, log_interval=interval))
-        states.append(loss)
-    assert same_state(*states)
 
 
 def test_one_buffer_given_twice_and_names_unfit_for_columns_are_refused() -> None:

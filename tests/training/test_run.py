@@ -379,5 +379,5 @@ def test_means_count_each_name_by_its_own_rate() -> None:
         row = run.write("train", episodes=3)
         assert (row["loss_q"], row["actor"]) == (1.5, 20.0)
         assert "elsewhere" not in row
-        assert {"updates": 4, "episodes": 3}.items() <= run.history["train"][0].items()
-        assert run.last_row("other") == {}
+        assert {"updates": 4, "episodes": 3}.items() <= run.rows("train")[0].items()
+        assert run.rows("other") == []

@@ -117,9 +117,7 @@ class Run:
     Attributes:
         position: progress in ``unit``, all resumptions included.
         resumed_from: position at which this call continued; 0 for a fresh run.
-        counters: further counters for every row.
         tally: the loop's own counters, which every checkpoint holds; set them before :meth:`keep`.
-        history: rows that this call wrote, by stream.
 
     Raises:
         CheckpointError: ``run_dir`` is in use by another process, or all its checkpoints are damaged.
@@ -138,11 +136,10 @@ class Run:
         self.run_dir = None if run_dir is None else as_path(run_dir, "run_dir")
         self.unit, self.streams, self.records, self.config = unit, streams, records, config
         self.position = self.resumed_from = 0
-        self.counters: dict[str, int] = {}
         self.tally: dict[str, int] = {}
-        self.history: dict[str, list[dict[str, Any]]] = {stream: [] for stream in streams}
         self.settings: dict[str, Any] = {}
         self.saved: dict[str, Any] = {}
+        self._rows: dict[str, list[dict[str, Any]]] = {stream: [] for stream in streams}  # without a record
         self._means = {stream: _Means() for stream in streams}
         self._checkpoint = Checkpoint(format="archive")
         self._modules: list[nn.Module] = []
@@ -233,7 +230,7 @@ class Run:
         Between two iterations a checkpoint is written when one is due (every ``checkpoint_interval`` in ``unit``, or
         every :data:`CHECKPOINT_SECONDS`), or when a signal asks the run to stop.
         """
-        if self.position > total and self.resumed_from:
+        if self.position > total:
             raise CheckpointError(
                 f"{self.run_dir} has done {self.position:,} {self.unit}, more than the {total:,} requested. Request at "
                 "least as many, or choose another run directory."
@@ -315,18 +312,19 @@ class Run:
         extra: Mapping[str, float] | None = None,
         **counters: int,
     ) -> dict[str, Any]:
-        """Write a row with the position, :attr:`counters` and ``counters``, and return it without them.
+        """Write a row with the position and ``counters``, and return it without them.
 
         It holds ``extra`` and ``values``; by default the means since the last row, which start again, rate and memory.
         """
-        counters = {self.unit: self.position, **self.counters, **counters}
+        counters = {self.unit: self.position, **counters}
         row: dict[str, Any] = {**(self.means(stream) if values is None else values), **(extra or {})}
         if values is None:
             self._means[stream].load_state_dict({"sums": {}, "counts": {}})
             if stream == self.streams[0]:
                 row |= self._rate_and_memory()
-        self.history[stream].append({**counters, **row})
-        if self.records is not None:
+        if self.records is None:
+            self._rows[stream].append({**counters, **row})
+        else:
             self.records.log(row, stream=stream, **counters)
         return row
 
@@ -343,13 +341,7 @@ class Run:
 
     def rows(self, stream: str) -> list[dict[str, Any]]:
         """Return every row of a stream; with a record, those of all resumptions."""
-        return self.history[stream] if self.records is None else self.records.rows(stream)
-
-    def last_row(self, stream: str) -> dict[str, Any]:
-        """Return the newest row of a stream without its counters; empty if there is none."""
-        rows = self.history[stream] or self.rows(stream)
-        left_out = {self.unit, *self.counters, "unix_time_s"}
-        return {name: value for name, value in rows[-1].items() if name not in left_out} if rows else {}
+        return self._rows[stream] if self.records is None else self.records.rows(stream)
 
     def save(self, *, is_finished: bool = False) -> None:
         """Write a checkpoint of everything that :meth:`keep` was given, unless it is not finite; two are kept."""
