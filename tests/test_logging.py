@@ -22,7 +22,8 @@ import torch
 import wandb
 
 from crptpro.errors import DiskSpaceError
-from crptpro.logging import RunLogger, WandbOptions
+from crptpro.logging import RunLogger
+from crptpro.training import Run
 
 
 def table(run_dir: Path, stream: str) -> list[dict[str, str]]:
@@ -193,7 +194,8 @@ def test_the_config_is_kept_with_versions_from_the_first_row_that_the_disk_takes
     def full(file: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    with RunLogger(tmp_path, config=Config()) as logger:
+    with RunLogger(tmp_path) as logger:
+        logger.describe(Config())
         # Not before: a request that is refused must not replace the settings of the run it found.
         assert not (tmp_path / "config.json").exists()
         with monkeypatch.context() as patched:
@@ -246,14 +248,15 @@ def fake_wandb(monkeypatch: pytest.MonkeyPatch, no_account: None) -> Iterator[li
     assert not [name for name in os.environ if name.startswith("WANDB_")]  # nothing is changed for the next
 
 
-def log_once(run_dir: Path, options: WandbOptions) -> None:
+def log_once(run_dir: Path, options: dict[str, Any]) -> None:
     with RunLogger(run_dir, wandb=options) as logger:
         logger.log({"loss": 1.0}, stream="train", updates=1)
 
 
 def test_wandb_gets_metrics_against_their_counter_under_one_identity(tmp_path: Path, fake_wandb: list[FakeRun]) -> None:
     for start in (0, 1):
-        with RunLogger(tmp_path, wandb=WandbOptions(tags=("t",)), config={"lr": 1}) as logger:
+        with RunLogger(tmp_path, wandb={"tags": ["t"], "notes": "n"}) as logger:
+            logger.describe({"lr": 1})
             assert len(fake_wandb) == start  # a request that is refused leaves nothing there
             logger.log({"loss": 1.0, "note": "x"}, stream="pretrain", updates=start + 1)
             state = logger.state_dict(["pretrain", "eval"])
@@ -262,7 +265,8 @@ def test_wandb_gets_metrics_against_their_counter_under_one_identity(tmp_path: P
             logger.log({"score": 2.0}, stream="eval", episodes=1, env_steps=10)
     first, second = fake_wandb
     assert first.options["id"] == second.options["id"]
-    assert (first.options["mode"], first.options["tags"], first.options["config"]) == ("offline", ["t"], {"lr": 1})
+    assert (first.options["mode"], first.options["config"]) == ("offline", {"lr": 1})
+    assert (first.options["tags"], first.options["notes"]) == (["t"], "n")
     assert first.axes == {"updates": None, "pretrain/*": "updates", "env_steps": None, "eval/*": "env_steps"}
     assert first.rows[0] == ({"updates": 1, "pretrain/loss": 1.0, "pretrain/note": "x"}, {"step": 0})
     assert first.rows[1] == first.rows[2]  # repeated rows come under the same step
@@ -270,10 +274,23 @@ def test_wandb_gets_metrics_against_their_counter_under_one_identity(tmp_path: P
     assert first.finished
 
 
+def test_a_run_that_begins_again_begins_another_wandb_run(tmp_path: Path, fake_wandb: list[FakeRun]) -> None:
+    for _ in range(2):  # the first ends without a checkpoint
+        with (
+            RunLogger(tmp_path, wandb={}) as records,
+            Run(tmp_path, unit="updates", streams=("train",), records=records, progress=False) as run,
+        ):
+            run.keep()
+            run.advance(1)
+            run.write("train", {"loss": 1.0})
+    assert [each.rows[0][1] for each in fake_wandb] == [{"step": 0}, {"step": 0}]
+    assert fake_wandb[0].options["id"] != fake_wandb[1].options["id"]
+
+
 @pytest.mark.parametrize(("options", "environment", "netrc", "expected"), [
-    ({}, {}, "", {"project": "crptpro", "name": "run", "group": None, "mode": "offline"}),
-    ({}, {"PROJECT": "mine", "NAME": "n", "RUN_GROUP": "g"}, "", {"project": "mine", "name": "n", "group": "g"}),
-    ({"project": "asked", "name": "a", "group": "h"}, {"PROJECT": "mine", "NAME": "n", "RUN_GROUP": "g"}, "",
+    ({}, {}, "", {"project": "crptpro", "name": "run", "mode": "offline"}),
+    ({}, {"PROJECT": "mine", "NAME": "n"}, "", {"project": "mine", "name": "n"}),
+    ({"project": "asked", "name": "a", "group": "h"}, {"PROJECT": "mine", "NAME": "n"}, "",
      {"project": "asked", "name": "a", "group": "h"}),
     # Online only if logged in or asked.
     ({}, {"API_KEY": "k"}, "", {"mode": "online"}),
@@ -290,7 +307,7 @@ def test_defaults_apply_only_where_the_user_has_said_nothing_to_wandb(
         patched.setenv("NETRC", str(tmp_path / "netrc"))
         for name, value in environment.items():
             patched.setenv(f"WANDB_{name}", value)
-        log_once(tmp_path / "run", WandbOptions(**options))
+        log_once(tmp_path / "run", options)
     assert expected.items() <= fake_wandb[0].options.items()
 
 
@@ -304,7 +321,7 @@ def test_a_failing_mirror_is_switched_off_with_one_warning_and_the_record_is_com
 
     monkeypatch.setattr(*((wandb, "init") if broken == "init" else (FakeRun, broken)), fail)
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with RunLogger(tmp_path, wandb=WandbOptions(), tensorboard=True) as logger:
+    with RunLogger(tmp_path, wandb={}, tensorboard=True) as logger:
         for updates in (1, 2, 3):
             logger.log({"loss": 1.0}, stream="train", updates=updates)
     assert len(table(tmp_path, "train")) == 3
@@ -323,7 +340,7 @@ def test_an_unreachable_server_means_offline(
         return working(**options)
 
     monkeypatch.setattr(wandb, "init", init)
-    log_once(tmp_path, WandbOptions(mode="online"))
+    log_once(tmp_path, {"mode": "online"})
     assert [run.options["mode"] for run in fake_wandb] == ["offline"]
 
 
@@ -336,7 +353,7 @@ def test_an_offline_wandb_run_and_event_files_are_really_written_and_resumed(
         monkeypatch.setenv(name, str(tmp_path / "elsewhere"))
     (tmp_path / "note.txt").write_text("an artifact")
     for updates in (1, 2):
-        with RunLogger(tmp_path, wandb=WandbOptions(), tensorboard=True) as logger:
+        with RunLogger(tmp_path, wandb={}, tensorboard=True) as logger:
             logger.log({"loss": 1.0 / updates, "note": "text"}, stream="train", env_steps=10 * updates)
             logger.artifact(tmp_path / "note.txt", name="gymnasium:note", kind="text")
     identity = json.loads((tmp_path / "wandb_run.json").read_text())["id"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import glob
 import hashlib
 import json
 import os
@@ -12,7 +11,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import psutil
 from torch import Tensor, nn
 
 from crptpro.errors import CRPTproError, DiskSpaceError, writing_error
@@ -92,7 +90,8 @@ def write_artifact(
     """Write ``weights.safetensors`` and ``card.json`` beside ``path`` and rename the directory into place.
 
     The new files are read back, and ``check`` is called with card and tensors, before they replace anything. A reader
-    sees the old artifact or the new one, never a mixture; a write that fails (a full disk, a kill) leaves the old one.
+    never sees a mixture, and a write that fails, e.g. on a full disk, leaves the old artifact. (A kill between the two
+    renames leaves it as ``.NAME.previous`` until the next write.)
 
     ``modules`` maps names to networks or their state dicts; tensors are stored as ``name.key``. ``format``, ``version``
     and ``weights_sha256`` are added to the plain facts of ``card``. Returns ``path``.
@@ -129,12 +128,8 @@ def write_artifact(
     content = save(tensors)
     facts = {"format": format_name, "version": version, "weights_sha256": hashlib.sha256(content).hexdigest()}
     temporary = path.with_name(f".{path.name}.writing.{os.getpid()}")
-    previous = previous_of(path)
+    previous = path.with_name(f".{path.name}.previous")
     try:
-        for stale in path.parent.glob(f".{glob.escape(path.name)}.writing*"):  # of writers that were killed
-            pid = stale.suffix[1:]
-            if stale == temporary or not (pid.isdigit() and psutil.pid_exists(int(pid))):
-                shutil.rmtree(stale, ignore_errors=True)
         write_whole(temporary / WEIGHTS_FILE, content)
         write_json(temporary / CARD_FILE, {**card, **facts})
         found = read_artifact(temporary, format_name=format_name, version=version)
@@ -163,9 +158,6 @@ def read_artifact(
     from safetensors.torch import load
 
     path = as_path(path).resolve()
-    previous = previous_of(path)  # where a writer that was killed between its two renames left it
-    if previous.is_dir() and not path.exists():
-        path = previous
     if not path.is_dir():
         raise error(f"{path} does not exist or is not a directory; expected one with {WEIGHTS_FILE} and {CARD_FILE}.")
     card = read_json(path / CARD_FILE, error=error)
@@ -195,8 +187,3 @@ def identity_of(card: Mapping[str, Any]) -> str | None:
         return None
     whole = card.get("slim_of") or card.get("trimmed_from")  # the second is in the cards under results/
     return whole or f"{card.get('method', 'unknown')}:{card['weights_sha256']}"
-
-
-def previous_of(path: Path) -> Path:
-    """Return where an artifact is between the two renames of its replacement."""
-    return path.parent / f".{path.name}.previous"

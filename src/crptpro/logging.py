@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from urllib.parse import urlparse
 
 from crptpro.artifact import write_json, write_whole
@@ -28,17 +28,7 @@ from crptpro.values import as_int, as_path, as_plain
 
 _LOG = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True)
-class WandbOptions:
-    """How a run appears on Weights & Biases; ``None`` follows W&B's own variables."""
-
-    project: str | None = None  #: ``WANDB_PROJECT``, else crptpro
-    group: str | None = None  #: runs of one comparison: ``WANDB_RUN_GROUP``, else none
-    name: str | None = None  #: ``WANDB_NAME``, else the run directory's name
-    tags: tuple[str, ...] = ()
-    #: auto: ``WANDB_MODE`` if set, online if logged in, else offline (``wandb sync`` uploads it later)
-    mode: Literal["auto", "online", "offline"] = "auto"
+WANDB_FILE = "wandb_run.json"  # the id of the directory's W&B run
 
 
 class RunLogger:
@@ -50,8 +40,9 @@ class RunLogger:
 
     Args:
         run_dir: directory of the run, created if missing; rows found there are continued.
-        config: settings of the run, a mapping or a dataclass; kept in ``config.json`` with versions and hardware.
-        wandb: mirror to Weights & Biases if given.
+        wandb: mirror to Weights & Biases, with these arguments of ``wandb.init``. By default the project is
+            ``WANDB_PROJECT`` or crptpro, the name ``WANDB_NAME`` or the directory's, and the mode ``WANDB_MODE``, or
+            online if logged in, else offline (``wandb sync`` uploads it later).
         tensorboard: mirror to TensorBoard (needs the ``tensorboard`` extra).
 
     Raises:
@@ -67,11 +58,11 @@ class RunLogger:
     """
 
     def __init__(
-        self, run_dir: str | Path, *, config: Any = None, wandb: WandbOptions | None = None, tensorboard: bool = False
+        self, run_dir: str | Path, *, wandb: Mapping[str, Any] | None = None, tensorboard: bool = False
     ) -> None:
         self.run_dir = as_path(run_dir, "run_dir").absolute()
         self.path = self.run_dir / "metrics.jsonl"
-        self._config = as_plain(config or {}, "config")
+        self._config: dict[str, Any] = {}
         self._lock = DirectoryLock(self.run_dir, error=CheckpointError, is_reentrant=True)
         self._rows, self._columns = self._read(), dict[str, list[str]]()
         for stream in {row["stream"] for row in self._rows}:
@@ -79,7 +70,7 @@ class RunLogger:
         self._has_begun = False
         self._mirrors: list[_Wandb | _TensorBoard] = []
         if wandb is not None:
-            self._mirrors.append(_Wandb(wandb, self.run_dir, self._config))
+            self._mirrors.append(_Wandb(dict(wandb), self.run_dir, self._config))
         if tensorboard:
             self._mirrors.append(_TensorBoard(self.run_dir))
 
@@ -90,7 +81,10 @@ class RunLogger:
         self.close()
 
     def describe(self, config: Any) -> None:
-        """Add settings to those of the run, a mapping or a dataclass, before its first row."""
+        """Add settings of the run, a mapping or a dataclass, before its first row.
+
+        They are kept in ``config.json`` with versions and hardware.
+        """
         self._config.update(as_plain(config, "config"))
 
     def log(self, metrics: Mapping[str, Any], *, stream: str, **counters: int) -> None:
@@ -170,6 +164,18 @@ class RunLogger:
         for stream in seen:
             self._write_csv(stream)
 
+    def begin_again(self, streams: Iterable[str]) -> None:
+        """Remove the rows of a run without a checkpoint: ``metrics.before.jsonl`` keeps them, as does their W&B run."""
+        streams = list(streams)
+        if any(map(self.rows, streams)):
+            kept = self.path.with_suffix(".before.jsonl")
+            before = kept.read_bytes() if kept.exists() else b""
+            write_whole(kept, before + self.path.read_bytes())
+            # W&B drops rows below the last index of a run, so the new rows need another run.
+            (self.run_dir / WANDB_FILE).unlink(missing_ok=True)
+            _LOG.warning("%s has no checkpoint: it begins again; its earlier rows are in %s.", self.run_dir, kept)
+        self.load_state_dict(dict.fromkeys(streams, 0))
+
     def writes_into(self, directory: str | Path) -> bool:
         """Whether the record is inside ``directory``: only then all of it belongs to that directory's run."""
         return self.run_dir.resolve().is_relative_to(Path(directory).resolve())
@@ -219,7 +225,7 @@ class RunLogger:
 class _Wandb:
     """One W&B run per directory. A row's index is its step: W&B drops those that a resumed run repeats."""
 
-    options: WandbOptions
+    options: dict[str, Any]
     run_dir: Path
     config: dict[str, Any]
     streams: set[str] = field(default_factory=set)
@@ -230,30 +236,28 @@ class _Wandb:
         """TorchRL's logger; the W&B run begins when it is first used."""
         from torchrl.record.loggers import get_logger
 
-        options, environment = self.options, os.environ
         arguments = {
-            "project": options.project or environment.get("WANDB_PROJECT") or "crptpro",
-            "group": options.group or environment.get("WANDB_RUN_GROUP"),
-            "tags": list(options.tags) or None,
+            "project": os.environ.get("WANDB_PROJECT") or "crptpro",
+            "name": os.environ.get("WANDB_NAME") or self.run_dir.name,
+            "mode": _wandb_mode(),
             "config": self.config,
             "id": _wandb_id(self.run_dir),
             "reinit": "create_new",
             "settings": {"silent": True, "console": "off", "init_timeout": 60.0},
             "log_env_packages": False,
+            **self.options,
         }
-        name = options.name or environment.get("WANDB_NAME") or self.run_dir.name
-        mode = options.mode if options.mode != "auto" else _wandb_mode()
 
-        def start(mode: str) -> Any:
-            return get_logger("wandb", str(self.run_dir), name, wandb_kwargs={**arguments, "mode": mode})
+        def start(**changed: str) -> Any:
+            return get_logger("wandb", str(self.run_dir), arguments["name"], wandb_kwargs={**arguments, **changed})
 
         try:
-            return start(mode)
+            return start()
         except Exception as reason:
-            if mode != "online":
+            if arguments["mode"] != "online":
                 raise
             _LOG.warning("W&B cannot be reached (%s); logging offline, `wandb sync` uploads it later.", reason)
-            return start("offline")
+            return start(mode="offline")
 
     def log(self, stream: str, counters: Mapping[str, int], values: Mapping[str, Any], index: int) -> None:
         if stream not in self.streams:
@@ -318,7 +322,7 @@ def _wandb_mode() -> str:
 
 def _wandb_id(run_dir: Path) -> str:
     """Return the id of this directory's W&B run, drawn once and kept."""
-    path = run_dir / "wandb_run.json"
+    path = run_dir / WANDB_FILE
     try:
         return str(json.loads(path.read_text())["id"])
     except (OSError, ValueError, KeyError, TypeError):

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
 from crptpro import modules
-from crptpro.artifact import CARD_FILE, identity_of, previous_of, read_artifact, write_artifact
+from crptpro.artifact import CARD_FILE, identity_of, read_artifact, write_artifact
 from crptpro.data import FrameDataset
 from crptpro.errors import PretrainedError, UnknownNameError
 from crptpro.modules import PixelEncoder
@@ -59,6 +59,8 @@ class Pretrained:
     card: dict[str, Any] = field(default_factory=dict)  #: how it was made
     #: Remaining state of the loss (further heads, coefficients), for fine-tuning.
     rest: dict[str, Tensor] = field(default_factory=dict, repr=False)
+    #: Checksum of the networks as they were read, which is what the card identifies.
+    read_checksum: str | None = field(default=None, repr=False)
 
     @property
     def method(self) -> str:
@@ -75,14 +77,18 @@ class Pretrained:
         return {name: module for name in NETWORKS if (module := getattr(self, name)) is not None}
 
     def identity(self) -> str:
-        """Return what identifies these weights: the method and a checksum."""
-        if (named := identity_of(self.card)) is not None:
+        """Return what identifies these weights: the method and a checksum; that of the card until they are changed."""
+        checksum = self._checksum()
+        if checksum == self.read_checksum and (named := identity_of(self.card)) is not None:
             return named
+        return f"{self.method}:{checksum}"
+
+    def _checksum(self) -> str:
         digest = hashlib.sha256()
         for key, value in nn.ModuleDict(self._networks()).state_dict().items():
             digest.update(key.encode())
             digest.update(value.cpu().reshape(-1).view(torch.uint8).numpy().tobytes())  # NumPy has no bfloat16
-        return f"{self.method}:{digest.hexdigest()}"
+        return digest.hexdigest()
 
     def require(self, *, image_size: int, frame_stack: int | None = None) -> Pretrained:
         """Check the encoder's image size, in pixels, and stack, as far as its ``config`` says them; returns self.
@@ -191,9 +197,7 @@ def _feature_moments(encoder: PixelEncoder, datasets: Sequence[FrameDataset], se
     return mean, torch.where(deviation > 1e-6, deviation, torch.ones_like(deviation))
 
 
-def save_pretrained(
-    trained: Any, path: str | Path, *, slim: bool = False, dtype: Literal["bfloat16"] | None = None
-) -> Path:
+def save_pretrained(trained: Any, path: str | Path, *, slim: bool = False) -> Path:
     """Write what was trained as a directory: ``weights.safetensors`` and ``card.json``.
 
     It is read back and rebuilt before it replaces anything.
@@ -205,24 +209,23 @@ def save_pretrained(
         path: directory to write and to return; an artifact there is replaced, as a whole.
         slim: leave out what only training reads: predictor, targets and further heads, and without prototypes the
             projector. Learning a task from it gives the same numbers; fine-tuning from it is refused.
-        dtype: ``"bfloat16"`` stores the weights in half the size, rounded to 8 bits; they are loaded as float32.
 
     Raises:
         PretrainedError: no encoder that can be rebuilt, or ``path`` is another kind of directory.
         ValueError: a network was built with something that cannot be stored as JSON.
         DiskSpaceError: the disk is full; an artifact there is kept.
     """
-    if dtype not in (None, "bfloat16"):
-        raise ValueError(f"`dtype` must be 'bfloat16' or None, got {dtype!r}.")
     path = as_path(path)
     source = _as_pretrained(trained)
+    card = dict(source.card)
+    if "weights_sha256" in card and (slim or "slim_of" in card):
+        card["slim_of"] = source.identity()
     if slim:
+        card["slim"] = True
         left_out: dict[str, Any] = dict.fromkeys(("predictor", *TARGETS)) | {"rest": {}}
         if source.prototypes is None or source.projector is None:
             left_out |= dict.fromkeys(("projector", "prototypes", "queue"))
-        whole = identity_of(source.card)
-        facts = {"slim": True} if whole is None else {"slim": True, "slim_of": whole}
-        source = replace(source, **left_out, card={**source.card, **facts})
+        source = replace(source, **left_out)
     states: dict[str, Mapping[str, Tensor]] = {}
     described: dict[str, dict[str, Any]] = {}
     classes: dict[str, type[nn.Module]] = {}
@@ -240,13 +243,7 @@ def save_pretrained(
         states["queue"] = {"latents": source.queue}
     if source.rest:
         states["loss"] = source.rest
-    card = {**source.card, "modules": described, "pixels": _pixel_facts(source.encoder), **provenance()}
-    if dtype is not None:
-        card.pop("slim_of", None)  # these are other numbers
-        states = {
-            name: {k: v.to(torch.bfloat16) if v.is_floating_point() else v for k, v in state.items()}
-            for name, state in states.items()
-        }
+    card |= {"modules": described, "pixels": _pixel_facts(source.encoder), **provenance()}
     check = partial(_rebuilt, path, classes)
     return write_artifact(path, states, card=card, format_name=FORMAT, version=VERSION, check=check)
 
@@ -262,7 +259,7 @@ def load_pretrained(path: str | Path, classes: Mapping[str, type[nn.Module]] | N
         PretrainedError: something is missing, truncated, tampered with, of another kind, or unknown.
     """
     path = as_path(path)
-    if path.name == str(path) and not path.exists() and not previous_of(path).exists():  # a name, not a path
+    if path.name == str(path) and not path.exists():  # a name, not a path
         if not (SHIPPED / path / CARD_FILE).exists():
             raise PretrainedError(
                 f"{path} does not exist, and no encoder of this name ships with crptpro; those that do: "
@@ -295,7 +292,7 @@ def _as_pretrained(trained: Any) -> Pretrained:
             f"{type(loss).__name__} has no `.encoder`, which a pre-training loss exposes. An encoder alone: "
             "Pretrained(encoder)."
         )
-    heads = {role: _unwrapped(getattr(loss, role, None)) for role in HEADS}
+    heads: dict[str, Any] = {role: _unwrapped(getattr(loss, role, None)) for role in HEADS}
     targets = {}
     for target, online in zip(TARGETS, (encoder, heads["projector"])):
         if online is not None and (state := _target_state(loss, target)):
@@ -388,4 +385,6 @@ def _rebuilt(
     queue, rest = parts.pop("queue", {}).get("latents"), parts.pop("loss", {})
     if parts:
         raise PretrainedError(f"{path} holds weights its card does not describe: {', '.join(sorted(parts))}.")
-    return Pretrained(**networks, queue=queue, card=card, rest=rest)
+    found = Pretrained(**networks, queue=queue, card=card, rest=rest)
+    found.read_checksum = found._checksum()
+    return found

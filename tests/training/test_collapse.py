@@ -54,30 +54,30 @@ def test_a_plateau_is_announced_and_passes_or_is_called_dead_when_it_outlasts_pa
 ) -> None:
     monitor = CollapseMonitor(512, patience_updates=300)
     with caplog.at_level(logging.INFO):
-        assert [monitor.observe(100 * index, comp=comp, cosine=0.9) for index, comp in enumerate(comps, 1)] == states
-        verdict = monitor.finish(end := 100 * len(comps) + 50)
+        found = [monitor.observe(100 * index, comp=comp, cosines={"a": 0.9}) for index, comp in enumerate(comps, 1)]
+        verdict = monitor.finish()
     assert [record.levelname for record in caplog.records] == [level for level, _ in announced]
     assert all(words in record.message for record, (_, words) in zip(caplog.records, announced))
+    assert found == states
     assert (verdict["verdict"], verdict["plateaus"]) == (states[-1], plateaus)
-    assert verdict["plateau_updates"] == sum((each["left"] or end) - each["entered"] for each in plateaus)
 
 
 def test_cosines_are_watched_without_prototypes_and_one_collapsed_domain_is_named(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     monitor = CollapseMonitor(None)
-    assert monitor.observe(100, comp=UNIFORM, cosine=0.5) == "learning"
-    assert monitor.observe(200, cosine={"walker": 0.4, "pendulum": 0.9999}) == "learning"
-    assert monitor.finish(200)["collapsed_domains"] == ["pendulum"]
+    assert monitor.observe(100, comp=UNIFORM, cosines={"walker": 0.5}) == "learning"
+    assert monitor.observe(200, comp=None, cosines={"walker": 0.4, "pendulum": 0.9999}) == "learning"
+    assert monitor.finish()["collapsed_domains"] == ["pendulum"]
     assert "pendulum" in caplog.text
-    assert monitor.observe(300, cosine={"walker": 0.999, "pendulum": 0.995}) == "plateau"
+    assert monitor.observe(300, comp=None, cosines={"walker": 0.999, "pendulum": 0.995}) == "plateau"
 
 
 def test_a_restored_monitor_judges_as_the_original() -> None:
     original, restored = (CollapseMonitor(512, patience_updates=300) for _ in range(2))
-    original.observe(100, comp=UNIFORM, cosine={"a": 0.9})
-    original.observe(200, comp=6.0, cosine={"a": 0.9})
+    original.observe(100, comp=UNIFORM, cosines={"a": 0.9})
+    original.observe(200, comp=6.0, cosines={"a": 0.9})
     restored.load_state_dict(original.state_dict())
     for updates, comp in ((300, 6.0), (400, UNIFORM), (800, UNIFORM)):
-        assert original.observe(updates, comp=comp) == restored.observe(updates, comp=comp)
-    assert original.finish(800) == restored.finish(800)
+        assert original.observe(updates, comp=comp, cosines={}) == restored.observe(updates, comp=comp, cosines={})
+    assert original.finish() == restored.finish()

@@ -12,7 +12,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.modules import RandomPolicy
-from toy_env import PoisonedEnv, fixed_length
+from toy_env import PoisonedEnv, ToyEnv, fixed_length
 from toy_runs import EPISODE, SIZE, make_encoder, toy_domain
 
 from crptpro.envs import make_env
@@ -76,15 +76,15 @@ def test_an_environment_that_was_closed_says_so() -> None:
         evaluate(make_agent(), env, episodes=1, progress=False)
 
 
-def test_a_non_finite_action_names_the_episode_and_the_decision() -> None:
+def test_a_non_finite_action_names_the_environment_the_episode_and_the_step_and_says_what_it_means() -> None:
     actions = iter([0.1] * (EPISODE + 3) + [float("nan")])
-    with pytest.raises(NonFiniteError, match="episode 1, decision 3: the policy acts"):
+    with pytest.raises(NonFiniteError, match=r"'toy_go' .* agent step 4 of episode 1 .* training has diverged"):
         evaluate(lambda _: torch.full((2,), next(actions)), make_toy_env(), episodes=2, progress=False)
 
 
-def test_a_reward_that_is_not_finite_names_the_episode_and_keeps_those_before() -> None:
+def test_a_reward_of_an_unchecked_environment_that_is_not_finite_names_the_episode_and_keeps_those_before() -> None:
     kept: list[Episode] = []
-    with pytest.raises(NonFiniteError, match="episode 1, decision 3: the reward is nan"):
+    with pytest.raises(NonFiniteError, match="episode 1: the rewards sum to nan"):
         evaluate(
             lambda _: torch.zeros(2), PoisonedEnv(fixed_length), episodes=3, progress=False, on_episode=kept.append
         )
@@ -169,6 +169,31 @@ def test_workers_that_die_between_two_evaluations_are_replaced_by_this_process(
     assert [counters for _, counters in results] == [{"env_steps": 0}, {"env_steps": 40}]
     assert "evaluating in this process from here on" in caplog.text
     lost.close()
+
+
+class BrokenEnv(ToyEnv):
+    """Fails as its driver does."""
+
+    def _reset(self, tensordict: Any = None, **options: Any) -> Any:
+        raise OSError("the camera is gone")
+
+
+def test_an_error_of_the_environment_is_no_lost_worker(caplog: pytest.LogCaptureFixture) -> None:
+    failing, _ = evaluator(1, functools.partial(BrokenEnv, fixed_length))
+    failing.start(env_steps=0)
+    with caplog.at_level("WARNING", logger="crptpro"), pytest.raises(OSError, match="the camera is gone"):
+        failing.finish()
+    assert not caplog.records
+    failing.close()
+
+
+def test_closing_ends_an_evaluation_that_is_under_way() -> None:
+    before = multiprocessing.active_children()
+    stopped, results = evaluator(1)
+    stopped.start(env_steps=0)
+    stopped.close()
+    assert multiprocessing.active_children() == before
+    assert results == []
 
 
 @pytest.mark.parametrize("make", [make_toy_env, lambda: make_toy_env()])

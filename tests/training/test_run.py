@@ -142,6 +142,15 @@ def test_a_checkpoint_of_more_gpus_is_continued_with_fewer() -> None:
     assert restored == [1]
 
 
+def test_a_run_of_a_gpu_is_continued_without_one(tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        cuda = [torch.zeros(16, dtype=torch.uint8)]
+        saved = _GlobalRNG.state_dict
+        patch.setattr(_GlobalRNG, "state_dict", lambda self: {**saved(self), "torch_cuda": cuda})
+        walk(tmp_path, 5)
+    assert first_update(tmp_path) == 5
+
+
 def test_without_an_interval_checkpoints_are_written_by_the_clock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -370,5 +379,5 @@ def test_means_count_each_name_by_its_own_rate() -> None:
         row = run.write("train", episodes=3)
         assert (row["loss_q"], row["actor"]) == (1.5, 20.0)
         assert "elsewhere" not in row
-        assert {"updates": 4, "episodes": 3}.items() <= run.history["train"][0].items()
-        assert run.last_row("other") == {}
+        assert {"updates": 4, "episodes": 3}.items() <= run.rows("train")[0].items()
+        assert run.rows("other") == []

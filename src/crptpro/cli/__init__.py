@@ -29,7 +29,7 @@ from crptpro.data import FrameDataset, collect_group
 from crptpro.domains import GROUPS, PAPER_DOMAINS, TASKS, expand_groups, get_domain
 from crptpro.envs import make_env
 from crptpro.errors import CRPTproError, DatasetError
-from crptpro.logging import RunLogger, WandbOptions
+from crptpro.logging import RunLogger
 from crptpro.modules import usable_device
 from crptpro.objectives import get_method
 from crptpro.plugins import load_plugins
@@ -73,9 +73,9 @@ class Logging:
         if self.wandb == "off" and not self.tensorboard:
             yield None
             return
-        wandb = None
-        if self.wandb != "off":
-            wandb = WandbOptions(self.wandb_project, self.wandb_group, tags=self.wandb_tags, mode=self.wandb)
+        mode = None if self.wandb == "auto" else self.wandb
+        asked = {"project": self.wandb_project, "group": self.wandb_group, "tags": self.wandb_tags, "mode": mode}
+        wandb = None if self.wandb == "off" else {name: value for name, value in asked.items() if value}
         is_new = not run_dir.exists()
         with RunLogger(run_dir, wandb=wandb, tensorboard=self.tensorboard) as logger:
             try:

@@ -91,10 +91,15 @@ class CheckedEnv:
         for key in keys:
             value = td.get(key, None)
             if value is not None and not value.isfinite().all():
+                remedy = "Fix what computes it, or keep the actions where the environment is stable."
+                if key == "action":
+                    remedy = (
+                        "If a policy computed it, training has diverged: lower the learning rate, or use "
+                        "precision='fp32'."
+                    )
                 raise NonFiniteError(
                     f"The environment {self._name!r} {verb} {key} {value.tolist()} in agent step {self._agent_step} of "
-                    f"episode {self._episode} (its first is 0). The step is not stored; fix what computes it, or keep "
-                    "the actions where the environment is stable."
+                    f"episode {self._episode} (its first is 0). The step is not stored. {remedy}"
                 )
 
     def _report_still_frames(self) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 
 from crptpro.artifact import read_artifact, write_artifact
-from crptpro.errors import CheckpointError, NonFiniteError
+from crptpro.errors import CheckpointError
 from crptpro.modules import PixelEncoder, SquashedGaussianActor, resolve_precision, set_compute_dtype
 from crptpro.modules.precision import evaluating
 from crptpro.objectives import RADSACLoss, SkillDDPGLoss
@@ -47,25 +47,16 @@ class PixelAgent(nn.Module):
             return self.encoder(pixels.unsqueeze(0).to(device))
 
     @torch.no_grad()
-    def explore(
-        self, features: Tensor, generator: torch.Generator, *, where: str, skill: Tensor | None = None
-    ) -> Tensor:
+    def explore(self, features: Tensor, generator: torch.Generator, *, skill: Tensor | None = None) -> Tensor:
         """Return a sample of the policy, float32 ``[A]`` in ``[-1, 1]``, for features ``[1, feature_dim]``.
 
-        ``skill`` is one-hot ``[S]``, for an actor that takes one. A policy that has diverged is a ``NonFiniteError``
-        that names ``where``, so that no simulator sees its actions.
+        ``skill`` is one-hot ``[S]``, for an actor that takes one.
         """
         if skill is not None:
             features = torch.cat([features, skill.unsqueeze(0).to(features.device)], -1)
         sampled = self.actor.sample(features, generator=generator)
         action = sampled if isinstance(sampled, Tensor) else sampled[0]
-        action = action.squeeze(0).float().cpu().clamp(-1, 1)
-        if not torch.isfinite(action).all():
-            raise NonFiniteError(
-                f"{where}: the policy returned the action {action.tolist()}; training has diverged. The last "
-                "checkpoint is kept; lower the learning rate or use precision='fp32'."
-            )
-        return action
+        return action.squeeze(0).float().cpu().clamp(-1, 1)
 
     def snapshot(self) -> PixelAgent:
         """Return the agent as it is now; an encoder that is trained is copied, a frozen one is shared."""

@@ -14,49 +14,40 @@ from torch import nn
 logger = logging.getLogger(__name__)
 
 LOSS_MARGIN = 0.005  # how near to ln(M) counts, as a fraction of it
+MAX_COSINE = 0.99
 
 
 class CollapseMonitor:
     """Watch a pre-training run for collapse and announce what it sees.
 
     A comparative loss of ln(M) (6.238 for 512 prototypes) means that predictions or assignments are uniform; a mean
-    pairwise cosine above ``cosine_threshold`` means that every observation has the same embedding. Small trials of the
+    pairwise cosine above 0.99 means that every observation has the same embedding. Small trials of the
     paper's loss stay there for about 1,200 updates and then leave. So being there is a ``plateau`` at first, and
     ``dead`` only when it lasts longer than ``patience_updates``. Two observations in a row outside end a plateau. A
     loss without prototypes (None) is watched by cosine only.
     """
 
-    def __init__(
-        self, num_prototypes: int | None = None, *, patience_updates: int = 5_000, cosine_threshold: float = 0.99
-    ) -> None:
+    def __init__(self, num_prototypes: int | None = None, *, patience_updates: int = 5_000) -> None:
         self.floor = math.log(num_prototypes) if num_prototypes and num_prototypes > 1 else None
-        self.patience_updates, self.cosine_threshold = patience_updates, cosine_threshold
+        self.patience_updates = patience_updates
         self.state = "learning"
         self.plateaus: list[dict[str, Any]] = []  # updates at which each was entered, and left
         self.outside_since: int | None = None
-        self.comp: float | None = None
         self.cosines: dict[str, float] = {}
 
     @classmethod
     def of(cls, loss: nn.Module) -> CollapseMonitor:
         """Return the monitor of a loss."""
-        # Healthy convolutional features, which are non-negative and share the background, come close to a cosine of 1.
         weight = getattr(getattr(loss, "prototypes", None), "weight", None)
-        has_projector = isinstance(getattr(loss, "projector", None), nn.Module)
-        threshold = 0.99 if has_projector else 0.9999
-        return cls(None if weight is None else len(weight), cosine_threshold=threshold)
+        return cls(None if weight is None else len(weight))
 
-    def observe(
-        self, updates: int, *, comp: float | None = None, cosine: float | Mapping[str, float] | None = None
-    ) -> str:
+    def observe(self, updates: int, *, comp: float | None, cosines: Mapping[str, float]) -> str:
         """Take a measurement after ``updates`` updates, and return the state after it.
 
-        ``comp`` is the comparative loss in nats, ``cosine`` the pairwise one, or one per domain (their mean decides).
+        ``comp`` is the comparative loss in nats, ``cosines`` the pairwise one of each domain (their mean decides).
         """
-        self.comp = comp
-        if cosine is not None:
-            self.cosines = dict(cosine) if isinstance(cosine, Mapping) else {"all": cosine}
-        reasons = self._reasons()
+        self.cosines = dict(cosines)
+        reasons = self._reasons(comp)
         entered = self.plateaus[-1]["entered"] if self.plateaus else updates
         if self.state == "learning":
             if reasons:
@@ -84,22 +75,9 @@ class CollapseMonitor:
         self.outside_since = None if reasons else updates
         return self.state
 
-    def verdict(self, updates: int) -> dict[str, Any]:
-        """Return the judgement after ``updates`` updates as plain values; changes nothing."""
-        ends = [updates if plateau["left"] is None else plateau["left"] for plateau in self.plateaus]
-        return {
-            "verdict": self.state,
-            "plateaus": copy.deepcopy(self.plateaus),
-            "plateau_updates": sum(ends) - sum(plateau["entered"] for plateau in self.plateaus),
-            "ln_num_prototypes": self.floor,
-            "comp": self.comp,
-            "cosine": dict(self.cosines),
-            "collapsed_domains": sorted(k for k, v in self.cosines.items() if v > self.cosine_threshold),
-        }
-
-    def finish(self, updates: int) -> dict[str, Any]:
-        """Announce how training ended and return :meth:`verdict`."""
-        verdict = self.verdict(updates)
+    def finish(self) -> dict[str, Any]:
+        """Announce how training ended and return the verdict as plain values."""
+        collapsed = sorted(domain for domain, cosine in self.cosines.items() if cosine > MAX_COSINE)
         if self.state == "dead":
             logger.error("Training ended. DEAD RUN: do not use this encoder; check the data and the temperatures.")
         elif self.state == "plateau":
@@ -108,25 +86,25 @@ class CollapseMonitor:
                 "(small trials of the paper's loss took about 1,200 updates); train longer.",
                 self.plateaus[-1]["entered"],
             )
-        elif verdict["collapsed_domains"]:
+        elif collapsed:
             logger.warning(
                 "Embeddings of %s have collapsed (pairwise cosine above %g), not those of every domain.",
-                ", ".join(verdict["collapsed_domains"]), self.cosine_threshold,
+                ", ".join(collapsed), MAX_COSINE,
             )  # fmt: skip
-        return verdict
+        return {"verdict": self.state, "plateaus": copy.deepcopy(self.plateaus), "collapsed_domains": collapsed}
 
     def state_dict(self) -> dict[str, Any]:
-        names = ("state", "plateaus", "outside_since", "comp", "cosines")
+        names = ("state", "plateaus", "outside_since", "cosines")
         return copy.deepcopy({name: getattr(self, name) for name in names})
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         vars(self).update(copy.deepcopy(dict(state)))
 
-    def _reasons(self) -> str:
+    def _reasons(self, comp: float | None) -> str:
         """Return what is wrong now; empty if nothing is."""
         found = []
-        if self.floor is not None and self.comp is not None and abs(self.comp - self.floor) <= LOSS_MARGIN * self.floor:
-            found.append(f"loss {self.comp:.4f} at ln(M) = {self.floor:.4f}")
-        if self.cosines and (mean := fmean(self.cosines.values())) > self.cosine_threshold:
+        if self.floor is not None and comp is not None and abs(comp - self.floor) <= LOSS_MARGIN * self.floor:
+            found.append(f"loss {comp:.4f} at ln(M) = {self.floor:.4f}")
+        if self.cosines and (mean := fmean(self.cosines.values())) > MAX_COSINE:
             found.append(f"pairwise cosine {mean:.4f}")
         return ", ".join(found)

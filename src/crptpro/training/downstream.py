@@ -245,8 +245,7 @@ def train_downstream(
                         features = agent.encode(td["pixels"])
                     else:  # encoded once, for the policy and for the batches that will contain it
                         features = dense.unshifted(number)
-                    where = f"{name}, agent step {agent_step}"
-                    td["action"] = agent.explore(features, generators["policy"], where=where)
+                    td["action"] = agent.explore(features, generators["policy"])
                 step = env.step(td)  # the next observation is drawn while the update computes
                 if learns:
                     # The sample has features under random shifts, and the bonus is part of its reward.
@@ -397,7 +396,10 @@ def attach_transforms(
 
 
 class _OnDevice(Transform):
-    """Moves samples of a replay to the device of the networks."""
+    """Moves samples of a replay to the device of the networks.
+
+    TorchRL's DeviceCastTransform waits for the GPU at every sample if the machine has one and ``device`` is the CPU.
+    """
 
     def __init__(self, device: torch.device) -> None:
         super().__init__(in_keys=[], out_keys=[])
@@ -422,11 +424,11 @@ def _eval_workers(task: str, make_this_env: Callable[[], EnvBase], config: Any) 
 
 
 def _record_evaluation(
-    run: Run, task: str, method: str, episodes: Sequence[Episode], counters: Mapping[str, int]
+    run: Run, task: str, method: str, episodes: Sequence[Episode], counters: Mapping[str, Any]
 ) -> None:
     for e in episodes:
         row = {"episode_return": e.episode_return, "episode_agent_steps": e.agent_steps, "seed": e.seed}
-        run.write("eval", {**row, "method": method}, extra=None, episode=e.episode, **counters)
+        run.write("eval", {**row, "method": method}, episode=e.episode, **counters)
     scores = summarize(episodes)
     logger.info(
         "%s: %s env steps, %s updates, return %.1f ± %.1f over %d episodes",

@@ -32,8 +32,6 @@ logger = logging.getLogger(__name__)
 Policy = Callable[[Any], Any]
 """Maps one observation, uint8 ``[C, H, W]``, to one action, float32 ``[A]`` in ``[-1, 1]``; or a policy of TorchRL."""
 WORKER_BYTES = 500_000_000
-LOST = (BrokenProcessPool, pickle.PicklingError, OSError)
-"""What a call of a worker raises if the process has died, or cannot be started."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,7 @@ def evaluate(
 
     Raises:
         ValueError: fewer than one episode.
-        NonFiniteError: an action or a reward is NaN or infinite; names the episode and the decision.
+        NonFiniteError: an action or a reward is NaN or infinite; names the episode.
     """
     results: list[Episode] = []
     bar = tqdm(
@@ -91,25 +89,23 @@ def run_episode(
     while not done:
         if on_frame is not None:
             on_frame(td["pixels"][-3:].clone())
-        where = f"Evaluation episode {episode}, decision {agent_steps}"
         is_torchrls = isinstance(policy, (TensorDictModuleBase, RandomPolicy))
         action = policy(td.copy()).get("action") if is_torchrls else policy(td["pixels"])
         if not isinstance(action, Tensor) or action.shape != env.action_spec.shape:
             got = tuple(action.shape) if isinstance(action, Tensor) else type(action).__name__
             raise ValueError(
-                f"{where}: the policy returned {got} for an action of shape {tuple(env.action_spec.shape)}. A policy "
-                'maps pixels to one action, or is a TorchRL module that writes "action" into a TensorDict.'
+                f"Evaluation episode {episode}, decision {agent_steps}: the policy returned {got} for an action of "
+                f"shape {tuple(env.action_spec.shape)}. A policy maps pixels to one action, or is a TorchRL module "
+                'that writes "action" into a TensorDict.'
             )
         td["action"] = action.detach()
-        if not torch.isfinite(td["action"]).all():
-            raise NonFiniteError(f"{where}: the policy acts {td['action'].tolist()}.")
         transition = env.step(td)
-        reward = transition["next", "reward"].item()
-        if not math.isfinite(reward):
-            raise NonFiniteError(f"{where}: the reward is {reward}.")
-        episode_return, agent_steps = episode_return + reward, agent_steps + 1
+        episode_return += transition["next", "reward"].item()
+        agent_steps += 1
         done = bool(transition["next", "done"].item())
         td = step_mdp(transition)
+    if not math.isfinite(episode_return):  # make_env's environments check every action and reward themselves
+        raise NonFiniteError(f"Evaluation episode {episode}: the rewards sum to {episode_return}.")
     return Episode(episode, episode_return, agent_steps, seed)
 
 
@@ -161,10 +157,10 @@ class Evaluator:
         self._env: EnvBase | None = None
         self._pending: tuple[PixelAgent, dict[str, int], int, list[Future[Episode]]] | None = None
 
-    def start(self, agent: PixelAgent | None = None, /, **counters: int) -> None:
-        """Evaluate an agent, by default the run's as it is now; ``counters``, with ``env_steps``, say where it is."""
+    def start(self, **counters: int) -> None:
+        """Evaluate the run's agent as it is now; ``counters``, with ``env_steps``, say where the run is."""
         self.finish()
-        self._begin(agent or self.agent.snapshot(), counters)
+        self._begin(self.agent.snapshot(), counters)
         if not self.workers:
             self.finish()
 
@@ -177,7 +173,7 @@ class Evaluator:
             seeds = [episode_seed(seed, episode) for episode in range(self.episodes)]
             try:
                 futures = [self._pool.submit(_evaluate, sent, *numbered) for numbered in enumerate(seeds)]
-            except LOST as reason:  # since the evaluation before
+            except (BrokenProcessPool, OSError) as reason:  # died since the evaluation before, or cannot be started
                 self._give_up(reason)
         self._pending = (agent, counters, seed, futures)
 
@@ -193,7 +189,7 @@ class Evaluator:
         agent, counters, seed, futures = self._pending
         try:
             episodes = [future.result() for future in futures]
-        except LOST as reason:
+        except BrokenProcessPool as reason:
             self._give_up(reason)
             futures = []
         if not futures:
@@ -227,7 +223,7 @@ class Evaluator:
 
     def close(self) -> None:
         if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
+            self._pool.end()
         if self._env is not None:
             self._env.close()
 

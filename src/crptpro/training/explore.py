@@ -232,8 +232,6 @@ def pretrain_active(
         done["updates"] = 0
         run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor,
                  **{f"explorer_{index}": explorer for index, explorer in enumerate(explorers)})  # fmt: skip
-        if done["updates"]:
-            run.counters["updates"] = done["updates"]
 
         update_encoder = make_update(loss, optimizer, targets, grad_clip=recipe.grad_clip)
         for _ in run.until(plan.env_steps, checkpoint_interval=settings.checkpoint_interval_env_steps):
@@ -251,11 +249,10 @@ def pretrain_active(
                 losses = update_encoder(batch)
                 schedule.step()
                 done["updates"] += 1
-                run.counters["updates"] = done["updates"]
                 run.log(scalars(losses, explorer.name))
                 if done["updates"] % settings.log_interval == 0:
-                    write_row(run, loss, monitor, batch, explorer.name)
-                    run.write("explore")
+                    write_row(run, loss, monitor, done["updates"])
+                    run.write("explore", updates=done["updates"])
             if trains_agent:
                 batch = batch if trains_encoder else explorer.replay.sample(settings.batch_size).to(device)
                 if "features" not in batch:
@@ -263,17 +260,15 @@ def pretrain_active(
                 metrics = explorer.learn(batch, agent_step // exploration.agent_update_interval)
                 run.log({f"{key}/{explorer.name}": value for key, value in metrics.items()}, "explore")
             if (row := explorer.end_step()) is not None:
-                run.write("episodes", {"domain": explorer.name, **row}, episodes=explorer.episodes)
+                run.write("episodes", row, updates=done["updates"], episodes=explorer.episodes)
             run.advance(explorer.action_repeat)
         run.finish()
-        first = explorers[0]
-        run.counters["updates"] = done["updates"]
         if run.means("pretrain"):
-            batch = first.replay.sample(min(settings.batch_size, 64)).to(device)
-            write_row(run, loss, monitor, batch, first.name)
-            run.write("explore")
+            write_row(run, loss, monitor, done["updates"])
+            run.write("explore", updates=done["updates"])
         explored = [{"domain": e.name, "agent_steps": e.agent_steps, "episodes": e.episodes} for e in explorers]
         facts = {"device": str(device), "datasets": explored, "env_steps": run.position}
+        first = explorers[0]
         return ExploreResult(
             **ending(run, loss, recipe, monitor, done["updates"], facts), env_steps=run.position,
             actor=first.agent.actor if exploration.transfers_actor else None, queue=first.candidates(),
@@ -331,23 +326,22 @@ class Explorer:
         if self.agent_steps < self.config.random_agent_steps:
             td["action"] = self.env.uniform_action(self.generators["random_actions"])
         else:
-            where = f"{self.name}, episode {self.episodes}, decision {len(self.actions)}"
             features, skill = self.agent.encode(td["pixels"]), td.get("skill", None)
-            td["action"] = self.agent.explore(features, self.generators["policy"], skill=skill, where=where)
+            td["action"] = self.agent.explore(features, self.generators["policy"], skill=skill)
         self._step = self.env.step(td)
 
-    def end_step(self) -> dict[str, float] | None:
-        """Store the outcome of the step; returns the episode's return and length if it ended one."""
+    def end_step(self) -> dict[str, Any] | None:
+        """Store the outcome of the step; returns the domain, return and length of the episode if it ended one."""
         transition = self._step.result()
         self.replay.extend(transition)
         self.agent_steps += 1
         self._take(transition)
         if not transition["next", "done"].item():
             return None
-        row = {"episode_return": self._episode_return, "episode_agent_steps": len(self.actions)}
+        episode = {"episode_return": self._episode_return, "episode_agent_steps": len(self.actions)}
         self.episodes += 1
         self._td, self.actions, self._episode_return = None, [], 0.0
-        return row
+        return {"domain": self.name, **episode}
 
     def learn(self, batch: TensorDictBase, agent_step: int) -> dict[str, Tensor]:
         """Let the agent learn from the intrinsic reward of a batch with features; returns detached scalars."""

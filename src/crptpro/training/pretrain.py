@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import RandomSampler, ReplayBuffer
@@ -21,9 +20,9 @@ from crptpro.data import FrameDataset
 from crptpro.errors import CRPTproError, DatasetError
 from crptpro.logging import RunLogger
 from crptpro.modules import computing, resolve_precision, usable_device
-from crptpro.modules.precision import PRECISION_NAMES, Precision, evaluating
+from crptpro.modules.precision import PRECISION_NAMES, Precision
 from crptpro.objectives import Method, get_method, method_of
-from crptpro.objectives.functional import mean_pairwise_cosine, prototype_metrics
+from crptpro.objectives.functional import prototype_metrics
 from crptpro.pretrained import Pretrained, class_name, load_pretrained, loss_options
 from crptpro.provenance import provenance
 from crptpro.training.collapse import CollapseMonitor
@@ -92,7 +91,7 @@ class PretrainResult:
     training: dict[str, Any] = field(repr=False)
     """how it was trained, as plain values, for the artifact's card"""
     history: list[dict[str, Any]] = field(default_factory=list, repr=False)
-    """the rows that this call wrote, oldest first"""
+    """the rows of the record, oldest first"""
 
 
 def pretrain(
@@ -155,16 +154,13 @@ def pretrain(
         datasets_facts = [_facts(name, buffer) for name, buffer in buffers.items()]
         run.require_same({
             **{name: getattr(settings, name) for name in (*METHOD_FIELDS, "seed")},
+            "device": device.type,  # the samplers draw from generators of the device
             # A schedule is stretched over the run, so that a run with one cannot be extended.
             "updates": None if recipe.schedule == "constant" else settings.updates,
             "schedule": recipe.schedule, "grad_clip": recipe.grad_clip, "precision": PRECISION_NAMES[dtype],
             "loss": describe_loss(loss), "started_from": started_from, "datasets": datasets_facts,
         })  # fmt: skip
-        samplers = {
-            f"sampler_{index}": buffer.sampler
-            for index, buffer in enumerate(buffers.values())
-            if type(buffer.sampler) is not RandomSampler
-        }
+        samplers = {f"sampler_{index}": buffer.sampler for index, buffer in enumerate(buffers.values())}
         run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor,
                  generators=generators, **samplers)  # fmt: skip
 
@@ -181,13 +177,10 @@ def pretrain(
             run.log(scalars(losses, domain))
             run.advance(1)
             if run.every(settings.log_interval):
-                write_row(run, loss, monitor, batch, domain)
+                write_row(run, loss, monitor, run.position)
         run.finish()
         if run.means("pretrain"):  # after the checkpoint: a longer run takes this shorter row back
-            if run.position == run.resumed_from:  # a finished run that is called again
-                domain = domains[(run.position - 1) % len(domains)]
-                batch = buffers[domain].sample(settings.batch_size).select(*loss.in_keys).to(device)
-            write_row(run, loss, monitor, batch, domain)
+            write_row(run, loss, monitor, run.position)
         facts = {"device": str(device), "datasets": datasets_facts}
         return PretrainResult(**ending(run, loss, recipe, monitor, run.position, facts))
 
@@ -206,7 +199,8 @@ def finetune(pretrained: Pretrained | str | Path, datasets: Any, **options: Any)
         pretrained = load_pretrained(pretrained)
     identity = pretrained.identity()
     config = options.get("config") or PretrainConfig()
-    updates = options.get("updates") or config.updates or get_method("crptpro-finetune").updates
+    if (updates := options.get("updates", config.updates)) is None:
+        updates = get_method("crptpro-finetune").updates
     options |= {"method": pretrained.method, "started_from": identity, "updates": updates}
     result = pretrain(pretrained.build_loss(), datasets, **options)
     before = {"started_from": identity, "previous_training": pretrained.card.get("training")}
@@ -289,7 +283,7 @@ def scalars(losses: TensorDictBase, domain: str) -> dict[str, Tensor]:
 
 
 @torch.no_grad()
-def write_row(run: Run, loss: LossModule, monitor: CollapseMonitor, batch: TensorDictBase, domain: str) -> None:
+def write_row(run: Run, loss: LossModule, monitor: CollapseMonitor, updates: int) -> None:
     """Write a row of the ``pretrain`` record with the prototypes' spread, and let the monitor judge it."""
     means = run.means("pretrain")
     extra = {}
@@ -301,18 +295,9 @@ def write_row(run: Run, loss: LossModule, monitor: CollapseMonitor, batch: Tenso
         if len(weight) >= 4:
             measured = prototype_metrics(weight.detach(), offset=float(getattr(loss, "offset", 1.5)))
             extra |= {name: float(value) for name, value in measured.items()}
-    if "embedding_cosine" not in means and "pixels" in batch and isinstance(getattr(loss, "encoder", None), nn.Module):
-        with evaluating(loss.encoder):  # measuring must not change what is trained
-            embeddings = loss.encoder(batch["pixels"][:128])
-        if isinstance(getattr(loss, "projector", None), nn.Module):
-            with evaluating(loss.projector):
-                embeddings = loss.projector(embeddings)
-        if isinstance(embeddings, Tensor) and embeddings.ndim == 2:
-            extra[f"cosine/{domain}"] = float(mean_pairwise_cosine(F.normalize(embeddings.float(), dim=-1)))
-    row = run.write("pretrain", extra=extra)
+    row = run.write("pretrain", extra=extra, updates=updates)
     cosines = {name.removeprefix("cosine/"): value for name, value in row.items() if name.startswith("cosine/")}
-    updates = run.counters.get("updates", run.position)
-    monitor.observe(updates, comp=row.get("comp", row.get("loss_comp")), cosine=cosines)
+    monitor.observe(updates, comp=row.get("comp", row.get("loss_comp")), cosines=cosines)
     run.show(loss=row["loss"])
 
 
@@ -330,7 +315,9 @@ def ending(
     run: Run, loss: LossModule, method: Method, monitor: CollapseMonitor, updates: int, facts: dict[str, Any]
 ) -> dict[str, Any]:
     """Return the fields of a :class:`PretrainResult`, and announce how training ended."""
-    collapse, metrics = monitor.finish(updates), run.last_row("pretrain")
+    collapse, rows = monitor.finish(), run.rows("pretrain")
+    last = rows[-1] if rows else {}  # the record of a finished run may be gone
+    metrics = {name: value for name, value in last.items() if name not in (run.unit, "updates", "unix_time_s")}
     training = {
         "updates": updates,
         "seconds": round(run.seconds, 1),
@@ -342,7 +329,7 @@ def ending(
     }
     return {
         "loss": loss, "method": method.name, "updates": updates, "resumed_from": run.resumed_from, "metrics": metrics,
-        "collapse": collapse, "training": training, "history": run.history["pretrain"],
+        "collapse": collapse, "training": training, "history": rows,
     }  # fmt: skip
 
 

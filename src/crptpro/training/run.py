@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import logging
 import os
 import shutil
 import signal
-import sys
 import threading
 import time
 import zipfile
@@ -22,7 +20,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 
-from crptpro.artifact import require_disk, write_whole
+from crptpro.artifact import require_disk
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import CheckpointError, DiskSpaceError, NonFiniteError, is_disk_full
 from crptpro.logging import RunLogger
@@ -80,8 +78,11 @@ class _Means:
 
 class _GlobalRNG(GlobalRNGState):
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        cuda = state_dict.get("torch_cuda")  # of all GPUs; another node may have fewer
-        super().load_state_dict({**state_dict, "torch_cuda": cuda[: torch.cuda.device_count()]} if cuda else state_dict)
+        state = dict(state_dict)
+        # Of all GPUs; another machine may have fewer, or none.
+        if cuda := state.pop("torch_cuda", [])[: torch.cuda.device_count()]:
+            state["torch_cuda"] = cuda
+        super().load_state_dict(state)
 
 
 class Run:
@@ -116,9 +117,7 @@ class Run:
     Attributes:
         position: progress in ``unit``, all resumptions included.
         resumed_from: position at which this call continued; 0 for a fresh run.
-        counters: further counters for every row.
         tally: the loop's own counters, which every checkpoint holds; set them before :meth:`keep`.
-        history: rows that this call wrote, by stream.
 
     Raises:
         CheckpointError: ``run_dir`` is in use by another process, or all its checkpoints are damaged.
@@ -137,11 +136,10 @@ class Run:
         self.run_dir = None if run_dir is None else as_path(run_dir, "run_dir")
         self.unit, self.streams, self.records, self.config = unit, streams, records, config
         self.position = self.resumed_from = 0
-        self.counters: dict[str, int] = {}
         self.tally: dict[str, int] = {}
-        self.history: dict[str, list[dict[str, Any]]] = {stream: [] for stream in streams}
         self.settings: dict[str, Any] = {}
         self.saved: dict[str, Any] = {}
+        self._rows: dict[str, list[dict[str, Any]]] = {stream: [] for stream in streams}  # without a record
         self._means = {stream: _Means() for stream in streams}
         self._checkpoint = Checkpoint(format="archive")
         self._modules: list[nn.Module] = []
@@ -155,7 +153,6 @@ class Run:
     def __enter__(self) -> Run:
         with contextlib.ExitStack() as stack:
             stack.enter_context(kept_global_rng())
-            stack.enter_context(_freed_memory_kept())
             if self.run_dir is not None:
                 stack.enter_context(DirectoryLock(self.run_dir, error=CheckpointError, is_reentrant=True))
                 self._rotation = CheckpointRotation(self.run_dir / "checkpoints", keep_last=2)
@@ -223,12 +220,7 @@ class Run:
                 self.records.load_state_dict(self.saved["record"])
             logger.info("Continues from %s %s.", f"{self.position:,}", self.unit)
         elif self.records is not None and self.run_dir is not None and self.records.writes_into(self.run_dir):
-            if any(map(self.records.rows, self.streams)):
-                kept = self.records.path.with_suffix(".before.jsonl")
-                before = kept.read_bytes() if kept.exists() else b""
-                write_whole(kept, before + self.records.path.read_bytes())
-                logger.warning("%s has no checkpoint: it begins again; its earlier rows are in %s.", self.run_dir, kept)
-            self.records.load_state_dict(dict.fromkeys(self.streams, 0))
+            self.records.begin_again(self.streams)
         self._saved_time = self._row_time = time.monotonic()
         self._started = self._row_time - self.saved.get("seconds", 0.0)
 
@@ -238,7 +230,7 @@ class Run:
         Between two iterations a checkpoint is written when one is due (every ``checkpoint_interval`` in ``unit``, or
         every :data:`CHECKPOINT_SECONDS`), or when a signal asks the run to stop.
         """
-        if self.position > total and self.resumed_from:
+        if self.position > total:
             raise CheckpointError(
                 f"{self.run_dir} has done {self.position:,} {self.unit}, more than the {total:,} requested. Request at "
                 "least as many, or choose another run directory."
@@ -320,18 +312,19 @@ class Run:
         extra: Mapping[str, float] | None = None,
         **counters: int,
     ) -> dict[str, Any]:
-        """Write a row with the position, :attr:`counters` and ``counters``, and return it without them.
+        """Write a row with the position and ``counters``, and return it without them.
 
         It holds ``extra`` and ``values``; by default the means since the last row, which start again, rate and memory.
         """
-        counters = {self.unit: self.position, **self.counters, **counters}
+        counters = {self.unit: self.position, **counters}
         row: dict[str, Any] = {**(self.means(stream) if values is None else values), **(extra or {})}
         if values is None:
             self._means[stream].load_state_dict({"sums": {}, "counts": {}})
             if stream == self.streams[0]:
                 row |= self._rate_and_memory()
-        self.history[stream].append({**counters, **row})
-        if self.records is not None:
+        if self.records is None:
+            self._rows[stream].append({**counters, **row})
+        else:
             self.records.log(row, stream=stream, **counters)
         return row
 
@@ -348,13 +341,7 @@ class Run:
 
     def rows(self, stream: str) -> list[dict[str, Any]]:
         """Return every row of a stream; with a record, those of all resumptions."""
-        return self.history[stream] if self.records is None else self.records.rows(stream)
-
-    def last_row(self, stream: str) -> dict[str, Any]:
-        """Return the newest row of a stream without its counters; empty if there is none."""
-        rows = self.history[stream] or self.rows(stream)
-        left_out = {self.unit, *self.counters, "unix_time_s"}
-        return {name: value for name, value in rows[-1].items() if name not in left_out} if rows else {}
+        return self._rows[stream] if self.records is None else self.records.rows(stream)
 
     def save(self, *, is_finished: bool = False) -> None:
         """Write a checkpoint of everything that :meth:`keep` was given, unless it is not finite; two are kept."""
@@ -414,29 +401,6 @@ class Run:
         if damaged:
             where = self._rotation.directory
             raise CheckpointError(f"All checkpoints in {where} are damaged. Remove that directory to start again.")
-
-
-@contextlib.contextmanager
-def _freed_memory_kept() -> Iterator[None]:
-    """Let glibc keep freed memory: an update makes tensors of the sizes of the one before.
-
-    They are mapped and zeroed anew otherwise. That took 0.17 s of the 4 s of processor time of a pre-training update in
-    float32 with AVX2, and takes 0.03 s now; peak memory grew from 2.0 to 2.2 GB.
-    """
-    libc = ctypes.CDLL(None) if sys.platform == "linux" else None
-    if libc is None or not hasattr(libc, "mallopt"):
-        yield
-        return
-    m_trim_threshold, m_mmap_threshold, m_mmap_max = -1, -3, -4
-    libc.mallopt(m_mmap_max, 0)
-    libc.mallopt(m_trim_threshold, -1)  # never
-    try:
-        yield
-    finally:  # what glibc arrives at by itself in a process that has freed large blocks
-        libc.mallopt(m_mmap_max, 65_536)
-        libc.mallopt(m_mmap_threshold, 32 * 2**20)
-        libc.mallopt(m_trim_threshold, 64 * 2**20)
-        libc.malloc_trim(0)
 
 
 def _not_finite(what: str) -> NonFiniteError:
