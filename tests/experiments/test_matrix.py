@@ -42,7 +42,7 @@ def of(found: list[Cell], label: str, **place: Any) -> list[Job]:
     # Five weights of two methods, three sizes of datasets.
     ("sensitivity", 3 * (5 * 2 + 3) * 3, {"run"}),
     ("efficiency", 8 * 3, {"timing"}),
-    ("prototypes", 2 + 1 + 2 + 2, {"prototypes"}),
+    ("prototypes", 2 + 1 + 2 + 2, {"encoder", "explored"}),
     ("coverage", 1, {"coverage"}),
     ("stability", 2 + 1 + 1, {"encoder", "explored"}),
     ("visualize", 2, {"embeddings"}),
@@ -126,7 +126,7 @@ def test_the_ablation_has_the_papers_weights_and_budgets() -> None:
     without = of(found, "crptpro without dispersion")[0].needs[0]
     assert option(without, "--loss") == "intr_loss_coef=0.0"
     assert of(found, "proto-rl-c with dispersion")[0].needs[0].facts["loss"] == {"intr_loss_coef": 5e-3}
-    measured = {cell.job.needs[0] for cell in cells("prototypes", PAPER, groups=("A", "C"))}
+    measured = {cell.job for cell in cells("prototypes", PAPER, groups=("A", "C"))}
     assert measured <= {needed for cell in found for needed in cell.job.needs}
 
 

@@ -41,7 +41,6 @@ KINDS = {
     "run": "downstream runs",
     "probe": "state probes",
     "timing": "timings, alone on the machine",
-    "prototypes": "prototype measurements",
     "coverage": "coverage measurements",
     "embeddings": "embeddings",
 }

@@ -339,19 +339,16 @@ def probe(scale: Scale, base: Job, data: Job) -> Job:
     return Job("probe", title, tuple(command), facts, (base, data))
 
 
-def _measurement(kind: str, trained: Job, command: Sequence[str], needs: Iterable[Job], **more: Any) -> Job:
-    facts = {name: trained.facts[name] for name in ("method", "domains", "seed")}
-    title = f"{facts['method']} {'+'.join(facts['domains'])} seed {facts['seed']}"
-    return Job(kind, title, tuple(command), facts | more, tuple(dict.fromkeys(needs)))
-
-
 def comparison(kind: str, base: Job, explorer: Job, datasets: Sequence[Job], *, samples: int, seed: int) -> Job:
     """Return a comparison of an explorer's data with random data: ``coverage`` or ``embeddings``."""
     replays = [f"{{{explorer.key}}}/replay/{domain}" for domain in explorer.facts["domains"]]
     command = ["measure", kind, "--encoder", _encoder_of(base), "--explorer", _encoder_of(explorer)]
     command += ["--replays", *replays, "--datasets", *map(_dataset_of, datasets), "--out", OWN]
     command += options(samples=samples, seed=seed)
-    return _measurement(kind, explorer, command, [base, explorer, *datasets], samples=samples)
+    facts = {name: explorer.facts[name] for name in ("method", "domains", "seed")}
+    title = f"{facts['method']} {'+'.join(facts['domains'])} seed {facts['seed']}"
+    needs = tuple(dict.fromkeys([base, explorer, *datasets]))
+    return Job(kind, title, tuple(command), {**facts, "samples": samples}, needs)
 
 
 def timing(request: Request, system: str, domain_sets: Sequence[Sequence[str]], seed: int) -> Job:
@@ -519,11 +516,10 @@ def _prototypes(request: Request) -> Iterator[Cell]:
     """How far prototypes spread, along pre-training and at its end, with and without the dispersion loss (IV.G)."""
     # The encoders of the ablation: those of an (S) method are trained on its domains.
     tasks = request.tasks or tuple(get_domain(domain).task for domain in SINGLE_DISPERSION)
+    scale = _ablated(request).scale
     for system, domains, place in replace(request, tasks=tasks).encoders(VARIANTS):
         for label, loss in _variants(system, domains[0]) if system in VARIANTS else ():
-            base = encoder(_ablated(request).scale, system, domains, place["encoder_seed"], loss=loss)
-            command = ["measure", "prototypes", _encoder_of(base), "--out", OWN]
-            yield Cell(label, _measurement("prototypes", base, command, [base]), place)
+            yield Cell(label, encoder(scale, system, domains, place["encoder_seed"], loss=loss), place)
 
 
 def _compared(request: Request, kind: str, groups: str, system: str, samples: int) -> Iterator[Cell]:

@@ -377,7 +377,7 @@ def _experiment(page: Page, experiment: str, scale: str, cells: pd.DataFrame, jo
         page.text(f"Missing: {names}. Missing results are left out, not replaced.", "warning")
         places = missing.drop(columns=["experiment", "scale", "done"])
         page.table(_count(len(missing), "missing result"), places, fold=True)
-    _measurements(page, name, cells, jobs)
+    _measurements(page, experiment, name, cells, jobs)
     _efficiency(page, name, cells, jobs)
     _scores(page, name, cells, jobs)
 
@@ -656,23 +656,35 @@ def _efficiency(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) 
 # --- measurements of encoders and data ------------------------------------------------------------------------------
 
 
-def _measurements(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
+def _measurements(page: Page, experiment: str, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     """Report the small tables of jobs. A job in two groups, as an (S) method's, counts once."""
     groups = cells.groupby("job")["group"].agg(lambda own: ", ".join(sorted(set(own))))
     once = cells.drop_duplicates("job").assign(group=lambda own: own["job"].map(groups))
-    for kind, measure in (("prototypes", _prototypes), ("coverage", _coverage), ("embeddings", _embeddings)):
+    for kind, measure in (("coverage", _coverage), ("embeddings", _embeddings)):
         rows = _records(page, once, jobs, [kind], kind)
         if len(rows):
             measure(page, name, rows, jobs)
-    rows = _records(page, cells, jobs, ["encoder", "explored", "finetuned"], "pretrain", "updates")
-    for group, own in rows.groupby("group") if len(rows) else ():
-        _diagnostics(page, f"{name}-{group}", f"Group {group}: diagnostics" if group else "Diagnostics", own)
+    trained = ["encoder", "explored", "finetuned"]
+    if experiment == "prototypes":
+        rows = _records(page, once, jobs, trained, "pretrain", "updates", *SPREAD)
+        if len(rows):
+            _prototypes(page, name, rows)
+    else:
+        rows = _records(page, cells, jobs, trained, "pretrain", "updates")
+        for group, own in rows.groupby("group") if len(rows) else ():
+            _diagnostics(page, f"{name}-{group}", f"Group {group}: diagnostics" if group else "Diagnostics", own)
     rows = _records(page, cells, jobs, ["probe"], "probe")
     if len(rows):
         _probes(page, rows)
 
 
-SPREAD = {"kne_3": "KNE, k = 3", "kne_half": "KNE, k = M/2", "ane": "ANE", "intr": "L_intr"}  # columns, headings
+SPREAD = {
+    "prototype_kne_3": "KNE, k = 3",
+    "prototype_kne_half": "KNE, k = M/2",
+    "prototype_ane": "ANE",
+    "prototype_dispersion": "L_intr",
+}
+"""Column of ``pretrain.csv`` to its heading."""
 
 
 def _last(rows: pd.DataFrame, keys: list[str], numbers: list[str], window: int = 1) -> pd.DataFrame:
@@ -682,11 +694,10 @@ def _last(rows: pd.DataFrame, keys: list[str], numbers: list[str], window: int =
     return ends.mean().assign(n=ends.size()).reset_index()
 
 
-def _prototypes(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> None:
-    rows["label"] = rows["method"] + rows["has_dispersion"].map({True: " with L_intr", False: " without L_intr"})
+def _prototypes(page: Page, name: str, rows: pd.DataFrame) -> None:
     table = []
-    for end in _last(rows, ["label", "method", "has_dispersion"], [*SPREAD, "updates"]).to_dict("records"):
-        paper = published.PROTOTYPE_METRICS.get((end["method"], end["has_dispersion"]))
+    for end in _last(rows, ["label"], [*SPREAD, "updates"]).to_dict("records"):
+        paper = published.PROTOTYPE_METRICS.get(end["label"])
         line = {"variant": end["label"], "encoders": end["n"], "updates": f"{end['updates']:,.0f}"}
         for column, title in SPREAD.items():
             printed = _number(getattr(paper, column, math.nan), ".3f")
