@@ -20,7 +20,6 @@ from crptpro.experiments.jobs import DONE, JOBS, KINDS, Plan, bytes_of, make_pla
 from crptpro.experiments.matrix import EXPERIMENTS, SCALES, Cell, Request
 from crptpro.free_memory import free_bytes
 from crptpro.modules import PixelEncoder, resolve_precision, usable_device
-from crptpro.objectives.methods import DOWNSTREAM, get_method
 from crptpro.values import as_path
 
 ALL = "all"
@@ -222,10 +221,8 @@ def memory_text(plan: Plan, jobs: int) -> str:
     """Return why fewer jobs at a time may be faster: their runs could keep dense maps. Empty if they can as it is."""
     from crptpro.transforms.dense_shift import dense_maps_bytes  # late, as it imports TorchRL
 
-    slots = 0
-    for facts in (job.facts for job in plan.missing if job.kind == "run" and job.needs):  # without DrQ's
-        usual = DOWNSTREAM | dict(get_method(facts["method"]).downstream)
-        slots = max(slots, min(facts.get("replay_capacity", usual["replay_capacity"]), facts["env_steps"]))
+    runs = [job.facts for job in plan.missing if job.kind == "run" and job.needs]  # without DrQ's
+    slots = max((min(facts["replay_capacity"], facts["env_steps"]) for facts in runs), default=0)
     needed = dense_maps_bytes(PixelEncoder(), slots, resolve_precision("auto", "cpu"), latent_dim=128)
     free = free_bytes(torch.device("cpu"))
     if needed <= 0.8 * free / jobs:

@@ -191,11 +191,10 @@ def bytes_of(job: Job) -> tuple[int, int]:
     if job.kind in ("encoder", "finetuned"):
         return ENCODER_BYTES, CHECKPOINT_BYTES
     if job.kind == "explored":
-        kept = min(facts["decisions"], 100_000 * len(facts["domains"]))
+        kept = min(facts["decisions"], facts["replay_capacity"] * len(facts["domains"]))
         return ENCODER_BYTES + kept * FRAME_BYTES, CHECKPOINT_BYTES * (1 + len(facts["domains"]))
     if job.kind == "run":
-        usual = 100_000 if facts["method"].startswith(("drq", "proto-rl")) else 40_000
-        return AGENT_BYTES, CHECKPOINT_BYTES + facts.get("replay_capacity", usual) * FRAME_BYTES
+        return AGENT_BYTES, CHECKPOINT_BYTES + facts["replay_capacity"] * FRAME_BYTES
     return 1_000_000, 0
 
 

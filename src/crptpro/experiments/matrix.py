@@ -16,6 +16,7 @@ from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.experiments.jobs import OWN, Job, options, plugins_digest
 from crptpro.experiments.published import COLORS, FINETUNE_UPDATES, UNSEEN, ScoreRow
 from crptpro.objectives import Method, get_method
+from crptpro.objectives.methods import DOWNSTREAM
 from crptpro.seeding import derive_seed
 from crptpro.training.explore import ExploreConfig, plan_exploration
 from crptpro.values import as_int
@@ -276,9 +277,10 @@ def encoder(scale: Scale, system: str, domains: Iterable[str], seed: int, *, los
     exploring = {**scale.explore, **(scale.explore_single if method.exploration.is_single_domain else {})}
     if "encoder_update_interval" in exploring:
         exploring["encoder_update_interval"] *= method.exploration.encoder_updates_each
-    plan = plan_exploration(method, names, ExploreConfig(**exploring))
+    config = ExploreConfig(**exploring)
+    plan = plan_exploration(method, names, config)
     facts |= {"explore": exploring, "env_steps": plan.env_steps, "decisions": plan.decisions}
-    facts["updates"] = plan.encoder_updates
+    facts |= {"updates": plan.encoder_updates, "replay_capacity": config.resolved(method).replay_capacity}
     command = ["pretrain", *names, *where, *options(seed=seed, **settings, **exploring)]
     return Job("explored", title, tuple(command), facts, (), _definition(*names, method=method))
 
@@ -314,18 +316,18 @@ def run(scale: Scale, system: str, task: str, base: Job | None, seed: int, *, co
         config["intrinsic_reward_coef"] = 0
     if colors != "normal":
         config["colors"] = colors
-    facts: dict[str, Any] = {"method": DRQ, "env_steps": 1_000_000}
-    by = ""
     if base is None:
         config.pop("queue_size", None)  # DrQ has no bonus
-    else:
-        facts = {"method": NO_BONUS if system == NO_BONUS else base.facts["method"], "env_steps": 500_000}
+    method = system if base is None or system == NO_BONUS else base.facts["method"]
+    facts: dict[str, Any] = {"method": method, **DOWNSTREAM, **get_method(method).downstream, **config}
+    facts |= {"task": task, "domain": get_domain(task).name, "seed": seed, "colors": colors}
+    by = ""
+    if base is not None:
         facts["encoder_seed"] = base.facts["seed"]
         by = f" encoder {base.facts['seed']}"
-    facts |= {"task": task, "domain": get_domain(task).name, "seed": seed, "colors": colors, **config}
     command = ["downstream", task, "--pretrained", DRQ if base is None else _encoder_of(base), "--out", OWN]
     command += options(seed=derive_seed(seed, "task", task), **config)
-    title = f"{task}{'' if colors == 'normal' else f' {colors}'} {facts['method']}{by} seed {seed}"
+    title = f"{task}{'' if colors == 'normal' else f' {colors}'} {method}{by} seed {seed}"
     needs = () if base is None else (base,)
     return Job("run", title, tuple(command), facts, needs, _definition(task))
 
