@@ -440,8 +440,30 @@ def test_a_damaged_record_of_embeddings_is_left_out_and_named(made: Reproduction
     assert re.search(r"Left out: .*explained\.json cannot be read", text)
 
 
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[pd.DataFrame]:
+    """The points of every figure."""
+    found: list[pd.DataFrame] = []
+    monkeypatch.setattr("crptpro.experiments.report.draw", lambda points, *_, **__: found.append(points) or Figure())
+    return found
+
+
+@pytest.mark.parametrize(("columns", "panels"), [
+    ({"comp": 4.0, "embedding_cosine": 0.5}, ["comparative loss [nats]", "mean pairwise cosine"]),  # no prototypes
+    ({"embedding_cosine": 0.5, "prototypes_in_use": 3.0, "prototype_ane": 0.1}, ["mean pairwise cosine"]),
+    ({"loss_mine": 1.0}, []),
+])  # fmt: skip
+def test_diagnostics_show_what_a_loss_of_ones_own_records(
+    made: Reproduction, drawn: list[pd.DataFrame], columns: dict[str, float], panels: list[str]
+) -> None:
+    job = made.job("encoder-1", "encoder", pretrain=[{"updates": n, **columns} for n in (100, 200)])
+    made.ask("stability", [("mine", job, {"group": "A", "encoder_seed": 0})])
+    assert made.report().cell(ENDS, "updates", "mine") == "200"
+    assert [panel for points in drawn for panel in points["panel"].unique()] == panels
+
+
 def test_a_curve_has_every_evaluation_of_runs_that_evaluate_at_other_env_steps(
-    made: Reproduction, monkeypatch: pytest.MonkeyPatch
+    made: Reproduction, drawn: list[pd.DataFrame]
 ) -> None:
     cells = made.runs("crptpro", "cheetah_run", [500, 600])
     others = made.runs("crptpro", "walker_run", [500, 600])  # evaluated at other intervals: only what both have
@@ -451,8 +473,6 @@ def test_a_curve_has_every_evaluation_of_runs_that_evaluate_at_other_env_steps(
             row["env_steps"] += (20 if place["task"] == "cheetah_run" else 20_000) * (seed % 2)
         write_rows(made.root / "jobs" / job / "eval.csv", rows)
     made.ask("seen", cells + others)
-    drawn: list[pd.DataFrame] = []
-    monkeypatch.setattr("crptpro.experiments.report.draw", lambda points, *_, **__: drawn.append(points) or Figure())
     made.report()
     [curves] = [points for points in drawn if "line" in points]
     mean = curves[(curves["line"] == "mean") & curves["panel"].str.contains("walker_run")]

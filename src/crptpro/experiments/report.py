@@ -28,7 +28,7 @@ from crptpro.experiments import published
 from crptpro.experiments import statistics as stats
 from crptpro.experiments.figures import draw, in_order
 from crptpro.experiments.launch import duration
-from crptpro.experiments.matrix import EXPERIMENTS
+from crptpro.experiments.matrix import EXPERIMENTS, PAPER
 from crptpro.values import as_path
 
 logger = logging.getLogger(__name__)
@@ -631,7 +631,7 @@ def _efficiency(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) 
     transitions = jobs["facts"].str.get("transitions")
     data = rows["job"].map(lambda job: transitions[_needed([job], jobs, "dataset")].mean())
     rows["collecting"] = rows["collection_seconds"].astype(float) / 3600
-    rows["hours"] = rows["paper_projected_hours"] + (rows["collecting"] * (100_000 / data)).fillna(0)
+    rows["hours"] = rows["paper_projected_hours"] + (rows["collecting"] * (PAPER.transitions / data)).fillna(0)
     table = []
     for (device, threads, method, count), own in rows.groupby(["device", "threads", "method", "domains"], sort=False):
         average = own.mean(numeric_only=True)
@@ -758,7 +758,8 @@ DIAGNOSTICS = {
     "prototypes_in_use": "prototypes in use",
     "prototype_ane": "ANE of prototypes",
 }
-"""Column of ``pretrain.csv`` to its heading; the first three are drawn."""
+"""Column of ``pretrain.csv`` to its heading."""
+DRAWN = ("comp", "embedding_cosine", "assignment_entropy_frac")  # along training, those that a record has
 WINDOW = 5  # a final value is the mean over this many rows at the end of a record
 PLATEAU = 0.99  # of ln M: a comparative loss that stays below has left the plateau, where all prototypes look alike
 
@@ -779,17 +780,18 @@ def left_plateau(record: pd.DataFrame) -> float:
 
 def _diagnostics(page: Page, name: str, title: str, rows: pd.DataFrame) -> None:
     shown = {column: heading for column, heading in DIAGNOSTICS.items() if column in rows}
-    headings = list(shown.values())
+    drawn = [shown[column] for column in DRAWN if column in shown]
     points = rows.rename(columns={"job": "line", "updates": "x", **shown})
     points["n"] = points.groupby("label")["line"].transform("nunique").astype(str)
-    points = points.melt(["label", "line", "x", "n"], headings[:3], "panel", "y").dropna(subset="y")
+    points = points.melt(["label", "line", "x", "n"], drawn, "panel", "y").dropna(subset="y")
     if len(points):
-        logs = rows["ln_num_prototypes"].dropna().unique() if points["panel"].iloc[0] == DIAGNOSTICS["comp"] else ()
+        has_plateau = "ln_num_prototypes" in rows and points["panel"].iloc[0] == DIAGNOSTICS["comp"]
+        logs = rows["ln_num_prototypes"].dropna().unique() if has_plateau else ()
         marks = {f"ln M = {value:.3f}": value for value in logs}
         caption = f"{title} along pre-training, a line per encoder (n in the legend)."
         page.figure(name, caption, draw(points, "encoder updates", marks=marks))
     ends = _last(rows, ["label"], list(shown), WINDOW).rename(columns={"n": "encoders", **shown})
-    ends[headings] = ends[headings].map(lambda value: _number(value, ".4g"))
+    ends[list(shown.values())] = ends[list(shown.values())].map(lambda value: _number(value, ".4g"))
     by_run = rows.groupby(["label", "job"])
     left = pd.Series({run: left_plateau(record) for run, record in by_run})
     summary = pd.DataFrame({"updates": by_run["updates"].max(), "left the plateau at": left})
