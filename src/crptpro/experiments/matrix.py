@@ -19,7 +19,6 @@ from crptpro.objectives import Method, get_method
 from crptpro.objectives.methods import DOWNSTREAM
 from crptpro.seeding import derive_seed
 from crptpro.training.explore import ExploreConfig, plan_exploration
-from crptpro.values import as_int
 
 Settings = Mapping[str, Any]
 NONE: Settings = {}
@@ -177,12 +176,11 @@ class Request:
             if group not in GROUPS:
                 raise UnknownNameError(f"There is no group {group!r}; choose from {', '.join(GROUPS)}.")
         object.__setattr__(self, "tasks", tuple(dict.fromkeys(get_domain(task).task for task in self.tasks)))
-        object.__setattr__(self, "seeds", tuple(self.seeds) or tuple(range(self.scale.seeds)))
+        object.__setattr__(self, "seeds", self.seeds or tuple(range(self.scale.seeds)))
         for name in ("encoder_seeds", "seeds"):
-            seeds = tuple(as_int(seed, name) for seed in getattr(self, name))
+            seeds = getattr(self, name)
             if not seeds or len(set(seeds)) != len(seeds) or not all(0 <= seed < SEEDS for seed in seeds):
                 raise CRPTproError(f"`{name}` must be different numbers from 0 to {SEEDS - 1}, got {seeds}.")
-            object.__setattr__(self, name, seeds)
 
     def tasks_in(self, domains: Collection[str]) -> list[str]:
         """Return the requested tasks of these domains; without requested tasks, one task of each domain."""
@@ -299,7 +297,7 @@ def encoder_for_task(
     if system != FINETUNE:
         return base
     data = dataset(scale, domain, seed)
-    updates = max(2, FINETUNE_UPDATES.get(domain, 3_000) * scale.updates // 50_000)  # the paper's, in proportion
+    updates = max(2, FINETUNE_UPDATES.get(domain, 3_000) * scale.updates // PAPER.updates)  # in proportion
     command = ["finetune", _encoder_of(base), _dataset_of(data), "--out", OWN]
     command += options(seed=seed, updates=updates, **scale.training)
     facts = {"method": FINETUNE, "domains": [domain], "seed": seed, "updates": updates, **scale.training}
