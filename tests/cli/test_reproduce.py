@@ -101,7 +101,6 @@ def test_all_means_the_experiments_with_requested_cells(call: Call) -> None:
     (("seen", "--jobs-per-gpu", "2"), "--jobs-per-gpu is for --device cuda, not cpu"),
     (("seen", "--launcher", "ray", "--device", "cuda:1"), "write --device cuda, not cuda:1"),
     (("seen", "--jobs", "0"), "--jobs must be at least 1, got 0"),
-    (("seen", "--attempts", "0"), "--attempts must be at least 1, got 0"),
     (("seen", "--device", "cuda:99"), "cuda:99"),
     (("seen", "--launcher", "slurm", "--hours", "0"), "a job needs a minute and 1 GB at least"),
     (("seen", "--launcher", "slurm", "--memory-gb", "0.1"), "a job needs a minute and 1 GB at least"),
@@ -157,7 +156,7 @@ class InProcess:
 
 def reproduce(root: Path, *arguments: str) -> None:
     """Run a part of a tiny reproduction in this process."""
-    part = ("--scale", "tiny", "--groups", "T", "--jobs", "1", "--cores-per-job", "1", "--attempts", "1")
+    part = ("--scale", "tiny", "--groups", "T", "--jobs", "1", "--cores-per-job", "1")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["crptpro", "reproduce", *arguments, *part, "--out", str(root)])
         main()

@@ -76,8 +76,6 @@ class Reproduce:
     """cores of each job (None: this machine's divided by jobs; on a cluster 1, beside a GPU 4)"""
     jobs_per_gpu: int = 1
     """local, ray: how many jobs share a GPU"""
-    attempts: int = 3
-    """how often a job is tried before it counts as failed; each attempt continues the one before"""
     partition: str | None = None
     """slurm: partition (None: the cluster's)"""
     hours: float = 24.0
@@ -126,9 +124,7 @@ class Reproduce:
         for name, cells in wanted.items():
             write_cells(root, name, self.scale, [(cell.label, cell.job.key, cell.place) for cell in cells])
         if launcher is not None:
-            failures = launch.run_jobs(
-                plan, root, launcher, jobs=jobs, cores=cores, device=self.device, attempts=self.attempts
-            )
+            failures = launch.run_jobs(plan, root, launcher, jobs=jobs, cores=cores, device=self.device)
             if failures:
                 print(failures_text(failures), flush=True)
                 raise SystemExit(1)
@@ -136,8 +132,6 @@ class Reproduce:
 
     def _checked_options(self) -> dict[str, Any]:
         """Refuse impossible options, and those of another launcher; returns the parameters of Slurm."""
-        if self.attempts < 1:
-            raise CRPTproError(f"--attempts must be at least 1, got {self.attempts}.")
         for each in dataclasses.fields(self):
             launchers = _LAUNCHERS.get(each.name, (self.launcher,))
             if getattr(self, each.name) != each.default and self.launcher not in launchers:
