@@ -44,7 +44,7 @@ def write_rows(path: Path, rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> 
 
 
 def probe_rows(
-    pretrained: Any, dataset: FrameDataset, *, encoder: str, samples: int = 2_000, seed: int = 0
+    pretrained: Any, dataset: FrameDataset, *, encoder: str, samples: int, seed: int
 ) -> tuple[list[dict[str, str]], list[dict[str, Any]]]:
     """Probe an encoder, called ``encoder`` in the rows, on a draw from a dataset with physical state.
 
