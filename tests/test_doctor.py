@@ -116,7 +116,6 @@ def test_what_a_machine_lacks_is_an_error_or_a_warning_with_its_remedy(
 @pytest.mark.parametrize(("installed", "severity", "words"), [
     ({"mujoco": "4.0.0", "torch": "2.13.0+cpu"}, "error", "mujoco 4.0.0"),
     ({"torch": "2.13.0"}, "error", "not installed"),
-    ({"mujoco": "3.17.0", "torch": "2.13.0", "mujoco-core": "4.0.0"}, "warning", "mujoco-core"),
     ({"mujoco": "3.17.0", "torch": "2.20.0"}, "warning", "is untested"),
 ])  # fmt: skip
 def test_versions_out_of_range_are_reported_with_their_remedy(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import logging
 import os
 import select
@@ -39,9 +38,6 @@ def run_main(main: Callable[[], object]) -> None:
     Expected are this library's own errors, a setting it refuses, and a file that cannot be read or written. A defect
     keeps its traceback. A closed pipe (``| head``) ends the program silently, with the status of SIGPIPE.
     """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
     configure_logging()
     try:
         try:

@@ -31,7 +31,6 @@ from crptpro.plugins import FLAG, load_plugins, loaded_plugins
 
 _BREAKING = ("mujoco", "dm-control", "torchrl", "tensordict")
 """Packages that are known to break outside their declared range; others are merely untested."""
-_LEFTOVERS = ("mujoco-core", "mujoco-studio")
 _GB = 1e9
 _TIMED_AGENT_STEPS = 8
 _OTHER_BACKEND = "Try another backend: MUJOCO_GL=osmesa or MUJOCO_GL=egl."
@@ -120,10 +119,6 @@ def check_versions(installed: Mapping[Any, str], requirements: Iterable[str]) ->
             effect = "known to break" if breaks else "untested"
             what = f"{name} {version} is outside {requirement.specifier}, which is {effect}."
             findings.append(Finding("error" if breaks else "warning", what, remedy))
-    if leftovers := [name for name in _LEFTOVERS if name in installed]:
-        what = f"{' and '.join(leftovers)} belong to MuJoCo 4 and break the import of MuJoCo 3."
-        remedy = f'pip uninstall -y {" ".join(leftovers)}; pip install --force-reinstall "mujoco>=3.17,<4"'
-        findings.append(Finding("warning", what, remedy))
     return findings
 
 

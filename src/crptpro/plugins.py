@@ -18,14 +18,12 @@ _loaded: list[str] = []
 def load_plugin(name: str) -> None:
     """Import a module, installed or of the working directory, or a Python file, a path that ends in ``.py``.
 
-    What is missing, imports what is missing, or is a file that no module may be named after, is a ``CRPTproError``.
+    What is missing, imports what is missing, or is a file with the name of another module, is a ``CRPTproError``.
     """
     path = as_path(name, FLAG)
     is_file = path.suffix == ".py"
     if is_file and not path.is_file():
         raise CRPTproError(f"{FLAG} {name}: there is no such file.")
-    if is_file and "." in path.stem:
-        raise CRPTproError(f"{FLAG} {name}: a module has no dot in its name; rename the file.")
     folder = str(path.resolve().parent if is_file else Path.cwd())
     if folder not in sys.path:
         sys.path.append(folder)  # last, so that it hides no installed module

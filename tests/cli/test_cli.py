@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import imageio.v2 as imageio
 import pandas as pd
 import pytest
 from command import FEW, SIZE, SMALL, TASK, Call, refused, rows, toy_dataset
@@ -18,6 +19,7 @@ from toy_env import PoisonedEnv, fixed_length, random_episode, write_dataset
 from crptpro import plugins
 from crptpro.cli import main
 from crptpro.domains import Domain, register_domain
+from crptpro.envs import make_env
 from crptpro.pretrained import load_pretrained
 from crptpro.training import load_agent
 
@@ -129,6 +131,33 @@ def test_a_reward_that_is_not_finite_ends_an_evaluation_and_keeps_its_finished_e
     line = refused(call("evaluate", "random-policy", "--task", "poisoned_go", "--episodes", 4, "--csv", "a.csv"))
     assert "'poisoned_go' returned reward" in line
     assert [row["episode"] for row in rows("a.csv")] == ["0"]
+
+
+def test_the_first_episode_is_written_as_a_video_after_its_score(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = ("evaluate", "random-policy", "--task", TASK, "--episodes", 2, "--video")
+    status, scores, err = call(*own, "new/first.mp4")
+    assert status == 0, err
+    with imageio.get_reader("new/first.mp4", format="FFMPEG") as video:
+        assert video.count_frames() == 10  # one per decision of the episode
+        size = 4 * make_env(TASK, seed=0).observation_spec["pixels"].shape[-1]
+        assert video.get_data(0).shape == (size, size, 3)
+
+    monkeypatch.setattr("imageio_ffmpeg.write_frames", lambda *_, **__: Path("absent/file").read_bytes())
+    status, out, err = call(*own, "new/second.mp4")
+    assert (status, out) == (1, scores)  # the episodes are not lost
+    assert "error: --video new/second.mp4 was not written" in err
+    assert [path.name for path in Path("new").iterdir()] == ["first.mp4"]
+
+
+def test_a_video_that_cannot_be_written_is_refused_before_any_episode(
+    call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("crptpro.training.evaluate", lambda *_, **__: pytest.fail("an episode ran"))
+    own = ("evaluate", "random-policy", "--task", TASK, "--video")
+    assert "the name of an MP4 ends in .mp4" in refused(call(*own, "first.gif"))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert "pip install 'crptpro[video]'" in refused(call(*own, "first.mp4"))
+    assert list(Path().iterdir()) == []
 
 
 def test_an_untrained_encoder_is_written_like_any_other(call: Call, dataset: Path) -> None:

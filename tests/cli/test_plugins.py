@@ -55,7 +55,6 @@ def test_a_users_method_explores_with_its_own_reward(call: Call) -> None:
 @pytest.mark.parametrize(("name", "message"), [
     ("needs_more.py", "it cannot be imported"),
     ("json.py", "'json' is the name of another module"),
-    ("my.maze.py", "has no dot in its name; rename the file"),
 ])  # fmt: skip
 def test_a_plugin_that_cannot_be_imported_says_so(call: Call, name: str, message: str) -> None:
     Path(name).write_text("import a_package_that_nobody_has")

@@ -12,9 +12,9 @@ import crptpro.objectives.methods as registry
 from crptpro import plugins
 from crptpro.domains import GROUPS
 from crptpro.experiments import matrix
-from crptpro.experiments.jobs import KINDS, Job, is_finished, make_plan
+from crptpro.experiments.jobs import FRAME_BYTES, KINDS, Job, bytes_of, is_finished, make_plan
 from crptpro.experiments.matrix import EXPERIMENTS, METHODS, PAPER, SMALL, TINY, Cell, Request
-from crptpro.objectives import ProtoLoss, register_method
+from crptpro.objectives import Exploration, ProtoLoss, register_method
 
 RESULTS = Path(__file__).parents[2] / "results"
 PART = {"groups": ("A",), "tasks": ("walker_run",)}
@@ -43,7 +43,7 @@ def of(found: list[Cell], label: str, **place: Any) -> list[Job]:
     # Five weights of two methods, three sizes of datasets.
     ("sensitivity", 3 * (5 * 2 + 3) * 3, {"run"}),
     ("efficiency", 8 * 3, {"timing"}),
-    ("prototypes", 2 + 1 + 2 + 2, {"prototypes"}),
+    ("prototypes", 2 + 1 + 2 + 2, {"encoder", "explored"}),
     ("coverage", 1, {"coverage"}),
     ("stability", 2 + 1 + 1, {"encoder", "explored"}),
     ("visualize", 2, {"embeddings"}),
@@ -127,7 +127,7 @@ def test_the_ablation_has_the_papers_weights_and_budgets() -> None:
     without = of(found, "crptpro without dispersion")[0].needs[0]
     assert option(without, "--loss") == "intr_loss_coef=0.0"
     assert of(found, "proto-rl-c with dispersion")[0].needs[0].facts["loss"] == {"intr_loss_coef": 5e-3}
-    measured = {cell.job.needs[0] for cell in cells("prototypes", PAPER, groups=("A", "C"))}
+    measured = {cell.job for cell in cells("prototypes", PAPER, groups=("A", "C"))}
     assert measured <= {needed for cell in found for needed in cell.job.needs}
 
 
@@ -179,3 +179,17 @@ def test_a_users_method_takes_the_scale_of_its_kind(tmp_path: Path, monkeypatch:
     plugin.write_text("# second")
     assert cells("seen", TINY, methods=("mine",), **PART)[0].job.needs[0].key != mine.key
     assert cells("seen", TINY, methods=("crptpro",), **PART)[0].job.needs[0].key == usual.key
+
+
+def test_a_users_method_is_planned_with_its_own_budgets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
+    own = {"replay_capacity": 1_000_000, "env_steps": 2_000_000}
+    register_method("mine", ProtoLoss, is_preset=True, downstream=own, exploration=Exploration(replay_capacity=5_000))
+    [job] = [c.job for c in cells("seen", PAPER, methods=("mine",), seeds=(0,), **PART)]
+    assert job.facts["env_steps"] == 2_000_000
+    assert bytes_of(job)[1] > 1_000_000 * FRAME_BYTES
+    frames, *_ = (bytes_of(needed)[0] / FRAME_BYTES for needed in job.needs)
+    assert 3 * 5_000 < frames < 3 * 8_000  # and the encoder
+    # Where the scale has a number, it is the scale's.
+    [job] = [c.job for c in cells("seen", SMALL, methods=("mine",), seeds=(0,), **PART)]
+    assert (job.facts["env_steps"], job.facts["replay_capacity"]) == (20_000, 12_000)

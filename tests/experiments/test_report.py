@@ -125,11 +125,12 @@ def test_returns_are_shown_beside_the_papers_without_intervals_of_two_runs(seen:
     (HOURS, "apt-s, 3", {"hours, paper's budget": "158 · paper 61.8"}),
     (HOURS, "becl, 2", {"encoder updates, paper's budget": "144,000 · paper 50,000"}),
     (HOURS, "crptpro-fast, 1", {"on": "2 threads", "machine": "7"}),
-    (SPREAD, "crptpro with L_intr", {"encoders": "1", "updates": "3,000", "KNE, k = 3": "125.156 · paper -26.545"}),
-    (SPREAD, "crptpro with L_intr", {"KNE, k = M/2": "3.513", "ANE": "2.848 · paper 7.996"}),
-    (SPREAD, "crptpro with L_intr", {"L_intr": "1.726 · paper -31.080"}),
-    (SPREAD, "crptpro-fast with L_intr", {"KNE, k = 3": "3028.036"}),
-    (SPREAD, "proto-rl-s without L_intr", {"ANE": "6.620 · paper 48.774"}),
+    (SPREAD, "crptpro", {"encoders": "1", "updates": "3,000", "KNE, k = 3": "120.855 · paper -26.545"}),
+    (SPREAD, "crptpro", {"KNE, k = M/2": "3.137", "ANE": "2.781 · paper 7.996"}),
+    (SPREAD, "crptpro", {"L_intr": "1.697 · paper -31.080"}),
+    (SPREAD, "crptpro-fast", {"KNE, k = 3": "3028.036"}),
+    (SPREAD, "crptpro without dispersion", {"ANE": "6.250 · paper 23.778"}),
+    (SPREAD, "proto-rl-s", {"ANE": "6.630 · paper 48.774"}),
     ("Coverage at the end", "walker, proto-rl-c explorer", {"coverage": "0.2630"}),
     ("Coverage at the end", "walker, random policy", {"all windows": "0.2467"}),
     (ENDS, "crptpro", {"left the plateau at": "1,700", r"comparative loss \[nats\]": "4.744"}),
@@ -439,8 +440,30 @@ def test_a_damaged_record_of_embeddings_is_left_out_and_named(made: Reproduction
     assert re.search(r"Left out: .*explained\.json cannot be read", text)
 
 
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[pd.DataFrame]:
+    """The points of every figure."""
+    found: list[pd.DataFrame] = []
+    monkeypatch.setattr("crptpro.experiments.report.draw", lambda points, *_, **__: found.append(points) or Figure())
+    return found
+
+
+@pytest.mark.parametrize(("columns", "panels"), [
+    ({"comp": 4.0, "embedding_cosine": 0.5}, ["comparative loss [nats]", "mean pairwise cosine"]),  # no prototypes
+    ({"embedding_cosine": 0.5, "prototypes_in_use": 3.0, "prototype_ane": 0.1}, ["mean pairwise cosine"]),
+    ({"loss_mine": 1.0}, []),
+])  # fmt: skip
+def test_diagnostics_show_what_a_loss_of_ones_own_records(
+    made: Reproduction, drawn: list[pd.DataFrame], columns: dict[str, float], panels: list[str]
+) -> None:
+    job = made.job("encoder-1", "encoder", pretrain=[{"updates": n, **columns} for n in (100, 200)])
+    made.ask("stability", [("mine", job, {"group": "A", "encoder_seed": 0})])
+    assert made.report().cell(ENDS, "updates", "mine") == "200"
+    assert [panel for points in drawn for panel in points["panel"].unique()] == panels
+
+
 def test_a_curve_has_every_evaluation_of_runs_that_evaluate_at_other_env_steps(
-    made: Reproduction, monkeypatch: pytest.MonkeyPatch
+    made: Reproduction, drawn: list[pd.DataFrame]
 ) -> None:
     cells = made.runs("crptpro", "cheetah_run", [500, 600])
     others = made.runs("crptpro", "walker_run", [500, 600])  # evaluated at other intervals: only what both have
@@ -450,8 +473,6 @@ def test_a_curve_has_every_evaluation_of_runs_that_evaluate_at_other_env_steps(
             row["env_steps"] += (20 if place["task"] == "cheetah_run" else 20_000) * (seed % 2)
         write_rows(made.root / "jobs" / job / "eval.csv", rows)
     made.ask("seen", cells + others)
-    drawn: list[pd.DataFrame] = []
-    monkeypatch.setattr("crptpro.experiments.report.draw", lambda points, *_, **__: drawn.append(points) or Figure())
     made.report()
     [curves] = [points for points in drawn if "line" in points]
     mean = curves[(curves["line"] == "mean") & curves["panel"].str.contains("walker_run")]

@@ -101,12 +101,3 @@ def test_a_run_under_two_tasks_is_redrawn_alike_and_counts_once() -> None:
     alone, twice = estimate(mean, own), estimate(mean, both)
     assert twice.runs == 5
     np.testing.assert_allclose([twice.low, twice.high], [alone.low, alone.high])
-
-
-def test_runs_that_cannot_be_estimated_are_refused_by_name() -> None:
-    with pytest.raises(ValueError, match=r"Run a 1 on a has a score that is not finite"):
-        estimate(mean, runs({"a": [1.0, float("nan")]}))
-    with pytest.raises(ValueError, match="no runs"):
-        estimate(mean, runs({"a": [1.0]}).iloc[:0])
-    with pytest.raises(ValueError, match="Only one of the methods has runs on b"):
-        estimate(probability_of_improvement, runs({"a": [1.0]}), runs({"a": [1.0], "b": [2.0]}))

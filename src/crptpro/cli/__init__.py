@@ -283,7 +283,8 @@ class Evaluate:
         if is_random and self.task is None:
             raise CRPTproError("The random policy has no task of its own; name one, e.g. --task walker_run.")
         require_writable(self.csv, "--csv")  # before an hour of episodes
-        require_writable(self.video, "--video")
+        if self.video is not None:
+            require_video(self.video)
         agent, card = (None, {}) if is_random else training.load_agent(self.agent)
         task = self.task or card["task"]
         usual = {"quality": "exact", "colors": "normal", "action_repeat": None} | card.get("config", {})
@@ -311,16 +312,17 @@ class Evaluate:
 
                     rows = [{"task": task, "agent": self.agent, **vars(episode)} for episode in episodes]
                     measure.write_rows(self.csv, rows)
+            scores = training.summarize(episodes)
+            print(
+                f"{task}: {scores['mean']:.1f} ± {scores['std']:.1f} "
+                f"({scores['min']:.1f} to {scores['max']:.1f}) over {len(episodes)} episodes",
+                flush=True,
+            )
             if self.video is not None:
                 frames: list[Any] = []
                 policy = agent or training.uniform_policy(env, seed=self.seed)
                 run_episode(policy, env, episode=0, seed=episode_seed(self.seed, 0), on_frame=frames.append)
                 write_video(frames, self.video)
-        scores = training.summarize(episodes)
-        print(
-            f"{task}: {scores['mean']:.1f} ± {scores['std']:.1f} "
-            f"({scores['min']:.1f} to {scores['max']:.1f}) over {len(episodes)} episodes"
-        )
 
 
 @dataclass(frozen=True)
@@ -385,13 +387,23 @@ class Report:
         print(build_report(self.directory, out=self.out))
 
 
+def require_video(path: Path) -> None:
+    """Refuse a video that cannot be written, before any work; makes nothing."""
+    if path.suffix.lower() != ".mp4":
+        raise CRPTproError(f"--video {path}: the name of an MP4 ends in .mp4.")
+    require_writable(path, "--video")
+    try:
+        import imageio_ffmpeg
+
+        imageio_ffmpeg.get_ffmpeg_exe()
+    except (ImportError, RuntimeError) as reason:
+        raise CRPTproError(f"--video needs the `video` extra ({reason}): pip install 'crptpro[video]'.") from None
+
+
 def write_video(frames: Sequence[torch.Tensor], path: Path) -> None:
     """Write RGB pictures, uint8 ``[3, H, W]``, as an MP4 at 25 pictures a second."""
-    try:
-        import imageio.v2 as imageio
-        import imageio_ffmpeg  # noqa: F401 - the encoder behind the FFMPEG format
-    except ImportError:
-        raise CRPTproError("--video needs the `video` extra: pip install 'crptpro[video]'.") from None
+    import imageio.v2 as imageio
+
     # Nearest-neighbour enlargement keeps 84 pixels visible on a screen; the codec wants even sizes.
     large = torch.stack(list(frames)).repeat_interleave(4, -1).repeat_interleave(4, -2)
     aside = path.with_name(f".{path.name}")
@@ -402,6 +414,8 @@ def write_video(frames: Sequence[torch.Tensor], path: Path) -> None:
         aside.replace(path)
     except (OSError, RuntimeError, ValueError) as reason:
         raise CRPTproError(f"--video {path} was not written: {reason}") from reason
+    finally:
+        aside.unlink(missing_ok=True)
 
 
 def named_values(option: str, words: Sequence[str]) -> dict[str, Any]:

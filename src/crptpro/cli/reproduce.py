@@ -20,7 +20,6 @@ from crptpro.experiments.jobs import DONE, JOBS, KINDS, Plan, bytes_of, make_pla
 from crptpro.experiments.matrix import EXPERIMENTS, SCALES, Cell, Request
 from crptpro.free_memory import free_bytes
 from crptpro.modules import PixelEncoder, resolve_precision, usable_device
-from crptpro.objectives.methods import DOWNSTREAM, get_method
 from crptpro.values import as_path
 
 ALL = "all"
@@ -77,8 +76,6 @@ class Reproduce:
     """cores of each job (None: this machine's divided by jobs; on a cluster 1, beside a GPU 4)"""
     jobs_per_gpu: int = 1
     """local, ray: how many jobs share a GPU"""
-    attempts: int = 3
-    """how often a job is tried before it counts as failed; each attempt continues the one before"""
     partition: str | None = None
     """slurm: partition (None: the cluster's)"""
     hours: float = 24.0
@@ -127,9 +124,7 @@ class Reproduce:
         for name, cells in wanted.items():
             write_cells(root, name, self.scale, [(cell.label, cell.job.key, cell.place) for cell in cells])
         if launcher is not None:
-            failures = launch.run_jobs(
-                plan, root, launcher, jobs=jobs, cores=cores, device=self.device, attempts=self.attempts
-            )
+            failures = launch.run_jobs(plan, root, launcher, jobs=jobs, cores=cores, device=self.device)
             if failures:
                 print(failures_text(failures), flush=True)
                 raise SystemExit(1)
@@ -137,8 +132,6 @@ class Reproduce:
 
     def _checked_options(self) -> dict[str, Any]:
         """Refuse impossible options, and those of another launcher; returns the parameters of Slurm."""
-        if self.attempts < 1:
-            raise CRPTproError(f"--attempts must be at least 1, got {self.attempts}.")
         for each in dataclasses.fields(self):
             launchers = _LAUNCHERS.get(each.name, (self.launcher,))
             if getattr(self, each.name) != each.default and self.launcher not in launchers:
@@ -222,10 +215,8 @@ def memory_text(plan: Plan, jobs: int) -> str:
     """Return why fewer jobs at a time may be faster: their runs could keep dense maps. Empty if they can as it is."""
     from crptpro.transforms.dense_shift import dense_maps_bytes  # late, as it imports TorchRL
 
-    slots = 0
-    for facts in (job.facts for job in plan.missing if job.kind == "run" and job.needs):  # without DrQ's
-        usual = DOWNSTREAM | dict(get_method(facts["method"]).downstream)
-        slots = max(slots, min(facts.get("replay_capacity", usual["replay_capacity"]), facts["env_steps"]))
+    runs = [job.facts for job in plan.missing if job.kind == "run" and job.needs]  # without DrQ's
+    slots = max((min(facts["replay_capacity"], facts["env_steps"]) for facts in runs), default=0)
     needed = dense_maps_bytes(PixelEncoder(), slots, resolve_precision("auto", "cpu"), latent_dim=128)
     free = free_bytes(torch.device("cpu"))
     if needed <= 0.8 * free / jobs:

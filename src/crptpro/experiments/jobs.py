@@ -7,7 +7,6 @@ number makes another job. ``ROOT/experiments`` lists the jobs of each experiment
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import re
@@ -19,7 +18,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from filelock import FileLock, Timeout
+from filelock import FileLock
 
 from crptpro.artifact import CARD_FILE, WEIGHTS_FILE, read_json, write_json
 from crptpro.data.storage import PIXELS_FILE
@@ -41,7 +40,6 @@ KINDS = {
     "run": "downstream runs",
     "probe": "state probes",
     "timing": "timings, alone on the machine",
-    "prototypes": "prototype measurements",
     "coverage": "coverage measurements",
     "embeddings": "embeddings",
 }
@@ -126,8 +124,7 @@ class Plan:
 
     jobs: tuple[Job, ...]
     missing: tuple[Job, ...]
-    #: Missing ones that were finished, and whose outputs were removed: when each was finished.
-    incomplete: Mapping[Job, int] = field(default_factory=dict)
+    incomplete: tuple[Job, ...] = ()  # missing ones that were finished, and whose outputs were removed
 
 
 def make_plan(wanted: Iterable[Job], root: Path) -> Plan:
@@ -150,28 +147,15 @@ def make_plan(wanted: Iterable[Job], root: Path) -> Plan:
     for job in wanted:
         require(job)
     kept = [job for key, job in finished.items() if key not in missing]
-    incomplete = {job: _finished_at(root, job) for job in missing.values() if is_finished(root, job)}
+    incomplete = tuple(job for job in missing.values() if is_finished(root, job))
     return Plan((*kept, *missing.values()), tuple(missing.values()), incomplete)
 
 
-def _finished_at(root: Path, job: Job) -> int:
-    path = directory_of(root, job.key) / DONE
-    return path.stat().st_mtime_ns if path.exists() else 0
-
-
 def describe(root: Path, plan: Plan) -> None:
-    """Write ``job.json`` of every job, and empty the directory of a finished job that has to run again.
-
-    A job that another command runs, or has finished since it was planned, is left alone.
-    """
-    for job, finished_at in plan.incomplete.items():
-        directory = directory_of(root, job.key)
-        with contextlib.suppress(Timeout), FileLock(directory / LOCK, timeout=0):
-            for entry in directory.iterdir() if _finished_at(root, job) == finished_at else ():
-                if entry.is_dir():
-                    shutil.rmtree(entry)
-                elif entry.name != LOCK:
-                    entry.unlink()
+    """Write ``job.json`` of every job, and empty the directory of a finished job that has to run again."""
+    for job in plan.incomplete:
+        if is_finished(root, job):  # otherwise another command has begun it anew
+            shutil.rmtree(directory_of(root, job.key))
     for job in plan.jobs:
         path = directory_of(root, job.key) / DESCRIPTION
         if not path.exists():
@@ -192,11 +176,10 @@ def bytes_of(job: Job) -> tuple[int, int]:
     if job.kind in ("encoder", "finetuned"):
         return ENCODER_BYTES, CHECKPOINT_BYTES
     if job.kind == "explored":
-        kept = min(facts["decisions"], 100_000 * len(facts["domains"]))
+        kept = min(facts["decisions"], facts["replay_capacity"] * len(facts["domains"]))
         return ENCODER_BYTES + kept * FRAME_BYTES, CHECKPOINT_BYTES * (1 + len(facts["domains"]))
     if job.kind == "run":
-        usual = 100_000 if facts["method"].startswith(("drq", "proto-rl")) else 40_000
-        return AGENT_BYTES, CHECKPOINT_BYTES + facts.get("replay_capacity", usual) * FRAME_BYTES
+        return AGENT_BYTES, CHECKPOINT_BYTES + facts["replay_capacity"] * FRAME_BYTES
     return 1_000_000, 0
 
 
@@ -210,7 +193,7 @@ def write_cells(root: Path, experiment: str, scale: str, cells: Iterable[tuple[s
     path.parent.mkdir(parents=True, exist_ok=True)
     new = [{"label": label, "job": key, "place": place} for label, key, place in cells]
     with FileLock(path.parent / ".lock"):
-        before = read_json(path, error=RecordError).get("cells", []) if path.exists() else []
+        before = read_json(path, error=RecordError)["cells"] if path.exists() else []
         taken = [(cell["label"], cell["place"]) for cell in new]
         kept = [cell for cell in before if (cell["label"], cell["place"]) not in taken]
         write_json(path, {"experiment": experiment, "scale": scale, "cells": [*new, *kept]})
@@ -246,13 +229,10 @@ def load_results(root: str | Path) -> Results:
     cells = []
     for path in sorted((root / EXPERIMENTS).glob("*.json")):
         content = read_json(path, error=RecordError)
-        try:
-            for cell in content["cells"]:
-                row = {name: content[name] for name in ("experiment", "scale")}
-                row |= {name: cell[name] for name in ("label", "job")}
-                cells.append({**row, "done": rows.get(row["job"], {}).get("done", False), **cell["place"]})
-        except (KeyError, TypeError) as reason:
-            raise RecordError(f"{path} does not say what was requested ({reason!r}); remove it.") from None
+        for cell in content["cells"]:
+            row = {"experiment": content["experiment"], "scale": content["scale"]}
+            row |= {"label": cell["label"], "job": cell["job"]}
+            cells.append({**row, "done": rows.get(row["job"], {}).get("done", False), **cell["place"]})
     columns = None if cells else ["experiment", "scale", "label", "job", "done"]
     table = pd.DataFrame(cells, columns=columns, dtype=object).astype({"done": bool})
     jobs = pd.DataFrame.from_dict(rows, orient="index", columns=[*DESCRIBED, *MADE, "path", "done", "machine"])
@@ -262,11 +242,8 @@ def load_results(root: str | Path) -> Results:
 def _job_row(path: Path) -> dict[str, Any]:
     content, done_path = read_json(path, error=RecordError), path.with_name(DONE)
     done = read_json(done_path, error=RecordError) if done_path.exists() else {}
-    try:
-        row = {name: content[name] for name in DESCRIBED} | {name: done.get(name) for name in MADE}
-    except KeyError as reason:
-        raise RecordError(f"{path} does not describe a job: it has no {reason}.") from None
-    return row | {"path": path.parent, "done": done_path.exists(), "machine": machine(done.get("hardware"))}
+    made = {name: done.get(name) for name in MADE} | {"machine": machine(done.get("hardware"))}
+    return {name: content[name] for name in DESCRIBED} | made | {"path": path.parent, "done": done_path.exists()}
 
 
 def machine(hardware: Mapping[str, Any] | None) -> str:

@@ -16,9 +16,9 @@ from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.experiments.jobs import OWN, Job, options, plugins_digest
 from crptpro.experiments.published import COLORS, FINETUNE_UPDATES, UNSEEN, ScoreRow
 from crptpro.objectives import Method, get_method
+from crptpro.objectives.methods import DOWNSTREAM
 from crptpro.seeding import derive_seed
 from crptpro.training.explore import ExploreConfig, plan_exploration
-from crptpro.values import as_int
 
 Settings = Mapping[str, Any]
 NONE: Settings = {}
@@ -176,12 +176,11 @@ class Request:
             if group not in GROUPS:
                 raise UnknownNameError(f"There is no group {group!r}; choose from {', '.join(GROUPS)}.")
         object.__setattr__(self, "tasks", tuple(dict.fromkeys(get_domain(task).task for task in self.tasks)))
-        object.__setattr__(self, "seeds", tuple(self.seeds) or tuple(range(self.scale.seeds)))
+        object.__setattr__(self, "seeds", self.seeds or tuple(range(self.scale.seeds)))
         for name in ("encoder_seeds", "seeds"):
-            seeds = tuple(as_int(seed, name) for seed in getattr(self, name))
+            seeds = getattr(self, name)
             if not seeds or len(set(seeds)) != len(seeds) or not all(0 <= seed < SEEDS for seed in seeds):
                 raise CRPTproError(f"`{name}` must be different numbers from 0 to {SEEDS - 1}, got {seeds}.")
-            object.__setattr__(self, name, seeds)
 
     def tasks_in(self, domains: Collection[str]) -> list[str]:
         """Return the requested tasks of these domains; without requested tasks, one task of each domain."""
@@ -276,9 +275,10 @@ def encoder(scale: Scale, system: str, domains: Iterable[str], seed: int, *, los
     exploring = {**scale.explore, **(scale.explore_single if method.exploration.is_single_domain else {})}
     if "encoder_update_interval" in exploring:
         exploring["encoder_update_interval"] *= method.exploration.encoder_updates_each
-    plan = plan_exploration(method, names, ExploreConfig(**exploring))
+    config = ExploreConfig(**exploring)
+    plan = plan_exploration(method, names, config)
     facts |= {"explore": exploring, "env_steps": plan.env_steps, "decisions": plan.decisions}
-    facts["updates"] = plan.encoder_updates
+    facts |= {"updates": plan.encoder_updates, "replay_capacity": config.resolved(method).replay_capacity}
     command = ["pretrain", *names, *where, *options(seed=seed, **settings, **exploring)]
     return Job("explored", title, tuple(command), facts, (), _definition(*names, method=method))
 
@@ -297,7 +297,7 @@ def encoder_for_task(
     if system != FINETUNE:
         return base
     data = dataset(scale, domain, seed)
-    updates = max(2, FINETUNE_UPDATES.get(domain, 3_000) * scale.updates // 50_000)  # the paper's, in proportion
+    updates = max(2, FINETUNE_UPDATES.get(domain, 3_000) * scale.updates // PAPER.updates)  # in proportion
     command = ["finetune", _encoder_of(base), _dataset_of(data), "--out", OWN]
     command += options(seed=seed, updates=updates, **scale.training)
     facts = {"method": FINETUNE, "domains": [domain], "seed": seed, "updates": updates, **scale.training}
@@ -314,18 +314,18 @@ def run(scale: Scale, system: str, task: str, base: Job | None, seed: int, *, co
         config["intrinsic_reward_coef"] = 0
     if colors != "normal":
         config["colors"] = colors
-    facts: dict[str, Any] = {"method": DRQ, "env_steps": 1_000_000}
-    by = ""
     if base is None:
         config.pop("queue_size", None)  # DrQ has no bonus
-    else:
-        facts = {"method": NO_BONUS if system == NO_BONUS else base.facts["method"], "env_steps": 500_000}
+    method = system if base is None or system == NO_BONUS else base.facts["method"]
+    facts: dict[str, Any] = {"method": method, **DOWNSTREAM, **get_method(method).downstream, **config}
+    facts |= {"task": task, "domain": get_domain(task).name, "seed": seed, "colors": colors}
+    by = ""
+    if base is not None:
         facts["encoder_seed"] = base.facts["seed"]
         by = f" encoder {base.facts['seed']}"
-    facts |= {"task": task, "domain": get_domain(task).name, "seed": seed, "colors": colors, **config}
     command = ["downstream", task, "--pretrained", DRQ if base is None else _encoder_of(base), "--out", OWN]
     command += options(seed=derive_seed(seed, "task", task), **config)
-    title = f"{task}{'' if colors == 'normal' else f' {colors}'} {facts['method']}{by} seed {seed}"
+    title = f"{task}{'' if colors == 'normal' else f' {colors}'} {method}{by} seed {seed}"
     needs = () if base is None else (base,)
     return Job("run", title, tuple(command), facts, needs, _definition(task))
 
@@ -339,19 +339,16 @@ def probe(scale: Scale, base: Job, data: Job) -> Job:
     return Job("probe", title, tuple(command), facts, (base, data))
 
 
-def _measurement(kind: str, trained: Job, command: Sequence[str], needs: Iterable[Job], **more: Any) -> Job:
-    facts = {name: trained.facts[name] for name in ("method", "domains", "seed")}
-    title = f"{facts['method']} {'+'.join(facts['domains'])} seed {facts['seed']}"
-    return Job(kind, title, tuple(command), facts | more, tuple(dict.fromkeys(needs)))
-
-
 def comparison(kind: str, base: Job, explorer: Job, datasets: Sequence[Job], *, samples: int, seed: int) -> Job:
     """Return a comparison of an explorer's data with random data: ``coverage`` or ``embeddings``."""
     replays = [str(dataset_path(f"{{{explorer.key}}}/replay", domain)) for domain in explorer.facts["domains"]]
     command = ["measure", kind, "--encoder", _encoder_of(base), "--explorer", _encoder_of(explorer)]
     command += ["--replays", *replays, "--datasets", *map(_dataset_of, datasets), "--out", OWN]
     command += options(samples=samples, seed=seed)
-    return _measurement(kind, explorer, command, [base, explorer, *datasets], samples=samples)
+    facts = {name: explorer.facts[name] for name in ("method", "domains", "seed")}
+    title = f"{facts['method']} {'+'.join(facts['domains'])} seed {facts['seed']}"
+    needs = tuple(dict.fromkeys([base, explorer, *datasets]))
+    return Job(kind, title, tuple(command), {**facts, "samples": samples}, needs)
 
 
 def timing(request: Request, system: str, domain_sets: Sequence[Sequence[str]], seed: int) -> Job:
@@ -519,11 +516,10 @@ def _prototypes(request: Request) -> Iterator[Cell]:
     """How far prototypes spread, along pre-training and at its end, with and without the dispersion loss (IV.G)."""
     # The encoders of the ablation: those of an (S) method are trained on its domains.
     tasks = request.tasks or tuple(get_domain(domain).task for domain in SINGLE_DISPERSION)
+    scale = _ablated(request).scale
     for system, domains, place in replace(request, tasks=tasks).encoders(VARIANTS):
         for label, loss in _variants(system, domains[0]) if system in VARIANTS else ():
-            base = encoder(_ablated(request).scale, system, domains, place["encoder_seed"], loss=loss)
-            command = ["measure", "prototypes", _encoder_of(base), "--out", OWN]
-            yield Cell(label, _measurement("prototypes", base, command, [base]), place)
+            yield Cell(label, encoder(scale, system, domains, place["encoder_seed"], loss=loss), place)
 
 
 def _compared(request: Request, kind: str, groups: str, system: str, samples: int) -> Iterator[Cell]:

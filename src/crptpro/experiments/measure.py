@@ -17,7 +17,7 @@ import pandas as pd
 import torch
 import torch.nn.functional as F
 import tyro
-from tyro.conf import Positional, UseAppendAction
+from tyro.conf import UseAppendAction
 
 from crptpro.analysis.coverage import coverage as particle_estimate
 from crptpro.analysis.embeddings import embed_pixels
@@ -28,16 +28,10 @@ from crptpro.errors import RecordError
 from crptpro.modules import Projector
 from crptpro.modules.precision import device_of
 from crptpro.objectives import get_method
-from crptpro.objectives.functional import prototype_metrics
 from crptpro.pretrained import Pretrained, load_pretrained
 from crptpro.seeding import derive_seed
 from crptpro.training.explore import plan_exploration
 
-PROTOTYPE_COLUMNS = {
-    "updates": "updates", "prototype_kne_3": "kne_3", "prototype_kne_half": "kne_half", "prototype_ane": "ane",
-    "prototype_dispersion": "intr",
-}  # fmt: skip
-"""Names in the training's record to columns of ``prototypes.csv``."""
 StageOf = Callable[[Sequence[str]], type]  # returns the dataclass of the stage that a command line names
 WINDOWS = 5  # parts of a timing; their median is robust against one hiccup of the machine
 RANDOM_AGENT_STEPS = 24  # random decisions per domain before a timed exploration, instead of the method's own
@@ -50,7 +44,7 @@ def write_rows(path: Path, rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> 
 
 
 def probe_rows(
-    pretrained: Any, dataset: FrameDataset, *, encoder: str, samples: int = 2_000, seed: int = 0
+    pretrained: Any, dataset: FrameDataset, *, encoder: str, samples: int, seed: int
 ) -> tuple[list[dict[str, str]], list[dict[str, Any]]]:
     """Probe an encoder, called ``encoder`` in the rows, on a draw from a dataset with physical state.
 
@@ -107,22 +101,6 @@ def domains_seen(card: Mapping[str, Any]) -> set[str]:
         seen |= {str(dataset.get("domain")) for dataset in training.get("datasets") or ()}
         training = training.get("previous_training")
     return seen
-
-
-def prototypes(encoder: Positional[Path], *, out: Path) -> None:
-    """Write how far prototypes have spread, along their training and at its end: OUT/prototypes.csv."""
-    pretrained: Any = load_pretrained(encoder)
-    if pretrained.prototypes is None:
-        raise RecordError(f"{encoder} has no prototypes; its method is {pretrained.method}.")
-    config, updates = pretrained.card["loss"]["config"], pretrained.card["training"]["updates"]
-    # The record's row of the last update is of weights before their normalisation: it is computed anew.
-    record = pd.read_csv(encoder.parent / "pretrain.csv", dtype=str, keep_default_na=False)
-    rows = record[record["updates"].astype(int) < updates].to_dict("records")
-    metrics = prototype_metrics(pretrained.prototypes.weight, offset=config["offset"])
-    rows.append({"updates": updates, **{name: float(value) for name, value in metrics.items()}})
-    about = {"method": pretrained.method, "has_dispersion": config["intr_loss_coef"] > 0}
-    rows = [about | {column: row[name] for name, column in PROTOTYPE_COLUMNS.items()} for row in rows]
-    write_rows(out / "prototypes.csv", rows)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -288,6 +266,6 @@ def _cost(stage_of: StageOf, command: str, updates: int, out: Path, device: str)
 
 def main(arguments: Sequence[str], stage_of: StageOf) -> None:
     """Run ``crptpro measure``; ``stage_of`` returns the class that the command line reads a training with."""
-    commands: dict[str, Any] = {each.__name__: each for each in (prototypes, coverage, embeddings)}
+    commands: dict[str, Any] = {each.__name__: each for each in (coverage, embeddings)}
     commands["timing"] = partial(timing, stage_of)
     tyro.extras.subcommand_cli_from_dict(commands, prog="crptpro measure", args=arguments)

@@ -138,22 +138,22 @@ FINETUNE_UPDATES: Mapping[str, int] = {
 class PrototypeMetrics(NamedTuple):
     """How far prototypes spread after pre-training: K- and all-neighbour estimation, and L_intr; lower is wider.
 
-    The k and the scale of the first are not published; a 3-nearest-neighbour cosine of 512 unit vectors in 128
-    dimensions is about +0.2, so these negative values are none. ``ane`` is the sum of the pairwise cosines of different
-    prototypes over M^2, ``intr`` the mean over all M^2 entries.
+    The names are those of the columns of ``pretrain.csv``. The k and the scale of the first are not published; a
+    3-nearest-neighbour cosine of 512 unit vectors in 128 dimensions is about +0.2, so these negative values are none.
+    ANE is the sum of the pairwise cosines of different prototypes over M^2, L_intr the mean over all M^2 entries.
     """
 
-    kne_3: float
-    ane: float
-    intr: float
+    prototype_kne_3: float
+    prototype_ane: float
+    prototype_dispersion: float
 
 
-PROTOTYPE_METRICS: Mapping[tuple[str, bool], PrototypeMetrics] = {
-    ("crptpro", True): PrototypeMetrics(-26.545, 7.996, -31.080),
-    ("crptpro", False): PrototypeMetrics(-10.871, 23.778, -20.505),
-    ("proto-rl-c", True): PrototypeMetrics(-38.602, 21.635, -50.294),
-    ("proto-rl-c", False): PrototypeMetrics(-7.701, 51.280, -26.860),
-    ("proto-rl-s", True): PrototypeMetrics(-80.131, 20.587, -140.213),
-    ("proto-rl-s", False): PrototypeMetrics(-44.036, 48.774, -80.839),
+PROTOTYPE_METRICS: Mapping[str, PrototypeMetrics] = {
+    "crptpro": PrototypeMetrics(-26.545, 7.996, -31.080),
+    "crptpro without dispersion": PrototypeMetrics(-10.871, 23.778, -20.505),
+    "proto-rl-c with dispersion": PrototypeMetrics(-38.602, 21.635, -50.294),
+    "proto-rl-c": PrototypeMetrics(-7.701, 51.280, -26.860),
+    "proto-rl-s with dispersion": PrototypeMetrics(-80.131, 20.587, -140.213),
+    "proto-rl-s": PrototypeMetrics(-44.036, 48.774, -80.839),
 }
-"""Table "... facilitates the diffusion of prototypes ...", in units of 1e-4: method, and whether with L_intr."""
+"""Table "... facilitates the diffusion of prototypes ...", in units of 1e-4, by variant: with and without L_intr."""

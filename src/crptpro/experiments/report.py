@@ -28,7 +28,7 @@ from crptpro.experiments import published
 from crptpro.experiments import statistics as stats
 from crptpro.experiments.figures import draw, in_order
 from crptpro.experiments.launch import duration
-from crptpro.experiments.matrix import EXPERIMENTS
+from crptpro.experiments.matrix import EXPERIMENTS, PAPER
 from crptpro.values import as_path
 
 logger = logging.getLogger(__name__)
@@ -377,7 +377,7 @@ def _experiment(page: Page, experiment: str, scale: str, cells: pd.DataFrame, jo
         page.text(f"Missing: {names}. Missing results are left out, not replaced.", "warning")
         places = missing.drop(columns=["experiment", "scale", "done"])
         page.table(_count(len(missing), "missing result"), places, fold=True)
-    _measurements(page, name, cells, jobs)
+    _measurements(page, experiment, name, cells, jobs)
     _efficiency(page, name, cells, jobs)
     _scores(page, name, cells, jobs)
 
@@ -631,7 +631,7 @@ def _efficiency(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) 
     transitions = jobs["facts"].str.get("transitions")
     data = rows["job"].map(lambda job: transitions[_needed([job], jobs, "dataset")].mean())
     rows["collecting"] = rows["collection_seconds"].astype(float) / 3600
-    rows["hours"] = rows["paper_projected_hours"] + (rows["collecting"] * (100_000 / data)).fillna(0)
+    rows["hours"] = rows["paper_projected_hours"] + (rows["collecting"] * (PAPER.transitions / data)).fillna(0)
     table = []
     for (device, threads, method, count), own in rows.groupby(["device", "threads", "method", "domains"], sort=False):
         average = own.mean(numeric_only=True)
@@ -656,23 +656,35 @@ def _efficiency(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) 
 # --- measurements of encoders and data ------------------------------------------------------------------------------
 
 
-def _measurements(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
+def _measurements(page: Page, experiment: str, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     """Report the small tables of jobs. A job in two groups, as an (S) method's, counts once."""
     groups = cells.groupby("job")["group"].agg(lambda own: ", ".join(sorted(set(own))))
     once = cells.drop_duplicates("job").assign(group=lambda own: own["job"].map(groups))
-    for kind, measure in (("prototypes", _prototypes), ("coverage", _coverage), ("embeddings", _embeddings)):
+    for kind, measure in (("coverage", _coverage), ("embeddings", _embeddings)):
         rows = _records(page, once, jobs, [kind], kind)
         if len(rows):
             measure(page, name, rows, jobs)
-    rows = _records(page, cells, jobs, ["encoder", "explored", "finetuned"], "pretrain", "updates")
-    for group, own in rows.groupby("group") if len(rows) else ():
-        _diagnostics(page, f"{name}-{group}", f"Group {group}: diagnostics" if group else "Diagnostics", own)
+    trained = ["encoder", "explored", "finetuned"]
+    if experiment == "prototypes":
+        rows = _records(page, once, jobs, trained, "pretrain", "updates", *SPREAD)
+        if len(rows):
+            _prototypes(page, name, rows)
+    else:
+        rows = _records(page, cells, jobs, trained, "pretrain", "updates")
+        for group, own in rows.groupby("group") if len(rows) else ():
+            _diagnostics(page, f"{name}-{group}", f"Group {group}: diagnostics" if group else "Diagnostics", own)
     rows = _records(page, cells, jobs, ["probe"], "probe")
     if len(rows):
         _probes(page, rows)
 
 
-SPREAD = {"kne_3": "KNE, k = 3", "kne_half": "KNE, k = M/2", "ane": "ANE", "intr": "L_intr"}  # columns, headings
+SPREAD = {
+    "prototype_kne_3": "KNE, k = 3",
+    "prototype_kne_half": "KNE, k = M/2",
+    "prototype_ane": "ANE",
+    "prototype_dispersion": "L_intr",
+}
+"""Column of ``pretrain.csv`` to its heading."""
 
 
 def _last(rows: pd.DataFrame, keys: list[str], numbers: list[str], window: int = 1) -> pd.DataFrame:
@@ -682,11 +694,10 @@ def _last(rows: pd.DataFrame, keys: list[str], numbers: list[str], window: int =
     return ends.mean().assign(n=ends.size()).reset_index()
 
 
-def _prototypes(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> None:
-    rows["label"] = rows["method"] + rows["has_dispersion"].map({True: " with L_intr", False: " without L_intr"})
+def _prototypes(page: Page, name: str, rows: pd.DataFrame) -> None:
     table = []
-    for end in _last(rows, ["label", "method", "has_dispersion"], [*SPREAD, "updates"]).to_dict("records"):
-        paper = published.PROTOTYPE_METRICS.get((end["method"], end["has_dispersion"]))
+    for end in _last(rows, ["label"], [*SPREAD, "updates"]).to_dict("records"):
+        paper = published.PROTOTYPE_METRICS.get(end["label"])
         line = {"variant": end["label"], "encoders": end["n"], "updates": f"{end['updates']:,.0f}"}
         for column, title in SPREAD.items():
             printed = _number(getattr(paper, column, math.nan), ".3f")
@@ -747,7 +758,8 @@ DIAGNOSTICS = {
     "prototypes_in_use": "prototypes in use",
     "prototype_ane": "ANE of prototypes",
 }
-"""Column of ``pretrain.csv`` to its heading; the first three are drawn."""
+"""Column of ``pretrain.csv`` to its heading."""
+DRAWN = ("comp", "embedding_cosine", "assignment_entropy_frac")  # along training, those that a record has
 WINDOW = 5  # a final value is the mean over this many rows at the end of a record
 PLATEAU = 0.99  # of ln M: a comparative loss that stays below has left the plateau, where all prototypes look alike
 
@@ -768,17 +780,18 @@ def left_plateau(record: pd.DataFrame) -> float:
 
 def _diagnostics(page: Page, name: str, title: str, rows: pd.DataFrame) -> None:
     shown = {column: heading for column, heading in DIAGNOSTICS.items() if column in rows}
-    headings = list(shown.values())
+    drawn = [shown[column] for column in DRAWN if column in shown]
     points = rows.rename(columns={"job": "line", "updates": "x", **shown})
     points["n"] = points.groupby("label")["line"].transform("nunique").astype(str)
-    points = points.melt(["label", "line", "x", "n"], headings[:3], "panel", "y").dropna(subset="y")
+    points = points.melt(["label", "line", "x", "n"], drawn, "panel", "y").dropna(subset="y")
     if len(points):
-        logs = rows["ln_num_prototypes"].dropna().unique() if points["panel"].iloc[0] == DIAGNOSTICS["comp"] else ()
+        has_plateau = "ln_num_prototypes" in rows and points["panel"].iloc[0] == DIAGNOSTICS["comp"]
+        logs = rows["ln_num_prototypes"].dropna().unique() if has_plateau else ()
         marks = {f"ln M = {value:.3f}": value for value in logs}
         caption = f"{title} along pre-training, a line per encoder (n in the legend)."
         page.figure(name, caption, draw(points, "encoder updates", marks=marks))
     ends = _last(rows, ["label"], list(shown), WINDOW).rename(columns={"n": "encoders", **shown})
-    ends[headings] = ends[headings].map(lambda value: _number(value, ".4g"))
+    ends[list(shown.values())] = ends[list(shown.values())].map(lambda value: _number(value, ".4g"))
     by_run = rows.groupby(["label", "job"])
     left = pd.Series({run: left_plateau(record) for run, record in by_run})
     summary = pd.DataFrame({"updates": by_run["updates"].max(), "left the plateau at": left})

@@ -93,28 +93,23 @@ def estimate(
     Args:
         statistic: an aggregate of this module; for two methods one that takes both.
         *methods: a row per run, with columns ``task``, ``encoder`` and ``run`` (names; a run without a pre-trained
-            encoder is its own), and the numbers. A run under several tasks is redrawn alike in all of them.
+            encoder is its own), and the numbers, which are finite. Two methods have the same tasks. A run under several
+            tasks is redrawn alike in all of them.
         columns: numbers to aggregate: one score, or the points of a curve.
         replicates: of the bootstrap.
         seed: of the bootstrap.
-
-    Raises:
-        ValueError: no run, a number that is not finite, or a task that only one method has.
     """
-    samples = [_by_task(method, columns) for method in methods]
-    if len({tuple(sample) for sample in samples}) > 1:
-        odd = sorted(set.symmetric_difference(*map(set, samples)))
-        raise ValueError(f"Only one of the methods has runs on {', '.join(map(str, odd))}.")
-    arrays = [[task[list(columns)].to_numpy(float).T for task in sample.values()] for sample in samples]
+    samples = [[task for _, task in method.sort_values(["encoder", "run"]).groupby("task")] for method in methods]
+    arrays = [[task[list(columns)].to_numpy(float).T for task in sample] for sample in samples]
     value = np.asarray(statistic(*arrays))
-    tables = [task for sample in samples for task in sample.values()]
+    tables = [task for sample in samples for task in sample]
     runs = pd.concat(tables)["run"].nunique()
     if min(map(len, tables)) < MIN_RUNS:
         return Estimate(value, None, None, runs)
     rng = np.random.default_rng(seed)
     redrawn = []
     for sample, scores in zip(samples, arrays):
-        indices = _resample(list(sample.values()), replicates, rng)
+        indices = _resample(sample, replicates, rng)
         redrawn.append([task[:, index] for task, index in zip(scores, indices)])  # [K, B, R_t] each
     tail = 50 * (1 - CONFIDENCE)
     low, high = np.percentile(statistic(*redrawn), [tail, 100 - tail], axis=-1)
@@ -144,15 +139,3 @@ def _resample(tasks: Sequence[pd.DataFrame], replicates: int, rng: np.random.Gen
             drawn[same] = (np.cumsum(counts) - counts)[chosen] + nth
         found.append(drawn[same])
     return found
-
-
-def _by_task(method: pd.DataFrame, columns: Sequence[str]) -> dict[str, pd.DataFrame]:
-    if method.empty:
-        raise ValueError("There are no runs to estimate from.")
-    wrong = method[~np.isfinite(method[list(columns)].to_numpy(float)).all(axis=1)]
-    if len(wrong):
-        raise ValueError(
-            f"Run {wrong['run'].iloc[0]} on {wrong['task'].iloc[0]} has a score that is not finite. A run that "
-            "diverged has no score: leave it out and say so."
-        )
-    return dict(iter(method.sort_values(["task", "encoder", "run"]).groupby("task")))
