@@ -207,6 +207,13 @@ def test_a_missing_entry_is_named() -> None:
         becl()(image_batch())
 
 
+def test_skills_that_are_integers_are_refused() -> None:
+    td = skill_image_batch()
+    for skills in (td["skill"].argmax(-1), td["skill"].argmax(-1, keepdim=True)):
+        with pytest.raises(ValueError, match=r"Skills must be one-hot, \[6, K\] .*, got"):
+            becl()(td.copy().set("skill", skills))
+
+
 def released_atc(loss: ATCLoss, td: TensorDict):
     """rlpyt ``augmented_temporal_contrast.py`` and ``atc_models.py``."""
     encoder, projector, head = copies(loss, "encoder", "projector", "anchor_head")

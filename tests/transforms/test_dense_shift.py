@@ -164,6 +164,18 @@ def test_projections_of_every_shift_are_kept_and_written_for_the_next_observatio
     assert not dense(replay.batch(16))["next", "embedding"].requires_grad
 
 
+def test_projections_are_those_of_the_network_in_evaluation_and_leave_one_in_training_as_it_is():
+    encoder, replay = small_encoder(), FakeReplay()
+    projector = nn.Sequential(nn.Linear(encoder.feature_dim, 5), nn.BatchNorm1d(5), nn.Dropout(0.5)).train()
+    before = copy.deepcopy(projector.state_dict())
+    td = dense_of(encoder, replay, projector=projector)(replay.batch(16))
+    assert projector.training
+    torch.testing.assert_close(projector.state_dict(), before, rtol=0, atol=0)
+    with torch.no_grad():
+        expected = projector.eval()(td["next", "features"])
+    torch.testing.assert_close(td["next", "embedding"], expected, rtol=1e-5, atol=1e-5)
+
+
 def test_threads_that_sample_side_by_side_get_each_their_own():
     dense = dense_of(generator=None, observations=2)  # each needs the places of the others
     plain = {n: crops_and_features(dense.encoder, dense.replay.frames[n])[1] for n in range(12)}

@@ -293,6 +293,10 @@ def test_a_state_dict_holds_what_a_reward_remembers_and_no_networks(kind):
         (lambda: on_latents().intrinsic_reward(torch.randn(3, D + 1)), f"length {D + 1}, the prototypes {D}"),
         (lambda: ParticleReward(None, k=1), "`k` must be at least 2, got 1"),
         (lambda: ContrastiveReward(None, temperature=0), "`temperature` must be positive, got 0"),
+        (
+            lambda: ContrastiveReward(None)(batch().set("skill", torch.arange(B) % 4)),
+            r"Skills must be one-hot, \[24, K\] with K of at least 2, got \[24, 1\]; torch.nn.functional.one_hot makes",
+        ),
     ],
 )
 def test_bad_settings_are_refused_by_name(make, named):

@@ -129,6 +129,16 @@ def require_positive(**values: float | None) -> None:
             raise ValueError(f"`{name}` must be positive, got {value}.")
 
 
+def skills_of(one_hot: Tensor, rows: int) -> Tensor:
+    """Return the number of each one-hot skill ``[B, K]``; other skills, such as integers, are a ``ValueError``."""
+    if one_hot.ndim != 2 or len(one_hot) != rows or one_hot.shape[-1] < 2:
+        raise ValueError(
+            f"Skills must be one-hot, [{rows}, K] with K of at least 2, got {list(one_hot.shape)}; "
+            "torch.nn.functional.one_hot makes them from integers."
+        )
+    return one_hot.argmax(dim=-1)
+
+
 def _reset(network: nn.Module) -> None:
     """Call the outermost ``reset_parameters`` of each branch."""
     reset = getattr(network, "reset_parameters", None)

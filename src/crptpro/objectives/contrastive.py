@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from crptpro.modules import AnchorHead, Projector, SkillHead
 from crptpro.modules.heads import latent_dim_of, require_one_latent_dim
-from crptpro.objectives.base import PretrainingLoss, require_positive
+from crptpro.objectives.base import PretrainingLoss, require_positive, skills_of
 from crptpro.objectives.functional import becl_loss, info_nce, mean_pairwise_cosine
 
 
@@ -131,7 +131,7 @@ class BeCLLoss(ContrastiveLoss):
     @dataclass
     class _AcceptedKeys:
         next_observation: NestedKey = ("next", "pixels")  # images that the skill led to
-        skill: NestedKey = "skill"  # one-hot [B, K], floating
+        skill: NestedKey = "skill"  # one-hot [B, K]
 
     default_keys = _AcceptedKeys
     _schedulable_buffers = frozenset({"temperature"})
@@ -154,7 +154,7 @@ class BeCLLoss(ContrastiveLoss):
 
     def _contrast(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         latents = self._latents(self._read(tensordict, self.tensor_keys.next_observation))
-        skills = self._read(tensordict, self.tensor_keys.skill, event_dims=1).argmax(dim=-1)
+        skills = skills_of(self._read(tensordict, self.tensor_keys.skill, event_dims=1), len(latents))
         with torch.autocast(latents.device.type, enabled=False):
             unit = F.normalize(latents.detach(), dim=-1)
             if len(latents) < 2:

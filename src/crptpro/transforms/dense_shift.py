@@ -23,7 +23,7 @@ from torchrl.envs.transforms import Transform
 
 from crptpro.free_memory import free_bytes
 from crptpro.modules import PixelEncoder
-from crptpro.modules.precision import device_of
+from crptpro.modules.precision import device_of, evaluating
 from crptpro.transforms.base import Keys, read_entry, require_pairs
 from crptpro.transforms.random_shift import as_numpy_bits, draw_offsets
 from crptpro.values import as_int
@@ -259,7 +259,8 @@ class DenseShiftFeatures(Transform):
         offsets = torch.cartesian_prod(side, side)
         rows = torch.zeros(len(offsets), dtype=torch.int64, device="cpu")
         features = crop_features(maps, rows, offsets, self._new_output(len(offsets)), pad=self.pad)
-        return projector(self.encoder.standardised(features)).float()
+        with evaluating(projector):  # it may be in training
+            return projector(self.encoder.standardised(features)).float()
 
     def _new_output(self, count: int) -> Tensor:
         dtype, device = self.encoder.compute_dtype, device_of(self.encoder)

@@ -15,7 +15,7 @@ from torchrl.envs.transforms import Transform
 
 from crptpro.modules.heads import latent_dim_of
 from crptpro.modules.precision import device_of, evaluating
-from crptpro.objectives.base import require_positive
+from crptpro.objectives.base import require_positive, skills_of
 from crptpro.objectives.functional import becl_loss, knn_distance, knn_distances, particle_entropy
 from crptpro.transforms.base import Keys, read_entry
 from crptpro.values import as_int
@@ -253,8 +253,8 @@ class ContrastiveReward(IntrinsicReward):
 
     Deviation: a batch of one gets 0; the published code fails.
 
-    ``head`` gives the embeddings, ``skill_key`` is the one-hot skill ``[*, K]`` at the root; ``options`` are
-    :class:`~crptpro.transforms.rewards.IntrinsicReward`'s.
+    ``head`` gives the embeddings, ``skill_key`` is the one-hot skill ``[*, K]`` at the root, others are a
+    ``ValueError``; ``options`` are :class:`~crptpro.transforms.rewards.IntrinsicReward`'s.
     """
 
     def __init__(
@@ -270,5 +270,5 @@ class ContrastiveReward(IntrinsicReward):
         embeddings = self._project(features)
         if len(embeddings) < 2:
             return embeddings.new_zeros(len(embeddings))
-        skills = extra[0].argmax(dim=-1)
+        skills = skills_of(extra[0], len(embeddings))
         return becl_loss(embeddings, skills, temperature=self.temperature, reduction="none").neg().exp()
