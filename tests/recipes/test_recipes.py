@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -208,12 +209,29 @@ def test_the_pieces_of_the_quickstart_run_in_the_cells_of_a_notebook(tmp_path: P
     assert ended.stdout.endswith("4 episodes evaluated\n")
 
 
+@pytest.mark.parametrize("recipe", ["drq", "explore", "finetune", "own_domain", "paper", "quickstart"])
+def test_a_stage_has_no_option_that_the_recipe_sets(
+    recipe: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ends(*arguments: str) -> tuple[Any, str]:
+        monkeypatch.setattr(sys, "argv", [recipe, *arguments])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(RECIPES / f"{recipe}.py"), run_name="__main__")
+        return ended.value.code, "".join(capsys.readouterr())
+
+    status, told = ends("--help")
+    options = set(re.findall(r"--([\w.-]+)", told))
+    stages = [name.split(".") for name in options if "." in name]
+    assert status == 0
+    assert {"seed", "downstream.batch-size", "downstream.device"} <= options
+    assert [option for _, option in stages if option in options] == []
+    assert ends("--downstream.seed", "1")[0] == 2
+
+
 @pytest.mark.parametrize(
     ("recipe", "changes", "message"),
     [
         ("paper", {"tasks": ("walkr_run",)}, "Nearest: walker"),
-        ("paper", {"method": "proto-rl-c"}, "needs more or less than random data: see explore.py"),
-        ("paper", {"method": "drq"}, "needs more or less than random data"),
         ("finetune", {"pretrained": "group-a", "domain": "walker"}, "slim"),
         ("finetune", {"pretrained": "absent", "domain": "walker"}, "absent does not exist"),
         ("finetune", {"pretrained": "absent", "domain": "walkr"}, "Nearest: walker"),
