@@ -203,7 +203,7 @@ def test_impossible_options_are_refused_by_name(make, options: dict, message: st
 
 
 def test_a_missing_entry_is_named() -> None:
-    with pytest.raises(KeyError, match=r"BeCLLoss needs the entry 'skill'; set_keys\(\) names another one"):
+    with pytest.raises(KeyError, match=r"BeCLLoss needs the entry 'skill' and found \['pixels', .*\]; set its keys"):
         becl()(image_batch())
 
 

@@ -289,7 +289,6 @@ def test_a_state_dict_holds_what_a_reward_remembers_and_no_networks(kind):
         (lambda: on_latents(knn_k=33), "`knn_k` must be at most 32"),
         (lambda: on_latents(queue=torch.zeros(3, D)), "expected a queue"),
         (lambda: PrototypeReward(None, Prototypes(512, 4), queue_size=2000), r"got 2000 and 512"),
-        (lambda: prototype(Projector(10, 5), Prototypes(8, 4)), "length 5, the prototypes 4"),
         (lambda: on_latents().intrinsic_reward(torch.randn(3, D + 1)), f"length {D + 1}, the prototypes {D}"),
         (lambda: ParticleReward(None, k=1), "`k` must be at least 2, got 1"),
         (lambda: ContrastiveReward(None, temperature=0), "`temperature` must be positive, got 0"),

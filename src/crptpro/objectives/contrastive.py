@@ -46,6 +46,8 @@ class ATCLoss(ContrastiveLoss):
     weights and an ``AnchorHead``; heads of different latent lengths are a ``ValueError``.
     """
 
+    anchor_head: nn.Module
+
     def __init__(
         self,
         encoder: nn.Module,
@@ -66,9 +68,8 @@ class ATCLoss(ContrastiveLoss):
 
     def _contrast(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         anchors = self._latents(self._read(tensordict, self.tensor_keys.observation))
-        with torch.no_grad():
-            positives = self._latents(self._read(tensordict, self.tensor_keys.next_observation), target=True)
-        queries = self._apply_network("anchor_head", anchors)
+        positives = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))
+        queries = self.anchor_head(anchors)
         with torch.autocast(queries.device.type, enabled=False):
             return info_nce(queries, positives.to(queries.dtype)), F.normalize(anchors.detach(), dim=-1)
 
