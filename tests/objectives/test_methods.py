@@ -11,7 +11,6 @@ from loss_cases import proto, small_encoder
 from torch import nn
 from torchrl.objectives import LossModule
 
-import crptpro.objectives.methods as table
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import (
@@ -25,11 +24,6 @@ from crptpro.objectives import (
     method_of,
     register_method,
 )
-
-
-@pytest.fixture(autouse=True)
-def _own_table(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(table, "_METHODS", dict(table._METHODS))
 
 
 class OwnLoss(LossModule):

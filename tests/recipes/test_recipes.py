@@ -14,7 +14,7 @@ from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock, patch
+from unittest.mock import Mock
 
 import pandas as pd
 import pytest
@@ -24,7 +24,7 @@ from crptpro.data import collect_group
 from crptpro.domains import GROUPS
 from crptpro.errors import CRPTproError
 from crptpro.modules import PixelEncoder
-from crptpro.objectives import ProtoLoss, method_names, methods
+from crptpro.objectives import ProtoLoss, method_names
 from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training import DownstreamConfig, ExploreConfig, PretrainConfig, load_agent
 
@@ -52,9 +52,9 @@ RESUMED: dict[str, dict[str, Any]] = {
 
 
 @pytest.fixture(autouse=True)
-def _what_a_recipe_registers_is_forgotten() -> Iterator[None]:
-    with patch.dict(methods._METHODS):
-        yield
+def _own_domain_is_imported_anew() -> Iterator[None]:
+    """What it registers is forgotten after each test."""
+    yield
     sys.modules.pop("recipes.own_domain", None)
 
 
