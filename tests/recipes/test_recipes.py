@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
-import pandas as pd
 import pytest
 import torch
+from toy_env import record
 
 from crptpro.data import collect_group
 from crptpro.domains import GROUPS
@@ -32,7 +32,6 @@ RECIPES = Path(__file__).parents[2] / "recipes"
 TASK = "gymnasium:Reacher-v5"
 """Real MuJoCo pixels with episodes of 25 decisions."""
 EPISODE = 50
-MEASURED = ["unix_time_s", "updates_per_s", "env_steps_per_s", "resident_bytes", "device_peak_bytes"]
 
 DATA = ["crptpro", "crptpro-fast", "released-code", "atc", "atc-native"]
 CONTROLS = ["random-encoder", "random-encoder-standardised"]
@@ -89,11 +88,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., None]:
         recipe.main(recipe.Config(out=out, **{k: v for k, v in usual.items() if k in names}, **settings))
 
     return run
-
-
-def record(path: Path) -> list[dict[str, str]]:
-    table = pd.read_csv(path, dtype=str, keep_default_na=False)
-    return table.drop(columns=MEASURED, errors="ignore").to_dict("records")
 
 
 def left(out: Path) -> dict[str, object]:

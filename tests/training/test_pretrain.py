@@ -15,8 +15,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import LossModule
-from toy_env import random_episode, write_dataset
-from toy_runs import SIZE, make_dataset, make_datasets, make_encoder, make_loss, record, same_state
+from toy_env import random_episode, record, write_dataset
+from toy_runs import SIZE, make_dataset, make_datasets, make_encoder, make_loss, same_state
 
 from crptpro.data import FrameDataset
 from crptpro.errors import CheckpointError, CRPTproError, DatasetError

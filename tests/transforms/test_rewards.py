@@ -285,7 +285,6 @@ def test_a_state_dict_holds_what_a_reward_remembers_and_no_networks(kind):
 @pytest.mark.parametrize(
     ("make", "named"),
     [
-        (lambda: on_latents(knn_k=0), "`knn_k` must be at least 1"),
         (lambda: on_latents(knn_k=33), "`knn_k` must be at most 32"),
         (lambda: on_latents(queue=torch.zeros(3, D)), "expected a queue"),
         (lambda: PrototypeReward(None, Prototypes(512, 4), queue_size=2000), r"got 2000 and 512"),
