@@ -2,29 +2,24 @@
 
 ``python -m benchmarks.loops ITEM SETTINGS`` holds its loop, prints a JSON object of seconds per pass by what they were
 spent on, and goes on when it reads a line. Nothing of a loop is copied here: clocks are put around public methods that
-it calls. Public names of the library only: ``benchmarks.revisions`` runs this with other revisions too.
+it calls.
 """
 
 from __future__ import annotations
 
 import functools
-import itertools
 import json
-import math
-import statistics
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from timeit import timeit
 from typing import Any
 from unittest import mock
 
 import torch
 
 from benchmarks import synthetic
-from benchmarks.synthetic import drifting_dataset, make_drifting
+from benchmarks.synthetic import make_drifting
 from crptpro.data import FrameDataset, FrameReplay, collect_random
 from crptpro.modules import PixelEncoder, Projector, Prototypes
 from crptpro.objectives import ProtoLoss
@@ -106,17 +101,15 @@ def pretraining(
 
 
 def downstream(
-    hold: Hold, *, image_size: int, prototypes: int, transitions: int, task: str = "", passes: int = 2,
-    is_filled: bool = True, **settings: Any,
+    hold: Hold, *, image_size: int, prototypes: int, transitions: int, task: str = "", passes: int = 2, **settings: Any,
 ) -> None:  # fmt: skip
     """Time ``train_downstream(...)`` on the drifting environment or a task: laps ``update``, ``store`` and ``act``.
 
-    The actor learns in every second pass. ``is_filled``: drifting pictures are stored and encoded before the first
-    update; otherwise the loop fills its replay. ``store`` begins when the next observation has been drawn, so that
-    ``update`` includes the wait for it.
+    The actor learns in every second pass. Drifting pictures are stored and encoded before the first update. ``store``
+    begins when the next observation has been drawn, so that ``update`` includes the wait for it.
     """
     laps = Laps(hold, passes)
-    to_fill = iter([transitions] if is_filled else [])
+    to_fill = iter([transitions])
 
     def begin(replay: FrameReplay, *_: int) -> None:
         for count in to_fill:
@@ -128,7 +121,7 @@ def downstream(
         train_downstream(
             task or "drifting", fresh_pretrained(image_size=image_size, prototypes=prototypes), progress=False,
             env_steps=500_000, replay_capacity=transitions,
-            random_agent_steps=1 if is_filled else transitions, eval_episodes=1, eval_workers=0,
+            random_agent_steps=1, eval_episodes=1, eval_workers=0,
             eval_interval_env_steps=500_000, **settings,
         )  # fmt: skip
 
@@ -143,34 +136,6 @@ def fill(replay: FrameReplay, transitions: int, image_size: int, *, encodes: boo
         replay[first : first + 500]
 
 
-def sampling(hold: Hold, *, path: str, batch_size: int) -> None:
-    """Time ``FrameDataset.sample``."""
-    dataset = FrameDataset.open(path)
-    while True:
-        hold({"sample": timeit(lambda: dataset.sample(batch_size), number=20) / 20})
-
-
-def opening(hold: Hold, *, path: str) -> None:
-    """Time ``FrameDataset.open``."""
-    while True:
-        hold({"open": timeit(lambda: FrameDataset.open(path), number=5) / 5})
-
-
-def collecting(hold: Hold, *, root: str, image_size: int, transitions: int) -> None:
-    """Collect a dataset of the drifting environment in one process, once a pass, and time its episodes.
-
-    The median time from one reset to the next leaves out what a start costs. It is NaN below two whole episodes.
-    """
-    Path(root).mkdir(parents=True, exist_ok=True)
-    for number in itertools.count():
-        clock = Path(root) / f"clock_{number}"
-        drifting_dataset(root, seed=number, clock=clock, transitions=transitions, image_size=image_size)
-        resets = [tuple(map(float, line.split())) for line in clock.read_text().splitlines()]
-        pairs = itertools.pairwise(resets)
-        episodes = [end - start for (start, _), (end, length) in pairs if length == synthetic.LENGTH]
-        hold({"collect": statistics.median(episodes or [math.nan]) / synthetic.LENGTH})
-
-
 def rendering(hold: Hold, *, root: str, task: str, image_size: int, transitions: int) -> None:
     """Collect a task once."""
     collect_random(task, root, transitions=transitions, image_size=image_size, progress=False)
@@ -182,9 +147,7 @@ def nothing(hold: Hold) -> None:
     hold({})
 
 
-ITEMS: dict[str, Callable[..., None]] = {
-    item.__name__: item for item in (pretraining, downstream, sampling, opening, collecting, rendering, nothing)
-}
+ITEMS: dict[str, Callable[..., None]] = {item.__name__: item for item in (pretraining, downstream, rendering, nothing)}
 
 
 def main(item: str, settings: dict[str, Any]) -> None:

@@ -54,22 +54,16 @@ class Loop:
     Args:
         item: name.
         of: the laps that count; all by default. ``laps`` holds all of the last call.
-        source: checkout whose ``src`` is imported; this one by default.
-        python: interpreter.
-        environment: variables of the process.
         **settings: of the item.
     """
 
-    def __init__(
-        self, item: str, *, of: Sequence[str] = (), source: Path = ROOT, python: Path | str = sys.executable,
-        environment: Mapping[str, str] | None = None, **settings: Any,
-    ) -> None:  # fmt: skip
+    def __init__(self, item: str, *, of: Sequence[str] = (), **settings: Any) -> None:
         self.item, self.of = item, of
-        path = os.pathsep.join(filter(None, [f"{source / 'src'}", f"{ROOT}", os.environ.get("PYTHONPATH")]))
+        path = os.pathsep.join(filter(None, [f"{ROOT / 'src'}", f"{ROOT}", os.environ.get("PYTHONPATH")]))
         variables = {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"}
         self.process = subprocess.Popen(
-            [python, "-m", "benchmarks.loops", item, json.dumps(settings, default=str)], cwd=ROOT, text=True,
-            env={**os.environ, **variables, **(environment or {})}, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            [sys.executable, "-m", "benchmarks.loops", item, json.dumps(settings, default=str)], cwd=ROOT, text=True,
+            env={**os.environ, **variables}, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         )  # fmt: skip
         self.laps = self._read()
 

@@ -1,12 +1,8 @@
-"""An environment without a simulator, one smooth picture that drifts at next to no cost, and its datasets.
-
-Public names of the library only: ``benchmarks.revisions`` runs this with other revisions too.
-"""
+"""An environment without a simulator, one smooth picture that drifts at next to no cost, and its datasets."""
 
 from __future__ import annotations
 
 import functools
-import time
 from pathlib import Path
 
 import torch
@@ -28,14 +24,11 @@ _PATCHES = 12
 
 
 class DriftingEnv(EnvBase):
-    """Single frames of a drifting picture. No two frames of an episode are equal (below ``image_size ** 2``).
+    """Single frames of a drifting picture. No two frames of an episode are equal (below ``image_size ** 2``)."""
 
-    Every reset appends the time and how many transitions came before it to the file ``clock``.
-    """
-
-    def __init__(self, *, seed: int, image_size: int, action_dim: int, clock: Path | None) -> None:
+    def __init__(self, *, seed: int, image_size: int, action_dim: int) -> None:
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([]))
-        self.image_size, self.clock, self.count = image_size, clock, 0
+        self.image_size, self.count = image_size, 0
         self._set_seed(seed)
         shape = (3, image_size, image_size)
         self.observation_spec = Composite(pixels=Bounded(0, 255, shape=shape, dtype=torch.uint8))
@@ -51,9 +44,6 @@ class DriftingEnv(EnvBase):
         return {"pixels": frame, **flags}
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: object) -> TensorDict:
-        if self.clock is not None:
-            with self.clock.open("a") as file:
-                file.write(f"{time.time()} {self.count}\n")
         self.count = 0
         return TensorDict(self._look(), [])
 
@@ -70,21 +60,18 @@ class DriftingEnv(EnvBase):
         self.scene = (smooth + grain).clamp(0, 255).to(torch.uint8)
 
 
-def make_drifting(
-    action_dim: int = ACTION_DIM, *, seed: int, image_size: int = 84, action_repeat: int = 2, clock: Path | None = None
-) -> EnvBase:
+def make_drifting(action_dim: int = ACTION_DIM, *, seed: int, image_size: int = 84, action_repeat: int = 2) -> EnvBase:
     """Build the environment of a domain; an agent step counts as ``action_repeat`` env steps."""
-    return DriftingEnv(seed=seed, image_size=image_size, action_dim=action_dim, clock=clock)
+    return DriftingEnv(seed=seed, image_size=image_size, action_dim=action_dim)
 
 
 register_domain(Domain("drifting", "drifting_task", make=make_drifting, action_repeat=2, episode_env_steps=2 * LENGTH))
 
 
 def drifting_dataset(
-    root: Path | str, *, transitions: int, image_size: int = 84, seed: int = 0, clock: Path | None = None,
-    action_dim: int = ACTION_DIM,
+    root: Path | str, *, transitions: int, image_size: int = 84, seed: int = 0, action_dim: int = ACTION_DIM,
 ) -> Path:  # fmt: skip
     """Collect a dataset of the environment in one process, or return it at once where it is complete."""
-    make = functools.partial(make_drifting, action_dim, clock=clock)
+    make = functools.partial(make_drifting, action_dim)
     domain = Domain(f"drifting_{seed}", "drifting_go", make=make, action_repeat=2, episode_env_steps=2 * LENGTH)
     return collect_random(domain, root, seed=seed, progress=False, transitions=transitions, image_size=image_size)

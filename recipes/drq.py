@@ -13,9 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import tyro
-
-from crptpro.console import run_main
+from crptpro.console import parse, run_main
 from crptpro.domains import TASKS, get_domain
 from crptpro.seeding import derive_seed
 from crptpro.training import DownstreamConfig, train_downstream
@@ -46,4 +44,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    run_main(lambda: main(tyro.cli(Config, description=__doc__)))
+    run_main(lambda: main(parse(Config, __doc__)))

@@ -15,9 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-import tyro
-
-from crptpro.console import run_main
+from crptpro.console import parse, run_main
 from crptpro.domains import expand_groups, get_domain
 from crptpro.objectives import get_method
 from crptpro.pretrained import load_pretrained, save_pretrained
@@ -69,4 +67,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    run_main(lambda: main(tyro.cli(Config, description=__doc__)))
+    run_main(lambda: main(parse(Config, __doc__)))

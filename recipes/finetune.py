@@ -15,7 +15,7 @@ from typing import Literal
 
 import tyro
 
-from crptpro.console import run_main
+from crptpro.console import parse, run_main
 from crptpro.data import collect_random
 from crptpro.domains import get_domain
 from crptpro.pretrained import load_pretrained, save_pretrained
@@ -70,4 +70,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    run_main(lambda: main(tyro.cli(Config, description=__doc__)))
+    run_main(lambda: main(parse(Config, __doc__)))

@@ -15,13 +15,12 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-import tyro
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictParams
 from torch import nn
 from torchrl.objectives import LossModule
 
-from crptpro.console import run_main
+from crptpro.console import parse, run_main
 from crptpro.data import collect_random
 from crptpro.modules import PixelEncoder, Predictor, Projector
 from crptpro.objectives import register_method
@@ -109,4 +108,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    run_main(lambda: main(tyro.cli(Config, description=__doc__)))
+    run_main(lambda: main(parse(Config, __doc__)))

@@ -16,12 +16,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-import tyro
-
-from crptpro.console import run_main
+from crptpro.console import parse, run_main
 from crptpro.data import collect_group
 from crptpro.domains import GROUPS, get_domain
-from crptpro.errors import CRPTproError
 from crptpro.objectives import get_method
 from crptpro.pretrained import load_pretrained, random_pretrained, save_pretrained
 from crptpro.seeding import derive_seed, seed_everything
@@ -35,9 +32,9 @@ class Config:
     group: Literal["A", "B", "C", "D"] = "A"
     """domains to pre-train on: A cheetah walker quadruped, B cartpole pendulum manipulation, C manipulation hopper
     finger, D walker pendulum hopper"""
-    method: str = "crptpro"
-    """any method that learns from random data: crptpro, crptpro-fast, released-code, atc, atc-native, and the controls
-    random-encoder and random-encoder-standardised"""
+    method: Literal["crptpro", "crptpro-fast", "released-code", "atc", "atc-native", "random-encoder",
+                    "random-encoder-standardised"] = "crptpro"  # fmt: skip
+    """how the encoder learns from random data, or which control"""
     tasks: tuple[str, ...] | None = None
     """tasks to learn (None: the group's own)"""
     out: Path = Path("runs/paper")
@@ -62,10 +59,6 @@ def main(config: Config) -> None:
     for task in tasks:
         get_domain(task)  # an unknown name ends the recipe here, not hours later
     method = get_method(config.method)
-    if config.method == "crptpro-no-bonus":
-        raise CRPTproError("crptpro-no-bonus is crptpro with --downstream.intrinsic-reward-coef 0.")
-    if config.method == "drq" or method.exploration or method.starts_from:
-        raise CRPTproError(f"{config.method} needs more or less than random data: see explore.py, finetune.py, drq.py.")
     name = f"{config.method}_group_{config.group}_seed_{config.seed}"
     datasets = {}
     if config.method != "random-encoder":
@@ -94,4 +87,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    run_main(lambda: main(tyro.cli(Config, description=__doc__)))
+    run_main(lambda: main(parse(Config, __doc__)))

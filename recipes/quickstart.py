@@ -15,10 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import tyro
-
 from crptpro.artifact import write_json
-from crptpro.console import run_main
+from crptpro.console import parse, run_main
 from crptpro.data import collect_group
 from crptpro.domains import get_domain
 from crptpro.envs import make_env
@@ -117,4 +115,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    run_main(lambda: main(tyro.cli(Config, description=__doc__)))
+    run_main(lambda: main(parse(Config, __doc__)))

@@ -12,7 +12,9 @@ from unittest.mock import patch
 
 import pytest
 
+from crptpro import domains, plugins
 from crptpro.modules import precision
+from crptpro.objectives import methods
 
 # Looking for doctests would import this file once more, under a name that another conftest.py has too.
 collect_ignore = ["conftest.py"]
@@ -37,18 +39,23 @@ def _signals_are_as_in_the_foreground() -> Iterator[None]:
         signal.signal(number, handler)
 
 
+@pytest.fixture(autouse=True)
+def _registries_are_as_before(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What a test registers, and the plugins it loads, are forgotten."""
+    monkeypatch.setattr(plugins, "_loaded", [*plugins._loaded])  # processes of later tests would load these
+    with patch.dict(methods._METHODS), patch.dict(domains._registered):
+        yield
+
+
 @pytest.fixture
 def plugins_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """What a plugin registers is as it was afterwards."""
+    """Plugins are imported anew by the next test; experiments and environments that they register are forgotten."""
     import gymnasium
 
-    from crptpro import plugins
     from crptpro.experiments import matrix
-    from crptpro.objectives import methods
 
-    monkeypatch.setattr(plugins, "_loaded", [])  # processes of later tests would load what this one has loaded
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if Path(entry) != Path(__file__).parent / "cli"])
-    with patch.dict(matrix.EXPERIMENTS), patch.dict(methods._METHODS), patch.dict(gymnasium.registry):
+    with patch.dict(matrix.EXPERIMENTS), patch.dict(gymnasium.registry):
         yield
     for name in ("own_method", "slow_env"):
         sys.modules.pop(name, None)

@@ -6,15 +6,16 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 import torch
 from tqdm import tqdm
 
-from crptpro.console import configure_logging, run_main
+from crptpro.console import configure_logging, parse, run_main
 from crptpro.errors import DatasetError
-from crptpro.training import DownstreamConfig
+from crptpro.training import DownstreamConfig, PretrainConfig
 
 
 def fails(error: BaseException) -> Callable[[], None]:
@@ -22,6 +23,23 @@ def fails(error: BaseException) -> Callable[[], None]:
         raise error
 
     return main
+
+
+@dataclass
+class Recipe:
+    """Two stages."""
+
+    seed: int = 0
+    pretrain: PretrainConfig = field(default_factory=lambda: PretrainConfig(updates=2_000))
+    downstream: DownstreamConfig = field(default_factory=DownstreamConfig)
+
+
+def test_the_options_of_a_recipe_and_of_its_stages_are_read_with_their_defaults(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["recipe", "--seed", "3", "--pretrain.batch-size", "8"])
+    expected = Recipe(3, PretrainConfig(updates=2_000, batch_size=8), DownstreamConfig())
+    assert parse(Recipe, "") == expected
 
 
 @pytest.mark.parametrize(("main", "status", "line"), [

@@ -11,7 +11,7 @@ os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
 
 # How long a waiting thread of OpenMP spins before it sleeps, read when PyTorch is first imported. With GNU's default of
 # 300,000 it keeps the core that the thread it waits for needs, once another process shares the cores: updates then took
-# 2 to 7 times as long. Without other work this costs nothing (`python -m benchmarks.contention`).
+# 2 to 7 times as long. Without other work this costs nothing (benchmarks/results/contention).
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 

@@ -1,4 +1,4 @@
-"""For the command line and the recipes: readable log lines, and one line per error."""
+"""For the command line and the recipes: readable log lines, one line per error, and options of several stages."""
 
 from __future__ import annotations
 
@@ -8,11 +8,16 @@ import select
 import sys
 import traceback
 from collections.abc import Callable
-from typing import TextIO
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TextIO, TypeVar
 
+import tyro
 from tqdm import tqdm
+from tyro.constructors import ConstructorRegistry
 
 from crptpro.errors import CRPTproError, is_disk_full
+
+_Config = TypeVar("_Config")
 
 
 class _BarFriendlyHandler(logging.Handler):
@@ -30,6 +35,28 @@ def configure_logging(level: int = logging.INFO) -> None:
     root.setLevel(level)
     root.propagate = False
     logging.getLogger("absl").setLevel(logging.ERROR)
+
+
+def parse(config: type[_Config], description: str | None) -> _Config:
+    """Return the settings of a recipe, a dataclass, from the command line.
+
+    Its fields that are dataclasses are stages. A stage has no option of a name that the recipe has itself, such as
+    ``seed``: the recipe sets it for all of them.
+    """
+    shared, registry, is_within = {field.name for field in fields(config)}, ConstructorRegistry(), False  # type: ignore[arg-type]
+
+    @registry.struct_rule
+    def stage(info: Any) -> Any:
+        nonlocal is_within
+        if is_within or info.type is config or not is_dataclass(info.type):
+            return None
+        is_within = True  # what follows asks every rule, this one too
+        usual: Any = ConstructorRegistry.get_struct_spec(info)
+        is_within = False
+        return replace(usual, fields=tuple(field for field in usual.fields if field.name not in shared))
+
+    with registry:
+        return tyro.cli(config, description=description)
 
 
 def run_main(main: Callable[[], object]) -> None:

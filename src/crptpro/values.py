@@ -1,4 +1,4 @@
-"""Values from users: converted to plain Python values, or refused before any work starts."""
+"""What users give: values as plain Python ones, or refused before any work starts, and entries of batches."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from typing import Any, Literal, get_args, get_type_hints
 
 import numpy as np
 import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
 
 Quality = Literal["exact", "fast"]
 Colors = Literal["normal", "reversed_background", "reversed_image"]
@@ -112,6 +114,15 @@ def check_numbers(config: Any, *, minima: Mapping[str, int], maxima: Mapping[str
         elif float in kinds:
             value = as_float(value, name, minimum=0, maximum=maxima.get(name))
         object.__setattr__(config, name, value)
+
+
+def read_entry(reader: object, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """Return an entry that a loss or a transform reads; a ``KeyError`` lists the present ones."""
+    value: Tensor | None = tensordict.get(key, None)
+    if value is None:
+        present = list(tensordict.keys(True, True))
+        raise KeyError(f"{type(reader).__name__} needs the entry {key!r} and found {present}; set its keys.")
+    return value
 
 
 def _scalar(value: Any) -> Any:

@@ -94,25 +94,6 @@ class Agents:
         return self.loss.critic_loss(self.td)["loss_qvalue"], theirs
 
 
-def test_the_plain_features_critic_actor_and_temperature_are_ours_in_losses_and_gradients() -> None:
-    agents = Agents()
-    td, ours, plain = agents.td, agents.loss, agents.plain
-    with torch.no_grad():
-        theirs = [plain.encoder(images) for images in (agents.batch.obs, agents.batch.next_obs)]
-    assert_all_close([td["features"], td["next", "features"]], theirs)
-    qvalue_losses = agents.critic_losses()
-    out = ours.actor_and_temperature_loss(td)
-    pairs = [qvalue_losses, *zip((out["loss_actor"], out["loss_alpha"]), plain.actor_loss(td["features"]), strict=True)]
-    networks = [(ours.critic, plain.critic), (ours.actor, plain.actor)]
-    for (one, other), compared in zip(pairs, [networks[0], networks[1], None], strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)
-        for loss in (one, other):
-            loss.backward()
-        if compared is not None:
-            assert_all_close(*([p.grad for p in net.parameters()] for net in compared), rtol=1e-3, atol=1e-5)
-    torch.testing.assert_close(ours.log_alpha.grad, plain.log_alpha.grad, rtol=1e-5, atol=1e-6)
-
-
 def test_plain_downstream_updates_have_the_losses_of_the_learner_and_its_queue_that_wraps_around() -> None:
     agents = Agents()
     agents.plain.queue, agents.bonus.queue = torch.zeros(2, 128, 16)

@@ -42,7 +42,7 @@ gymnasium.register(ENV_ID, SlowEnv, max_episode_steps=20)
 
 def slow(request: Request) -> list[Cell]:
     """A collection of some seconds."""
-    return [Cell("slow", dataset(request.scale, f"gymnasium:{ENV_ID}", 0, 300), {"seed": 0})]
+    return [Cell("slow", dataset(request.scale, f"gymnasium:{ENV_ID}", 0, 120), {"seed": 0})]
 
 
 EXPERIMENTS["slow"] = Experiment("Slow", "A collection of some seconds.", slow)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -197,3 +198,9 @@ def collect_toy(path: Path, *, episodes: int | None = None, **request: Any) -> P
     if not dataset.is_complete:
         writer.close()
     return path
+
+
+def record(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV without what depends on the clock or the machine."""
+    table = pd.read_csv(path, dtype=str, keep_default_na=False)
+    return table.loc[:, ~table.columns.str.contains("time|per_s|bytes")].to_dict("records")

@@ -101,18 +101,10 @@ def test_neither_the_number_of_threads_nor_a_second_backward_pass_changes_a_bit_
     torch.set_num_threads(before)
 
 
-def test_autocast_and_functional_transforms_see_the_operations_of_the_encoder() -> None:
+def test_autocast_sees_the_operations_of_the_encoder() -> None:
     encoder, images = encoder_and_images()
     with torch.autocast("cpu", torch.bfloat16):
         assert encoder(images).dtype == torch.bfloat16
-    weights = {name: weight.detach() for name, weight in encoder.named_parameters()}
-
-    def total(given: dict[str, Tensor]) -> Tensor:
-        return torch.func.functional_call(encoder, given, (images,)).square().sum()
-
-    found = torch.func.grad(total)(weights)
-    encoder(images).square().sum().backward()
-    torch.testing.assert_close(found["convs.0.weight"], encoder.convs[0].weight.grad, rtol=1e-4, atol=1e-3)
 
 
 def test_a_forked_process_computes_and_threads_that_cannot_start_let_it_end() -> None:

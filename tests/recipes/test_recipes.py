@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -13,17 +14,17 @@ from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock, patch
+from unittest.mock import Mock
 
-import pandas as pd
 import pytest
 import torch
+from toy_env import record
 
 from crptpro.data import collect_group
 from crptpro.domains import GROUPS
 from crptpro.errors import CRPTproError
 from crptpro.modules import PixelEncoder
-from crptpro.objectives import ProtoLoss, method_names, methods
+from crptpro.objectives import ProtoLoss, method_names
 from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training import DownstreamConfig, ExploreConfig, PretrainConfig, load_agent
 
@@ -31,7 +32,6 @@ RECIPES = Path(__file__).parents[2] / "recipes"
 TASK = "gymnasium:Reacher-v5"
 """Real MuJoCo pixels with episodes of 25 decisions."""
 EPISODE = 50
-MEASURED = ["unix_time_s", "updates_per_s", "env_steps_per_s", "resident_bytes", "device_peak_bytes"]
 
 DATA = ["crptpro", "crptpro-fast", "released-code", "atc", "atc-native"]
 CONTROLS = ["random-encoder", "random-encoder-standardised"]
@@ -51,9 +51,9 @@ RESUMED: dict[str, dict[str, Any]] = {
 
 
 @pytest.fixture(autouse=True)
-def _what_a_recipe_registers_is_forgotten() -> Iterator[None]:
-    with patch.dict(methods._METHODS):
-        yield
+def _own_domain_is_imported_anew() -> Iterator[None]:
+    """What it registers is forgotten after each test."""
+    yield
     sys.modules.pop("recipes.own_domain", None)
 
 
@@ -88,11 +88,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., None]:
         recipe.main(recipe.Config(out=out, **{k: v for k, v in usual.items() if k in names}, **settings))
 
     return run
-
-
-def record(path: Path) -> list[dict[str, str]]:
-    table = pd.read_csv(path, dtype=str, keep_default_na=False)
-    return table.drop(columns=MEASURED, errors="ignore").to_dict("records")
 
 
 def left(out: Path) -> dict[str, object]:
@@ -208,12 +203,29 @@ def test_the_pieces_of_the_quickstart_run_in_the_cells_of_a_notebook(tmp_path: P
     assert ended.stdout.endswith("4 episodes evaluated\n")
 
 
+@pytest.mark.parametrize("recipe", ["drq", "explore", "finetune", "own_domain", "paper", "quickstart"])
+def test_a_stage_has_no_option_that_the_recipe_sets(
+    recipe: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ends(*arguments: str) -> tuple[Any, str]:
+        monkeypatch.setattr(sys, "argv", [recipe, *arguments])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(RECIPES / f"{recipe}.py"), run_name="__main__")
+        return ended.value.code, "".join(capsys.readouterr())
+
+    status, told = ends("--help")
+    options = set(re.findall(r"--([\w.-]+)", told))
+    stages = [name.split(".") for name in options if "." in name]
+    assert status == 0
+    assert {"seed", "downstream.batch-size", "downstream.device"} <= options
+    assert [option for _, option in stages if option in options] == []
+    assert ends("--downstream.seed", "1")[0] == 2
+
+
 @pytest.mark.parametrize(
     ("recipe", "changes", "message"),
     [
         ("paper", {"tasks": ("walkr_run",)}, "Nearest: walker"),
-        ("paper", {"method": "proto-rl-c"}, "needs more or less than random data: see explore.py"),
-        ("paper", {"method": "drq"}, "needs more or less than random data"),
         ("finetune", {"pretrained": "group-a", "domain": "walker"}, "slim"),
         ("finetune", {"pretrained": "absent", "domain": "walker"}, "absent does not exist"),
         ("finetune", {"pretrained": "absent", "domain": "walkr"}, "Nearest: walker"),

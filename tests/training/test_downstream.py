@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
+from toy_env import record
 from toy_runs import (
     EPISODE,
     SIZE,
@@ -21,7 +22,6 @@ from toy_runs import (
     make_dataset,
     make_encoder,
     make_pretrained,
-    record,
     same_state,
     signalling,
     toy_domain,

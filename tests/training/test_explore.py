@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import torch
 from torchrl.objectives import LossModule
-from toy_env import ToyEnv
-from toy_runs import EPISODE, kill, make_encoder, record, same_state, signalling, toy_domain
+from toy_env import ToyEnv, record
+from toy_runs import EPISODE, kill, make_encoder, same_state, signalling, toy_domain
 
 from crptpro.errors import CheckpointError, CRPTproError
 from crptpro.objectives import get_method

@@ -15,8 +15,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import LossModule
-from toy_env import random_episode, write_dataset
-from toy_runs import SIZE, make_dataset, make_datasets, make_encoder, make_loss, record, same_state
+from toy_env import random_episode, record, write_dataset
+from toy_runs import SIZE, make_dataset, make_datasets, make_encoder, make_loss, same_state
 
 from crptpro.data import FrameDataset
 from crptpro.errors import CheckpointError, CRPTproError, DatasetError
@@ -96,12 +96,11 @@ def test_training_lowers_the_loss_and_the_record_says_so(tmp_path: Path) -> None
     assert (result.updates, result.resumed_from, result.collapse["verdict"]) == (60, 0, "learning")
 
 
-@pytest.mark.parametrize("method", ["crptpro", "atc", "apt-c"])
-def test_a_resumed_run_gives_the_weights_and_the_record_of_an_uninterrupted_one(tmp_path: Path, method: str) -> None:
+@pytest.mark.parametrize("make", [make_loss, get_method("atc").build, SimCLRLoss])
+def test_a_resumed_run_gives_the_weights_and_the_record_of_an_uninterrupted_one(tmp_path: Path, make: Any) -> None:
     def build() -> LossModule:
         torch.manual_seed(0)
-        options = {"num_prototypes": 8, "hidden_dim": 16} if method == "crptpro" else {}
-        return get_method(method).build(make_encoder(), latent_dim=8, **options)
+        return make() if make is make_loss else make(make_encoder(), latent_dim=8)
 
     whole, parts = build(), build()
     run(whole, 14, tmp_path / "whole", warmup_updates=3)
@@ -130,14 +129,22 @@ def test_a_larger_budget_extends_a_finished_run_and_the_same_one_gives_its_resul
 @pytest.mark.parametrize(
     ("method", "message"),
     [
-        ("proto-rl-c", r"explores its domains .* use pretrain_active"),
-        ("crptpro-finetune", "takes a trained encoder of crptpro"),
-        ("crptpro-no-bonus", "takes a trained encoder of crptpro"),
+        ("proto-rl-c", r"proto-rl-c explores its domains .* use pretrain_active"),
+        ("crptpro-finetune", "crptpro-finetune takes a trained encoder of crptpro"),
+        ("crptpro-no-bonus", "crptpro-no-bonus takes a trained encoder of crptpro"),
     ],
 )
 def test_a_method_that_does_not_begin_with_datasets_is_refused(method: str, message: str) -> None:
     with pytest.raises(CRPTproError, match=message):
         pretrain(make_loss(), make_datasets(), method=method, progress=False)
+    built = get_method(method).build(make_encoder(), num_prototypes=8, latent_dim=8)
+    with pytest.raises(CRPTproError, match=message):
+        pretrain(built, make_datasets(), progress=False)
+
+
+def test_the_card_of_a_loss_built_by_hand_names_no_method_that_explores(tmp_path: Path) -> None:
+    result = run(SimCLRLoss(make_encoder(), latent_dim=8), 1)
+    assert result.method == load_pretrained(save_pretrained(result, tmp_path)).method == "SimCLRLoss"
 
 
 def test_finetuning_takes_the_updates_of_the_method_of_that_name(

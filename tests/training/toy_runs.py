@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -101,9 +100,3 @@ def same_state(one: torch.nn.Module, two: torch.nn.Module) -> bool:
     """Bit equality of two modules, targets and coefficients included."""
     first, second = one.state_dict(), two.state_dict()
     return first.keys() == second.keys() and all(torch.equal(first[key], second[key]) for key in first)
-
-
-def record(path: Path) -> list[dict[str, str]]:
-    """Rows of a CSV without what depends on the clock or the machine."""
-    table = pd.read_csv(path, dtype=str, keep_default_na=False)
-    return table.loc[:, ~table.columns.str.contains("time|per_s|bytes")].to_dict("records")

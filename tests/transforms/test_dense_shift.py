@@ -164,6 +164,18 @@ def test_projections_of_every_shift_are_kept_and_written_for_the_next_observatio
     assert not dense(replay.batch(16))["next", "embedding"].requires_grad
 
 
+def test_projections_are_those_of_the_network_in_evaluation_and_leave_one_in_training_as_it_is():
+    encoder, replay = small_encoder(), FakeReplay()
+    projector = nn.Sequential(nn.Linear(encoder.feature_dim, 5), nn.BatchNorm1d(5), nn.Dropout(0.5)).train()
+    before = copy.deepcopy(projector.state_dict())
+    td = dense_of(encoder, replay, projector=projector)(replay.batch(16))
+    assert projector.training
+    torch.testing.assert_close(projector.state_dict(), before, rtol=0, atol=0)
+    with torch.no_grad():
+        expected = projector.eval()(td["next", "features"])
+    torch.testing.assert_close(td["next", "embedding"], expected, rtol=1e-5, atol=1e-5)
+
+
 def test_threads_that_sample_side_by_side_get_each_their_own():
     dense = dense_of(generator=None, observations=2)  # each needs the places of the others
     plain = {n: crops_and_features(dense.encoder, dense.replay.frames[n])[1] for n in range(12)}
@@ -243,18 +255,6 @@ def test_a_replay_that_goes_back_encodes_its_numbers_anew(way, tmp_path):
         torch.testing.assert_close(batch["features"], expected, rtol=0, atol=1e-6 * float(expected.abs().max()))
 
 
-def test_numbers_that_go_back_are_encoded_anew_after_forget():
-    dense = dense_of()
-    number = TensorDict({"number": torch.tensor([[2]]), "next": {"number": torch.tensor([[3]])}}, [1])
-    before = dense(number.clone())["features"].clone()
-    dense.replay.frames = dense.replay.frames.flip(0)
-    for forget in (dense.forget, lambda: dense.load_state_dict({})):
-        forget()
-        after = dense(number.clone())["features"]
-        assert after.shape == before.shape == (1, dense.encoder.feature_dim)
-        assert not torch.equal(after, before)
-
-
 def test_too_few_places_are_refused_instead_of_giving_features_of_another_observation():
     dense = dense_of(observations=np.int64(4), in_keys="number", out_keys="features")
     assert dense(TensorDict({"number": torch.tensor([0, 5])}, [2]))["features"].shape[0] == 2
@@ -305,15 +305,11 @@ def test_auto_takes_dense_maps_where_they_fit_and_says_why(encoder, dtype, avail
     assert "\n" not in reason
 
 
-def test_explicit_modes_are_obeyed_or_refused_and_memory_is_measured(caplog):
-    assert choose_feature_mode("reencode", PixelEncoder(), 1)[0] == "reencode"
-    assert choose_feature_mode("auto", PixelEncoder(), 1)[0] == "dense"
-    assert choose_feature_mode("auto", PixelEncoder(), 10**9)[0] == "reencode"
+def test_explicit_modes_are_obeyed_or_refused(caplog):
+    assert choose_feature_mode("reencode", PixelEncoder(), 1, torch.float32, 2**40)[0] == "reencode"
     assert choose_feature_mode("dense", PixelEncoder(), 1000, torch.bfloat16, 2**40)[0] == "dense"
     assert not caplog.records
     assert choose_feature_mode("dense", PixelEncoder(), 1000, torch.bfloat16, 2**20)[0] == "dense"
     assert "may not fit: 0.4 GiB for 1000 observations, 0.0 GiB free" in caplog.text
     with pytest.raises(ValueError, match="Flatten"):
-        choose_feature_mode("dense", nn.Flatten(), 1)
-    with pytest.raises(ValueError, match="cached"):
-        choose_feature_mode("cached", PixelEncoder(), 1)
+        choose_feature_mode("dense", nn.Flatten(), 1, torch.float32, 2**40)

@@ -285,14 +285,16 @@ def test_a_state_dict_holds_what_a_reward_remembers_and_no_networks(kind):
 @pytest.mark.parametrize(
     ("make", "named"),
     [
-        (lambda: on_latents(knn_k=0), "`knn_k` must be at least 1"),
         (lambda: on_latents(knn_k=33), "`knn_k` must be at most 32"),
         (lambda: on_latents(queue=torch.zeros(3, D)), "expected a queue"),
         (lambda: PrototypeReward(None, Prototypes(512, 4), queue_size=2000), r"got 2000 and 512"),
-        (lambda: prototype(Projector(10, 5), Prototypes(8, 4)), "length 5, the prototypes 4"),
         (lambda: on_latents().intrinsic_reward(torch.randn(3, D + 1)), f"length {D + 1}, the prototypes {D}"),
         (lambda: ParticleReward(None, k=1), "`k` must be at least 2, got 1"),
         (lambda: ContrastiveReward(None, temperature=0), "`temperature` must be positive, got 0"),
+        (
+            lambda: ContrastiveReward(None)(batch().set("skill", torch.arange(B) % 4)),
+            r"Skills must be one-hot, \[24, K\] with K of at least 2, got \[24, 1\]; torch.nn.functional.one_hot makes",
+        ),
     ],
 )
 def test_bad_settings_are_refused_by_name(make, named):

@@ -82,15 +82,13 @@ class SquashedGaussianActor(LinearNetwork):
         low, high = self.log_std_bounds
         return loc, (low + 0.5 * (high - low) * (torch.tanh(raw) + 1)).exp()
 
-    def sample(
-        self, features: Tensor, *, noise: Tensor | None = None, generator: torch.Generator | None = None
-    ) -> tuple[Tensor, Tensor]:
+    def sample(self, features: Tensor, *, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """Return reparameterised actions ``[*, A]`` in [-1, 1], and their ``log_prob`` ``[*]`` (nats, summed over A).
 
-        Standard normal ``noise`` ``[*, A]`` is drawn from ``generator`` (torch's global one if None) unless given.
+        The noise is drawn from ``generator`` (torch's global one if None).
         """
         loc, scale = self(features)
-        return squashed_gaussian(loc, scale, standard_normal_like(loc, generator) if noise is None else noise)
+        return squashed_gaussian(loc, scale, standard_normal_like(loc, generator))
 
     def mode(self, features: Tensor) -> Tensor:
         """Evaluation action ``tanh(loc)``, ``[*, A]``."""

@@ -13,13 +13,14 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from crptpro.values import as_float
+from crptpro.values import as_float, read_entry
 
 
 class NetworkLoss(LossModule):
-    """A loss whose networks hold its parameters, in a copy too; re-initialising them updates the targets.
+    """A loss whose networks hold its parameters, also once it was copied or moved; re-initialising updates the targets.
 
-    A subclass converts its networks and lists the outputs of ``forward``.
+    They are therefore called as they are; only a target's parameters have to be put into a network, for a block. A
+    subclass converts its networks and lists the outputs of ``forward``.
     """
 
     default_out_keys: tuple[str, ...] = ()
@@ -46,8 +47,7 @@ class NetworkLoss(LossModule):
     def reset_parameters_recursive(self) -> None:
         """Re-initialise all networks and copy them into their targets; TorchRL's version skips plain modules."""
         for name in self.network_names:
-            with self._holding(name):
-                _reset(getattr(self, name))
+            _reset(getattr(self, name))
             if (target := self._modules.get(f"target_{name}_params")) is not None:
                 target.data.update_(getattr(self, f"{name}_params").data)
 
@@ -67,16 +67,10 @@ class NetworkLoss(LossModule):
         for name in self.network_names:
             getattr(self, f"{name}_params").to_module(getattr(self, name), preserve_module_state=False)
 
-    def _holding(self, name: str, *, target: bool = False) -> AbstractContextManager[Any]:
-        """Let a network hold its parameters, or its target's, in a block."""
-        params = getattr(self, f"target_{name}_params" if target else f"{name}_params")
-        return params.to_module(getattr(self, name), preserve_module_state=False)
-
-    def _entry(self, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-        value: Tensor | None = tensordict.get(key, None)
-        if value is None:
-            raise KeyError(f"{type(self).__name__} needs the entry {key!r}; set_keys() names another one.")
-        return value
+    def _as_target(self, name: str) -> AbstractContextManager[Any]:
+        """Let a network hold its target's parameters in a block."""
+        target = getattr(self, f"target_{name}_params")
+        return target.to_module(getattr(self, name), preserve_module_state=False)
 
     def _set_in_keys(self) -> None:
         self._in_keys = [getattr(self.tensor_keys, field.name) for field in fields(self.tensor_keys)]
@@ -109,16 +103,17 @@ class PretrainingLoss(NetworkLoss):
             number = None if value is None else as_float(value, name)
             self.register_coeff_buffer(name, number, dtype=torch.float64)
 
-    def _apply_network(self, name: str, inputs: Tensor, *, target: bool = False) -> Tensor:
-        with self._holding(name, target=target):
-            return getattr(self, name)(inputs)
+    def _latents(self, pixels: Tensor) -> Tensor:
+        return self.projector(self.encoder(pixels))
 
-    def _latents(self, pixels: Tensor, *, target: bool = False) -> Tensor:
-        return self._apply_network("projector", self._apply_network("encoder", pixels, target=target), target=target)
+    @torch.no_grad()
+    def _target_latents(self, pixels: Tensor) -> Tensor:
+        with self._as_target("encoder"), self._as_target("projector"):
+            return self._latents(pixels)
 
     def _read(self, tensordict: TensorDictBase, key: NestedKey, *, event_dims: int = 3) -> Tensor:
         """Return an entry with one batch dimension before its last ``event_dims``."""
-        value = self._entry(tensordict, key)
+        value = read_entry(self, tensordict, key)
         return value.reshape(-1, *value.shape[value.ndim - event_dims :])
 
 
@@ -127,6 +122,16 @@ def require_positive(**values: float | None) -> None:
     for name, value in values.items():
         if value is not None and not as_float(value, name) > 0:
             raise ValueError(f"`{name}` must be positive, got {value}.")
+
+
+def skills_of(one_hot: Tensor, rows: int) -> Tensor:
+    """Return the number of each one-hot skill ``[B, K]``; other skills, such as integers, are a ``ValueError``."""
+    if one_hot.ndim != 2 or len(one_hot) != rows or one_hot.shape[-1] < 2:
+        raise ValueError(
+            f"Skills must be one-hot, [{rows}, K] with K of at least 2, got {list(one_hot.shape)}; "
+            "torch.nn.functional.one_hot makes them from integers."
+        )
+    return one_hot.argmax(dim=-1)
 
 
 def _reset(network: nn.Module) -> None:

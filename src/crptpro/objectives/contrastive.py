@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from crptpro.modules import AnchorHead, Projector, SkillHead
 from crptpro.modules.heads import latent_dim_of, require_one_latent_dim
-from crptpro.objectives.base import PretrainingLoss, require_positive
+from crptpro.objectives.base import PretrainingLoss, require_positive, skills_of
 from crptpro.objectives.functional import becl_loss, info_nce, mean_pairwise_cosine
 
 
@@ -46,6 +46,8 @@ class ATCLoss(ContrastiveLoss):
     weights and an ``AnchorHead``; heads of different latent lengths are a ``ValueError``.
     """
 
+    anchor_head: nn.Module
+
     def __init__(
         self,
         encoder: nn.Module,
@@ -66,9 +68,8 @@ class ATCLoss(ContrastiveLoss):
 
     def _contrast(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         anchors = self._latents(self._read(tensordict, self.tensor_keys.observation))
-        with torch.no_grad():
-            positives = self._latents(self._read(tensordict, self.tensor_keys.next_observation), target=True)
-        queries = self._apply_network("anchor_head", anchors)
+        positives = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))
+        queries = self.anchor_head(anchors)
         with torch.autocast(queries.device.type, enabled=False):
             return info_nce(queries, positives.to(queries.dtype)), F.normalize(anchors.detach(), dim=-1)
 
@@ -131,7 +132,7 @@ class BeCLLoss(ContrastiveLoss):
     @dataclass
     class _AcceptedKeys:
         next_observation: NestedKey = ("next", "pixels")  # images that the skill led to
-        skill: NestedKey = "skill"  # one-hot [B, K], floating
+        skill: NestedKey = "skill"  # one-hot [B, K]
 
     default_keys = _AcceptedKeys
     _schedulable_buffers = frozenset({"temperature"})
@@ -154,7 +155,7 @@ class BeCLLoss(ContrastiveLoss):
 
     def _contrast(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         latents = self._latents(self._read(tensordict, self.tensor_keys.next_observation))
-        skills = self._read(tensordict, self.tensor_keys.skill, event_dims=1).argmax(dim=-1)
+        skills = skills_of(self._read(tensordict, self.tensor_keys.skill, event_dims=1), len(latents))
         with torch.autocast(latents.device.type, enabled=False):
             unit = F.normalize(latents.detach(), dim=-1)
             if len(latents) < 2:

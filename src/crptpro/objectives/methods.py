@@ -82,7 +82,7 @@ class Method:
     exploration: Exploration | None = None  #: None for a method that does not explore
     downstream: Mapping[str, Any] = field(default_factory=dict)  #: values that replace those of :data:`DOWNSTREAM`
     starts_from: str | None = None  #: method whose encoder it takes, to train it further for ``updates``
-    is_preset: bool = False  #: a variant of another method, which :func:`method_names` and :func:`method_of` skip
+    is_preset: bool = False  #: a variant of another method: not in :func:`method_names`, and no loss by hand's method
     is_builtin: bool = False  #: part of the library
 
     def __post_init__(self) -> None:
@@ -145,7 +145,7 @@ _BECL = Method(
 
 _preset = functools.partial(replace, is_preset=True)
 
-# A loss built by hand is trained by the first row of its class that is no preset.
+# A loss built by hand is trained by the first row of its class that is no preset and does not explore.
 TABLE = (
     _CRPTPRO,
     _preset(_CRPTPRO, name="crptpro-no-bonus", updates=0, starts_from="crptpro", downstream=_NO_BONUS),
@@ -176,14 +176,13 @@ def register_method(name: str, loss_class: type[LossModule], **fields: Any) -> M
     """Make a method available by name, on the command line too.
 
     ``fields`` are further fields of :class:`Method`, such as ``updates=10_000`` or ``exploration=Exploration()``, but
-    not ``starts_from``. A name that is registered for another class, or a number out of its range, is a ``ValueError``.
+    not ``starts_from``. The last registration of a name counts. A name of the library's own methods, or a number out of
+    its range, is a ``ValueError``.
     """
     if "starts_from" in fields:
         raise ValueError(f"The method {name!r} must pre-train its own encoder: `starts_from` is for built-in methods.")
-    taken = _METHODS.get(name)
-    if taken is not None and taken.loss_class is not loss_class:
-        owner = "no loss" if taken.loss_class is None else taken.loss_class.__name__
-        raise ValueError(f"The method {name!r} is already registered for {owner}; choose another.")
+    if name in _METHODS and _METHODS[name].is_builtin:
+        raise ValueError(f"{name!r} is a method of the library; choose another name.")
     _METHODS[name] = Method(name, loss_class, **fields)
     return _METHODS[name]
 
@@ -202,21 +201,21 @@ def method_names(*, presets: bool = False) -> list[str]:
     return sorted(name for name, row in _METHODS.items() if presets or not (row.is_preset or row.loss_class is None))
 
 
-def method_of(loss: LossModule | type[LossModule]) -> Method:
-    """Return the method that built a loss, else the first of its class or nearest base class, else CRPTpro's numbers.
+def method_of(loss: LossModule) -> Method:
+    """Return the method that built a loss, or for a loss built by hand the first passive one of its class.
 
-    For a loss built by hand, ``encoder_tau`` is None exactly if the loss has no targets.
+    If its class has none, the method is named after the class; its numbers are those of the nearest base class that has
+    one, or CRPTpro's, and its ``encoder_tau`` is None exactly if the loss has no targets.
     """
-    loss_class = loss if isinstance(loss, type) else type(loss)
     if (named := _METHODS.get(getattr(loss, "method_name", None) or "")) is not None:
         return named
-    listed = [row for row in _METHODS.values() if not row.is_preset]
+    loss_class = type(loss)
+    # Whether somebody who built a loss by hand lets it explore is not known.
+    listed = [row for row in _METHODS.values() if not row.is_preset and row.exploration is None]
     found = next((row for base in loss_class.__mro__ for row in listed if row.loss_class is base), None)
     if found is not None and found.loss_class is loss_class:
         return found
     method = replace(found or _CRPTPRO, name=loss_class.__name__, loss_class=loss_class, is_builtin=False)
-    if isinstance(loss, type):
-        return method
     if not any(name.startswith("target_") for name, _ in loss.named_children()):
         return replace(method, encoder_tau=None)
     return method if method.encoder_tau is not None else replace(method, encoder_tau=_CRPTPRO.encoder_tau)

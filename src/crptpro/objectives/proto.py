@@ -40,6 +40,7 @@ class ProtoLoss(PretrainingLoss):
     different latent lengths, are a ``ValueError``.
     """
 
+    predictor: nn.Module
     prototypes: Prototypes
 
     default_out_keys = (
@@ -83,20 +84,17 @@ class ProtoLoss(PretrainingLoss):
 
     def before_update(self) -> ProtoLoss:
         """Scale the prototype rows to unit length in place, as the released code does. Returns self."""
-        with self._holding("prototypes"):
-            self.prototypes.normalize_()
+        self.prototypes.normalize_()
         return self
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         latents = self._latents(self._read(tensordict, self.tensor_keys.observation))
-        predictions = self._apply_network("predictor", latents)
-        with torch.no_grad():
-            targets = self._latents(self._read(tensordict, self.tensor_keys.next_observation), target=True)
+        predictions = self.predictor(latents)
+        targets = self._target_latents(self._read(tensordict, self.tensor_keys.next_observation))
         # From here on in the precision of the prototypes, also under autocast or after a half-precision head.
         with torch.autocast(latents.device.type, enabled=False):
-            with self._holding("prototypes"):
-                unit = self.prototypes.unit_weight()
+            unit = self.prototypes.unit_weight()
             latents, predictions, targets = (x.to(unit.dtype) for x in (latents, predictions, targets))
             assignments = functional.sinkhorn_knopp(
                 F.normalize(targets, dim=-1) @ unit.detach().T,

@@ -14,9 +14,9 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import SACLoss, ValueEstimators
 
 from crptpro.modules import DeterministicActor, PixelEncoder, SquashedGaussianActor, TwinCritic
-from crptpro.modules.actor_critic import PixelCritic, standard_normal_like
+from crptpro.modules.actor_critic import PixelCritic
 from crptpro.objectives.base import NetworkLoss, require_positive
-from crptpro.values import as_float
+from crptpro.values import as_float, read_entry
 
 REGRESSION_KEYS = ("q_mean", "target_q_mean", "td_error")
 
@@ -108,12 +108,9 @@ class RADSACLoss(NetworkLoss, SACLoss):
             # With any other count SACLoss stacks copies of the parameters, and initialises those of a single module
             # again, without orthogonal initialisation.
             num_qvalue_nets=0,
-            loss_function="l2",
             alpha_init=float(alpha_init),
             target_entropy=-float(actor.action_dim) if target_entropy is None else target_entropy,
-            scalar_output_mode="exclude",
         )
-        self.num_qvalue_nets = 2
         self.generator = generator
         self.make_value_estimator(ValueEstimators.TD0, gamma=gamma)
 
@@ -132,11 +129,10 @@ class RADSACLoss(NetworkLoss, SACLoss):
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not changed."""
         for key in self.in_keys:
-            self._entry(tensordict, key)
+            read_entry(self, tensordict, key)
         target = self._compute_target_v2(tensordict)  # (B,)
         action = tensordict.get(self.tensor_keys.action)
-        with self._holding("qvalue_network"):
-            values = torch.stack([self.critic(view, action) for view in self._views(tensordict)], -2)
+        values = torch.stack([self.critic(view, action) for view in self._views(tensordict)], -2)
         return squared_errors(values, target)
 
     def actor_and_temperature_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -160,7 +156,7 @@ class RADSACLoss(NetworkLoss, SACLoss):
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """``loss_actor``, and the detached ``log_prob`` ``[B]`` of its actions."""
         features = self._policy_features(self._views(tensordict)[0])
-        action, log_prob = self._act(features)
+        action, log_prob = self.actor.sample(features, generator=self.generator)
         # Detached weights: the gradient passes through Q to the action and to nothing else.
         with self._cached_detached_qvalue_params.to_module(self.qvalue_network, preserve_module_state=False):
             value = self._q_values_on_features(features, action).amin(-1)
@@ -173,8 +169,8 @@ class RADSACLoss(NetworkLoss, SACLoss):
     def _compute_target_v2(self, tensordict: TensorDictBase) -> Tensor:
         soft_values = []
         for view in self._views(tensordict.get("next")):
-            action, log_prob = self._act(self._policy_features(view))
-            with self._holding("qvalue_network", target=True):
+            action, log_prob = self.actor.sample(self._policy_features(view), generator=self.generator)
+            with self._as_target("qvalue_network"):
                 soft_values.append(self.critic(view, action).amin(-1) - self._alpha * log_prob)
         soft_value = torch.stack(soft_values).mean(0).unsqueeze(-1)
         names = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
@@ -184,16 +180,8 @@ class RADSACLoss(NetworkLoss, SACLoss):
         estimate.set(("next", self.value_estimator.tensor_keys.value), soft_value)
         return self.value_estimator.value_estimate(estimate).squeeze(-1)
 
-    def _act(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Return an action of the policy, and its log-probability."""
-        # The noise is drawn before the parameters are swapped in, because a compiled graph cannot break inside.
-        like = features.new_empty(*features.shape[:-1], self.actor.action_dim, dtype=self.log_alpha.dtype)
-        noise = standard_normal_like(like, self.generator)
-        with self._holding("actor_network"):
-            return self.actor.sample(features, noise=noise)
-
     def _views(self, tensordict: TensorDictBase) -> list[Tensor]:
-        return [self._entry(tensordict, getattr(self.tensor_keys, name)).detach() for name in self.view_names]
+        return [read_entry(self, tensordict, getattr(self.tensor_keys, name)).detach() for name in self.view_names]
 
     # DrQ overrides these two, because its views are images.
 
@@ -259,8 +247,7 @@ class DrQLoss(AveragedSACLoss):
 
     @torch.no_grad()
     def _policy_features(self, view: Tensor) -> Tensor:
-        with self._holding("qvalue_network"):
-            return self.critic.encoder(view)
+        return self.critic.encoder(view)
 
     def _q_values_on_features(self, features: Tensor, action: Tensor) -> Tensor:
         return self.critic.head(features, action)
@@ -337,11 +324,10 @@ class SkillDDPGLoss(NetworkLoss):
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
         """``loss_qvalue`` with ``q_mean``, ``target_q_mean`` and ``td_error``; the input is not changed."""
         for key in self.in_keys:
-            self._entry(tensordict, key)
+            read_entry(self, tensordict, key)
         target = self._target(tensordict)  # (B,)
         inputs = self._inputs(tensordict, tensordict)
-        with self._holding("qvalue_network"):
-            values = self.qvalue_network(inputs, tensordict.get(self.tensor_keys.action))  # (B, 2)
+        values = self.qvalue_network(inputs, tensordict.get(self.tensor_keys.action))  # (B, 2)
         return squared_errors(values.unsqueeze(-2), target)
 
     def actor_and_temperature_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -358,16 +344,15 @@ class SkillDDPGLoss(NetworkLoss):
         following = tensordict.get("next")
         inputs = self._inputs(following, tensordict)
         action = self._act(inputs)
-        with self._holding("qvalue_network", target=True):
+        with self._as_target("qvalue_network"):
             value = self.qvalue_network(inputs, action).amin(-1)
         reward = following.get(self.tensor_keys.reward).squeeze(-1)
         discount = following.get(self.tensor_keys.discount).squeeze(-1)
         return reward + discount * value
 
     def _act(self, inputs: Tensor) -> Tensor:
-        with self._holding("actor_network"):
-            return self.actor_network.sample(inputs, noise_clip=self.noise_clip, generator=self.generator)
+        return self.actor_network.sample(inputs, noise_clip=self.noise_clip, generator=self.generator)
 
     def _inputs(self, observed: TensorDictBase, root: TensorDictBase) -> Tensor:
-        features = self._entry(observed, self.tensor_keys.observation).detach()
-        return torch.cat([features, self._entry(root, self.tensor_keys.skill).to(features.dtype)], dim=-1)
+        features = read_entry(self, observed, self.tensor_keys.observation).detach()
+        return torch.cat([features, read_entry(self, root, self.tensor_keys.skill).to(features.dtype)], dim=-1)

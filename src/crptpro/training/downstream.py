@@ -362,7 +362,7 @@ def attach_transforms(
     slots = min(replay.window, 2 * -(-config.env_steps // config.action_repeat))
     mode, reason = choose_feature_mode(
         "dense" if is_rounded else setting, encoder, slots, map_dtype,
-        available_bytes=max(0, free_bytes(device) - reserved_bytes), pad=SHIFT_PAD, device=device,
+        available_bytes=max(0, free_bytes(device) - reserved_bytes),
         latent_dim=prototypes.weight.shape[1] if keeps_projections else None,
     )  # fmt: skip
     logger.info("features: %s", reason)

@@ -128,7 +128,9 @@ def plan_exploration(
 ) -> ExplorationPlan:
     """Spread a method's budget over domains; refused if the method does not explore, or would learn nothing."""
     if method.exploration is None:
-        raise CRPTproError(f"{method.name} learns from datasets and does not explore; use pretrain().")
+        raise CRPTproError(
+            f"{method.name} learns from datasets and does not explore; use pretrain(), or name a method that explores."
+        )
     settings = (config or ExploreConfig()).resolved(method)
     repeats = tuple(resolve_action_repeat(domain) for domain in domains)
     plan = ExplorationPlan(

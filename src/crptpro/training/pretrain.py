@@ -133,9 +133,14 @@ def pretrain(
     """
     recipe = method_of(loss) if method is None else get_method(method)
     if started_from is None and recipe.starts_from is not None:
-        raise CRPTproError(f"{method} takes a trained encoder of {recipe.starts_from} and does not pre-train its own.")
-    if started_from is None and method is not None and recipe.exploration is not None:
-        raise CRPTproError(f"{method} explores its domains and does not learn from datasets; use pretrain_active().")
+        raise CRPTproError(
+            f"{recipe.name} takes a trained encoder of {recipe.starts_from} and does not pre-train its own."
+        )
+    if started_from is None and recipe.exploration is not None:
+        raise CRPTproError(
+            f"{recipe.name} explores its domains and does not learn from datasets; use pretrain_active(), or build "
+            f"{type(loss).__name__} without its method."
+        )
     settings = dataclasses.replace(config or PretrainConfig(), **overrides).resolved(recipe)
     device = usable_device(settings.device)
     loss.to(device).train()

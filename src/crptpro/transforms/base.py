@@ -5,22 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
-from torch import Tensor
 from torchrl.data.tensor_specs import Composite
 from torchrl.envs.transforms import Transform
 
+from crptpro.values import read_entry
+
 #: One (nested) key, or a list of keys: as in TorchRL, a tuple is one key.
 Keys = Any
-
-
-def read_entry(transform: Transform, tensordict: TensorDictBase, key: NestedKey) -> Tensor:
-    """Return an entry; a ``KeyError`` lists the present ones."""
-    value = tensordict.get(key, None)
-    if value is None:
-        present = list(tensordict.keys(True, True))
-        raise KeyError(f"{type(transform).__name__} found no {key!r} among {present}; set its keys.")
-    return value
 
 
 def require_pairs(transform: Transform) -> None:

@@ -21,12 +21,11 @@ from torch import Tensor, nn
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.envs.transforms import Transform
 
-from crptpro.free_memory import free_bytes
 from crptpro.modules import PixelEncoder
-from crptpro.modules.precision import device_of
-from crptpro.transforms.base import Keys, read_entry, require_pairs
+from crptpro.modules.precision import device_of, evaluating
+from crptpro.transforms.base import Keys, require_pairs
 from crptpro.transforms.random_shift import as_numpy_bits, draw_offsets
-from crptpro.values import as_int
+from crptpro.values import as_int, read_entry
 
 logger = logging.getLogger(__name__)
 
@@ -134,7 +133,7 @@ class DenseShiftFeatures(Transform):
             ``[B, C, H, W]``, and a ``window``: those that it holds at once have numbers that differ modulo this.
         pad: largest shift in pixels.
         projector: its float32 output for all ``(2 * pad + 1)**2`` shifts of an observation is kept too, and
-            ``embedding_key`` is written; None for neither.
+            ``("next", "embedding")`` is written, ``[*, D]`` of the observation of the last in key; None for neither.
         dtype: of the kept maps; the encoder's compute dtype when None. bfloat16 halves the memory and rounds each
             feature to eight significant bits (exact if the encoder computes in bfloat16).
         generator: source of the offsets, which the state dict excludes; torch's global one when None.
@@ -142,7 +141,6 @@ class DenseShiftFeatures(Transform):
         in_keys: int64 ``[*]`` or ``[*, 1]``, numbers of observations; ``"number"`` and ``("next", "number")`` if None.
         out_keys: features ``[*, feature_dim]`` in the encoder's compute dtype, one key per observation; ``"features"``
             and ``("next", "features")`` if None.
-        embedding_key: with a projector, projections ``[*, D]`` of the observation of the last in key.
 
     Raises:
         ValueError: an encoder without dense maps, key lists of unequal length, or a ``dtype`` unfit for the encoder's.
@@ -163,7 +161,6 @@ class DenseShiftFeatures(Transform):
         observations: int | None = None,
         in_keys: Keys | None = None,
         out_keys: Keys | None = None,
-        embedding_key: NestedKey = ("next", "embedding"),
     ) -> None:
         super().__init__(in_keys=["number", ("next", "number")] if in_keys is None else in_keys)
         self.out_keys = ["features", ("next", "features")] if out_keys is None else out_keys
@@ -186,7 +183,6 @@ class DenseShiftFeatures(Transform):
         slots = replay.window if observations is None else observations
         self.observations = as_int(slots, "observations", minimum=1)
         self.generator = generator
-        self.embedding_key = embedding_key
         self.forget()
 
     def forget(self) -> None:
@@ -211,7 +207,7 @@ class DenseShiftFeatures(Transform):
             if embeddings is not None:
                 shifts = offsets[:, 0] * (2 * self.pad + 1) + offsets[:, 1]
                 found = embeddings[rows.to(embeddings.device), shifts.to(embeddings.device)]
-                tensordict.set(self.embedding_key, found.reshape(*lead, -1))
+                tensordict.set(("next", "embedding"), found.reshape(*lead, -1))
         return tensordict
 
     @torch.no_grad()
@@ -259,7 +255,8 @@ class DenseShiftFeatures(Transform):
         offsets = torch.cartesian_prod(side, side)
         rows = torch.zeros(len(offsets), dtype=torch.int64, device="cpu")
         features = crop_features(maps, rows, offsets, self._new_output(len(offsets)), pad=self.pad)
-        return projector(self.encoder.standardised(features)).float()
+        with evaluating(projector):  # it may be in training
+            return projector(self.encoder.standardised(features)).float()
 
     def _new_output(self, count: int) -> Tensor:
         dtype, device = self.encoder.compute_dtype, device_of(self.encoder)
@@ -289,47 +286,42 @@ def choose_feature_mode(
     mode: Literal["auto", "dense", "reencode"],
     encoder: nn.Module,
     observations: int,
-    dtype: torch.dtype = torch.float32,
-    available_bytes: int | None = None,
+    dtype: torch.dtype,
+    available_bytes: int,
     *,
-    pad: int = 4,
     latent_dim: int | None = None,
-    device: torch.device | str = "cpu",
 ) -> tuple[Literal["dense", "reencode"], str]:
     """Choose dense maps or re-encoding of shifted images, which give the same features; returns mode and reason.
 
-    ``"auto"`` chooses dense maps for a suitable encoder if four fifths of the free memory (by default that of
-    ``device``) hold the maps of ``observations`` in ``dtype`` and, with ``latent_dim``, their projections; the rest is
-    for networks, batches and the page cache. ``"dense"`` for an unsuitable encoder is a ``ValueError``.
+    ``"auto"`` chooses dense maps for a suitable encoder if four fifths of the free memory, ``available_bytes``, hold
+    the maps of ``observations`` in ``dtype`` and, with ``latent_dim``, their projections; the rest is for networks,
+    batches and the page cache. ``"dense"`` for an unsuitable encoder is a ``ValueError``. Shifts are of up to 4 pixels.
     """
     if mode == "reencode":
         return "reencode", "re-encoding at every update, as requested"
-    if mode not in ("auto", "dense"):
-        raise ValueError(f"mode must be 'auto', 'dense' or 'reencode', got {mode!r}.")
     try:
-        needed = dense_maps_bytes(encoder, observations, dtype, pad=pad, latent_dim=latent_dim)
+        needed = dense_maps_bytes(encoder, observations, dtype, latent_dim=latent_dim)
     except ValueError as error:
         if mode == "dense":
             raise
         return "reencode", f"re-encoding at every update: {error}"
-    available = free_bytes(torch.device(device)) if available_bytes is None else available_bytes
-    size = f"{needed / 2**30:.1f} GiB for {observations} observations, {available / 2**30:.1f} GiB free"
+    size = f"{needed / 2**30:.1f} GiB for {observations} observations, {available_bytes / 2**30:.1f} GiB free"
     if mode == "dense":
-        if needed > available:
+        if needed > available_bytes:
             logger.warning("The dense-shift cache was requested and may not fit: %s.", size)
         return "dense", f"dense-shift cache, as requested ({size})"
-    budget = 0.8 * available
+    budget = 0.8 * available_bytes
     if needed <= budget:
         return "dense", f"dense-shift cache ({size})"
-    in_bf16 = dense_maps_bytes(encoder, observations, torch.bfloat16, pad=pad, latent_dim=latent_dim)
+    in_bf16 = dense_maps_bytes(encoder, observations, torch.bfloat16, latent_dim=latent_dim)
     if in_bf16 <= budget:
         size += f"; with features=dense-bf16 it would fit in {in_bf16 / 2**30:.1f} GiB"
     return "reencode", f"re-encoding at every update: too little memory for the dense-shift cache ({size})"
 
 
 def dense_maps_bytes(
-    encoder: nn.Module, observations: int, dtype: torch.dtype, *, pad: int = 4, latent_dim: int | None = None
+    encoder: nn.Module, observations: int, dtype: torch.dtype, *, latent_dim: int | None = None
 ) -> int:
     """Return the memory of dense maps in bytes; see :func:`choose_feature_mode`."""
-    values = math.prod(dense_shift_geometry(encoder, pad)[2])
-    return observations * (values * dtype.itemsize + (latent_dim or 0) * 4 * (2 * pad + 1) ** 2)
+    values = math.prod(dense_shift_geometry(encoder)[2])
+    return observations * (values * dtype.itemsize + (latent_dim or 0) * 4 * 9**2)  # 9 x 9 shifts

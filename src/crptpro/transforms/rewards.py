@@ -13,12 +13,11 @@ from torch import Tensor, nn
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.envs.transforms import Transform
 
-from crptpro.modules.heads import latent_dim_of
 from crptpro.modules.precision import device_of, evaluating
-from crptpro.objectives.base import require_positive
+from crptpro.objectives.base import require_positive, skills_of
 from crptpro.objectives.functional import becl_loss, knn_distance, knn_distances, particle_entropy
-from crptpro.transforms.base import Keys, read_entry
-from crptpro.values import as_int
+from crptpro.transforms.base import Keys
+from crptpro.values import as_int, read_entry
 
 logger = logging.getLogger(__name__)
 
@@ -141,8 +140,6 @@ class PrototypeReward(IntrinsicReward):
         start = torch.zeros(queue_size, latent_dim) if queue is None else queue
         if start.shape != (queue_size, latent_dim):
             raise ValueError(f"expected a queue of shape {(queue_size, latent_dim)}, got {tuple(start.shape)}.")
-        if projector is not None:
-            _check_latents(latent_dim_of(projector) or latent_dim, latent_dim)
         super().__init__(projector, coef=coef, **keys)
         self.__dict__["prototypes"] = prototypes
         self.knn_k = as_int(knn_k, "knn_k", minimum=1, maximum=queue_size)
@@ -153,7 +150,11 @@ class PrototypeReward(IntrinsicReward):
     @torch.no_grad()
     def intrinsic_reward(self, features: Tensor, *extra: Tensor) -> Tensor:
         latents = F.normalize(self._project(features), dim=-1)
-        _check_latents(latents.shape[-1], self.queue.shape[-1])
+        if latents.shape[-1] != self.queue.shape[-1]:
+            raise ValueError(
+                f"projections have length {latents.shape[-1]}, the prototypes {self.queue.shape[-1]}; use the "
+                "projector they were trained with."
+            )
         weight = self.prototypes.get_parameter("weight")
         candidates = draw_candidates(F.normalize(weight.float(), dim=-1) @ latents.T, self.generator)
         count = candidates.shape[0]
@@ -161,13 +162,6 @@ class PrototypeReward(IntrinsicReward):
         self.queue.index_copy_(0, rows, latents[candidates].to(self.queue.dtype))
         self.queue_pointer.add_(count).remainder_(self.queue.shape[0])
         return knn_distance(latents, self.queue.to(latents.dtype), k=self.knn_k)
-
-
-def _check_latents(length: int, expected: int) -> None:
-    if length != expected:
-        raise ValueError(
-            f"projections have length {length}, the prototypes {expected}; use the projector they were trained with."
-        )
 
 
 def warn_if_mostly_zero(num_prototypes: int, batch_size: int, knn_k: int) -> None:
@@ -253,8 +247,8 @@ class ContrastiveReward(IntrinsicReward):
 
     Deviation: a batch of one gets 0; the published code fails.
 
-    ``head`` gives the embeddings, ``skill_key`` is the one-hot skill ``[*, K]`` at the root; ``options`` are
-    :class:`~crptpro.transforms.rewards.IntrinsicReward`'s.
+    ``head`` gives the embeddings, ``skill_key`` is the one-hot skill ``[*, K]`` at the root, others are a
+    ``ValueError``; ``options`` are :class:`~crptpro.transforms.rewards.IntrinsicReward`'s.
     """
 
     def __init__(
@@ -270,5 +264,5 @@ class ContrastiveReward(IntrinsicReward):
         embeddings = self._project(features)
         if len(embeddings) < 2:
             return embeddings.new_zeros(len(embeddings))
-        skills = extra[0].argmax(dim=-1)
+        skills = skills_of(extra[0], len(embeddings))
         return becl_loss(embeddings, skills, temperature=self.temperature, reduction="none").neg().exp()
