@@ -27,7 +27,10 @@ DOMAINS = ("cheetah", "walker", "quadruped", "finger", "pendulum")
 PAPER_SCALE = RECORDS / "paper_scale"
 """Records with the paper's settings; downstream runs in directories TASK/METHOD_seed_N."""
 ENV_STEPS = {"cheetah_run": 100_000, "finger_spin": 60_000}
-"""Length of these runs."""
+"""Length of these runs; those of cheetah_run that go on are shown apart."""
+FIGURES = {"cheetah_run": ("cheetah_run", 100_000), "cheetah_run_long": ("cheetah_run", 500_000),
+           "finger_spin": ("finger_spin", 60_000)}  # fmt: skip
+"""Name of each task's figures to the task and the env steps that are drawn."""
 PROBES = {
     **{n: PAPER_SCALE / f"probe_{n}_updates.csv" for n in (0, 1_000, 3_000, 10_000, 30_000)},
     50_000: ROOT / "src" / "crptpro" / "encoders" / "group-a" / "probe.csv",
@@ -165,6 +168,21 @@ def cheetah_run_means() -> pd.DataFrame:
     )
 
 
+def cheetah_run_long() -> pd.DataFrame:
+    """Means of cheetah_run over the evaluations of every 100,000 env steps, of runs longer than that."""
+    rows = []
+    for name, own in evaluations("cheetah_run"):
+        at = [list(range(first + 20_000, first + 120_000, 20_000)) for first in range(0, 500_000, 100_000)]
+        own = own.reindex(columns=[n for each in at for n in each])
+        own = own[own[at[1]].notna().any(axis=1)]
+        if own.empty:
+            continue
+        row = {"cheetah_run": name, "runs": len(own)}
+        row |= {f"{each[0]:,} to {each[-1]:,}": _over_runs(own[each].mean(axis=1, skipna=False)) for each in at}
+        rows.append(row | {"500,000 env steps": _over_runs(own[500_000])})
+    return pd.DataFrame(rows)
+
+
 def finger_spin_means() -> pd.DataFrame:
     """Means of finger_spin over the evaluations decided on beforehand, and over the last training episodes."""
     columns = {"evaluations at 40,000 and 60,000 env steps": [40_000, 60_000]}
@@ -231,8 +249,9 @@ def probe_scores(paths: Mapping[int, Path]) -> dict[int, pd.Series]:
 
 TABLES = {"quickstart": quickstart, "small scale": small_scale, "controls": controls, "two tasks": two_tasks,
           "control differences": control_differences, "cheetah_run": partial(paper_scale, "cheetah_run"),
-          "cheetah_run means": cheetah_run_means, "finger_spin": partial(paper_scale, "finger_spin"),
-          "finger_spin means": finger_spin_means, "pre-training": pretraining, "probes": probes}  # fmt: skip
+          "cheetah_run means": cheetah_run_means, "cheetah_run long": cheetah_run_long,
+          "finger_spin": partial(paper_scale, "finger_spin"), "finger_spin means": finger_spin_means,
+          "pre-training": pretraining, "probes": probes}  # fmt: skip
 
 
 def draw() -> None:
@@ -262,9 +281,9 @@ def draw() -> None:
     figure.savefig(FIGURE, dpi=110, metadata={"Software": None})
 
 
-def draw_task(task: str) -> None:
-    """Draw a task's training returns with the paper's settings beside what others published."""
-    end = ENV_STEPS[task]
+def draw_task(name: str, task: str, end: int) -> None:
+    """Draw training returns up to ``end`` env steps with the paper's settings, beside what others published."""
+    window = max(5, end // 20_000)  # of episodes, which have 1,000 env steps
     figure, axes = plt.subplots(figsize=(7.4, 3.8), layout="constrained")
     drq = _published(task).agg(["mean", "std"]).T
     drq = drq[drq.index <= end]
@@ -274,17 +293,18 @@ def draw_task(task: str) -> None:
     curves = [(path, "CRPTpro, its authors' log (1 run)", "#5d6672") for path in log]
     for method, color in {"crptpro": "#0b80c3", "crptpro-no-bonus": "#109e77", "random-encoder": "#d9640a",
                           "random-encoder-standardised": "#b03a78"}.items():  # fmt: skip
-        runs = sorted((PAPER_SCALE / task).glob(f"{method}_seed_*/episodes.csv"))
+        found = sorted((PAPER_SCALE / task).glob(f"{method}_seed_*/episodes.csv"))
+        runs = [path for path in found if pd.read_csv(path)["env_steps"].max() > end / 2]
         label = f"{method}, this library ({len(runs)} run{'s' * (len(runs) > 1)})"
         curves += [(path, None if place else label, color) for place, path in enumerate(runs)]
     for path, label, color in curves:
         episodes = pd.read_csv(path)
         episodes = episodes[episodes["env_steps"] <= end].set_index("env_steps")["episode_return"]
-        axes.plot(episodes.rolling(5, min_periods=1).mean(), color=color, label=label, linewidth=1.2)
-    axes.set(title=task, xlabel="env steps", ylabel="return, mean of 5 training episodes")
+        axes.plot(episodes.rolling(window, min_periods=1).mean(), color=color, label=label, linewidth=1.2)
+    axes.set(title=task, xlabel="env steps", ylabel=f"return, mean of {window} training episodes")
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8)
-    figure.savefig(ROOT / "docs" / f"{task}.png", dpi=110, metadata={"Software": None})
+    figure.savefig(ROOT / "docs" / f"{name}.png", dpi=110, metadata={"Software": None})
 
 
 def filled(page: str) -> str:
@@ -332,5 +352,5 @@ if __name__ == "__main__":
     for path in PAGES:
         path.write_text(filled(path.read_text()))
     draw()
-    for task in ENV_STEPS:
-        draw_task(task)
+    for name, (task, end) in FIGURES.items():
+        draw_task(name, task, end)
