@@ -28,9 +28,8 @@ PAPER_SCALE = RECORDS / "paper_scale"
 """Records with the paper's settings; downstream runs in directories TASK/METHOD_seed_N."""
 ENV_STEPS = {"cheetah_run": 100_000, "finger_spin": 60_000}
 """Length of these runs; those of cheetah_run that go on are shown apart."""
-FIGURES = {"cheetah_run": ("cheetah_run", 100_000), "cheetah_run_long": ("cheetah_run", 500_000),
-           "finger_spin": ("finger_spin", 60_000)}  # fmt: skip
-"""Name of each task's figures to the task and the env steps that are drawn."""
+FIGURES = {task: (task, end) for task, end in ENV_STEPS.items()} | {"cheetah_run_long": ("cheetah_run", 500_000)}
+"""Names of figures to the task and the env steps that are drawn."""
 PROBES = {
     **{n: PAPER_SCALE / f"probe_{n}_updates.csv" for n in (0, 1_000, 3_000, 10_000, 30_000)},
     50_000: ROOT / "src" / "crptpro" / "encoders" / "group-a" / "probe.csv",
@@ -170,9 +169,9 @@ def cheetah_run_means() -> pd.DataFrame:
 
 def cheetah_run_long() -> pd.DataFrame:
     """Means of cheetah_run over the evaluations of every 100,000 env steps, of runs longer than that."""
+    at = [list(range(first + 20_000, first + 120_000, 20_000)) for first in range(0, 500_000, 100_000)]
     rows = []
     for name, own in evaluations("cheetah_run"):
-        at = [list(range(first + 20_000, first + 120_000, 20_000)) for first in range(0, 500_000, 100_000)]
         own = own.reindex(columns=[n for each in at for n in each])
         own = own[own[at[1]].notna().any(axis=1)]
         if own.empty:
@@ -282,7 +281,7 @@ def draw() -> None:
 
 
 def draw_task(name: str, task: str, end: int) -> None:
-    """Draw training returns up to ``end`` env steps with the paper's settings, beside what others published."""
+    """Draw training returns up to ``end`` env steps, of runs longer than half of it, beside what others published."""
     window = max(5, end // 20_000)  # of episodes, which have 1,000 env steps
     figure, axes = plt.subplots(figsize=(7.4, 3.8), layout="constrained")
     drq = _published(task).agg(["mean", "std"]).T
