@@ -15,12 +15,12 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import pandas as pd
+from matplotlib.figure import Figure
 from scipy.stats import ttest_ind
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDS = ROOT / "results"
 PAGES = (ROOT / "README.md", ROOT / "docs" / "start.md", ROOT / "docs" / "results.md")
-FIGURE = ROOT / "docs" / "results.png"
 METHODS = ("crptpro", "crptpro-fast", "crptpro-finetune", "proto-rl-c", "proto-rl-s", "atc", "apt-c", "apt-s", "becl",
            "drq", "crptpro-no-bonus", "paper-scale-10k", "random-encoder", "random-encoder-standardised")  # fmt: skip
 DOMAINS = ("cheetah", "walker", "quadruped", "finger", "pendulum")
@@ -30,6 +30,9 @@ ENV_STEPS = {"cheetah_run": 100_000, "finger_spin": 60_000}
 """Length of these runs; those of cheetah_run that go on are shown apart."""
 FIGURES = {task: (task, end) for task, end in ENV_STEPS.items()} | {"cheetah_run_long": ("cheetah_run", 500_000)}
 """Names of figures to the task and the env steps that are drawn."""
+COLORS = {"`crptpro`": "#0b80c3", "`crptpro-no-bonus`": "#109e77", "`random-encoder`": "#d9640a",
+          "`random-encoder-standardised`": "#b03a78", "CRPTpro, its authors' log": "#5d6672",
+          "DrQ, its authors' log": "#8a7bd8"}  # fmt: skip
 PROBES = {
     **{n: PAPER_SCALE / f"probe_{n}_updates.csv" for n in (0, 1_000, 3_000, 10_000, 30_000)},
     50_000: ROOT / "src" / "crptpro" / "encoders" / "group-a" / "probe.csv",
@@ -253,56 +256,61 @@ TABLES = {"quickstart": quickstart, "small scale": small_scale, "controls": cont
           "pre-training": pretraining, "probes": probes}  # fmt: skip
 
 
-def draw() -> None:
-    """Draw the loss and the probes along pre-training, and the training returns of the controls."""
-    figure, (loss, gain, learning) = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")
+def draw_pretraining() -> None:
+    """Draw the loss and the probes along pre-training with the paper's settings."""
+    figure, (loss, gain) = plt.subplots(1, 2, figsize=(10, 3.4), layout="constrained")
     record = pd.read_csv(PAPER_SCALE / "pretrain.csv")
-    loss.plot(record["updates"], record["loss_comp"], label="paper's settings, group A")
+    loss.plot(record["updates"], record["loss_comp"], label="group A")
     loss.axhline(math.log(512), color="grey", linestyle=":", label="ln 512: uniform predictions")
-    loss.set(title="Pre-training (1 run)", xlabel="updates", ylabel="comparative loss")
+    loss.set(title="Pre-training", xlabel="updates", ylabel="comparative loss")
     scores = probe_scores(PROBES)
     for name in DOMAINS:
         gains = [scores[n][name, "r2_velocity"] - scores[0][name, "r2_velocity"] for n in PROBES]
         unseen = name not in DOMAINS[:3]
-        gain.plot(range(len(PROBES)), gains, "o--" if unseen else "o-", label=name + " (unseen)" * unseen)
-    gain.set(title="State probe of its encoders (1 run)", xlabel="updates", ylabel="R² of velocities, beyond untrained")
-    gain.set_xticks(range(len(PROBES)), [f"{n:,}" for n in PROBES])
+        gain.plot(list(PROBES), gains, "o--" if unseen else "o-", label=name + " (unseen)" * unseen)
+    gain.set(title="State probe of its encoders", xlabel="updates", ylabel="R² of velocities, beyond untrained")
+    gain.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
+    _save(figure, "pretraining")
+
+
+def draw_controls() -> None:
+    """Draw the training returns of the controls at small scale."""
+    figure, axes = plt.subplots(figsize=(7.4, 3.8), layout="constrained")
     episodes = downstream_runs("controls", "episodes")
+    episodes = episodes[episodes["method"] != "paper-scale-10k"]  # one run, not part of the comparison
     for method, own in episodes.groupby("method", observed=True):
-        curve = own.groupby("env_steps")["episode_return"].mean().rolling(5).mean()
-        learning.plot(curve.index, curve, label=f"{method} (n = {own['run'].nunique()})")
-    learning.set(
-        title="Controls at small scale: walker_run", xlabel="env steps", ylabel="return, last 5 training episodes"
-    )
-    for axes in (loss, gain, learning):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(frameon=False, fontsize=8)
-    figure.savefig(FIGURE, dpi=110, metadata={"Software": None})
+        runs = own.pivot(index="env_steps", columns="run", values="episode_return").rolling(5).mean()
+        mean, deviation = runs.mean(axis=1), runs.std(axis=1)
+        (line,) = axes.plot(mean, label=f"{method} ({runs.shape[1]} runs, mean ± sd)")
+        axes.fill_between(mean.index, mean - deviation, mean + deviation, color=line.get_color(), alpha=0.1)
+    axes.set(title="walker_run, small scale", xlabel="env steps", ylabel="return, mean of 5 training episodes")
+    _save(figure, "controls")
 
 
 def draw_task(name: str, task: str, end: int) -> None:
-    """Draw training returns up to ``end`` env steps, of runs longer than half of it, beside what others published."""
-    window = max(5, end // 20_000)  # of episodes, which have 1,000 env steps
+    """Draw the evaluations up to ``end`` env steps, of runs longer than half of it, and those that others published."""
     figure, axes = plt.subplots(figsize=(7.4, 3.8), layout="constrained")
-    drq = _published(task).agg(["mean", "std"]).T
-    drq = drq[drq.index <= end]
-    axes.plot(drq.index, drq["mean"], color="#8a7bd8", label="DrQ, its authors' log: evaluations, mean ± sd of 10 runs")
-    axes.fill_between(drq.index, drq["mean"] - drq["std"], drq["mean"] + drq["std"], color="#8a7bd8", alpha=0.15)
-    log = RECORDS.glob(f"references/crptpro_{task}_train.csv")
-    curves = [(path, "CRPTpro, its authors' log (1 run)", "#5d6672") for path in log]
-    for method, color in {"crptpro": "#0b80c3", "crptpro-no-bonus": "#109e77", "random-encoder": "#d9640a",
-                          "random-encoder-standardised": "#b03a78"}.items():  # fmt: skip
-        found = sorted((PAPER_SCALE / task).glob(f"{method}_seed_*/episodes.csv"))
-        runs = [path for path in found if pd.read_csv(path)["env_steps"].max() > end / 2]
-        label = f"{method}, this library ({len(runs)} run{'s' * (len(runs) > 1)})"
-        curves += [(path, None if place else label, color) for place, path in enumerate(runs)]
-    for path, label, color in curves:
-        episodes = pd.read_csv(path)
-        episodes = episodes[episodes["env_steps"] <= end].set_index("env_steps")["episode_return"]
-        axes.plot(episodes.rolling(window, min_periods=1).mean(), color=color, label=label, linewidth=1.2)
-    axes.set(title=task, xlabel="env steps", ylabel=f"return, mean of {window} training episodes")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8)
+    for method, runs in evaluations(task):
+        runs = runs.loc[:, runs.columns <= end]
+        runs = runs[runs.loc[:, runs.columns > end / 2].notna().any(axis=1)]
+        color = COLORS[method]
+        label = f"{method.strip('`')} ({len(runs)} run{'s' * (len(runs) > 1)}{', mean ± sd' * (len(runs) >= 10)})"
+        if len(runs) >= 10:
+            mean, deviation = runs.mean(), runs.std()
+            axes.plot(mean, color=color, label=label)
+            axes.fill_between(mean.index, mean - deviation, mean + deviation, color=color, alpha=0.15)
+        else:
+            for place, (_, run) in enumerate(runs.iterrows()):
+                axes.plot(run.dropna(), "o-", ms=3, lw=1.2, color=color, label=None if place else label)
+    axes.set(title=task, xlabel="env steps", ylabel="return, mean of an evaluation's episodes")
+    _save(figure, name)
+
+
+def _save(figure: Figure, name: str) -> None:
+    for axes in figure.axes:
+        axes.spines[["top", "right"]].set_visible(False)
+        if axes.get_legend() is None:
+            axes.legend(frameon=False, fontsize=8)
     figure.savefig(ROOT / "docs" / f"{name}.png", dpi=110, metadata={"Software": None})
 
 
@@ -350,6 +358,7 @@ def _spread(returns: pd.Series) -> str:
 if __name__ == "__main__":
     for path in PAGES:
         path.write_text(filled(path.read_text()))
-    draw()
+    draw_pretraining()
+    draw_controls()
     for name, (task, end) in FIGURES.items():
         draw_task(name, task, end)

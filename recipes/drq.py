@@ -3,8 +3,8 @@
     python recipes/drq.py                                      # every task of the paper at paper scale; needs a GPU
     python recipes/drq.py --tasks walker_run reach_duplo --downstream.device cuda --seed 1
 
-Every default is the number of the paper's comparison or, where the paper is silent, of denisyarats/drq. Disk: a replay
-of 2.3 GB per task. If killed, the same command resumes. Writes one eval.csv per task below OUT, a row per episode. The
+Every default is the number of the paper's comparison or, where the paper is silent, of denisyarats/drq. Disk: 2.6 GB
+per task. If killed, the same command resumes. Writes one eval.csv per task below OUT, a row per episode. The
 training loop is the one that pretrained encoders use.
 """
 
