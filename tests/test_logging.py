@@ -217,12 +217,16 @@ class FakeRun:
     def __init__(self, **options: Any) -> None:
         self.options, self.finished, self.axes = options, False, dict[str, str | None]()
         self.rows: list[tuple[Any, dict[str, Any]]] = []
+        self.artifacts: list[str] = []
 
     def define_metric(self, name: str, step_metric: str | None = None) -> None:
         self.axes[name] = step_metric
 
     def log(self, row: dict[str, Any], **options: Any) -> None:
         self.rows.append((row, options))
+
+    def log_artifact(self, artifact: Any) -> None:
+        self.artifacts.append(artifact.name)
 
     def finish(self) -> None:
         self.finished = True
@@ -272,6 +276,13 @@ def test_wandb_gets_metrics_against_their_counter_under_one_identity(tmp_path: P
     assert first.rows[1] == first.rows[2]  # repeated rows come under the same step
     assert second.rows[0][1] == {"step": 2}
     assert first.finished
+
+
+def test_wandb_gets_an_artifact_of_a_call_that_has_no_row_to_write(tmp_path: Path, fake_wandb: list[FakeRun]) -> None:
+    (tmp_path / "weights").touch()  # of a run that was killed before the upload
+    with RunLogger(tmp_path, wandb={}) as logger:
+        logger.artifact(tmp_path / "weights", name="encoder", kind="model")
+    assert [(run.artifacts, run.finished) for run in fake_wandb] == [(["encoder"], True)]
 
 
 def test_a_run_that_begins_again_begins_another_wandb_run(tmp_path: Path, fake_wandb: list[FakeRun]) -> None:

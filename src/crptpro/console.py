@@ -28,11 +28,11 @@ class _BarFriendlyHandler(logging.Handler):
         tqdm.write(prefix + self.format(record), file=sys.stderr)
 
 
-def configure_logging(level: int = logging.INFO) -> None:
+def configure_logging() -> None:
     """Show the library's log lines on standard error; other packages' from warnings upwards."""
     root = logging.getLogger("crptpro")
     root.handlers[:] = [_BarFriendlyHandler()]
-    root.setLevel(level)
+    root.setLevel(logging.INFO)
     root.propagate = False
     logging.getLogger("absl").setLevel(logging.ERROR)
 

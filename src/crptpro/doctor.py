@@ -66,7 +66,7 @@ class DoctorReport:
             lines.append(f"{finding.severity}: {finding.what}")
             if finding.remedy:
                 lines.append(f"  what to do: {finding.remedy}")
-        return "\n".join([*lines, "A run would work." if self.ok else "A run would not work."])
+        return "\n".join([*lines, "This machine can run crptpro." if self.ok else "This machine cannot run crptpro."])
 
 
 def run_doctor(domains: Iterable[str] | None = None) -> DoctorReport:

@@ -182,6 +182,7 @@ class RunLogger:
 
     def close(self) -> None:
         """Finish the mirrors and unlock the directory; every row is on disk already."""
+        self._mirrors = [mirror for mirror in self._mirrors if "logger" in vars(mirror)]  # that have begun
         self._mirror(lambda mirror: mirror.close())
         self._mirrors = []
         self._lock.release()
@@ -213,7 +214,7 @@ class RunLogger:
         self._columns[stream] = columns
 
     def _mirror(self, call: Callable[[_Wandb | _TensorBoard], None]) -> None:
-        for mirror in list(self._mirrors) if self._has_begun else ():
+        for mirror in list(self._mirrors):
             try:
                 call(mirror)
             except Exception as reason:

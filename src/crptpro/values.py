@@ -1,4 +1,4 @@
-"""What users give: values as plain Python ones, or refused before any work starts, and entries of batches."""
+"""Validation of user input before any work starts, and access to the entries of batches."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import math
 import operator
 import os
 from collections.abc import Mapping
-from enum import Enum
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, get_args, get_type_hints
@@ -71,8 +70,6 @@ def as_plain(value: Any, name: str) -> Any:
     NumPy and torch scalars become numbers, arrays and tensors lists, dataclasses dicts, paths and dtypes texts. An
     entry that has no such form is a ``ValueError`` with its name.
     """
-    if isinstance(value, Enum):
-        value = value.value
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):

@@ -31,8 +31,8 @@ from crptpro.experiments.launch import Failure, RayLauncher, SlurmLauncher, Work
 UNTRAINED = Job("untrained", "u", ("pretrain", "--method", "random-encoder", "--out", "{out}", "--seed", "0"), {})
 
 
-def job(name: str, *needs: Job, kind: str = "run") -> Job:
-    return Job(kind, name, ("evaluate", name, *(f"{{{n.key}}}/x" for n in needs)), {}, needs)
+def job(name: str, *needs: Job, kind: str = "run", **facts: Any) -> Job:
+    return Job(kind, name, ("evaluate", name, *(f"{{{n.key}}}/x" for n in needs)), facts, needs)
 
 
 class FakeLauncher:
@@ -86,10 +86,11 @@ def test_a_job_starts_when_its_needs_are_finished(tmp_path: Path) -> None:
     assert again.started == []
 
 
-def test_a_timing_runs_alone_and_has_all_cores(tmp_path: Path) -> None:
+def test_a_timing_runs_alone_and_has_the_threads_of_its_plan(tmp_path: Path) -> None:
     launcher = FakeLauncher()
-    launcher.run(tmp_path, job("t", kind="timing"), job("a"), job("b"), job("u", kind="timing"), jobs=2, cores=3)
-    assert sorted(launcher.started) == [("a", 3), ("b", 3), ("t", 6), ("u", 6)]
+    timings = [job(name, kind="timing", threads=5) for name in ("t", "u")]
+    launcher.run(tmp_path, timings[0], job("a"), job("b"), timings[1], jobs=2, cores=3)
+    assert sorted(launcher.started) == [("a", 3), ("b", 3), ("t", 5), ("u", 5)]
     assert sorted(launcher.at_once) == [1, 1, 1, 2]
 
 

@@ -103,6 +103,12 @@ def test_all_systems_have_as_many_runs_and_no_two_runs_are_the_same() -> None:
     assert len({option(job, "--seed") for job in tasks}) == len(tasks) == 3
 
 
+def test_a_repeated_name_is_planned_once() -> None:
+    once = {"groups": ("A",), "tasks": ("walker_run",), "methods": ("crptpro",)}
+    for experiment in ("probe", "efficiency", "seen"):
+        assert cells(experiment, **{name: each * 2 for name, each in once.items()}) == cells(experiment, **once)
+
+
 def test_experiments_share_what_they_have_in_common() -> None:
     seen = {cell.job for cell in cells("seen", SMALL, **PART)}
     assert {cell.job for cell in cells("finetune", SMALL, **PART)} <= seen

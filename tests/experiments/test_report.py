@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import html
-import os
+import math
 import re
 import shutil
 import subprocess
-import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +19,9 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from crptpro.artifact import write_json
-from crptpro.errors import DiskSpaceError, RecordError
+from crptpro.errors import RecordError
 from crptpro.experiments.measure import write_rows
-from crptpro.experiments.report import Page, build_report, left_plateau
+from crptpro.experiments.report import build_report, left_plateau
 
 RESULTS = Path(__file__).parents[2] / "results"
 COST, HOURS, SPREAD = "Mean cost of jobs", "Pre-training by number of domains", "Spread of the prototypes at the end"
@@ -284,7 +283,7 @@ def test_unreadable_records_are_left_out_by_name(made: Reproduction) -> None:
     made.ask("seen", cells)
     report = made.report()
     assert f"{paths[0].parent.name} has no eval.csv" in report.text
-    assert "a `episode_return` in it is no finite number".replace("`", r"\`") in report.text
+    assert "a `episode_return` in it is not a finite number".replace("`", r"\`") in report.text
     assert report.cell("Episode return at the final", "crptpro", "A walker_run").startswith("520 (n = 1)")
 
 
@@ -462,35 +461,40 @@ def test_diagnostics_show_what_a_loss_of_ones_own_records(
     assert [panel for points in drawn for panel in points["panel"].unique()] == panels
 
 
-def test_a_curve_has_every_evaluation_of_runs_that_evaluate_at_other_env_steps(
+def test_a_curve_is_interpolated_where_runs_evaluate_at_other_env_steps(
     made: Reproduction, drawn: list[pd.DataFrame]
 ) -> None:
-    cells = made.runs("crptpro", "cheetah_run", [500, 600])
-    others = made.runs("crptpro", "walker_run", [500, 600])  # evaluated at other intervals: only what both have
-    for seed, (_, job, place) in enumerate(cells + others):
-        rows = evaluations(500.0)
-        for row in rows[2:-2]:
-            row["env_steps"] += (20 if place["task"] == "cheetah_run" else 20_000) * (seed % 2)
-        write_rows(made.root / "jobs" / job / "eval.csv", rows)
-    made.ask("seen", cells + others)
+    cells = made.runs("crptpro", "walker_run", [500, 500])
+    for seed, (_, job, _) in enumerate(cells):
+        points = [0, 100_000, 200_000 + 30_000 * seed, 500_000]
+        rows = [{"env_steps": n, "episode_return": n / 1000 + seed, "method": "crptpro"} for n in points]
+        write_rows(made.root / "jobs" / job / "eval.csv", rows[seed:])  # the second is not evaluated at 0
+    made.ask("seen", cells)
     made.report()
     [curves] = [points for points in drawn if "line" in points]
-    mean = curves[(curves["line"] == "mean") & curves["panel"].str.contains("walker_run")]
-    assert mean["x"].tolist() == [0, 500_000]
-    mean = curves[(curves["line"] == "mean") & curves["panel"].str.contains("cheetah_run")]
-    assert mean["x"].tolist() == [0, *(50_000 * n + 10 for n in range(1, 10)), 500_000]
+    mean = curves[curves["line"] == "mean"]
+    assert mean["x"].tolist() == [100_000, 200_000, 230_000, 500_000]
+    assert mean["y"].tolist() == pytest.approx([100.5, 200.5, 230.5, 500.5])
 
 
-def test_a_full_disk_is_reported_and_the_older_page_kept(tmp_path: Path) -> None:
-    page = Page(tmp_path)
-    page.section("One", "one")
-    page.text("before")
-    page.write("A title", "")
-    (tmp_path / f".index.html.{os.getpid()}.{threading.get_ident()}.partial").symlink_to("/dev/full")
-    page.text("after")
-    with pytest.raises(DiskSpaceError, match=r"disk is full: .*index\.html cannot be written"):
-        page.write("A title", "")
-    assert "after" not in (tmp_path / "index.html").read_text()
+def test_runs_without_a_common_span_and_probes_without_a_finite_number_are_left_out(made: Reproduction) -> None:
+    cells = made.runs("crptpro", "walker_run", [500, 500])
+    for (_, job, _), n in zip(cells, (0, 10_000), strict=True):
+        write_rows(
+            made.root / "jobs" / job / "eval.csv", [{"env_steps": n, "episode_return": 1.0, "method": "crptpro"}]
+        )
+    made.ask("seen", cells)
+    about = {"domain": "mine", "colors": "normal", "seen": "no", "embedding": "features", "coordinate": "",
+             "samples": 10, "held_out_episodes": 1}  # fmt: skip
+    scores = {"r2_position": math.nan, "r2_velocity": 0.5, "effective_rank": 3.0, "mean_cosine": 0.1}
+    facts = {"method": "random-encoder"}
+    probe = made.job(
+        "probe-1", "probe", facts=facts, probe=[{**about, "measure": m, "value": v} for m, v in scores.items()]
+    )
+    made.ask("probe", [("random-encoder", probe, {"group": "A", "encoder_seed": 0})])
+    report = made.report()
+    assert "R2 of positions" not in report.text
+    assert report.cell("R2 of velocities", "mine", "random-encoder").startswith("0.500")
 
 
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome")

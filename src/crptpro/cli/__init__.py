@@ -1,6 +1,6 @@
 """The ``crptpro`` command: a thin, typed shell over the library's functions.
 
-Every stage's settings are the dataclass that its function takes; nothing is named, defaulted or explained twice.
+The settings of each training stage are the dataclass that its function takes.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, Union
+from typing import Annotated, Any, Literal
 
+import pandas as pd
 import torch
 import tyro
-from tyro.conf import OmitSubcommandPrefixes, Positional, arg, subcommand
+from tyro.conf import OmitSubcommandPrefixes, Positional, arg
 
 from crptpro import training
 from crptpro.cli.reproduce import Reproduce
@@ -73,6 +74,7 @@ class Logging:
         if self.wandb == "off" and not self.tensorboard:
             yield None
             return
+        run_dir = as_path(run_dir, "out")
         mode = None if self.wandb == "auto" else self.wandb
         asked = {"project": self.wandb_project, "group": self.wandb_group, "tags": self.wandb_tags, "mode": mode}
         wandb = None if self.wandb == "off" else {name: value for name, value in asked.items() if value}
@@ -282,16 +284,14 @@ class Evaluate:
         is_random = self.agent == "random-policy"
         if is_random and self.task is None:
             raise CRPTproError("The random policy has no task of its own; name one, e.g. --task walker_run.")
-        require_writable(self.csv, "--csv")  # before an hour of episodes
-        if self.video is not None:
-            require_video(self.video)
+        csv, video = require_writable(self.csv, "--csv"), require_video(self.video)  # before an hour of episodes
         agent, card = (None, {}) if is_random else training.load_agent(self.agent)
         task = self.task or card["task"]
         usual = {"quality": "exact", "colors": "normal", "action_repeat": None} | card.get("config", {})
         names = ("quality", "colors", "action_repeat")
         given = {name: getattr(self, name) for name in names}
         settings: dict[str, Any] = {name: usual[name] if given[name] is None else given[name] for name in names}
-        settings["render"] = not is_random or self.video is not None  # the random policy needs no pixels
+        settings["render"] = not is_random or video is not None  # the random policy needs no pixels
         if agent is not None:
             encoder: Any = agent.encoder
             settings |= {"image_size": encoder.image_size, "frame_stack": encoder.in_channels // 3}
@@ -307,22 +307,22 @@ class Evaluate:
             try:
                 training.evaluate(policy, env, episodes=self.episodes, seed=self.seed, on_episode=episodes.append)
             finally:  # a later episode may have failed
-                if self.csv is not None and episodes:
+                if csv is not None and episodes:
                     from crptpro.experiments import measure
 
                     rows = [{"task": task, "agent": self.agent, **vars(episode)} for episode in episodes]
-                    measure.write_rows(self.csv, rows)
+                    measure.write_rows(csv, rows)
             scores = training.summarize(episodes)
             print(
                 f"{task}: {scores['mean']:.1f} ± {scores['std']:.1f} "
                 f"({scores['min']:.1f} to {scores['max']:.1f}) over {len(episodes)} episodes",
                 flush=True,
             )
-            if self.video is not None:
+            if video is not None:
                 frames: list[Any] = []
                 policy = agent or training.uniform_policy(env, seed=self.seed)
                 run_episode(policy, env, episode=0, seed=episode_seed(self.seed, 0), on_frame=frames.append)
-                write_video(frames, self.video)
+                write_video(frames, video)
 
 
 @dataclass(frozen=True)
@@ -347,7 +347,7 @@ class Probe:
 
         if self.samples < 1:
             raise CRPTproError(f"--samples must be at least 1, got {self.samples}.")
-        require_writable(self.csv, "--csv")  # before minutes of probing
+        csv = require_writable(self.csv, "--csv")  # before minutes of probing
         usable_device(self.device)
         image_size, frame_stack = image_format(self.datasets)
         if self.encoder == "random-encoder":
@@ -356,20 +356,19 @@ class Probe:
             pretrained = load_pretrained(self.encoder).require(image_size=image_size)
         for network in filter(None, (pretrained.encoder, pretrained.projector)):
             network.to(self.device)
-        table: list[dict[str, str]] = []
-        numbers: list[dict[str, Any]] = []
+        rows: list[dict[str, Any]] = []
         settings: dict[str, Any] = {"encoder": self.encoder, "samples": self.samples, "seed": self.seed}
         try:
             for path in self.datasets:
-                rows, measures = measure.probe_rows(pretrained, FrameDataset.open(path), **settings)
-                table += rows
-                numbers += measures
-                if self.csv is not None:
-                    measure.write_rows(self.csv, numbers)
+                rows += measure.probe_rows(pretrained, FrameDataset.open(path), **settings)
+                if csv is not None:
+                    measure.write_rows(csv, rows)
         finally:  # a later dataset may be refused, and writing may fail
-            if table:
-                lines = [list(table[0]), ["---"] * len(table[0]), *(list(row.values()) for row in table)]
-                print("\n".join(f"| {' | '.join(line)} |" for line in lines))
+            if rows:
+                about = ["method", "domain", "seen", "colors", "embedding"]
+                means = pd.DataFrame(row for row in rows if not row["coordinate"]).astype({"value": float})
+                table = means.pivot_table("value", about, "measure", sort=False).round(4).reset_index()
+                print(table.to_string(index=False))
 
 
 @dataclass(frozen=True)
@@ -387,17 +386,20 @@ class Report:
         print(build_report(self.directory, out=self.out))
 
 
-def require_video(path: Path) -> None:
+def require_video(path: Path | None) -> Path | None:
     """Refuse a video that cannot be written, before any work; makes nothing."""
+    path = require_writable(path, "--video")
+    if path is None:
+        return None
     if path.suffix.lower() != ".mp4":
         raise CRPTproError(f"--video {path}: the name of an MP4 ends in .mp4.")
-    require_writable(path, "--video")
     try:
         import imageio_ffmpeg
 
         imageio_ffmpeg.get_ffmpeg_exe()
     except (ImportError, RuntimeError) as reason:
         raise CRPTproError(f"--video needs the `video` extra ({reason}): pip install 'crptpro[video]'.") from None
+    return path
 
 
 def write_video(frames: Sequence[torch.Tensor], path: Path) -> None:
@@ -445,7 +447,7 @@ def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
     for path in datasets:
         if not path.exists() and str(path) in (*GROUPS, *PAPER_DOMAINS, *TASKS):
             raise DatasetError(
-                f"{path} is no directory. This method learns from datasets: `crptpro collect {path}` makes them, "
+                f"{path} is not a directory. This method learns from datasets: `crptpro collect {path}` makes them, "
                 "data/... by default."
             )
         dataset = FrameDataset.open(path)
@@ -456,15 +458,17 @@ def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
     return next(iter(formats.values()))
 
 
-def require_writable(path: Path | None, option: str) -> None:
-    """Refuse a path that no file can have, before any work; makes nothing."""
+def require_writable(path: Path | None, option: str) -> Path | None:
+    """Return a path with ``~`` expanded; one that no file can have is refused before any work. Makes nothing."""
     if path is None:
-        return
+        return None
+    path = as_path(path, option)
     if path.exists() and not path.is_file():  # the finished file would replace it, /dev/stdout for example
-        raise CRPTproError(f"{option} {path} is no ordinary file; name one.")
+        raise CRPTproError(f"{option} {path} is not a regular file; name one.")
     parent = next(parent for parent in path.absolute().parents if parent.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise CRPTproError(f"{option} {path} cannot be written: {parent} is a file, or not yours to write to.")
+    return path
 
 
 def pretrain_command(arguments: Sequence[str]) -> type[Pretrain] | type[Explore]:
@@ -492,9 +496,8 @@ def main() -> None:
             "doctor": Doctor, "collect": Collect, "pretrain": pretrain_command(arguments), "finetune": Finetune,
             "downstream": Downstream, "evaluate": Evaluate, "probe": Probe, "reproduce": Reproduce, "report": Report,
         }  # fmt: skip
-        stages: Any = Union[tuple(Annotated[stage, subcommand(name)] for name, stage in commands.items())]  # noqa: UP007
-        tyro.cli(
-            stages, prog="crptpro", description=DESCRIPTION, args=arguments, config=(OmitSubcommandPrefixes,)
+        tyro.extras.subcommand_cli_from_dict(
+            commands, prog="crptpro", description=DESCRIPTION, args=arguments, config=(OmitSubcommandPrefixes,)
         ).run()
 
     run_main(run)

@@ -20,6 +20,7 @@ from crptpro.experiments.jobs import DONE, JOBS, KINDS, Plan, bytes_of, make_pla
 from crptpro.experiments.matrix import EXPERIMENTS, SCALES, Cell, Request
 from crptpro.free_memory import free_bytes
 from crptpro.modules import PixelEncoder, resolve_precision, usable_device
+from crptpro.provenance import cpu_cores
 from crptpro.values import as_path
 
 ALL = "all"
@@ -96,7 +97,7 @@ class Reproduce:
         request = Request(
             SCALES[self.scale], methods=self.methods, groups=self.groups, tasks=self.tasks, seeds=self.seeds,
             encoder_seeds=self.encoder_seeds, colors=f"reversed_{self.colors_by}", device=self.device,
-            threads=cores * (jobs if self.launcher == "local" else 1),
+            threads=min(cores * jobs, cpu_cores()) if self.launcher == "local" else cores,
         )  # fmt: skip
         wanted = self._wanted(request)
         plan = make_plan([cell.job for cells in wanted.values() for cell in cells], root)

@@ -8,13 +8,16 @@ from typing import Any
 
 import pandas as pd
 
+from crptpro.experiments.matrix import METHODS
+
 COLORS = {
-    "crptpro": "#0b80c3", "crptpro-fast": "#3d44d8", "crptpro-finetune": "#5fc0f0", "proto-rl-c": "#d9640a",
-    "proto-rl-s": "#e6a800", "atc": "#109e77", "apt-c": "#c76aa2", "apt-s": "#8a3f70", "becl": "#8f8a2a",
-    "drq": "#8a7bd8", "random-encoder": "#858a91", "random policy": "#858a91",
+    "crptpro": "#0b80c3", "crptpro-fast": "#3d44d8", "crptpro-no-bonus": "#0b80c3", "crptpro-finetune": "#5fc0f0",
+    "proto-rl-c": "#d9640a", "proto-rl-s": "#e6a800", "atc": "#109e77", "apt-c": "#c76aa2", "apt-s": "#8a3f70",
+    "becl": "#8f8a2a", "drq": "#8a7bd8", "random-encoder": "#858a91", "random-encoder-standardised": "#858a91",
+    "random policy": "#858a91",
 }  # fmt: skip
-"""Methods in the order of tables and legends; colours from Okabe and Ito's and from Tol's colour-blind-safe sets."""
-OTHERS = ("#0b80c3", "#d9640a", "#109e77", "#c76aa2", "#8f8a2a", "#8a7bd8", "#e6a800", "#858a91", "#bb5566")
+"""From Okabe and Ito's and from Tol's colour-blind-safe sets; methods that are not listed take matplotlib's."""
+ORDER = (*METHODS, "random policy")  # of tables and legends
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h", "*", "d")
 DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1)), (0, (3, 1, 1, 1, 1, 1)))
 GREY, RULE = "#5d6672", "#d8dce1"
@@ -27,28 +30,26 @@ def base_method(label: str) -> str:
         >>> base_method("proto-rl-c with dispersion"), base_method("crptpro-finetune"), base_method("mine")
         ('proto-rl-c', 'crptpro-finetune', '')
     """
-    fitting = [m for m in COLORS if label == m or label.startswith((f"{m} ", f"{m},", f"{m}-"))]
+    fitting = [m for m in ORDER if label == m or label.startswith((f"{m} ", f"{m},", f"{m}-"))]
     return max(fitting, key=len, default="")
 
 
 def in_order(labels: Iterable[str]) -> list[str]:
     """Sort labels as tables show them: methods in the paper's order, variants after their method, others last."""
-    order = [*COLORS, ""]
-    return sorted(dict.fromkeys(labels), key=lambda label: (order.index(base_method(label)), label not in COLORS))
+    order = [*ORDER, ""]
+    return sorted(dict.fromkeys(labels), key=lambda label: (order.index(base_method(label)), label not in order))
 
 
 def styles(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Return colour, marker and dash of labels; a variant has its method's colour and another marker and dash."""
-    bases = {label: base_method(label) for label in in_order(labels)}
-    free = [color for color in OTHERS if color not in {COLORS.get(base) for base in bases.values()}]
-    order = list(COLORS)
-    found: dict[str, dict[str, Any]] = {}
-    for label, base in bases.items():
-        alike = [bases[other] for other in found].count(base)
-        color = COLORS[base] if base else free[alike % len(free)]
-        marker = MARKERS[((order.index(base) if base else 0) + alike) % len(MARKERS)]
-        found[label] = {"color": color, "marker": marker, "linestyle": DASHES[alike % len(DASHES)]}
-    return found
+    return {
+        label: {
+            "color": COLORS.get(base_method(label), f"C{place % 10}"),
+            "marker": MARKERS[place % len(MARKERS)],
+            "linestyle": DASHES[place % len(DASHES)],
+        }
+        for place, label in enumerate(in_order(labels))
+    }
 
 
 def draw(

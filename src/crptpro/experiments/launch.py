@@ -47,7 +47,7 @@ MAX_REQUEUES = 1_000  # of a Slurm job at its time limit; it makes progress each
 POLL_S = 0.2
 REFUSED_S = 60.0  # pause after a queue refused a job
 LAST_WAIT_S = 10.0  # for jobs that were told to stop at once
-SLURM_LOOK_S = 10.0  # between questions about jobs that stop; submitit alone asks every ten minutes
+SLURM_POLL_S = 10.0  # between polls of jobs that stop; submitit alone polls every ten minutes
 
 
 # --- one job --------------------------------------------------------------------------------------------------------
@@ -248,7 +248,7 @@ class _SlurmJob:
     looked: float = -math.inf
 
     def poll(self) -> str | None:
-        is_due = self.is_stopping and time.monotonic() - self.looked > SLURM_LOOK_S
+        is_due = self.is_stopping and time.monotonic() - self.looked > SLURM_POLL_S
         if is_due:
             self.looked = time.monotonic()
         if not self.job.done(force_check=is_due):
@@ -410,8 +410,8 @@ class _Queue:
             work = replace(self.usual, key=job.key)
             if self.launcher.is_one_machine and job.kind == "dataset":
                 work = replace(work, workers=work.workers * share)
-            if self.launcher.is_one_machine and job.is_exclusive:
-                work = replace(work, threads=work.threads * self.jobs)
+            if job.is_exclusive:
+                work = replace(work, threads=job.facts["threads"])
             try:
                 handle = self.launcher.start(work, is_exclusive=job.is_exclusive)
             except SubmissionError as refusal:
@@ -427,7 +427,7 @@ class _Queue:
         return bool(chosen)
 
     def look(self) -> None:
-        """Take in the jobs that have ended."""
+        """Collect finished jobs."""
         for job, (handle, began) in list(self.running.items()):
             lost = handle.poll()
             if lost is None:

@@ -175,7 +175,9 @@ class Request:
         for group in self.groups:
             if group not in GROUPS:
                 raise UnknownNameError(f"There is no group {group!r}; choose from {', '.join(GROUPS)}.")
-        object.__setattr__(self, "tasks", tuple(dict.fromkeys(get_domain(task).task for task in self.tasks)))
+        tasks = [get_domain(task).task for task in self.tasks]
+        for name, values in {"methods": self.methods, "groups": self.groups, "tasks": tasks}.items():
+            object.__setattr__(self, name, tuple(dict.fromkeys(values)))
         object.__setattr__(self, "seeds", self.seeds or tuple(range(self.scale.seeds)))
         for name in ("encoder_seeds", "seeds"):
             seeds = getattr(self, name)

@@ -45,12 +45,11 @@ def write_rows(path: Path, rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> 
 
 def probe_rows(
     pretrained: Any, dataset: FrameDataset, *, encoder: str, samples: int, seed: int
-) -> tuple[list[dict[str, str]], list[dict[str, Any]]]:
+) -> list[dict[str, Any]]:
     """Probe an encoder, called ``encoder`` in the rows, on a draw from a dataset with physical state.
 
     Its features are probed, and its projections if it has a projector. The untrained control gets an untrained
-    projector, so that it has z, too. Returns a formatted row per embedding, and the rows of ``probe.csv``: one per
-    measure, and per coordinate of each R2.
+    projector, so that it has z, too. Returns the rows of ``probe.csv``: one per measure, and per coordinate of each R2.
 
     Raises:
         DatasetError: there is no physical state, or too little data to split.
@@ -65,13 +64,8 @@ def probe_rows(
         "colors": dataset.card.get("colors", "normal"),
     }  # fmt: skip
     counts = {"samples": len(observed.pixels), "held_out_episodes": observed.held_out_episodes, "seed": seed}
-    table, numbers = [], []
+    rows = []
     for embedding, result in probe(observed, pretrained.encoder, projector).items():
-        table.append({
-            **about, "embedding": embedding, "R2 positions": f"{result.position_r2:.3f}",
-            "R2 velocities": f"{result.velocity_r2:.3f}", "effective rank": f"{result.effective_rank:.1f}",
-            "mean cosine": f"{result.mean_cosine:.4f}",
-        })  # fmt: skip
         found: list[tuple[str, str, Any]] = [
             *(("r2_position", *each) for each in result.positions.items()),
             *(("r2_velocity", *each) for each in result.velocities.items()),
@@ -81,8 +75,8 @@ def probe_rows(
         ]  # fmt: skip
         for measure, coordinate, value in found:
             row = {"embedding": embedding, "measure": measure, "coordinate": coordinate, "value": value}
-            numbers.append({"encoder": encoder, **about, **row, **counts})
-    return table, numbers
+            rows.append({"encoder": encoder, **about, **row, **counts})
+    return rows
 
 
 def _untrained_projector(pretrained: Pretrained) -> Projector:

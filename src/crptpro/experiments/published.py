@@ -139,7 +139,8 @@ class PrototypeMetrics(NamedTuple):
     """How far prototypes spread after pre-training: K- and all-neighbour estimation, and L_intr; lower is wider.
 
     The names are those of the columns of ``pretrain.csv``. The k and the scale of the first are not published; a
-    3-nearest-neighbour cosine of 512 unit vectors in 128 dimensions is about +0.2, so these negative values are none.
+    3-nearest-neighbour cosine of 512 unit vectors in 128 dimensions is about +0.2, so these negative values cannot be
+    such cosines.
     ANE is the sum of the pairwise cosines of different prototypes over M^2, L_intr the mean over all M^2 entries.
     """
 

@@ -1,7 +1,7 @@
 """One page on a reproduction, or on any downstream runs: tables beside the paper's, figures, and what is missing.
 
 :func:`build_report` reads two frames: the cells of experiments, and the jobs behind them. The kinds of an experiment's
-jobs decide what its section contains, also for an experiment of a plugin. Missing or unknown values stay empty.
+jobs decide what its section contains. Missing or unknown values stay empty.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def _read(path: Path, *columns: str) -> pd.DataFrame:
         if column not in table or not len(table):
             raise RecordError(f"{path} has no {f'column `{column}`' if len(table) else 'rows'}.")
         if not np.isfinite(pd.to_numeric(table[column], errors="coerce")).all():
-            raise RecordError(f"{path} is damaged: a `{column}` in it is no finite number.")
+            raise RecordError(f"{path} is damaged: a `{column}` in it is not a finite number.")
     return table
 
 
@@ -196,7 +196,7 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
             facts = content["config"] | {"method": label}
             is_done = bool(episodes["env_steps"].max() >= facts["env_steps"])
         except (RecordError, KeyError, TypeError, AttributeError) as reason:
-            logger.warning("Left out: %s is no downstream run that can be read (%s).", path, reason)
+            logger.warning("Left out: %s is not a readable downstream run (%s).", path, reason)
             continue
         key = str(path.relative_to(root))
         place = {"task": facts["task"], "colors": facts.get("colors", "")}
@@ -254,7 +254,7 @@ def _spread(values: pd.Series, digits: int, n: bool = True) -> str:
 
 
 def _contents(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
-    page.section("What is here", "contents")
+    page.section("Overview", "contents")
     numbers = cells.groupby(["experiment", "scale"], sort=False)["done"].agg(requested="size", finished="sum")
     page.table("Experiments: requested and finished results.", numbers.reset_index())
     counts = jobs.groupby("kind")["done"].agg(["sum", "size"])
@@ -285,7 +285,7 @@ BUDGETS = (
 
 def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     """Show the budgets of every scale beside the paper's, and what such budgets cannot show."""
-    page.section("What this scale cannot show", "limits")
+    page.section("Limits of this scale", "limits")
     names = [*(name for name, *_ in BUDGETS), "downstream runs per encoder"]
     table = pd.DataFrame(index=pd.Index(names, name="budget"))
     for scale, own in cells[cells["scale"] != "paper"].groupby("scale", sort=False):
@@ -304,7 +304,7 @@ def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
             "This scale does not show which method is ahead after the full budget: methods that learn late look worse "
             "here. It does not show what an encoder learns after the plateau near ln M, which lasts for over a "
             "thousand updates at batch 512, nor the method itself where a smaller batch, replay or dataset changes it. "
-            f"Fewer than {stats.MIN_RUNS} runs on a task give no interval, and two or three runs rank nothing.",
+            f"Fewer than {stats.MIN_RUNS} runs on a task give no interval, and two or three do not support a ranking.",
             "warning",
         )
 
@@ -517,9 +517,8 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
         held = "; ".join(f"{count}: {share:.0%}" for count, share in stats.COVERAGE.items())
         page.text(
             f"Brackets are {stats.CONFIDENCE:.0%} intervals ({stats.REPLICATES:,} stratified bootstrap replicates that "
-            "redraw encoders and then their runs). With one encoder they describe that encoder, not its method. For "
-            "normally distributed runs of one task, they cover the true mean with this frequency by number of runs: "
-            f"{held}.",
+            "resample encoders, then runs within them). With one encoder they describe it, not its method. For "
+            f"normally distributed runs of one task they cover the true mean this often, by number of runs: {held}.",
             "warning",
         )
     if fewest.min() < stats.MIN_RUNS:
@@ -572,13 +571,10 @@ def _estimated(found: stats.Estimate, **columns: Any) -> pd.DataFrame:
 def _learning_curves(page: Page, name: str, evaluations: pd.DataFrame) -> None:
     drawn = []
     for (task, label), own in evaluations.groupby(["task", "label"], sort=False):
-        # A task that ends early is evaluated at other env steps in each run.
-        ranks = own["env_steps"].groupby(own.groupby("run")["env_steps"].rank())
-        spread, interval = (ranks.max() - ranks.min()).max(), ranks.mean().diff().min()
-        is_alike = own.groupby("run").size().nunique() == 1 and spread < 0.15 * interval
-        at = ranks.transform("mean") if is_alike else own["env_steps"]
-        runs = own.assign(at=at).pivot_table("score", ["task", "encoder", "run"], "at").dropna(axis=1)
-        if runs.empty:  # no evaluation that all runs have
+        # A task whose episodes end early is evaluated at other env steps in each run.
+        runs = own.pivot_table("score", ["task", "encoder", "run"], "env_steps")
+        runs = runs.interpolate("index", axis=1, limit_area="inside").dropna(axis=1)
+        if runs.empty:  # no env steps that the evaluations of all runs span
             continue
         found = stats.estimate(stats.mean, runs.reset_index(), columns=list(runs))
         about = {"panel": task, "label": label, "n": str(len(runs))}
@@ -586,12 +582,14 @@ def _learning_curves(page: Page, name: str, evaluations: pd.DataFrame) -> None:
         if found.low is None and len(runs) > 1:  # too few for an interval: the runs themselves
             curves = own[["env_steps", "score", "run"]].set_axis(["x", "y", "line"], axis=1)
             drawn.append(curves.assign(**about, thin=True))
-    page.figure(
-        f"{name}-curves",
-        f"Episode return along training: mean over runs, with {stats.CONFIDENCE:.0%} bootstrap intervals from "
-        f"{stats.MIN_RUNS} runs up, below that with a thin line per run.",
-        draw(pd.concat(drawn, ignore_index=True), "env steps", "episode return"),
-    )
+    if drawn:
+        page.figure(
+            f"{name}-curves",
+            f"Episode return along training: mean over runs, interpolated between evaluations, with "
+            f"{stats.CONFIDENCE:.0%} bootstrap intervals from {stats.MIN_RUNS} runs up, below that with a thin line "
+            "per run.",
+            draw(pd.concat(drawn, ignore_index=True), "env steps", "episode return"),
+        )
 
 
 def _sensitivity(page: Page, name: str, runs: pd.DataFrame, varied: str) -> None:
@@ -831,6 +829,8 @@ def _probes(page: Page, rows: pd.DataFrame) -> None:
     means = means.assign(at=means["domain"] + colors, encoder=means["label"] + groups, seen=seen)
     for embedding, (measure, (title, digits)) in product(means["embedding"].unique(), MEASURES.items()):
         own = means[(means["embedding"] == embedding) & (means["measure"] == measure)]
+        if own.empty:  # as the R2 of positions that hardly vary
+            continue
         places = own.groupby(["encoder", "group", "at"], sort=False)
         counts = places["job"].nunique()
         cells = {

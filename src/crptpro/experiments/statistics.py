@@ -62,7 +62,7 @@ def relative_mean(scores: Sequence[Array], others: Sequence[Array]) -> Array:
 
 
 class Estimate(NamedTuple):
-    """A number or a curve ``[K]``, its interval (``None`` below :data:`MIN_RUNS` runs of a task), its sample."""
+    """A number or a curve ``[K]``, its interval (``None`` below :data:`MIN_RUNS` runs of a task), and how many runs."""
 
     value: Array
     low: Array | None
@@ -86,7 +86,7 @@ def estimate(
 ) -> Estimate:
     """Aggregate the runs of one method, or of two to compare, with a two-level stratified bootstrap interval.
 
-    A replicate redraws the encoders, once for all tasks that share them, and then, in place of each run, a downstream
+    A replicate resamples the encoders, once for all tasks that share them, and then, in place of each run, a downstream
     run of the drawn encoder; tasks are kept (Davison & Hinkley, Bootstrap Methods and their Application, 1997, section
     3.8). If all runs share one encoder, the interval is about that encoder only.
 
@@ -94,7 +94,7 @@ def estimate(
         statistic: an aggregate of this module; for two methods one that takes both.
         *methods: a row per run, with columns ``task``, ``encoder`` and ``run`` (names; a run without a pre-trained
             encoder is its own), and the numbers, which are finite. Two methods have the same tasks. A run under several
-            tasks is redrawn alike in all of them.
+            tasks is resampled jointly in all of them.
         columns: numbers to aggregate: one score, or the points of a curve.
         replicates: of the bootstrap.
         seed: of the bootstrap.
@@ -107,21 +107,21 @@ def estimate(
     if min(map(len, tables)) < MIN_RUNS:
         return Estimate(value, None, None, runs)
     rng = np.random.default_rng(seed)
-    redrawn = []
+    resampled = []
     for sample, scores in zip(samples, arrays):
         indices = _resample(sample, replicates, rng)
-        redrawn.append([task[:, index] for task, index in zip(scores, indices)])  # [K, B, R_t] each
+        resampled.append([task[:, index] for task, index in zip(scores, indices)])  # [K, B, R_t] each
     tail = 50 * (1 - CONFIDENCE)
-    low, high = np.percentile(statistic(*redrawn), [tail, 100 - tail], axis=-1)
+    low, high = np.percentile(statistic(*resampled), [tail, 100 - tail], axis=-1)
     return Estimate(value, low, high, runs)
 
 
 def _resample(tasks: Sequence[pd.DataFrame], replicates: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
     """Draw encoders with replacement, jointly for the tasks that share them, and then runs of the drawn encoders.
 
-    The first encoder's ``n`` runs become ``n`` runs of the first encoder drawn, redrawn with replacement, and so on.
-    Tasks with the same runs are redrawn alike. The rows of a task are sorted by encoder. Returns indices ``[B, R_t]``
-    per task.
+    The first encoder's ``n`` runs become ``n`` runs of the first encoder drawn, resampled with replacement, and so on.
+    Tasks with the same runs are resampled jointly. The rows of a task are sorted by encoder. Returns indices
+    ``[B, R_t]`` per task.
     """
     encoders = [set(task["encoder"]) for task in tasks]
     is_shared = np.array([[not own.isdisjoint(other) for other in encoders] for own in encoders])
