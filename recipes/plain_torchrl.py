@@ -1,4 +1,4 @@
-"""CRPTpro from TorchRL's and this library's components: ``python recipes/plain_torchrl.py --task walker_walk``."""
+"""CRPTpro in TorchRL's idioms (--task walker_walk). Deviation: every decision updates actor, critic and temperature."""
 
 import torch
 import tyro

@@ -185,5 +185,4 @@ def identity_of(card: Mapping[str, Any]) -> str | None:
     """
     if "weights_sha256" not in card:
         return None
-    whole = card.get("slim_of") or card.get("trimmed_from")  # the second is in the cards under results/
-    return whole or f"{card.get('method', 'unknown')}:{card['weights_sha256']}"
+    return card.get("slim_of") or f"{card.get('method', 'unknown')}:{card['weights_sha256']}"

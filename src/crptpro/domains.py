@@ -135,7 +135,7 @@ def register_domain(domain: Domain) -> Domain:
 
     A name that several domains share means the one registered last. A worker process starts without registered
     domains: pass the ``Domain`` itself, or call ``register_domain`` at the top level of the module that defines
-    ``make``. A domain with a name or letter of the paper's is a ``CRPTproError``.
+    ``make``. A domain with a name or letter of the paper's raises a ``CRPTproError``.
     """
     for name in (domain.name, domain.task):
         if name in {*PAPER_DOMAINS, *TASKS, *GROUPS} or name.startswith(GYMNASIUM_PREFIX):

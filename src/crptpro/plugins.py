@@ -18,7 +18,7 @@ _loaded: list[str] = []
 def load_plugin(name: str) -> None:
     """Import a module, installed or of the working directory, or a Python file, a path that ends in ``.py``.
 
-    What is missing, imports what is missing, or is a file with the name of another module, is a ``CRPTproError``.
+    What is missing, imports what is missing, or is a file with the name of another module, raises a ``CRPTproError``.
     """
     path = as_path(name, FLAG)
     is_file = path.suffix == ".py"

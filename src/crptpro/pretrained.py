@@ -90,30 +90,12 @@ class Pretrained:
             digest.update(value.cpu().reshape(-1).view(torch.uint8).numpy().tobytes())  # NumPy has no bfloat16
         return digest.hexdigest()
 
-    def require(self, *, image_size: int, frame_stack: int | None = None) -> Pretrained:
-        """Check the encoder's image size, in pixels, and stack, as far as its ``config`` says them; returns self.
-
-        What does not fit is a PretrainedError that names all of it with both values. ``None`` is not checked.
-        """
-        has = _pixel_facts(self.encoder)
-        wrong = [
-            f"it was trained with {name} {has[name]}, not {value}"
-            for name, value in {"image_size": image_size, "frame_stack": frame_stack}.items()
-            if value is not None and has[name] not in (None, value)
-        ]
-        if wrong:
-            raise PretrainedError(
-                f"The pretrained encoder ({self.method}) does not fit: {'; '.join(wrong)}. "
-                "Use an artifact made for this, or change the settings to match it."
-            )
-        return self
-
     def build_loss(self) -> LossModule:
         """Build the loss that this was trained with, as trainable copies of all networks, targets included.
 
         A PretrainedError if its method is not registered or does not take these networks, or they were saved slim.
         """
-        if self.card.get("slim") or "trimmed_from" in self.card:
+        if self.card.get("slim"):
             raise PretrainedError(
                 "The artifact was saved slim: it lacks the networks that training reads. Take the one with all of them."
             )

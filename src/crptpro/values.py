@@ -27,7 +27,7 @@ MAX_SEED = 2**32 - 1
 def as_int(value: Any, name: str, *, minimum: int | None = None, maximum: int | None = None) -> int:
     """Return a count, size or seed as a plain ``int``: of an int, a NumPy or torch scalar, or a float such as ``1e5``.
 
-    Anything else is a ``ValueError``, which names the setting, its value and what is allowed.
+    Anything else raises a ``ValueError``, which names the setting, its value and what is allowed.
     """
     try:
         number = _scalar(value)
@@ -53,7 +53,7 @@ def as_float(value: Any, name: str, *, minimum: float | None = None, maximum: fl
 
 
 def as_path(value: str | os.PathLike[str], name: str = "path") -> Path:
-    """Return a path with ``~`` expanded; one that is empty or not UTF-8, as records are, is a ``ValueError``."""
+    """Return a path with ``~`` expanded; one that is empty or not UTF-8, as records are, raises a ``ValueError``."""
     text = os.fsdecode(value)
     if not text:
         raise ValueError(f"`{name}` is empty; name a directory, or `.` for the working directory.")
@@ -68,7 +68,7 @@ def as_plain(value: Any, name: str) -> Any:
     """Return a setting, or a whole card of them, as what JSON holds: numbers, texts, lists, dicts with string keys.
 
     NumPy and torch scalars become numbers, arrays and tensors lists, dataclasses dicts, paths and dtypes texts. An
-    entry that has no such form is a ``ValueError`` with its name.
+    entry that has no such form raises a ``ValueError`` with its name.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
@@ -123,7 +123,7 @@ def read_entry(reader: object, tensordict: TensorDictBase, key: NestedKey) -> Te
 
 
 def _scalar(value: Any) -> Any:
-    """Return the Python number of a scalar; what is no number, a bool or an array is a TypeError here or later."""
+    """Return the Python number of a scalar; what is no number, a bool or an array raises a TypeError here or later."""
     number = value.item() if getattr(value, "ndim", None) == 0 else value
     if isinstance(number, (bool, str, bytes)) or getattr(number, "ndim", 0) > 0:
         raise TypeError

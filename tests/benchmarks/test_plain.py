@@ -100,7 +100,7 @@ def test_plain_downstream_updates_have_the_losses_of_the_learner_and_its_queue_t
     learner = SACLearner(agents.loss)
     for agent_step in range(3):
         agents.plain.update(agents.batch, agent_step)
-        learner.update(agents.bonus(agents.td.clone()), agent_step=agent_step)
+        learner.update(agents.bonus(agents.td.clone()), agent_update=agent_step)
     agents.plain.generator.set_state(agents.loss.generator.get_state())
     torch.testing.assert_close(agents.bonus.queue, agents.plain.queue)
     torch.testing.assert_close(*agents.critic_losses(), rtol=1e-3, atol=0)

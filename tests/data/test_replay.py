@@ -184,7 +184,7 @@ def test_misuse_is_refused_in_words_and_stores_nothing() -> None:
             small(**options)
     with pytest.raises(ValueError, match="keeps no priorities"):
         small(sampler=PrioritizedSampler.__new__(PrioritizedSampler))
-    for name in ("reward", "next", "row_of", "discount"):
+    for name in ("reward", "next", "row_of"):
         with pytest.raises(ValueError, match=name):
             small(extra_columns={name: ((1,), torch.float32)})
     assert len(replay) == 0
@@ -253,7 +253,7 @@ def test_windows_and_their_returns_are_those_of_the_published_loop(n: int, lengt
         for row in batch:
             reward, discount = expected[float(row["action"])]
             assert row["next", "reward"].item() == pytest.approx(reward, rel=1e-6)
-            assert row["next", "discount"].item() == pytest.approx(discount, rel=1e-6)
+            assert GAMMA**n * (not row["next", "terminated"]) == pytest.approx(discount, rel=1e-6)
             assert row["steps_to_next_obs"].item() == n
         assert torch.equal(batch["next", "number"], batch["number"] + n)
         assert torch.equal(replay.observations(batch["next", "number"]), batch["next", "pixels"])

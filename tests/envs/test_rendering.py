@@ -13,11 +13,11 @@ from unittest import mock
 import pytest
 
 from crptpro.envs import rendering
-from crptpro.envs.rendering import PROOF_VARIABLE, TIMEOUT_VARIABLE, backend_card, first_frame_watchdog, select_backend
+from crptpro.envs.rendering import CHECK_VARIABLE, TIMEOUT_VARIABLE, backend_card, first_frame_watchdog, select_backend
 from crptpro.errors import RenderingError
 
 LLVMPIPE = {"gl_vendor": "Mesa", "gl_renderer": "llvmpipe", "gl_version": "4.5", "gl_kind": "software", "alive": True}
-CLEARED = ("MUJOCO_GL", "MUJOCO_EGL_DEVICE_ID", PROOF_VARIABLE, "LP_NUM_THREADS", "DISPLAY", "WAYLAND_DISPLAY")
+CLEARED = ("MUJOCO_GL", "MUJOCO_EGL_DEVICE_ID", CHECK_VARIABLE, "LP_NUM_THREADS", "DISPLAY", "WAYLAND_DISPLAY")
 
 
 def answer(**changes: object) -> str:
@@ -51,7 +51,7 @@ def probe(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Probe:
     return install
 
 
-def test_the_first_backend_that_renders_is_taken_and_proven_once_for_child_processes_too(probe: Probe) -> None:
+def test_the_first_backend_that_renders_is_taken_and_checked_once_for_child_processes_too(probe: Probe) -> None:
     started = probe(ANSWER)
     assert select_backend() == select_backend() == os.environ["MUJOCO_GL"] == "egl"
     assert started() == ["egl"]
@@ -59,7 +59,7 @@ def test_the_first_backend_that_renders_is_taken_and_proven_once_for_child_proce
     assert backend_card() == {"backend": "egl", **described}
 
 
-def test_a_proof_does_not_hold_on_another_machine_or_gpu(probe: Probe, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_check_does_not_hold_on_another_machine_or_gpu(probe: Probe, monkeypatch: pytest.MonkeyPatch) -> None:
     started = probe(ANSWER)
     select_backend()
     os.environ["MUJOCO_EGL_DEVICE_ID"] = "1"
@@ -74,7 +74,7 @@ def test_a_proof_does_not_hold_on_another_machine_or_gpu(probe: Probe, monkeypat
 
 
 @pytest.mark.parametrize("spelling", ["osmesa", "OSMesa"])
-def test_a_users_mujoco_gl_is_kept_and_proven(probe: Probe, spelling: str) -> None:
+def test_a_users_mujoco_gl_is_kept_and_checked(probe: Probe, spelling: str) -> None:
     os.environ["MUJOCO_GL"] = spelling
     started = probe(ANSWER)
     assert select_backend() == "osmesa"
@@ -132,7 +132,7 @@ def test_a_backend_that_fails_gives_way_and_is_not_tried_again(probe: Probe, cap
     assert started() == ["egl", "osmesa", "osmesa", "osmesa"]
 
 
-def test_several_processes_are_proven_at_the_same_time(probe: Probe, tmp_path: Path) -> None:
+def test_several_processes_are_checked_at_the_same_time(probe: Probe, tmp_path: Path) -> None:
     # Each waits until all three have started, so only simultaneous processes can answer.
     record = str(tmp_path / "started")
     started = probe(f"while len(open({record!r}).read().split()) < 3: time.sleep(0.01)\n{ANSWER}")

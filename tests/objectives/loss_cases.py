@@ -118,7 +118,6 @@ def pixel_batch(count: int = 6, seed: int = 0) -> TensorDict:
 def skill_batch(count: int = 6, seed: int = 0) -> TensorDict:
     td, generator = transition_batch(count, seed), torch.Generator().manual_seed(seed + 1)
     td["skill"] = F.one_hot(torch.randint(SKILLS, (count,), generator=generator), SKILLS).float()
-    td["next", "discount"] = 0.9 * (~td["next", "terminated"]).float()
     return td
 
 
@@ -143,7 +142,7 @@ CONTRAST = {"loss_contrast": {"encoder_params", "projector_params"}}
 DDPG = {"loss_qvalue": {"qvalue_network_params"}, "loss_actor": {"actor_network_params"}}
 SAC = {**DDPG, "loss_alpha": {"log_alpha"}}
 SAC_KEYS = {name: name for name in ("action", "reward", "done", "terminated")}
-SKILL_KEYS = {name: name for name in ("skill", "action", "reward", "discount")}
+SKILL_KEYS = {name: name for name in ("skill", "action", "reward", "terminated", "steps_to_next_obs")}
 ON_FEATURES = {"observation": "features"}
 
 CASES = [

@@ -218,6 +218,7 @@ def truncated_normal(mu: Tensor, noise: Tensor) -> Tensor:
 
 def test_skill_ddpg_equals_the_released_update_in_value_and_gradients() -> None:
     loss, td = skill_ddpg(generator=generator()), skill_batch()
+    td["steps_to_next_obs"] = torch.full((len(td), 1), 3)
     disturb(loss.critic)
     actor, critic, target = copy.deepcopy(loss.actor), copy.deepcopy(loss.critic), target_of(loss)
     next_noise, noise = noise_of(6, 2)
@@ -226,7 +227,7 @@ def test_skill_ddpg_equals_the_released_update_in_value_and_gradients() -> None:
 
     with torch.no_grad():
         action = truncated_normal(torch.tanh(actor.mlp(actor.trunk(following))), next_noise)
-        y = td["next", "reward"] + td["next", "discount"] * smaller(target(following, action))
+        y = td["next", "reward"] + 0.99**3 * ~td["next", "terminated"] * smaller(target(following, action))
     q1, q2 = critic(observation, td["action"]).split(1, dim=-1)
     critic_loss = F.mse_loss(q1, y) + F.mse_loss(q2, y)
     critic_loss.backward()
@@ -239,7 +240,7 @@ def test_skill_ddpg_equals_the_released_update_in_value_and_gradients() -> None:
     expected |= {"q_mean": torch.cat([q1, q2]).mean()}
     expected |= {"td_error": torch.maximum((q1 - y).abs(), (q2 - y).abs()).mean()}
     require_same(out, expected, (loss.critic, critic), (loss.actor, actor))
-    td["next", "discount"].zero_()  # the discount of the batch is the only one
+    td["next", "terminated"].fill_(True)
     assert loss(td)["target_q_mean"] == td["next", "reward"].mean()
 
 

@@ -78,7 +78,7 @@ def test_a_run_evaluates_at_every_interval_and_at_both_ends(tmp_path: Path) -> N
     assert [row["episode_agent_steps"] for row in record(tmp_path / "episodes.csv")] == [str(EPISODE)] * 6
     assert loads(result)
     _, card = load_agent(tmp_path / "agent")
-    assert (card["task"], card["env_steps"], card["config"]["seed"]) == ("toy_go", 120, 0)
+    assert (card["task"], card["env_steps"], card["seed"]) == ("toy_go", 120, 0)
 
 
 @pytest.mark.parametrize("method", ["crptpro", "drq"])
@@ -280,6 +280,21 @@ def test_what_is_left_open_is_the_methods_own(methods: list[str], own: dict[str,
         resolved = dataclasses.asdict(DownstreamConfig().resolved("walker_run", make_pretrained(method)))
         assert resolved == {**resolved, **own}
     assert DownstreamConfig(env_steps=10).resolved("walker_run", make_pretrained("drq")).env_steps == 10
+
+
+def test_candidates_that_the_artifact_brings_set_the_length_of_the_queue() -> None:
+    pretrained = make_pretrained("proto-rl-s")
+    assert DownstreamConfig().resolved("walker_run", pretrained).queue_size == 2_048
+    pretrained.queue = torch.rand(16, 4)
+    assert DownstreamConfig().resolved("walker_run", pretrained).queue_size == 16
+    train(None, pretrained, env_steps=40)
+
+
+def test_a_run_that_begins_removes_no_file_of_anybody_else(tmp_path: Path) -> None:
+    (tmp_path / "replay").mkdir()
+    (tmp_path / "replay" / "mine.txt").touch()
+    train(tmp_path, env_steps=40)
+    assert (tmp_path / "replay" / "mine.txt").exists()
 
 
 def returns(run_dir: Path) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 from pathlib import Path
 from typing import Any
@@ -117,6 +118,15 @@ def test_a_domain_whose_name_is_no_path_is_explored_and_resumed(tmp_path: Path) 
     run("apt-s", tmp_path, [toy_domain("a/b:c")], env_steps=20)
     assert (tmp_path / "replay" / "a-b-c").is_dir()
     assert run("apt-s", tmp_path, [toy_domain("a/b:c")], env_steps=20).training["datasets"][0]["domain"] == "a/b:c"
+
+
+def test_a_finished_run_gives_its_result_again_without_its_replays(tmp_path: Path) -> None:
+    first = run("proto-rl-s", tmp_path)
+    shutil.rmtree(tmp_path / "replay")
+    again = run("proto-rl-s", tmp_path)
+    assert same_state(again.loss, first.loss)
+    assert torch.equal(again.queue, first.queue)
+    assert not (tmp_path / "replay").exists()
 
 
 def test_a_run_of_other_settings_is_refused_by_name(tmp_path: Path) -> None:

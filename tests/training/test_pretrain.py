@@ -23,6 +23,7 @@ from crptpro.errors import CheckpointError, CRPTproError, DatasetError
 from crptpro.objectives import ATCLoss, SimCLRLoss, get_method
 from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training import PretrainConfig, PretrainResult, Run, finetune, pretrain
+from crptpro.training.pretrain import make_optimizer
 
 SETTINGS = PretrainConfig(
     batch_size=8, learning_rate=1e-3, seed=3, log_interval=4, checkpoint_interval=5, precision="fp32"
@@ -218,6 +219,17 @@ def test_a_run_follows_the_learning_rate_and_the_clipping_of_its_method() -> Non
     assert loss.layer.weight.grad.norm() == pytest.approx(10)
 
 
+def test_loading_keeps_the_learning_rate_that_a_recorded_update_reads() -> None:
+    loss, method = make_loss(), get_method("atc")
+    saved = make_optimizer(loss, method, cuda_graph=True)[0].state_dict()
+    optimizer = make_optimizer(loss, method, cuda_graph=True)[0]
+    rate = optimizer.param_groups[0]["lr"]
+    saved["param_groups"][0]["lr"] = torch.tensor(0.5)
+    optimizer.load_state_dict(saved)
+    assert optimizer.param_groups[0]["lr"] is rate
+    assert rate.item() == 0.5
+
+
 def test_prototypes_are_scaled_to_unit_length_before_an_update() -> None:
     loss = make_loss()
     loss.prototypes.weight.data.mul_(3)
@@ -290,7 +302,10 @@ def test_what_is_no_dataset_or_gpu_or_lacks_an_entry_is_refused() -> None:
 
 
 def test_the_stacks_that_an_open_dataset_samples_must_fit_the_encoder_whatever_its_card_says(tmp_path: Path) -> None:
-    single = FrameDataset.open(write_dataset(tmp_path, [random_episode(20, size=SIZE)]), frame_stack=1)
+    path = write_dataset(tmp_path, [random_episode(20, size=SIZE)])
+    for channels in (3, 12):  # a directory is opened for the encoder's stack
+        assert run(make_loss(channels=channels), 2, datasets=path).updates == 2
+    single = FrameDataset.open(path, frame_stack=1)
     assert run(make_loss(channels=3), 2, datasets=single).updates == 2
     with pytest.raises(DatasetError, match=r"as \(3, 16, 16\); the encoder takes \(9, 16, 16\)\..*samples stacks"):
         run(make_loss(channels=9), 2, datasets=single)

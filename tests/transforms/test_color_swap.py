@@ -9,13 +9,14 @@ from crptpro.transforms import ColorSwap
 
 def test_every_frame_of_a_stack_has_its_channels_reversed_and_none_changes_place() -> None:
     stack = torch.arange(2 * 6 * 4 * 5, dtype=torch.uint8).view(2, 6, 4, 5)
-    td = ColorSwap()(TensorDict({"pixels": stack.clone()}, [2]))  # lacks ("next", "pixels"), which is no error
+    swap = ColorSwap(["pixels"])
+    td = swap(TensorDict({"pixels": stack.clone()}, [2]))
     assert td["pixels"].dtype == torch.uint8
     assert torch.equal(td["pixels"], stack[:, [2, 1, 0, 5, 4, 3]])
-    assert torch.equal(ColorSwap()(td)["pixels"], stack)
+    assert torch.equal(swap(td)["pixels"], stack)
 
 
 @pytest.mark.parametrize("shape", [(4, 8, 8), (8, 8)])
 def test_what_is_no_rgb_is_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="RGB"):
-        ColorSwap()(TensorDict({"pixels": torch.zeros(shape)}))
+        ColorSwap(["pixels"])(TensorDict({"pixels": torch.zeros(shape)}))

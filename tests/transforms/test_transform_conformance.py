@@ -32,13 +32,12 @@ def rewarding(make: Callable[..., Transform]) -> Transform:
     return Compose(encode, make(*small_heads(encoder)))
 
 
-IN_PLACE = {"pixels", ("next", "pixels")}
 REWARDED = {("next", "features"), ("next", "intrinsic_reward"), ("next", "reward")}
 
-# How each is made, and what it changes in, or adds to, a batch; the first three are for environments, too.
+# How each is made, and what it changes in, or adds to, a batch; the first three are for environments.
 CASES: dict[str, tuple[Callable[[], Transform], set]] = {
-    "shift": (RandomShift, IN_PLACE),
-    "colors": (ColorSwap, IN_PLACE),
+    "shift": (partial(RandomShift, ["pixels"]), {"pixels"}),
+    "colors": (partial(ColorSwap, ["pixels"]), {"pixels"}),
     "encoder": (lambda: FrozenEncoder(small_encoder()), {"features"}),
     "prototype": (partial(rewarding, lambda z, c: PrototypeReward(z, c, queue_size=16, knn_k=10)), REWARDED),
     "particle": (partial(rewarding, lambda z, _: ParticleReward(z, k=3, coef=0.2)), REWARDED),

@@ -16,7 +16,7 @@ def coverage(embeddings: Tensor, *, k: int = 12) -> float:
     (arXiv 2102.11271). The paper plots "a particle-based estimator" and states neither k, nor the number of
     observations, nor the encoder: these are this project's choice. The value falls with the number of observations:
     compare equal numbers. It is 0 if all embeddings are equal, and at most log 3 for unit vectors. Embeddings are
-    ``[N, D]``; N up to ``k``, the number of neighbours, is a ``ValueError``.
+    ``[N, D]``; N up to ``k``, the number of neighbours, raises a ``ValueError``.
     """
     if len(embeddings) <= k:
         raise ValueError(f"{k} neighbours need more than {k} observations, got {len(embeddings)}.")

@@ -225,8 +225,7 @@ class Finetune(EncoderRun):
     """every number of the stage"""
 
     def run(self) -> None:
-        image_size, frame_stack = image_format([self.dataset])
-        pretrained = load_pretrained(self.pretrained).require(image_size=image_size, frame_stack=frame_stack)
+        pretrained = load_pretrained(self.pretrained)
         with self.logging.records(self.out) as records:
             result = training.finetune(pretrained, self.dataset, run_dir=self.out, config=self.config, records=records)
             self.keep(result, records)
@@ -287,7 +286,7 @@ class Evaluate:
         csv, video = require_writable(self.csv, "--csv"), require_video(self.video)  # before an hour of episodes
         agent, card = (None, {}) if is_random else training.load_agent(self.agent)
         task = self.task or card["task"]
-        usual = {"quality": "exact", "colors": "normal", "action_repeat": None} | card.get("config", {})
+        usual = {"quality": "exact", "colors": "normal", "action_repeat": None} | card
         names = ("quality", "colors", "action_repeat")
         given = {name: getattr(self, name) for name in names}
         settings: dict[str, Any] = {name: usual[name] if given[name] is None else given[name] for name in names}
@@ -353,7 +352,7 @@ class Probe:
         if self.encoder == "random-encoder":
             pretrained = random_pretrained(self.seed, image_size=image_size, in_channels=3 * frame_stack)
         else:
-            pretrained = load_pretrained(self.encoder).require(image_size=image_size)
+            pretrained = load_pretrained(self.encoder)
         for network in filter(None, (pretrained.encoder, pretrained.projector)):
             network.to(self.device)
         rows: list[dict[str, Any]] = []

@@ -118,7 +118,7 @@ def collect_group(
         if jobs:
             _announce(jobs, root, image_size)
             if any(needs_gl(job.domain) for job in jobs):
-                # Proven here once, for as many renderers as will run: some drivers hang when several start together.
+                # Checked once, for as many renderers as will run: some drivers hang when several start together.
                 select_backend(processes=workers)
             for job in jobs:
                 job.writer.note_rendering(backend_card() if needs_gl(job.domain) else {})

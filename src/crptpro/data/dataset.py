@@ -86,7 +86,7 @@ class FrameDataset(ReplayBuffer):
 
         It can be sampled after ``transitions``; the last episode is cut to fit. ``about`` holds further facts for the
         card that every attempt must repeat: ``task``, ``seed``, ``action_repeat``, ... Another content or writer of the
-        directory is a DatasetError.
+        directory raises a DatasetError.
         """
         path = as_path(path).absolute()
         usual = {"task": domain, "seed": 0, "action_repeat": 1, "camera": None, "quality": "exact", "colors": "normal"}
@@ -101,10 +101,6 @@ class FrameDataset(ReplayBuffer):
         dataset = cls.open(path, frame_stack=frame_stack)
         _require_request(path, dataset.card["request"], request)
         return dataset
-
-    def observations(self, numbers: Tensor) -> Tensor:
-        """Return observations by number, uint8 ``[B, k * C, H, W]``."""
-        return self._storage.observations(numbers)
 
     @property
     def card(self) -> dict[str, Any]:
@@ -127,11 +123,6 @@ class FrameDataset(ReplayBuffer):
     @property
     def frame_stack(self) -> int:
         return self._storage.frame_stack
-
-    @property
-    def window(self) -> int:
-        """Frames that it holds; their numbers are below it."""
-        return len(self._storage.pixels)
 
     @property
     def image_size(self) -> int:

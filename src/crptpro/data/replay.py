@@ -44,9 +44,9 @@ class FrameReplay(ReplayBuffer):
       stored before the observation's newest one. A number is never used again; :meth:`observations` reads it.
 
     With ``n_step`` above 1 only windows of n transitions are drawn that are in one episode and in the ring; none is cut
-    short. ``("next", ...)`` is then n agent steps ahead, with the last transition's flags, the n-step return as reward,
-    and a ``discount`` ``[B, 1]`` (:func:`~crptpro.data.storage.n_step_return`); ``steps_to_next_obs`` ``[B, 1]`` is n,
-    as of TorchRL's ``MultiStepTransform``. Indexing reads single transitions.
+    short. ``("next", ...)`` is then n agent steps ahead, with the last transition's flags; the reward is the sum of
+    gamma^i times the i-th reward, i from 0. ``steps_to_next_obs`` ``[B, 1]`` is n, as of TorchRL's
+    ``MultiStepTransform``. Indexing reads single transitions.
     Deviation: url_benchmark draws an episode uniformly, and then an anchor in it; here every anchor is equally likely.
 
     A ring on disk is its own checkpoint: :meth:`state_dict` holds a few counters, and loading it restores the content,
@@ -93,7 +93,7 @@ class FrameReplay(ReplayBuffer):
             **dict.fromkeys(("done", "terminated", "truncated"), ((1,), torch.bool)),
         }
         extra = dict(extra_columns or {})
-        own = {"branch", "discount", "index", "next", "number", "row_of", "step", "steps_to_next_obs"}
+        own = {"branch", "index", "next", "number", "row_of", "step", "steps_to_next_obs"}
         if taken := sorted({*columns, *own} & extra.keys()):
             raise ValueError(f"extra_columns may not be named {taken}: a sample has those; choose other names.")
         if "sampler" in options and n_step > 1:

@@ -172,9 +172,6 @@ class StackStorage(Storage):
     def __len__(self) -> int:
         return self.max_size
 
-    def held(self) -> range:
-        return range(len(self.pixels))
-
     def get(self, index: Any, **how: Any) -> TensorDict:
         """Return transitions by any index of a one-dimensional tensor; 0 is the oldest."""
         positions = torch.arange(len(self), device=self.device)[index]
@@ -184,18 +181,6 @@ class StackStorage(Storage):
             sample.set("pixels", self._stacks(sample.get("number")))
             sample.set(("next", "pixels"), self._stacks(sample.get(("next", "number"))))
         return sample if positions.ndim == 1 else sample.reshape(positions.shape)
-
-    def observations(self, numbers: Tensor) -> Tensor:
-        """Return observations by number, uint8 ``[B, k * C, H, W]``; a DatasetError if one is no longer stored."""
-        numbers = torch.as_tensor(numbers, dtype=torch.int64, device=self.device)
-        held = self.held()
-        first = numbers - torch.clamp(self.step[numbers % len(self.pixels)], max=self.frame_stack - 1)
-        gone = (first < held.start) | (numbers >= held.stop)
-        if gone.any():
-            raise DatasetError(
-                f"Observation {int(numbers[gone][0])} is not stored; {held.start} to {held.stop - 1} are."
-            )
-        return self._stacks(numbers)
 
     def _stacks(self, numbers: Tensor) -> Tensor:
         count = len(self.pixels)
@@ -245,8 +230,9 @@ class RingStorage(StackStorage):
         if self.path is not None and not (self.path / "pixels.memmap").exists():
             row_bytes = sum(math.prod(shape) * dtype.itemsize for shape, dtype in columns.values())
             require_disk(self.path, self.rows * row_bytes, f"A replay of {self.max_size} transitions")
-        # ``number`` is one more than the row's counter, 0 if it was never written; ``row_of`` is by transition. Whoever
-        # opens or loads begins a ``branch`` with its first row: what it overwrites is lost to states of earlier ones.
+        # ``number`` is one more than the row's counter, 0 if it was never written; ``row_of`` is by transition. After
+        # opening or loading, the first row begins a new ``branch``. A state is refused if a later branch overwrote its
+        # rows.
         own = {"step": torch.int32, "number": torch.int64, "row_of": torch.int64, "branch": torch.int32}
         specs = {**columns, **{name: ((), dtype) for name, dtype in own.items()}}
         if self.path is not None and (numbers := self.path / "number.memmap").exists():
@@ -326,8 +312,17 @@ class RingStorage(StackStorage):
     def __len__(self) -> int:
         return self.transitions - self.oldest
 
-    def held(self) -> range:
-        return range(max(0, self.frames - self.window), self.frames)
+    def observations(self, numbers: Tensor) -> Tensor:
+        """Return observations by number, uint8 ``[B, k * C, H, W]``; a DatasetError if one is no longer stored."""
+        numbers = torch.as_tensor(numbers, dtype=torch.int64, device=self.device)
+        held = range(max(0, self.frames - self.window), self.frames)
+        first = numbers - torch.clamp(self.step[numbers % len(self.pixels)], max=self.frame_stack - 1)
+        gone = (first < held.start) | (numbers >= held.stop)
+        if gone.any():
+            raise DatasetError(
+                f"Observation {int(numbers[gone][0])} is not stored; {held.start} to {held.stop - 1} are."
+            )
+        return self._stacks(numbers)
 
     def __getitem__(self, index: Any) -> TensorDict:
         # Not every transition has a window: indexing reads single ones.
@@ -348,8 +343,8 @@ class RingStorage(StackStorage):
                 root[name] = self.content[name][row]
         if n_step > 1:
             window = (row.unsqueeze(-1) + torch.arange(n_step, device="cpu")) % self.rows
-            rewards, ended = self.content["reward"][window], self.content["terminated"][window]
-            following["reward"], following["discount"] = n_step_return(rewards, ended, self.discount)
+            powers = self.discount ** torch.arange(n_step, device="cpu").unsqueeze(-1)
+            following["reward"] = (self.content["reward"][window] * powers).sum(1)
             root["steps_to_next_obs"] = torch.full((*index.shape, 1), n_step, device="cpu")
         return TensorDict({**root, "next": TensorDict(following, index.shape)}, index.shape)
 
@@ -387,7 +382,7 @@ class RingStorage(StackStorage):
             for name, column in state_dict["content"].items():
                 self.content[name][: len(column)] = column
         else:
-            self._require_rows(counters["frames"], counters.get("branch", 0))
+            self._require_rows(counters["frames"], counters["branch"])
         for name, value in counters.items():
             setattr(self, name, value)
         self._is_continued = False
@@ -414,23 +409,6 @@ class RingStorage(StackStorage):
     def __getstate__(self) -> dict[str, Any]:
         # A copy cannot share the files that this ring keeps writing: it holds the rows in RAM.
         return {**super().__getstate__(), "path": None}
-
-
-def n_step_return(rewards: Tensor, terminated: Tensor, discount: float) -> tuple[Tensor, Tensor]:
-    r"""Discounted return of windows, and the discount of the value that follows (url_benchmark, replay_buffer.py).
-
-    .. math::
-        R = \sum_{i=0}^{n-1} \gamma^i \Big(\prod_{j<i} d_j\Big) r_i, \qquad
-        D = \gamma^n \prod_{j=0}^{n-1} d_j
-
-    with :math:`d_j = 0` where transition j terminated (truncation does not count) and 1 elsewhere. ``rewards`` and
-    ``terminated`` are ``[B, n, 1]``, R and D ``[B, 1]``.
-    """
-    total, factor = torch.zeros_like(rewards[:, 0]), torch.ones_like(rewards[:, 0])
-    for reward, ended in zip(rewards.unbind(1), terminated.unbind(1)):
-        total = total + factor * reward
-        factor = factor * (discount * (~ended).to(factor))
-    return total, factor
 
 
 def map_file(path: Path, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:

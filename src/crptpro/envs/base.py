@@ -245,7 +245,7 @@ def read_frame(image: Any, name: str) -> Tensor:
 def action_range(low: np.ndarray, high: np.ndarray, dtype: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower end and half the width of an environment's action bounds; without bounds they are -1 and 1.
 
-    Bounds that [-1, 1] cannot be mapped to are a ``CRPTproError``.
+    Bounds that [-1, 1] cannot be mapped to raise a ``CRPTproError``.
     """
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     is_free = np.minimum(np.abs(low), np.abs(high)) >= NO_BOUND

@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 BACKENDS = ("egl", "osmesa", "glfw")
 #: Environment variable with the passed test as JSON, for later calls and child processes. A cluster may copy the
 #: environment to another machine, where the test does not count.
-PROOF_VARIABLE = "CRPTPRO_GL_PROOF"
+CHECK_VARIABLE = "CRPTPRO_GL_CHECK"
 #: Environment variable with the time limit of a first frame in seconds, for slow disks and busy machines.
 TIMEOUT_VARIABLE = "CRPTPRO_GL_TIMEOUT_S"
 
@@ -81,8 +81,8 @@ def select_backend(*, processes: int = 1) -> str:
     cause and remedy for each.
     """
     timeout_s = first_frame_timeout_s()
-    proof = _proof()
-    requested, imported = _requested_backend(proof), _imported_backend()
+    checked = _checked()
+    requested, imported = _requested_backend(checked), _imported_backend()
     if imported is not None and requested not in (None, imported):
         raise RenderingError(
             f"dm_control was already imported with the backend {imported!r}, so {requested!r} cannot be used in this "
@@ -91,15 +91,15 @@ def select_backend(*, processes: int = 1) -> str:
     only = requested or imported
     candidates = (only,) if only else _platform_candidates()
     place = {"host": socket.gethostname(), "egl_device": os.environ.get("MUJOCO_EGL_DEVICE_ID")}
-    if proof.get("backend") in candidates and proof.items() >= place.items():
-        if proof["processes"] >= processes:
-            os.environ["MUJOCO_GL"] = proof["backend"]
-            return proof["backend"]
-        candidates = candidates[candidates.index(proof["backend"]) :]  # those before it have failed already
+    if checked.get("backend") in candidates and checked.items() >= place.items():
+        if checked["processes"] >= processes:
+            os.environ["MUJOCO_GL"] = checked["backend"]
+            return checked["backend"]
+        candidates = candidates[candidates.index(checked["backend"]) :]  # those before it have failed already
     failures: list[str] = []
     for backend in candidates:
         try:
-            gl = _prove(backend, timeout_s, processes)
+            gl = _check(backend, timeout_s, processes)
         except RenderingError as reason:
             failures.append(str(reason))
             continue
@@ -109,7 +109,7 @@ def select_backend(*, processes: int = 1) -> str:
         if gl["gl_kind"] == "software":
             os.environ.setdefault("LP_NUM_THREADS", "1")
         gl |= {"backend": backend, "processes": processes, "chosen_by": "user" if requested else "crptpro"}
-        os.environ[PROOF_VARIABLE] = json.dumps(gl | place)
+        os.environ[CHECK_VARIABLE] = json.dumps(gl | place)
         logger.info("GL backend %s: %s", backend, gl["gl_renderer"])
         return backend
     what = "No GL backend renders a frame."
@@ -126,7 +126,7 @@ def select_backend(*, processes: int = 1) -> str:
 def backend_card() -> dict[str, Any]:
     """Return the tested backend, the GL vendor, renderer and version, and whether GL is software or hardware."""
     keys = ("backend", "gl_vendor", "gl_renderer", "gl_version", "gl_kind")
-    return {key: _proof().get(key, "unknown") for key in keys}
+    return {key: _checked().get(key, "unknown") for key in keys}
 
 
 @contextlib.contextmanager
@@ -229,7 +229,7 @@ def _kill(process: subprocess.Popen[bytes]) -> None:
             process.wait(2.0)
 
 
-def _prove(backend: str, timeout_s: float, processes: int) -> dict[str, Any]:
+def _check(backend: str, timeout_s: float, processes: int) -> dict[str, Any]:
     """Render in ``processes`` simultaneous processes, and return the answer of the last probe."""
     gl: dict[str, Any] = {}
     for status, stdout, stderr in run_isolated([PROBE_COMMAND] * processes, backend, timeout_s=timeout_s):
@@ -261,11 +261,11 @@ def _platform_candidates() -> tuple[str, ...]:
     return BACKENDS if has_display else ("egl", "osmesa")
 
 
-def _requested_backend(proof: dict[str, Any]) -> str | None:
+def _requested_backend(checked: dict[str, Any]) -> str | None:
     """Return the backend of a MUJOCO_GL that the user set, and not an earlier call, perhaps on another machine."""
     text = os.environ.get("MUJOCO_GL", "")
     backend = text.strip().lower()
-    if not backend or (proof.get("chosen_by") == "crptpro" and backend == proof["backend"]):
+    if not backend or (checked.get("chosen_by") == "crptpro" and backend == checked["backend"]):
         return None
     if backend not in BACKENDS:
         raise RenderingError(
@@ -280,6 +280,6 @@ def _imported_backend() -> str | None:
     return name if name in BACKENDS else None
 
 
-def _proof() -> dict[str, Any]:
+def _checked() -> dict[str, Any]:
     """Return the passed test, perhaps one of another machine."""
-    return json.loads(os.environ.get(PROOF_VARIABLE) or "{}")
+    return json.loads(os.environ.get(CHECK_VARIABLE) or "{}")

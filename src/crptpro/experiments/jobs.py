@@ -187,7 +187,7 @@ def write_cells(root: Path, experiment: str, scale: str, cells: Iterable[tuple[s
     """Record the cells of an experiment: label, key of the job and place of each number.
 
     They are added to earlier cells, and replace those with the same label and place. An earlier file that cannot be
-    read is a ``RecordError``.
+    read raises a ``RecordError``.
     """
     path = root / EXPERIMENTS / f"{experiment}-{scale}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -220,7 +220,7 @@ MADE = ("seconds", "attempts", "threads", "device", "git_revision", "versions") 
 def load_results(root: str | Path) -> Results:
     """Read the cells of experiments, and their jobs, from the directory of a reproduction.
 
-    A damaged record is a ``RecordError``.
+    A damaged record raises a ``RecordError``.
     """
     import pandas as pd
 

@@ -342,7 +342,7 @@ def run_jobs(
     At most ``jobs`` run at a time, with ``cores`` each; an exclusive job starts when no other can. Each of the
     ``attempts`` at a job continues the one before. Ctrl-C, SIGTERM and SIGHUP stop all jobs at their next checkpoint, a
     second one at once; KeyboardInterrupt or SystemExit is raised when all jobs have ended. A queue that refuses the
-    first job is a ``SubmissionError``.
+    first job raises a ``SubmissionError``.
     """
     describe(root, plan)
     usual = Work(str(root.resolve()), "", device, threads=cores, workers=cores, plugins=loaded_plugins())

@@ -41,7 +41,7 @@ def build_report(root: str | Path, *, out: str | Path | None = None) -> Path:
     """Write a report on a reproduction, or on any directory with downstream runs.
 
     ``root`` is a directory of ``crptpro reproduce``, finished or not, or one with downstream runs in or below it. One
-    that is missing, or has nothing to report on, is a ``RecordError``. Returns the HTML page in ``out``, or else in
+    that is missing, or has nothing to report on, raises a ``RecordError``. Returns the HTML page in ``out``, or else in
     ``root/report``; ``report.md`` and ``figures/*.png`` lie beside it.
     """
     root = as_path(root, "directory")

@@ -29,7 +29,7 @@ class PixelEncoder(nn.Module):
     The input is ``pixels * pixel_scale - pixel_offset``, and ``pixel_offset`` is 0.5 in URLB-style methods. In bfloat16
     it is the raw 0..255 values, which are exact there, and the first kernel is scaled instead. Parameters and gradients
     stay float32. Images are uint8, or floating in [0, 1], which count as already divided by 255 (one warning per
-    encoder); others are a ``ValueError``.
+    encoder); others raise a ``ValueError``.
 
     ``in_channels`` are the colour channels times the stacked frames; ``init="kaiming"`` (normal, fan-in, for ReLU) is
     that of ATC's encoder; ``standardised`` creates the buffers of :meth:`standardise` (0 and 1), to load weights into.

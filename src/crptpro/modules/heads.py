@@ -1,6 +1,6 @@
 """Heads on the encoder for pre-training: those of CRPTpro and Proto-RL, of ATC, and of BeCL.
 
-Every head keeps its arguments in ``config``. A size that is not a positive whole number is a ``ValueError``.
+Every head keeps its arguments in ``config``. A size that is not a positive whole number raises a ``ValueError``.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ _Module = TypeVar("_Module", bound=nn.Module)
 
 
 def resolve_precision(precision: Precision, device: torch.device | str) -> torch.dtype:
-    """Return the compute dtype of a precision for a device; an unknown name is a ``ValueError``.
+    """Return the compute dtype of a precision for a device; an unknown name raises a ``ValueError``.
 
     ``"auto"`` is bf16 where that is faster: CUDA of compute capability 8 or newer, AMX, or AMD's AVX512-BF16.
     float32 on a CUDA device disables TF32 for the whole process, so that fp32 means the same on every device.

@@ -125,7 +125,7 @@ def require_positive(**values: float | None) -> None:
 
 
 def skills_of(one_hot: Tensor, rows: int) -> Tensor:
-    """Return the number of each one-hot skill ``[B, K]``; other skills, such as integers, are a ``ValueError``."""
+    """Return the number of each one-hot skill ``[B, K]``; other skills, such as integers, raise a ``ValueError``."""
     if one_hot.ndim != 2 or len(one_hot) != rows or one_hot.shape[-1] < 2:
         raise ValueError(
             f"Skills must be one-hot, [{rows}, K] with K of at least 2, got {list(one_hot.shape)}; "

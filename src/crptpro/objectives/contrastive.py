@@ -43,7 +43,7 @@ class ATCLoss(ContrastiveLoss):
 
     A loss of ln B (6.238 for a batch of 512) is chance. The source masks the ends of episodes; here ``("next",
     "pixels")`` is the true successor also there. The default heads are a ``Projector`` with ATC's Kaiming-normal
-    weights and an ``AnchorHead``; heads of different latent lengths are a ``ValueError``.
+    weights and an ``AnchorHead``; heads of different latent lengths raise a ``ValueError``.
     """
 
     anchor_head: nn.Module

@@ -70,7 +70,7 @@ def knn_distances(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
     """Euclidean distances ``[N, k]`` of queries ``[N, D]`` to the k nearest of keys ``[K, D]``, ascending.
 
     They are found by a matrix product, which is inexact near zero, and recomputed from differences, so that a key equal
-    to the query is at exactly 0. Fewer keys than ``k`` are a ``ValueError``.
+    to the query is at exactly 0. Fewer keys than ``k`` raise a ``ValueError``.
     """
     if not 1 <= k <= keys.shape[0]:
         raise ValueError(f"k must be between 1 and the number of keys {keys.shape[0]}, got {k}.")

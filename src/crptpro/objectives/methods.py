@@ -33,7 +33,7 @@ class Exploration:
     """How a method explores while it pre-trains; the defaults are Proto-RL's.
 
     Every interval counts the agent steps of one domain. A number out of its range, an unknown name, or skills that do
-    not fit agent and reward are a ``ValueError``.
+    not fit agent and reward raise a ``ValueError``.
     """
 
     #: The agent's only reward: ``"prototype"``, ``"particle"``, ``"skill-contrast"``, or a function of the loss and a
@@ -65,7 +65,7 @@ class Exploration:
 
 @dataclass(frozen=True)
 class Method:
-    """A row of the table; the defaults are CRPTpro's. Numbers out of range and unknown names are a ``ValueError``."""
+    """A row of the table; the defaults are CRPTpro's. Numbers out of range and unknown names raise a ``ValueError``."""
 
     name: str
     loss_class: type[LossModule] | None  #: built as ``loss_class(encoder, **loss_options)``; None without pre-training
@@ -82,7 +82,7 @@ class Method:
     exploration: Exploration | None = None  #: None for a method that does not explore
     downstream: Mapping[str, Any] = field(default_factory=dict)  #: values that replace those of :data:`DOWNSTREAM`
     starts_from: str | None = None  #: method whose encoder it takes, to train it further for ``updates``
-    is_preset: bool = False  #: a variant of another method: not in :func:`method_names`, and no loss by hand's method
+    is_preset: bool = False  #: a variant: not in :func:`method_names`, nor the default of its loss class
     is_builtin: bool = False  #: part of the library
 
     def __post_init__(self) -> None:
@@ -97,7 +97,7 @@ class Method:
         return PixelEncoder(in_channels, image_size=image_size, **{**self.encoder_options, **options})
 
     def build(self, encoder: nn.Module, **options: Any) -> LossModule:
-        """Build the loss on ``encoder``; ``options`` override the method's own, an unknown one is a ``ValueError``."""
+        """Build the loss on ``encoder``; ``options`` override the method's own; unknown ones raise a ``ValueError``."""
         if self.loss_class is None:
             raise CRPTproError(f"The method {self.name!r} pre-trains nothing; it is for downstream training.")
         parameters = inspect.signature(self.loss_class.__init__).parameters
@@ -177,7 +177,7 @@ def register_method(name: str, loss_class: type[LossModule], **fields: Any) -> M
 
     ``fields`` are further fields of :class:`Method`, such as ``updates=10_000`` or ``exploration=Exploration()``, but
     not ``starts_from``. The last registration of a name counts. A name of the library's own methods, or a number out of
-    its range, is a ``ValueError``.
+    its range, raises a ``ValueError``.
     """
     if "starts_from" in fields:
         raise ValueError(f"The method {name!r} must pre-train its own encoder: `starts_from` is for built-in methods.")

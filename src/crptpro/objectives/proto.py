@@ -37,7 +37,7 @@ class ProtoLoss(PretrainingLoss):
 
     The predictor's ``hidden_dim`` is 1024 in the paper's table, 512 in the released code. ``intr_loss_coef`` is alpha,
     and ``assignment_temperature`` replaces tau in the assignments. A coefficient out of its range, or heads of
-    different latent lengths, are a ``ValueError``.
+    different latent lengths, raise a ``ValueError``.
     """
 
     predictor: nn.Module

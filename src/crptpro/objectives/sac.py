@@ -47,7 +47,7 @@ class RADSACLoss(NetworkLoss, SACLoss):
     * ``loss_alpha`` = mean(exp(log_alpha) * sg(-log pi - target_entropy)), gradient to ``log_alpha`` only.
 
     With the ``steps_to_next_obs`` of TorchRL's ``MultiStepTransform`` in the batch, gamma is raised to the number n of
-    steps; it is no in key. Features never receive a gradient.
+    steps; it is not an in_key. Features never receive a gradient.
 
     Differences from ``SACLoss``: squared error; alpha in place of its logarithm in the temperature loss; the log-std
     squash and pre-tanh log-probability of
@@ -227,8 +227,10 @@ class DrQLoss(AveragedSACLoss):
 
     Actor and critic share the convolutions, which learn from ``loss_qvalue`` alone; the target critic copies
     convolutions and head. In DrQ, actor and critic have ``has_tanh=True``. The actor acts on features: a policy is
-    ``actor.sample(encoder(pixels))``. ``options`` are those of :class:`RADSACLoss`; a critic that does not fit the
-    encoder is a ``ValueError``.
+    ``actor.sample(encoder(pixels))``. ``options`` are those of :class:`RADSACLoss`.
+
+    Raises:
+        ValueError: the critic does not fit the encoder.
     """
 
     @dataclass
@@ -258,14 +260,17 @@ class SkillDDPGLoss(NetworkLoss):
 
     With :math:`s = [h, z]` the features of an observation and its skill, :math:`s^+ = [h^+, z]` n steps later:
 
-    * :math:`y = R_n + d_n \min(Q_1', Q_2')(s^+, a^+)`, where :math:`R_n` is ``("next", "reward")`` and
-      :math:`d_n = \gamma^n \prod (\text{discounts of the environment})` is ``("next", "discount")``;
+    * :math:`y = R_n + \gamma^n (1 - \mathrm{terminated}) \min(Q_1', Q_2')(s^+, a^+)`, where :math:`R_n` is
+      ``("next", "reward")`` and n is ``steps_to_next_obs``, 1 without that entry;
     * ``loss_qvalue`` = MSE(Q1, y) + MSE(Q2, y), gradient to the critic only;
     * ``loss_actor`` = -mean(min(Q1, Q2)(s, a)), gradient to the actor only.
 
     Both actions have Gaussian noise clipped to ``noise_clip``, from ``generator`` (torch's global one if None). Only
     the critic has a target; in the released code its trunk ends with a tanh. Features never receive a gradient.
-    Diagnostics and both halves of ``forward`` are as in :class:`RADSACLoss`. A misfitting critic is a ``ValueError``.
+    Diagnostics and both halves of ``forward`` are as in :class:`RADSACLoss`.
+
+    Raises:
+        ValueError: the critic's input size does not match that of the actor.
     """
 
     @dataclass
@@ -274,7 +279,8 @@ class SkillDDPGLoss(NetworkLoss):
         skill: NestedKey = "skill"  # one-hot, at the root
         action: NestedKey = "action"
         reward: NestedKey = "reward"  # n-step return, under "next"
-        discount: NestedKey = "discount"  # of the value n steps later, under "next"
+        terminated: NestedKey = "terminated"  # under "next"
+        steps_to_next_obs: NestedKey = "steps_to_next_obs"  # n, at the root
 
     default_keys = _AcceptedKeys
     tensor_keys: Any
@@ -289,6 +295,7 @@ class SkillDDPGLoss(NetworkLoss):
         actor: DeterministicActor,
         critic: TwinCritic,
         *,
+        gamma: float = 0.99,
         noise_clip: float = 0.3,
         generator: torch.Generator | None = None,
     ) -> None:
@@ -299,6 +306,7 @@ class SkillDDPGLoss(NetworkLoss):
                 f"and skill); build the critic with feature_dim={inputs}."
             )
         super().__init__()
+        self.gamma = as_float(gamma, "gamma", minimum=0, maximum=1)
         self.noise_clip = as_float(noise_clip, "noise_clip", minimum=0)
         self.generator = generator
         self._convert(("qvalue_network",), actor_network=actor, qvalue_network=critic)
@@ -313,7 +321,7 @@ class SkillDDPGLoss(NetworkLoss):
 
     def _set_in_keys(self) -> None:
         keys = self.tensor_keys
-        following = (keys.observation, keys.reward, keys.discount)
+        following = (keys.observation, keys.reward, keys.terminated)
         root = [keys.observation, keys.skill, keys.action]
         self._in_keys = [*root, *(unravel_key(("next", key)) for key in following)]
 
@@ -331,7 +339,7 @@ class SkillDDPGLoss(NetworkLoss):
         return squared_errors(values.unsqueeze(-2), target)
 
     def actor_and_temperature_loss(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """``loss_actor``: there is no temperature."""
+        """``loss_actor``; the name is that of :class:`RADSACLoss`, which has a temperature."""
         inputs = self._inputs(tensordict, tensordict)
         action = self._act(inputs)
         # Detached weights: the gradient passes through Q to the action and to nothing else.
@@ -347,8 +355,10 @@ class SkillDDPGLoss(NetworkLoss):
         with self._as_target("qvalue_network"):
             value = self.qvalue_network(inputs, action).amin(-1)
         reward = following.get(self.tensor_keys.reward).squeeze(-1)
-        discount = following.get(self.tensor_keys.discount).squeeze(-1)
-        return reward + discount * value
+        bootstraps = ~following.get(self.tensor_keys.terminated).squeeze(-1)
+        steps_ahead = tensordict.get(self.tensor_keys.steps_to_next_obs, None)
+        discount = self.gamma if steps_ahead is None else self.gamma ** steps_ahead.squeeze(-1)
+        return reward + discount * bootstraps * value
 
     def _act(self, inputs: Tensor) -> Tensor:
         return self.actor_network.sample(inputs, noise_clip=self.noise_clip, generator=self.generator)

@@ -76,7 +76,7 @@ def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[P
     """Rebuild an agent from its directory, to act in the precision it was trained in; return it and its card.
 
     An encoder that is no :class:`~crptpro.modules.PixelEncoder` is needed as ``encoder``, a module of its class, whose
-    weights are loaded. A directory that is missing, damaged, or not an agent is a ``CheckpointError``.
+    weights are loaded. A directory that is missing, damaged, or not an agent raises a ``CheckpointError``.
     """
     card, tensors = read_artifact(path, format_name=AGENT_FORMAT, version=AGENT_VERSION, error=CheckpointError)
     if encoder is None and card.get("encoder_class") != PixelEncoder.__name__:
@@ -98,7 +98,7 @@ class SACLearner:
     """Steps critic, actor and temperature, and moves the target critic, on the reference schedule.
 
     Each of the three has its own Adam, as in Proto-RL's and CRPTpro's released agents. Actor, temperature and target,
-    whose EMA rate is ``critic_tau``, move every ``interval`` agent steps; it is 1 in the source of ``SkillDDPGLoss``,
+    whose EMA rate is ``critic_tau``, move at every ``interval``-th update; it is 1 in the source of ``SkillDDPGLoss``,
     which has no temperature.
     """
 
@@ -124,20 +124,20 @@ class SACLearner:
         self._critic_loss = accelerate(loss.critic_loss, compile=compile)
         self._actor_loss = accelerate(loss.actor_and_temperature_loss, compile=compile)
         recording: dict[str, Any] = {"cuda_graph": cuda_graph, "device": groups["critic"][0].device}
-        # By whether they move the critic alone.
         self._updates: dict[bool, Update] = {
-            alone: accelerate(functools.partial(self._update, alone), **recording) for alone in (True, False)
+            critic_only: accelerate(functools.partial(self._update, critic_only), **recording)
+            for critic_only in (True, False)
         }
 
-    def update(self, batch: TensorDictBase, *, agent_step: int) -> TensorDictBase:
-        """Do one update on a batch with features and rewards; returns detached scalars."""
-        return self._updates[agent_step % self.interval != 0](batch)
+    def update(self, batch: TensorDictBase, *, agent_update: int) -> TensorDictBase:
+        """Do the update of this number on a batch with features and rewards; returns detached scalars."""
+        return self._updates[agent_update % self.interval != 0](batch)
 
-    def _update(self, is_alone: bool, batch: TensorDictBase) -> TensorDictBase:
+    def _update(self, critic_only: bool, batch: TensorDictBase) -> TensorDictBase:
         critic, *others = self.optimizers.values()
         losses = self._critic_loss(batch)
         _step(losses["loss_qvalue"], critic)
-        if not is_alone:
+        if not critic_only:
             actor_losses = self._actor_loss(batch)
             terms = [value for name, value in actor_losses.items() if name.startswith("loss")]
             _step(torch.stack(terms).sum(), *others)

@@ -27,7 +27,7 @@ def accelerate(
 
     Raises:
         ValueError: ``cuda_graph`` on a ``device`` that is no GPU.
-        CompileError: a call of the update fails, most likely the first, while it is compiled or recorded.
+        CompileError: a call of the update fails in PyTorch, most likely while it is compiled or recorded.
     """
     if cuda_graph and torch.device(device).type != "cuda":
         raise ValueError(
@@ -46,7 +46,9 @@ def accelerate(
         try:
             out = fast(batch)
             return out.clone() if cuda_graph else out
-        except Exception as reason:
+        except torch.OutOfMemoryError:
+            raise
+        except RuntimeError as reason:  # as the compiler's own errors are
             what = (str(reason).strip().splitlines() or [type(reason).__name__])[0]
             raise CompileError(
                 f"The update cannot be compiled or recorded: {what} `compile` needs a C++ compiler (CXX=...), on a GPU "

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase
 from torch import nn
-from torchrl.envs import EnvBase, Transform
+from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
 from crptpro.data import FrameReplay
@@ -64,8 +63,8 @@ class DownstreamConfig:
     """weight of the prototype-kNN bonus (None: the method's; 0.2 for those with prototypes); 0 switches it off"""
     knn_k: int = 3
     """the bonus is the distance to the k-th nearest candidate"""
-    queue_size: int = 2_048
-    """candidates kept, a multiple of the number of prototypes"""
+    queue_size: int | None = None
+    """candidates kept, a multiple of the number of prototypes (None: as many as the artifact brings, else 2,048)"""
     hidden_dim: int = 1_024
     """width of the two hidden layers of actor and critic"""
     discount: float = 0.99
@@ -123,6 +122,8 @@ class DownstreamConfig:
         values: dict[str, Any] = {name: value for name, value in own.items() if getattr(self, name) is None}
         if "replay_capacity" in values:
             values["replay_capacity"] = max(values["replay_capacity"], self.random_agent_steps)
+        if self.queue_size is None:
+            values["queue_size"] = 2_048 if pretrained.queue is None else len(pretrained.queue)
         if self.action_repeat is None:
             values["action_repeat"] = resolve_action_repeat(task)
         return dataclasses.replace(self, **values)
@@ -161,7 +162,7 @@ def train_downstream(
     ``overrides`` are single settings of :class:`DownstreamConfig`; the rest as in :func:`~crptpro.training.pretrain`.
 
     Raises:
-        PretrainedError: the artifact does not fit, e.g. another image size.
+        PretrainedError: the artifact cannot be read, or its networks do not fit together.
         CheckpointError: ``run_dir`` holds a run of other settings (named), or one whose replay is gone.
         NonFiniteError: a loss, a weight, an action or a reward is not finite; the last checkpoint is kept.
         DiskSpaceError: the disk cannot hold the replay.
@@ -197,7 +198,6 @@ def train_downstream(
         generators = Generators(settings.seed, "replay", "shift", "bonus", "policy", "random_actions")
         env = EnvThread(task, pretrained.encoder, settings, seed=settings.seed, action_repeat=repeat)
         stack.callback(env.close)
-        pretrained.require(image_size=env.env.observation_spec["pixels"].shape[-1])
         encoder = _frozen_copy(pretrained.encoder, device, dtype)
         actor, action_dim = pretrained.actor, env.env.action_spec.shape[-1]
         # Proto-RL(S): it begins as the actor that explored the task's own domain.
@@ -217,7 +217,7 @@ def train_downstream(
         dense = next((each for each in replay.transform if isinstance(each, DenseShiftFeatures)), None)
         if dense is not None:  # its replay refers to it, too: the maps would stay until cycles are collected
             stack.callback(dense.forget)
-        counters = run.tally
+        counters = run.counters
         counters.update(updates=0, episodes=0, last_evaluation=-1)
         run.keep(**learner.components(), generators=generators, evaluator=evaluator,
                  replay=None if is_complete else replay)  # fmt: skip
@@ -250,7 +250,7 @@ def train_downstream(
                 if learns:
                     # The sample has features under random shifts, and the bonus is part of its reward.
                     batch = replay.sample(settings.batch_size).to(device)
-                    run.log(learner.update(batch, agent_step=agent_step))
+                    run.log(learner.update(batch, agent_update=agent_step))
                     if (intrinsic := batch.get(("next", "intrinsic_reward"), None)) is not None:
                         run.log({"intrinsic_reward": intrinsic.mean()})
                     counters["updates"] += 1
@@ -275,7 +275,7 @@ def train_downstream(
         run.finish()
         path = None
         if run.run_dir is not None:
-            card = {"env_steps": run.position, "config": dataclasses.asdict(settings), **run.settings}
+            card = {**run.settings, "env_steps": run.position}
             path = save_agent(run.run_dir / "agent", agent, card=card)
             if run.records is not None:
                 run.records.artifact(path, name=f"agent_{name}", kind="agent")
@@ -370,7 +370,9 @@ def attach_transforms(
     run.settings["features"] = setting if is_rounded else mode
     if mode == "reencode":
         keeps_projections = False
-        replay.append_transform(_OnDevice(device))  # features, 40 times as large as a frame, need not move
+        # Features, 40 times as large as a frame, need not move. TorchRL's DeviceCastTransform waits for the GPU at
+        # every sample if the machine has one and `device` is the CPU.
+        replay.append_transform(lambda sample: sample.to(device))
         replay.append_transform(RandomShift(in_keys=pixels, **shift))
         replay.append_transform(FrozenEncoder(encoder, in_keys=pixels, out_keys=features))
     else:
@@ -393,20 +395,6 @@ def attach_transforms(
         generator=generators["bonus"],
     )
     replay.append_transform(bonus)
-
-
-class _OnDevice(Transform):
-    """Moves samples of a replay to the device of the networks.
-
-    TorchRL's DeviceCastTransform waits for the GPU at every sample if the machine has one and ``device`` is the CPU.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        super().__init__(in_keys=[], out_keys=[])
-        self.target = device
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        return tensordict.to(self.target)
 
 
 def _eval_workers(task: str, make_this_env: Callable[[], EnvBase], config: Any) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import shutil
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
@@ -73,7 +72,8 @@ def make_replay(run: Run, path: Path | None, env: EnvBase, capacity: int, **opti
     """Return the replay of an environment, in ``path`` or in RAM."""
     channels, height, width = env.observation_spec["pixels"].shape
     if path is not None and not run.saved:
-        shutil.rmtree(path, ignore_errors=True)  # of an attempt without a checkpoint
+        for file in path.glob("*.memmap"):  # of an attempt without a checkpoint
+            file.unlink()
     return FrameReplay(
         capacity,
         frame_shape=(3, height, width),

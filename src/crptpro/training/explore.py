@@ -93,9 +93,9 @@ class ExploreConfig:
         check_numbers(self, minima={"random_agent_steps": 0}, maxima={})
 
     def resolved(self, method: Method) -> Any:
-        homes = {"batch_size": method, "learning_rate": method}
+        owners = {"batch_size": method, "learning_rate": method}
         left_open = [name for name, value in vars(self).items() if value is None]
-        return dataclasses.replace(self, **{n: getattr(homes.get(n, method.exploration), n) for n in left_open})
+        return dataclasses.replace(self, **{n: getattr(owners.get(n, method.exploration), n) for n in left_open})
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,7 @@ def pretrain_active(
             explorers.append(Explorer(name, domain, loss, exploration, settings, run, capacity=capacity, slack=slack,
                                       dtype=dtype, reward=shared))  # fmt: skip
             stack.callback(explorers[-1].env.close)
-        done = run.tally
+        done = run.counters
         done["updates"] = 0
         run.keep(loss=loss, optimizer=optimizer, schedule=schedule, targets=targets, monitor=monitor,
                  **{f"explorer_{index}": explorer for index, explorer in enumerate(explorers)})  # fmt: skip
@@ -308,10 +308,13 @@ class Explorer:
         self.agent = PixelAgent(loss.encoder, self.learner.loss.actor)
         self.networks = [self.learner.loss]
         self.reward = self._make_reward() if reward is None else reward
+        # A finished run needs neither its replay, which may have been deleted, nor its last episode.
+        self._is_finished = bool(run.saved.get("is_finished"))
         path = None if run.run_dir is None else dataset_path(run.run_dir / "replay", name)
-        self.replay = self._make_replay(run, path, capacity, slack)
-        self._parts = {**self.learner.components(), "reward": self.reward, "replay": self.replay,
-                       "generators": self.generators}  # fmt: skip
+        self.replay = self._make_replay(run, None if self._is_finished else path, capacity, slack)
+        self._parts = {**self.learner.components(), "reward": self.reward, "generators": self.generators}
+        if not self._is_finished:
+            self._parts["replay"] = self.replay
         self.agent_steps = self.episodes = self.skill = 0
         self.actions: list[Tensor] = []  # of the running episode
         self._td: TensorDictBase | None = None  # its newest observation
@@ -345,14 +348,12 @@ class Explorer:
         self._td, self.actions, self._episode_return = None, [], 0.0
         return {"domain": self.name, **episode}
 
-    def learn(self, batch: TensorDictBase, agent_step: int) -> dict[str, Tensor]:
+    def learn(self, batch: TensorDictBase, agent_update: int) -> dict[str, Tensor]:
         """Let the agent learn from the intrinsic reward of a batch with features; returns detached scalars."""
         batch = self.reward(batch)
         intrinsic = batch["next", "intrinsic_reward"]
         batch["next", "reward"] = intrinsic
-        if ("next", "discount") not in batch:  # n_step is 1
-            batch["next", "discount"] = DISCOUNT * (~batch["next", "terminated"]).to(intrinsic)
-        losses = self.learner.update(batch, agent_step=agent_step)
+        losses = self.learner.update(batch, agent_update=agent_update)
         return {"intrinsic_reward": intrinsic.mean(), **dict(losses.items())}
 
     def candidates(self) -> Tensor | None:
@@ -373,7 +374,7 @@ class Explorer:
         self.agent_steps, self.episodes, self.skill = state["counters"]
         for name, part in self._parts.items():
             part.load_state_dict(state[name])
-        if state["actions"] is None:
+        if state["actions"] is None or self._is_finished:
             return
         self._td = self._reset()
         for action in state["actions"]:
@@ -397,7 +398,7 @@ class Explorer:
         if self.exploration.agent == "skill-ddpg":
             policy = DeterministicActor(feature_dim, action_dim, skill_dim=skills, hidden_dim=hidden_dim)
             critic = TwinCritic(feature_dim + skills, action_dim, hidden_dim=hidden_dim, has_tanh=True)
-            ddpg = SkillDDPGLoss(policy.to(self.device), critic.to(self.device), generator=generator)
+            ddpg = SkillDDPGLoss(policy.to(self.device), critic.to(self.device), gamma=DISCOUNT, generator=generator)
             return SACLearner(ddpg, interval=1)
         sac_class = {"rad-sac": RADSACLoss, "averaged-sac": AveragedSACLoss}[self.exploration.agent]
         actor = SquashedGaussianActor(feature_dim, action_dim, hidden_dim=hidden_dim)
@@ -430,17 +431,17 @@ class Explorer:
         )  # fmt: skip
         images: list[Any] = ["pixels", ("next", "pixels")]
         features: list[Any] = ["features", ("next", "features")]
-        seconds: list[Any] = []
+        second_views: list[Any] = []
         views: dict[Any, Any] = dict(getattr(self.loss, "views", {}))
         if isinstance(self.learner.loss, AveragedSACLoss):
-            seconds = ["pixels_view", ("next", "pixels_view")]
-            views |= zip(seconds, images)
+            second_views = ["pixels_view", ("next", "pixels_view")]
+            views |= zip(second_views, images)
             features += ["features_view", ("next", "features_view")]
         read, written = [*views.values(), *images], [*views, *images]
         generator = self.generators["shift"]
         replay.append_transform(RandomShift(pad=SHIFT_PAD, in_keys=read, out_keys=written, generator=generator))
         # Adds the features of every image to a batch, without gradient.
-        self.encode = FrozenEncoder(self.loss.encoder, in_keys=[*images, *seconds], out_keys=features)
+        self.encode = FrozenEncoder(self.loss.encoder, in_keys=[*images, *second_views], out_keys=features)
         return replay
 
 

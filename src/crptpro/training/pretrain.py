@@ -222,8 +222,18 @@ def make_optimizer(
     parameters = [parameter for parameter in loss.parameters() if parameter.requires_grad]
     if not parameters:
         raise ValueError(f"{type(loss).__name__} has no parameters that require a gradient: nothing to train.")
-    rate = torch.tensor(method.learning_rate, device=parameters[0].device) if cuda_graph else method.learning_rate
-    optimizer = torch.optim.Adam(parameters, lr=rate, fused=True, capturable=cuda_graph)
+    rate = torch.tensor(method.learning_rate, device=parameters[0].device)
+    optimizer = torch.optim.Adam(
+        parameters, lr=rate if cuda_graph else method.learning_rate, fused=True, capturable=cuda_graph
+    )
+
+    def keep_rate(optimizer: torch.optim.Optimizer) -> None:
+        # A graph reads this tensor. A loaded one is on the CPU, and its value would be recorded as a constant.
+        for group in optimizer.param_groups:
+            group["lr"] = rate.copy_(group["lr"])
+
+    if cuda_graph:
+        optimizer.register_load_state_dict_post_hook(keep_rate)
 
     def factor(update: int) -> float:
         warmup = method.warmup_updates
@@ -351,7 +361,8 @@ def _opened(
     buffers: dict[str, ReplayBuffer] = {}
     for index, (name, dataset) in enumerate(given):
         if isinstance(dataset, (str, Path)):
-            dataset = FrameDataset.open(dataset, device=device)
+            channels = getattr(getattr(loss, "encoder", None), "in_channels", 9)
+            dataset = FrameDataset.open(dataset, frame_stack=channels // 3, device=device)
         if not isinstance(dataset, ReplayBuffer):
             raise DatasetError(
                 f"Dataset {index} is a {type(dataset).__name__}; give a directory, a FrameDataset or a ReplayBuffer."
@@ -402,9 +413,9 @@ def _shift_for(
             raise DatasetError(
                 f"The dataset {name!r} shows {key!r} as {found}; the encoder takes {(channels, size, size)}. {remedy}"
             )
-    seconds = [view for view, key in views.items() if key in images]
-    read = [*(views[view] for view in seconds), *images]
-    return RandomShift(pad=SHIFT_PAD, in_keys=read, out_keys=[*seconds, *images], generator=generator)
+    second_views = [view for view, key in views.items() if key in images]
+    read = [*(views[view] for view in second_views), *images]
+    return RandomShift(pad=SHIFT_PAD, in_keys=read, out_keys=[*second_views, *images], generator=generator)
 
 
 def _facts(name: str, buffer: ReplayBuffer) -> dict[str, Any]:

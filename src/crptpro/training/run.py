@@ -117,7 +117,7 @@ class Run:
     Attributes:
         position: progress in ``unit``, all resumptions included.
         resumed_from: position at which this call continued; 0 for a fresh run.
-        tally: the loop's own counters, which every checkpoint holds; set them before :meth:`keep`.
+        counters: the loop's own counters, which every checkpoint holds; set them before :meth:`keep`.
 
     Raises:
         CheckpointError: ``run_dir`` is in use by another process, or all its checkpoints are damaged.
@@ -136,7 +136,7 @@ class Run:
         self.run_dir = None if run_dir is None else as_path(run_dir, "run_dir")
         self.unit, self.streams, self.records, self.config = unit, streams, records, config
         self.position = self.resumed_from = 0
-        self.tally: dict[str, int] = {}
+        self.counters: dict[str, int] = {}
         self.settings: dict[str, Any] = {}
         self.saved: dict[str, Any] = {}
         self._rows: dict[str, list[dict[str, Any]]] = {stream: [] for stream in streams}  # without a record
@@ -182,7 +182,7 @@ class Run:
     def require_same(self, settings: Mapping[str, Any]) -> None:
         """Name everything that decides the numbers of the run; a run of other settings is refused by name.
 
-        What a checkpoint could not store is a ``ValueError`` that names it.
+        What a checkpoint could not store raises a ``ValueError`` that names it.
         """
         self.settings = as_plain(settings, "settings")
         if not self.saved:
@@ -215,7 +215,7 @@ class Run:
             except Exception as reason:
                 raise CheckpointError(f"The checkpoint {self._latest} does not fit this run: {reason}") from reason
             self.position = self.resumed_from = self._row_position = self.saved["position"]
-            self.tally.update(self.saved["tally"])
+            self.counters.update(self.saved["counters"])
             if self.records is not None and self.saved["record"] is not None:
                 self.records.load_state_dict(self.saved["record"])
             logger.info("Continues from %s %s.", f"{self.position:,}", self.unit)
@@ -363,7 +363,7 @@ class Run:
         self.saved = {
             "settings": self.settings,
             "position": self.position,
-            "tally": dict(self.tally),
+            "counters": dict(self.counters),
             "seconds": self.seconds,
             "is_finished": is_finished,
             "record": None if self.records is None else self.records.state_dict(self.streams),

@@ -122,8 +122,8 @@ class DenseShiftFeatures(Transform):
 
     Attached to a :class:`~crptpro.data.FrameReplay` it does what ``RandomShift`` and ``FrozenEncoder`` would, with the
     same shifts from the same generator and the same bits, but encodes each observation once, when it is first sampled.
-    Its dense maps are kept until the replay has overwritten it; no state dictionary, copy or pickle holds them. Where
-    the replay's numbers go back (``load_state_dict`` on the one in use), call :meth:`forget`.
+    Its dense maps are kept until the replay has overwritten it; no state dictionary, copy or pickle holds them. If the
+    transform is not attached, call :meth:`forget` after loading a state of the replay.
 
     Threads may share it. On an environment use :class:`~crptpro.transforms.FrozenEncoder`.
 
@@ -196,7 +196,7 @@ class DenseShiftFeatures(Transform):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         numbers = [self._numbers(tensordict, key) for key in self.in_keys]
-        # The lock is held until the crops are read: another thread might need the same place for a newer observation.
+        # The lock is held until the crops are read: another thread might need the same slot for a newer observation.
         with self._lock:
             maps, embeddings = self._encode_missing(torch.cat([flat for flat, _ in numbers]))
             for (flat, lead), out_key in zip(numbers, self.out_keys):
@@ -246,7 +246,7 @@ class DenseShiftFeatures(Transform):
         if len(missing) and not torch.equal(self._held[numbers % self.observations], numbers):
             raise ValueError(
                 f"`observations` is {self.observations}, fewer than the replay holds: two observations of one batch "
-                "need the same place. Leave it out, or keep as many as the replay."
+                "map to the same slot. Leave it out, or keep as many as the replay."
             )
         return self._maps, self._embeddings
 
@@ -295,7 +295,8 @@ def choose_feature_mode(
 
     ``"auto"`` chooses dense maps for a suitable encoder if four fifths of the free memory, ``available_bytes``, hold
     the maps of ``observations`` in ``dtype`` and, with ``latent_dim``, their projections; the rest is for networks,
-    batches and the page cache. ``"dense"`` for an unsuitable encoder is a ``ValueError``. Shifts are of up to 4 pixels.
+    batches and the page cache. Shifts are of up to 4 pixels. ``"dense"`` for an unsuitable encoder raises a
+    ``ValueError``.
     """
     if mode == "reencode":
         return "reencode", "re-encoding at every update, as requested"

@@ -27,7 +27,7 @@ def random_shift(pixels: Tensor, offsets: Tensor, *, pad: int = 4) -> Tensor:
     """Crop every image ``[B, C, H, W]``, its border replicated ``pad`` times, at its own integer offset ``[B, 2]``.
 
     This is the augmentation of DrQ (denisyarats/drq) as CRPTpro and Proto-RL use it. Offsets are (row, column) in
-    ``{0, ..., 2 * pad}``; others on a CPU are a ``ValueError``. Values are copied, never interpolated: on a CPU by
+    ``{0, ..., 2 * pad}``; others on a CPU raise a ``ValueError``. Values are copied, never interpolated: on a CPU by
     slices, in half the time of padding and cropping; on other devices, under ``torch.compile`` and for a gradient by
     one gather without host synchronisation.
 
@@ -97,17 +97,13 @@ class RandomShift(PixelTransform):
     Every key and every sample draws its own offset, common to all channels (stacked frames). The transform acts in
     evaluation mode too, into which TorchRL puts every attached transform.
 
-    ``in_keys`` are required; by default they are ``"pixels"`` and, if present, ``("next", "pixels")``. On an
-    environment only root keys are shifted. Without ``out_keys`` the images are replaced. Clones share the ``generator``
-    of the offsets (torch's global one if None), and the state dict excludes it.
+    ``in_keys`` are ``["pixels", ("next", "pixels")]`` in a replay buffer of transitions, ``["pixels"]`` on an
+    environment. Without ``out_keys`` the images are replaced. Clones share the ``generator`` of the offsets (torch's
+    global one if None), and the state dict excludes it.
     """
 
     def __init__(
-        self,
-        pad: int = 4,
-        in_keys: Keys | None = None,
-        out_keys: Keys | None = None,
-        generator: torch.Generator | None = None,
+        self, in_keys: Keys, out_keys: Keys | None = None, *, pad: int = 4, generator: torch.Generator | None = None
     ) -> None:
         super().__init__(in_keys, out_keys)
         self.pad = as_int(pad, "pad", minimum=0)

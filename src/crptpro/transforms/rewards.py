@@ -51,7 +51,7 @@ class IntrinsicReward(Transform):
         self.reward_key = reward_key
 
     def intrinsic_reward(self, features: Tensor, *extra: Tensor) -> Tensor:
-        """Return the reward of rows ``[B, D]`` before the coefficient, float32 ``[B]``; updates what is remembered."""
+        """Return the reward of rows ``[B, D]``, float32 ``[B]``, without coefficient; updates the queue or the mean."""
         raise NotImplementedError
 
     def _project(self, features: Tensor) -> Tensor:
