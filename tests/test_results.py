@@ -94,9 +94,9 @@ def sentences() -> Iterator[str]:
     yield f"From 60,000 to 100,000 env steps its runs average {RESULTS['_spread'](drq)}"
     complete = runs["`crptpro`"].loc[:, :100_000].dropna()
     means = complete[[60_000, 80_000, 100_000]].mean(axis=1)
-    one, two, three = (f"{mean:.0f}" for mean in means)
+    listed = " and ".join(", ".join(f"{mean:.0f}" for mean in means).rsplit(", ", 1))
     within = "within" if 200 <= means.mean() <= 340 else "outside"
-    yield f"from 60,000 to 100,000 env steps is {means.mean():.0f} ({one}, {two} and {three}), {within} the 200 to 340"
+    yield f"from 60,000 to 100,000 env steps is {means.mean():.0f} ({listed}), {within} the 200 to 340"
     theirs = authors[[60_000, 80_000, 100_000]].mean(axis=1).iloc[0]
     all_of_theirs = runs[AUTHORS].loc[:, 60_000:100_000].mean(axis=1).iloc[0]
     yield f"The authors' run has {theirs:.0f} ({all_of_theirs:.0f} over all its evaluations there"
@@ -135,6 +135,6 @@ def sentences() -> Iterator[str]:
     yield f"its comparative loss is {below:.0%} below that of uniform predictions".replace("%", " %")
 
 
-@pytest.mark.parametrize("sentence", list(sentences()))
-def test_the_readme_or_the_page_says_what_the_records_give(sentence: str) -> None:
-    assert sentence in " ".join(f"{RESULTS['PAGES'][0].read_text()} {RESULTS['PAGES'][-1].read_text()}".split())
+def test_the_readme_and_the_page_say_what_the_records_give() -> None:
+    text = " ".join(f"{RESULTS['PAGES'][0].read_text()} {RESULTS['PAGES'][-1].read_text()}".split())
+    assert [sentence for sentence in sentences() if sentence not in text] == []

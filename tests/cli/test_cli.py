@@ -181,7 +181,6 @@ def test_a_real_process_ends_with_the_same_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.gl
-@pytest.mark.slow
 def test_collect_pretrain_and_downstream_on_a_real_domain(call: Call) -> None:
     fast = ("--quality", "fast", "--action-repeat", 4)
     assert call("collect", "cartpole", "--out", "data", "--transitions", 20, "--workers", 1, *fast)[0] == 0

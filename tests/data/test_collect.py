@@ -170,13 +170,11 @@ def test_an_environment_that_fails_is_named_with_its_cause_and_does_not_block_th
     assert len(FrameDataset.open(collect_random(repaired, tmp_path, transitions=5, **SMALL))) == 5
 
 
-@pytest.mark.slow
 def test_a_process_that_dies_gives_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(WorkerLostError, match=r"episode 0 of toy-dying has died.*use fewer workers.*run the same"):
         collect_random(DYING, tmp_path, transitions=50, workers=2, **SMALL)
 
 
-@pytest.mark.slow
 def test_an_exception_that_cannot_leave_its_process_is_reported_by_what_it_says(tmp_path: Path) -> None:
     with pytest.raises(EnvCrashedError, match=r"no seed \d+ in the catalogue \(UncopiableError in "):
         collect_random(SEEDLESS, tmp_path, transitions=50, workers=2, **SMALL)
@@ -263,7 +261,6 @@ def stop_while_collecting(process: subprocess.Popen, path: Path, how: int, *, wh
     return errors
 
 
-@pytest.mark.slow
 def test_interrupted_or_killed_and_started_again_gives_the_same_bytes(tmp_path: Path, whole: dict[str, bytes]) -> None:
     interrupted, killed = tmp_path / "interrupted", tmp_path / "killed"
     with ThreadPoolExecutor(2) as threads:
@@ -282,7 +279,6 @@ def test_interrupted_or_killed_and_started_again_gives_the_same_bytes(tmp_path: 
         assert data_bytes(path) == whole
 
 
-@pytest.mark.slow
 def test_processes_that_cannot_be_started_are_an_error_that_says_why(tmp_path: Path) -> None:
     few = "import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (20, 20))"
     unguarded = 'collect_random(SLOW, sys.argv[0] + "data", transitions=400, workers=2, image_size=8)'

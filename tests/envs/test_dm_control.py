@@ -115,7 +115,7 @@ def test_fast_quality_reaches_the_render_context_and_changes_few_pixels(task: st
 
 
 @pytest.mark.gl
-@pytest.mark.parametrize("name", ["cheetah", pytest.param("manipulation", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["cheetah", "manipulation"])
 def test_a_real_background_changes_its_colours_and_the_episode_stays_the_same(name: str) -> None:
     """Manipulation compiles a new model at every reset."""
     images, states = {}, {}

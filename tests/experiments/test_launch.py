@@ -254,7 +254,6 @@ def _collected(root: Path) -> int:
     return sum(read_json(path)["episodes"] for path in root.glob("jobs/dataset-*/*/card.json"))
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("plugins_are_forgotten")
 def test_a_command_that_is_killed_continues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -284,7 +283,6 @@ def test_a_command_that_is_killed_continues(
     assert "continuing after" in log.read_text()  # what the first had collected was kept
 
 
-@pytest.mark.slow
 def test_a_slurm_job_runs_as_submitit_runs_it(tmp_path: Path) -> None:
     launcher = SlurmLauncher({"timeout_min": 60}, cluster="local")
     assert run_jobs(make_plan([UNTRAINED], tmp_path), tmp_path, launcher, attempts=1) == []
@@ -293,7 +291,6 @@ def test_a_slurm_job_runs_as_submitit_runs_it(tmp_path: Path) -> None:
     assert not list((tmp_path / "submitted").iterdir())
 
 
-@pytest.mark.slow
 def test_ray_runs_jobs_and_one_whose_worker_died_is_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

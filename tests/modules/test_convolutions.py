@@ -112,12 +112,15 @@ def test_a_forked_process_computes_and_threads_that_cannot_start_let_it_end() ->
 import os, threading, torch
 from crptpro.modules import convolutions
 torch.set_num_threads(2)
-assert convolutions._map(lambda i: i, [1, 2, 3]) == [1, 2, 3]
+def compute():
+    chunks = torch.arange(3.0).split(1)
+    return convolutions.apply_to_chunks(lambda chunk, _: chunk, chunks, []).tolist() == [0, 1, 2]
+assert compute()
 child = os.fork()
 if child == 0:
-    os._exit(0 if convolutions._map(lambda i: i, [1, 2, 3]) == [1, 2, 3] else 1)
+    os._exit(0 if compute() else 1)
 assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
-convolutions._pool.cache_clear()
+torch.set_num_threads(3)  # another pool
 start, count = threading.Thread.start, 0
 def start_the_first_only(thread):
     global count
@@ -127,7 +130,7 @@ def start_the_first_only(thread):
     start(thread)
 threading.Thread.start = start_the_first_only
 try:
-    convolutions._map(lambda i: i, [1, 2, 3])
+    compute()
 except RuntimeError as reason:
     print(reason)
 """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import re
 
 import pytest
 import torch
@@ -47,6 +48,14 @@ def test_each_key_has_its_default_and_can_be_renamed_and_nested(case: LossCase) 
         assert_same(run(loss, original), expected)
     with pytest.raises(ValueError, match="not an accepted tensordict key"):
         loss.set_keys(unheard_of="x")
+
+
+@each
+def test_a_missing_entry_is_named(case: LossCase) -> None:
+    loss = case.make()
+    for key in loss.in_keys:
+        with pytest.raises(KeyError, match=re.escape(f"{type(loss).__name__} needs the entry {key!r} and found")):
+            run(loss, case.batch().exclude(key))
 
 
 @each

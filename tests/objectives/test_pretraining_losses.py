@@ -200,11 +200,6 @@ def test_impossible_options_are_refused_by_name(make, options: dict, message: st
         make(**options)
 
 
-def test_a_missing_entry_is_named() -> None:
-    with pytest.raises(KeyError, match=r"BeCLLoss needs the entry 'skill' and found \['pixels', .*\]; set its keys"):
-        becl()(image_batch())
-
-
 def test_skills_that_are_integers_are_refused() -> None:
     td = skill_image_batch()
     for skills in (td["skill"].argmax(-1), td["skill"].argmax(-1, keepdim=True)):

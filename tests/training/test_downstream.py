@@ -22,6 +22,7 @@ from toy_runs import (
     make_dataset,
     make_encoder,
     make_pretrained,
+    pretend_cpu,
     same_state,
     signalling,
     toy_domain,
@@ -290,6 +291,23 @@ def test_candidates_that_the_artifact_brings_set_the_length_of_the_queue() -> No
     train(None, pretrained, env_steps=40)
 
 
+def test_a_run_keeps_its_precision_and_features_on_another_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pretend_cpu("amx_bf16", monkeypatch, tmp_path)
+    train(tmp_path / "run", env_steps=40, precision="auto", features="auto")
+    pretend_cpu("", monkeypatch, tmp_path)
+    monkeypatch.setattr("crptpro.training.downstream.free_bytes", lambda device: 0)
+    result = train(tmp_path / "run", env_steps=60, precision="auto", features="auto")
+    _, card = load_agent(result.agent_path)
+    assert (card["precision"], card["features"]) == ("bf16", "dense")
+
+
+def test_batches_too_small_for_the_prototypes_are_announced(caplog: pytest.LogCaptureFixture) -> None:
+    train(None, batch_size=2, env_steps=40)
+    assert "8 prototypes draw their candidates from batches of 2" in caplog.text
+
+
 def test_a_run_that_begins_removes_no_file_of_anybody_else(tmp_path: Path) -> None:
     (tmp_path / "replay").mkdir()
     (tmp_path / "replay" / "mine.txt").touch()
@@ -321,6 +339,8 @@ CHANGED = {
     "hidden_dim": 8,
     "random_agent_steps": 14,
     "replay_capacity": 20,
+    "action_repeat": 4,
+    "colors": "reversed_image",
     "seed": 1,
 }
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torchrl.objectives import LossModule
 from toy_env import ToyEnv, record
-from toy_runs import EPISODE, kill, make_encoder, same_state, signalling, toy_domain
+from toy_runs import EPISODE, kill, make_encoder, pretend_cpu, same_state, signalling, toy_domain
 
 from crptpro.errors import CheckpointError, CRPTproError
 from crptpro.objectives import get_method
@@ -127,6 +127,21 @@ def test_a_finished_run_gives_its_result_again_without_its_replays(tmp_path: Pat
     assert same_state(again.loss, first.loss)
     assert torch.equal(again.queue, first.queue)
     assert not (tmp_path / "replay").exists()
+
+
+def test_a_run_keeps_its_precision_on_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend_cpu("amx_bf16", monkeypatch, tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        run("apt-s", tmp_path / "run", [signalling("left", 15, signal.SIGINT)], precision="auto")
+    pretend_cpu("", monkeypatch, tmp_path)
+    resumed = run("apt-s", tmp_path / "run", precision="auto")
+    assert resumed.resumed_from
+    assert resumed.training["settings"]["precision"] == "bf16"
+
+
+def test_batches_too_small_for_the_prototypes_are_announced(caplog: pytest.LogCaptureFixture) -> None:
+    run("proto-rl-s", batch_size=2)
+    assert "8 prototypes draw their candidates from batches of 2" in caplog.text
 
 
 def test_a_run_of_other_settings_is_refused_by_name(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from torch import nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import LossModule
 from toy_env import random_episode, record, write_dataset
-from toy_runs import SIZE, make_dataset, make_datasets, make_encoder, make_loss, same_state
+from toy_runs import SIZE, make_dataset, make_datasets, make_encoder, make_loss, pretend_cpu, same_state
 
 from crptpro.data import FrameDataset
 from crptpro.errors import CheckpointError, CRPTproError, DatasetError
@@ -309,6 +309,13 @@ def test_the_stacks_that_an_open_dataset_samples_must_fit_the_encoder_whatever_i
     assert run(make_loss(channels=3), 2, datasets=single).updates == 2
     with pytest.raises(DatasetError, match=r"as \(3, 16, 16\); the encoder takes \(9, 16, 16\)\..*samples stacks"):
         run(make_loss(channels=9), 2, datasets=single)
+
+
+def test_a_run_keeps_its_precision_on_another_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend_cpu("amx_bf16", monkeypatch, tmp_path)
+    run(make_loss(), 4, tmp_path / "run", precision="auto")
+    pretend_cpu("", monkeypatch, tmp_path)
+    assert run(make_loss(), 8, tmp_path / "run", precision="auto").training["settings"]["precision"] == "bf16"
 
 
 def test_bf16_stays_within_the_spread_of_two_fp32_seeds_and_ends_with_the_run() -> None:

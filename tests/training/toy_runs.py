@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -18,7 +19,7 @@ from torchrl.envs import EnvBase
 from toy_env import ToyEnv, fixed_length
 
 from crptpro.domains import Domain
-from crptpro.modules import PixelEncoder, Projector, Prototypes
+from crptpro.modules import PixelEncoder, Projector, Prototypes, precision
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import Pretrained
 
@@ -80,6 +81,13 @@ def signalling(name: str, step: int, number: signal.Signals) -> Domain:
     """An environment that sends a signal to this process with one of its steps."""
     steps = itertools.count(1)
     return toy_domain(name, on_step=lambda _: next(steps) == step and os.kill(os.getpid(), number))
+
+
+def pretend_cpu(flags: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Let ``auto`` see a processor of these flags."""
+    path = tmp_path / "cpuinfo"
+    path.write_text(f"flags: {flags}")
+    monkeypatch.setattr(precision, "CPUINFO", path)
 
 
 def python(code: str) -> subprocess.CompletedProcess[str]:

@@ -10,7 +10,7 @@ from torch import nn
 
 from crptpro.modules import Projector, Prototypes
 from crptpro.transforms import ContrastiveReward, ParticleReward, PrototypeReward
-from crptpro.transforms.rewards import draw_candidates, warn_if_mostly_zero
+from crptpro.transforms.rewards import draw_candidates
 
 B, D, M = 24, 6, 8
 
@@ -106,14 +106,6 @@ def test_a_sample_drawn_k_times_gets_exactly_zero_and_that_happens_to_eight_perc
     assert torch.equal(reward == 0, times_drawn >= 3)
     assert 0.05 < float((reward == 0).float().mean()) < 0.115
     assert float(on_latents(queue_size=64).intrinsic_reward(latents(5)).max()) <= 1.0 + 1e-6  # unfilled rows
-
-
-def test_batches_too_small_for_the_prototypes_are_announced(caplog: pytest.LogCaptureFixture) -> None:
-    warn_if_mostly_zero(512, 512, 3)
-    assert not caplog.text
-    warn_if_mostly_zero(512, 128, 3)
-    assert "512 prototypes draw their candidates from batches of 128" in caplog.text
-    assert "batches of more than 192" in caplog.text
 
 
 def test_the_queue_is_first_in_first_out_and_can_be_handed_over():

@@ -126,7 +126,7 @@ def test_a_batch_and_a_sample_of_a_buffer_are_changed_and_what_is_stored_is_not(
     sample = buffer.sample()
     assert sample.batch_size == (4,)
     assert changed(stored[sample["rows"]], sample) == writes
-    assert changed(stored, buffer._storage[:]) == set()
+    assert changed(stored, buffer.storage[:]) == set()
 
 
 @each
