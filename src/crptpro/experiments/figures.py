@@ -42,14 +42,13 @@ def in_order(labels: Iterable[str]) -> list[str]:
 
 def styles(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Return colour, marker and dash of labels; a variant has its method's colour and another marker and dash."""
-    return {
-        label: {
-            "color": COLORS.get(base_method(label), f"C{place % 10}"),
-            "marker": MARKERS[place % len(MARKERS)],
-            "linestyle": DASHES[place % len(DASHES)],
-        }
-        for place, label in enumerate(in_order(labels))
-    }
+    found: dict[str, dict[str, Any]] = {}
+    for place, label in enumerate(in_order(labels)):
+        color = COLORS.get(base_method(label), f"C{place % 10}")
+        alike = sum(style["color"] == color for style in found.values())
+        marker, dash = MARKERS[place % len(MARKERS)], DASHES[alike % len(DASHES)]
+        found[label] = {"color": color, "marker": marker, "linestyle": dash}
+    return found
 
 
 def draw(
