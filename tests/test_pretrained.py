@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import toy_runs
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
@@ -21,7 +23,7 @@ from crptpro import pretrained
 from crptpro.data import FrameDataset
 from crptpro.errors import CRPTproError, PretrainedError, UnknownNameError
 from crptpro.modules import PixelEncoder, SquashedGaussianActor
-from crptpro.objectives import BeCLLoss, ProtoLoss, SimCLRLoss
+from crptpro.objectives import BeCLLoss, SimCLRLoss
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained, save_pretrained, shipped_encoders
 from crptpro.training import PretrainResult, finetune, pretrain, train_downstream
 from crptpro.transforms import RandomShift
@@ -31,10 +33,7 @@ PIXELS = torch.randint(0, 256, (5, 9, 16, 16), dtype=torch.uint8, generator=torc
 OPTIONS: dict[str, Any] = {"batch_size": 8, "precision": "fp32", "progress": False}
 
 
-def make_loss(seed: int = 0, **options: Any) -> ProtoLoss:
-    torch.manual_seed(seed)
-    sizes = {"num_prototypes": 8, "latent_dim": 8, "hidden_dim": 16}
-    return ProtoLoss(PixelEncoder(**TINY), **{**sizes, **options})
+make_loss = partial(toy_runs.make_loss, channels=9)
 
 
 def states(source: Any, *roles: str) -> dict[str, Tensor]:

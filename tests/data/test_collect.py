@@ -20,6 +20,7 @@ import numpy as np
 import psutil
 import pytest
 import torch
+import toy_env
 from torchrl.modules import RandomPolicy
 from toy_env import DYING, FAILING, FIXED, SEEDLESS, SLOW, VARIABLE, ToyEnv, data_bytes, make_toy, variable_length
 
@@ -202,7 +203,7 @@ def test_an_environment_that_no_other_process_can_import_is_collected_in_this_on
 def program(root: Path, *, workers: int = 2, limit: str = "pass", more: str = "pass") -> str:
     return textwrap.dedent(f"""
         import sys
-        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        sys.path.insert(0, {str(Path(toy_env.__file__).parent)!r})
         from toy_env import SLOW
         from crptpro.data import collect_random
         {more}

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 import torch
+import toy_env
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.data import PrioritizedSampler, SamplerWithoutReplacement
@@ -431,7 +432,7 @@ def test_a_ring_in_ram_carries_its_content_in_the_state(tmp_path: Path) -> None:
 def test_a_killed_process_leaves_a_ring_that_restores_and_half_a_file_that_any_replay_replaces(tmp_path: Path) -> None:
     program = f"""
         import os, signal, sys, torch
-        sys.path.insert(0, {str(Path(__file__).parent)!r})
+        sys.path[:0] = [{str(Path(__file__).parent)!r}, {str(Path(toy_env.__file__).parent)!r}]
         from test_replay import Driver, small, storage
         driver = Driver(small(path={str(tmp_path / "ring")!r}, slack=10)).write(50)
         torch.save((driver.replay.state_dict(), driver.replay[:].clone().to_dict()), {str(tmp_path / "state.pt")!r})

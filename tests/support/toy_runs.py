@@ -92,7 +92,7 @@ def pretend_cpu(flags: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> 
 
 def python(code: str) -> subprocess.CompletedProcess[str]:
     """Run a program that may import these tests' modules."""
-    path = os.pathsep.join([str(HERE), str(HERE.parent / "data"), *sys.path])
+    path = os.pathsep.join([str(HERE), str(HERE.parent / "training"), *sys.path])
     environment = {**os.environ, "PYTHONPATH": path}
     command = [sys.executable, "-c", code]
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
