@@ -41,7 +41,7 @@ class Domain:
     action_repeat: int = 1  #: env steps per agent step; others can be asked for if ``make`` takes it as an argument
     camera: int | str | None = 0  #: index or name of the camera; ``None`` leaves it to the environment
     make: Callable[..., EnvBase] | None = None
-    episode_env_steps: int | None = None  #: of a full episode; if ``None``, the time limit is 1000 agent steps
+    episode_env_steps: int | None = None  #: after which an episode is truncated; if ``None``, after 1000 agent steps
     source: Literal["suite", "manipulation", "gymnasium", "own"] = "own"  #: library of ``task``
 
     def __post_init__(self) -> None:

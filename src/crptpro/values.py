@@ -16,12 +16,21 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
+from crptpro.errors import CRPTproError
+
 Quality = Literal["exact", "fast"]
 Colors = Literal["normal", "reversed_background", "reversed_image"]
 """Both are explained by :func:`crptpro.envs.make_env`."""
 
 MAX_SEED = 2**32 - 1
 """NumPy's largest."""
+
+
+def check_choices(**given: str) -> None:
+    """Refuse a ``quality`` or ``colors`` that does not exist, with a ``CRPTproError``."""
+    for name, value in given.items():
+        if value not in (allowed := get_args({"quality": Quality, "colors": Colors}[name])):
+            raise CRPTproError(f"{name} must be {' or '.join(map(repr, allowed))}, got {value!r}.")
 
 
 def as_int(value: Any, name: str, *, minimum: int | None = None, maximum: int | None = None) -> int:

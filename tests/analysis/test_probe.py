@@ -170,3 +170,9 @@ def test_a_coordinate_predicted_worse_than_by_a_constant_counts_as_unknown() -> 
     result = fit(torch.randn(240, 30), torch.randn(240, 6))
     assert min(result.positions.values()) < 0
     assert 0 <= result.position_r2 < 0.2
+
+
+def test_counts_are_taken_as_they_are_meant(dataset: FrameDataset) -> None:
+    assert len(probe_samples(dataset, samples=4e1, frame_stack=np.int64(3)).pixels) == 40  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="`samples` must be at least 1, got -5"):
+        probe_samples(dataset, samples=-5)

@@ -171,6 +171,17 @@ def test_an_environment_that_fails_is_named_with_its_cause_and_does_not_block_th
     assert len(FrameDataset.open(collect_random(repaired, tmp_path, transitions=5, **SMALL))) == 5
 
 
+def test_a_domain_that_cannot_be_built_is_refused_before_the_others_are_collected(tmp_path: Path) -> None:
+    def no_camera(*, seed: int, image_size: int) -> ToyEnv:
+        raise ValueError("there is no camera")
+
+    with pytest.raises(EnvCrashedError, match="there is no camera"):
+        collect_group([FIXED, Domain("blind", "blind_go", make=no_camera)], tmp_path, transitions=5, **SMALL)
+    with pytest.raises(CRPTproError, match="colors must be"):
+        collect_group([FIXED], tmp_path, transitions=5, colors="blue", **SMALL)
+    assert not list(tmp_path.rglob("*.memmap"))
+
+
 def test_a_process_that_dies_gives_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(WorkerLostError, match=r"episode 0 of toy-dying has died.*use fewer workers.*run the same"):
         collect_random(DYING, tmp_path, transitions=50, workers=2, **SMALL)

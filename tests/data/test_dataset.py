@@ -341,3 +341,10 @@ def test_a_dataset_takes_21_kb_per_transition(tmp_path: Path) -> None:
     path = write_dataset(tmp_path, [random_episode(100, size=84)])
     size = sum(file.stat().st_size for file in path.rglob("*.memmap"))
     assert size / 100 < 1.01 * (3 * 84 * 84) + 100
+
+
+def test_what_an_unfinished_dataset_does_not_have_yet_is_refused(tmp_path: Path) -> None:
+    unfinished = FrameDataset.create(tmp_path, domain="mine", transitions=10)
+    for name in ("domain", "image_size", "frames", "transitions"):
+        with pytest.raises(DatasetError, match="complete"):
+            getattr(unfinished, name)

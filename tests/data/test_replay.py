@@ -496,6 +496,39 @@ def test_a_stored_replay_shows_only_what_the_last_writer_of_its_directory_stored
     assert shown(stored) == [[2 * episode] * 3 for episode in range(10)]
 
 
+def test_a_stored_replay_shows_no_frame_of_an_abandoned_branch(tmp_path: Path) -> None:
+    replay = small(path=tmp_path, slack=60)
+    driver = Driver(replay, 1000).write(100)
+    state = replay.state_dict()
+    driver.write(30)
+    reopened = small(path=tmp_path, slack=60)
+    reopened.load_state_dict(state)
+    Driver(reopened, 1000).write(1)  # another episode than that of the abandoned frames
+    newest = [stack[-1] for stack in shown(StoredReplay(tmp_path))]
+    assert newest == [*range(newest[0], 100), 0]
+
+
+def test_a_cut_after_which_another_episode_begins_with_the_same_picture_is_seen() -> None:
+    shown = [[1, 1, 1], [1, 1, 2], [1, 2, 3], [2, 3, 1]], [[1, 1, 1], [1, 1, 4], [1, 4, 5], [4, 5, 6]]
+    stacks = [torch.tensor(each, dtype=torch.uint8) for each in shown]
+    replay = small(frame_stack=3)
+    pixels = [each.repeat_interleave(3, 1)[..., None, None].expand(-1, -1, 2, 2) for each in stacks]
+    for observed in pixels:
+        end = torch.zeros(3, 1, dtype=torch.bool)
+        following = {"pixels": observed[1:], "reward": torch.zeros(3, 1), "done": end, "terminated": end}
+        replay.extend(TensorDict({"pixels": observed[:-1], "action": torch.zeros(3, 1), "next": following}, [3]))
+    assert torch.equal(replay[:]["pixels"], torch.cat([each[:-1] for each in pixels]))
+
+
+def test_a_state_of_other_columns_is_refused() -> None:
+    replay = small()
+    for columns, message in (({"code": ((2,), torch.float32)}, "code"), ({"code": ((3,), torch.float32)}, "code is")):
+        other = small(extra_columns=columns)
+        with pytest.raises(CheckpointError, match=message):
+            other.load_state_dict(replay.state_dict())
+        replay = small(extra_columns=columns)
+
+
 def test_what_is_no_stored_replay_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"absent/number.memmap is missing"):
         StoredReplay(tmp_path / "absent")

@@ -132,6 +132,17 @@ def test_an_endless_environment_is_truncated_and_starts_again(truncates: bool, m
     assert make_env(limited, seed=0, image_size=8).rollout(50).shape == (12,)
 
 
+def test_an_episode_ends_after_the_env_steps_of_its_domain() -> None:
+    endless = Domain("endless", "endless_go", make=lambda **_: PlainEnv(length=60), episode_env_steps=10)
+    rollout = make_env(endless, seed=0, image_size=8).rollout(60)
+    assert len(rollout) == 10
+    assert rollout["next", "truncated"][-1]
+
+
+def test_a_partial_of_a_class_is_given_what_the_class_names() -> None:
+    assert len(make_env(own(functools.partial(PlainEnv)), seed=0, image_size=8).rollout(2)) == 2
+
+
 def test_agent_steps_are_counted_by_what_a_domain_repeats() -> None:
     repeating, endless = own(make_chw, action_repeat=np.int64(4), episode_env_steps=2e1), own(make_chw)
     assert resolve_action_repeat(endless) == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import signal
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,20 @@ def test_a_domain_whose_name_is_no_path_is_explored_and_resumed(tmp_path: Path) 
     run("apt-s", tmp_path, [toy_domain("a/b:c")], env_steps=20)
     assert (tmp_path / "replay" / "a-b-c").is_dir()
     assert run("apt-s", tmp_path, [toy_domain("a/b:c")], env_steps=20).training["datasets"][0]["domain"] == "a/b:c"
+
+
+def test_a_run_that_was_killed_before_its_first_checkpoint_begins_again_in_the_space_that_it_holds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(SystemExit):
+        run("apt-s", tmp_path, [toy_domain("left", on_step=lambda count: count == 6 and sys.exit(1))])
+
+    def held() -> int:
+        return sum(file.stat().st_size for file in tmp_path.glob("replay/*/*"))
+
+    usage, disk = shutil.disk_usage(tmp_path), int(1.9 * held())
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=disk - held()))
+    assert run("apt-s", tmp_path, [LEFT]).env_steps == 112
 
 
 def test_a_finished_run_gives_its_result_again_without_its_replays(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from crptpro.data.storage import gather_stacks, stack_rows
 from crptpro.errors import DatasetError
 from crptpro.objectives.functional import mean_pairwise_cosine
 from crptpro.seeding import derive_seed
+from crptpro.values import as_int
 
 HELD_OUT = 0.25
 """Fraction of the episodes that is held out, and of the other episodes that choose the penalty."""
@@ -74,6 +75,8 @@ def probe_samples(
     Raises:
         DatasetError: there is no physical state, or too few episodes or samples to split.
     """
+    samples = as_int(samples, "samples", minimum=1)
+    frame_stack = dataset.frame_stack if frame_stack is None else as_int(frame_stack, "frame_stack", minimum=1)
     if "qpos" not in dataset.frames or "qvel" not in dataset.frames:
         raise DatasetError(f"The dataset of {dataset.domain!r} stores no physical state (qpos, qvel).")
     transitions = dataset.transitions
@@ -95,7 +98,7 @@ def probe_samples(
     position_names, positions = position_coordinates(dataset.frames["qpos"][row], joints)
     velocity_names, velocities = velocity_coordinates(dataset.frames["qvel"][row], joints)
     names = [("position", name) for name in position_names] + [("velocity", name) for name in velocity_names]
-    rows = stack_rows(row, step, frame_stack or dataset.frame_stack)
+    rows = stack_rows(row, step, frame_stack)
     pixels = gather_stacks(dataset.frames["pixels"], rows)
     targets = torch.cat([positions, velocities], 1)
     return ProbeSamples(pixels, targets, names, train, validation, test, held_out)

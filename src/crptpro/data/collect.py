@@ -29,7 +29,7 @@ from crptpro.envs.rendering import backend_card, select_backend
 from crptpro.errors import CRPTproError, DatasetError, RenderingError, WorkerLostError
 from crptpro.progress import Progress
 from crptpro.seeding import derive_seed, kept_global_rng
-from crptpro.values import MAX_SEED, Colors, Quality, as_int, as_path
+from crptpro.values import MAX_SEED, Colors, Quality, as_int, as_path, check_choices
 from crptpro.workers import SPAWN, Inline, WorkerPool, can_be_sent
 
 logger = logging.getLogger(__name__)
@@ -96,6 +96,7 @@ def collect_group(
     transitions = as_int(transitions, "transitions", minimum=1)
     workers, seed = as_int(workers, "workers", minimum=1), as_int(seed, "seed", minimum=0, maximum=MAX_SEED)
     root, image_size = as_path(root, "root"), as_int(image_size, "image_size", minimum=1)
+    check_choices(quality=quality, colors=colors)
     paths: dict[str, Path] = {}
     jobs: list[_Job] = []
     with ExitStack() as stack:
@@ -120,6 +121,8 @@ def collect_group(
             if any(needs_gl(job.domain) for job in jobs):
                 # Checked once, for as many renderers as will run: some drivers hang when several start together.
                 select_backend(processes=workers)
+            for job in jobs:  # what cannot be built is refused before hours of the others
+                job.make(render=False).close()
             for job in jobs:
                 job.writer.note_rendering(backend_card() if needs_gl(job.domain) else {})
                 _collect(job, seed, workers, progress)
@@ -152,7 +155,7 @@ class _Job(NamedTuple):
     domain: Domain
     dataset: FrameDataset
     writer: Any  # of the dataset
-    make: Callable[[], EnvBase]
+    make: Callable[..., EnvBase]
     length: int | None  # agent steps of an episode, if known
 
 

@@ -38,13 +38,15 @@ class FrameDataset(ReplayBuffer):
     - ``action`` float32 ``[B, A]``, ``("next", "reward")`` float32 ``[B, 1]``,
       ``("next", "done" | "terminated" | "truncated")`` bool ``[B, 1]``;
     - ``index``, ``episode``, ``step`` in the episode, and ``number``, ``("next", "number")``: the rows of the
-      observations' newest frames, which :meth:`observations` reads.
+      observations' newest frames.
 
     Frames are mapped from disk without write access: processes may share a dataset, and threads an object.
     :meth:`open` reads a finished dataset; :meth:`create` begins or continues one, and ``extend`` fills it with what
-    :class:`~crptpro.data.FrameReplay` takes, but each episode must begin at its reset::
+    :class:`~crptpro.data.FrameReplay` takes, but each episode must begin at its reset. A program that continues one
+    draws other episodes than before if it seeds by the number of those that are there::
 
         dataset = FrameDataset.create("data/mine", domain="mine", transitions=10_000)
+        torch.manual_seed(env.set_seed(dataset.writer.episodes))
         for rollout in Collector(env, RandomPolicy(env.full_action_spec), frames_per_batch=100, total_frames=-1):
             dataset.extend(rollout)
             if dataset.is_complete:
@@ -118,7 +120,7 @@ class FrameDataset(ReplayBuffer):
 
     @property
     def domain(self) -> str:
-        return self.card["domain"]
+        return self._complete.card["domain"]
 
     @property
     def frame_stack(self) -> int:
@@ -127,17 +129,22 @@ class FrameDataset(ReplayBuffer):
     @property
     def image_size(self) -> int:
         """H = W of a frame, pixels."""
-        return self._storage.pixels.shape[-1]
+        return self._complete.pixels.shape[-1]
 
     @property
     def frames(self) -> TensorDictBase:
         """All frame rows, TensorDict ``[F]``: ``pixels`` uint8 ``[F, C, H, W]``, float64 ``qpos`` and ``qvel``."""
-        return self._storage.frames
+        return self._complete.frames
 
     @property
     def transitions(self) -> TensorDictBase:
         """All transition rows without pixels, TensorDict ``[N]``."""
-        return self._storage.transitions
+        return self._complete.transitions
+
+    @property
+    def _complete(self) -> FrameStorage:
+        self._storage.require_complete()
+        return self._storage
 
 
 class FrameStorage(StackStorage):
@@ -184,12 +191,12 @@ class FrameStorage(StackStorage):
         self.step[self.transitions["row"] + 1] = self.transitions["step"] + 1
 
     def columns_at(self, index: Tensor, **how: Any) -> TensorDict:
-        self._require_complete()
+        self.require_complete()
         columns = self.transitions.apply(lambda column: column.index_select(0, index), batch_size=index.shape)
         number = columns.pop("row")
         return columns.set("number", number).set(("next", "number"), number + 1)
 
-    def _require_complete(self) -> None:
+    def require_complete(self) -> None:
         if not self.card:
             raise DatasetError(f"{self.path} is being collected: it can be read once it is complete.")
 
@@ -204,7 +211,7 @@ class FrameStorage(StackStorage):
         _require_request(self.path, self.state_dict(), state_dict)
 
     def __reduce__(self) -> Any:
-        self._require_complete()
+        self.require_complete()
         return FrameStorage, (self.path, self.frame_stack, str(self.device))
 
 
@@ -261,7 +268,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
         rows = read_rows(data, channels=channels, frame_stack=frame_stack, extra=extra, what="A dataset")
         if (size := self.request.get("image_size")) not in (None, rows.following.shape[-1]):
             raise DatasetError(f"{self.path} is of image_size {size}, got frames {list(rows.following.shape[1:])}.")
-        last = self._pending[-1].following[-1] if self._pending else None
+        last = self._pending[-1].last_stack if self._pending else None
         for begins, part in rows.part(0, self.missing).pieces(last):
             if begins:
                 self.end_episode()
@@ -324,9 +331,9 @@ class EpisodeWriter(ImmutableDatasetWriter):
 
     def _pending_columns(self) -> dict[str, Tensor]:
         """Return the rows of the running episode by file."""
-        parts = self._pending
+        parts, channels = self._pending, self._pending[0].following.shape[1]
         rows = {name: torch.cat([part.columns[name] for part in parts]) for name in parts[0].columns}
-        columns = {"frames/pixels": torch.cat([parts[0].newest[:1], *(part.following for part in parts)])}
+        columns = {"frames/pixels": torch.cat([parts[0].stacks[:1, -channels:], *(part.following for part in parts)])}
         for name in ("qpos", "qvel"):
             if name in rows:
                 columns[f"frames/{name}"] = torch.cat([rows[name], rows["next", name][-1:]]).double()

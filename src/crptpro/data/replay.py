@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, PrioritizedSampler, RandomSampler, ReplayBuffer
 
-from crptpro.data.storage import RingStorage, StackStorage, map_rows, read_rows
+from crptpro.data.storage import RingStorage, StackStorage, map_rows, read_rows, stack_rows
 from crptpro.errors import DatasetError
 from crptpro.values import as_int, as_path
 
@@ -155,9 +155,10 @@ class StoredReplay(StackStorage):
     def __init__(self, path: str | Path, *, frame_stack: int = 3) -> None:
         path = as_path(path)
         self.frame_stack = frame_stack = as_int(frame_stack, "frame_stack", minimum=1)
-        number, row_of = (map_rows(path / f"{name}.memmap", torch.int64, ()) for name in ("number", "row_of"))
-        self.step = map_rows(path / "step.memmap", torch.int32, ())
+        number = map_rows(path / "number.memmap", torch.int64, ())
         rows = len(number)
+        row_of = map_rows(path / "row_of.memmap", torch.int64, (), rows)
+        self.step = map_rows(path / "step.memmap", torch.int32, (), rows)
         size = math.isqrt(len(map_rows(path / "pixels.memmap", torch.uint8, ())) // (3 * rows))
         self.pixels = map_rows(path / "pixels.memmap", torch.uint8, (3, size, size), rows)
         # `number` counts from 1. Transitions that were overwritten, and rows never written (0), point elsewhere.
@@ -165,7 +166,10 @@ class StoredReplay(StackStorage):
         oldest = max(0, end - rows)
         starts = torch.cat([row_of[:1], row_of[row_of > 0]]).unique()
         starts = starts[(starts >= oldest) & (starts + 1 < end)]
-        self._starts = starts[starts - self.step[starts % rows].clamp(max=frame_stack - 1) >= oldest]
+        starts = starts[starts - self.step[starts % rows].clamp(max=frame_stack - 1) >= oldest]
+        # After a checkpoint was loaded, rows that are not overwritten yet belong to an abandoned branch.
+        held = stack_rows(starts, self.step[starts % rows], frame_stack)
+        self._starts = starts[(number[held % rows] == held + 1).all(1)]
         if not len(self._starts):
             raise DatasetError(f"The replay in {path} has no transition.")
         super().__init__(len(self._starts))

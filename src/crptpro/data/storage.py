@@ -68,8 +68,9 @@ class Rows(NamedTuple):
     columns: dict[NestedKey, Tensor]  # [T, ...]: action, reward, done, terminated, truncated, ...
 
     @property
-    def newest(self) -> Tensor:
-        return self.stacks[:, -self.following.shape[1] :]
+    def last_stack(self) -> Tensor:
+        """The stack that the last transition leads to, as far as it is given."""
+        return torch.cat([self.stacks[-1, self.following.shape[1] :], self.following[-1]])
 
     def part(self, first: int, end: int) -> Rows:
         columns = {name: values[first:end] for name, values in self.columns.items()}
@@ -78,13 +79,17 @@ class Rows(NamedTuple):
     def pieces(self, last: Tensor | None) -> Iterator[tuple[bool, Rows]]:
         """Split where episodes begin; yields whether a piece begins one, and its rows.
 
-        A row continues the one before, or the running episode of newest frame ``last``, if that was not done and led to
-        the frame that this one begins with.
+        A row continues the one before, or the running episode of newest stack ``last``, if that was not done and led to
+        the stack that this one begins with.
         """
-        newest, length = self.newest, len(self.following)
-        starts = [0] if last is None or not torch.equal(newest[:1], last.unsqueeze(0)) else []
+        channels, length = self.following.shape[1], len(self.following)
+        starts = [0]
+        if last is not None and length:
+            known = min(len(last), self.stacks.shape[1])
+            starts = [] if torch.equal(self.stacks[0, -known:], last[-known:]) else [0]
         if length > 1:
-            begins = (newest[1:] != self.following[:-1]).flatten(1).any(1) | self.columns["done"][:-1, 0]
+            ahead = torch.cat([self.stacks[:-1, channels:], self.following[:-1]], 1)
+            begins = (self.stacks[1:] != ahead).flatten(1).any(1) | self.columns["done"][:-1, 0]
             starts += (1 + begins.nonzero().squeeze(-1)).tolist()
         for first, end in itertools.pairwise(sorted({0, *starts, length})):
             yield first in starts, self.part(first, end)
@@ -260,7 +265,7 @@ class RingStorage(StackStorage):
         numbers = [torch.empty(0, dtype=torch.int64, device="cpu")]
         for begin in range(0, len(rows.following), self.max_size):
             part = rows.part(begin, begin + self.max_size)
-            last = self.pixels[(self.frames - 1) % self.rows] if self.is_open else None
+            last = self._stacks(torch.tensor([self.frames - 1], device="cpu"))[0] if self.is_open else None
             numbers += [self._write_piece(piece, begins=begins) for begins, piece in part.pieces(last)]
         return torch.cat(numbers)
 
@@ -378,8 +383,12 @@ class RingStorage(StackStorage):
                 f"The replay's checkpoint has {rows} rows, {window} of them in use; this replay has {self.rows} and "
                 f"{self.window}. Use the capacity and slack it was written with."
             )
-        if "content" in state_dict:
-            for name, column in state_dict["content"].items():
+        if (content := state_dict.get("content")) is not None:
+            for name in {*content, *self.content}:
+                found = [tuple(each[name].shape[1:]) if name in each else "absent" for each in (content, self.content)]
+                if found[0] != found[1]:
+                    raise CheckpointError(f"{name} is {found[0]} in the replay's checkpoint, and here {found[1]}.")
+            for name, column in content.items():
                 self.content[name][: len(column)] = column
         else:
             self._require_rows(counters["frames"], counters["branch"])

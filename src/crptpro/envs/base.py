@@ -73,7 +73,7 @@ class CheckedEnv:
         with passed_on(self._name, "step"):
             found: TensorDictBase = super()._step(tensordict)  # type: ignore[misc]
         self._require_finite(found, "returned", "reward", "qpos", "qvel")
-        if self._agent_step == self.agent_step_limit:
+        if self._agent_step == self.agent_step_limit and not found.get("done").any():
             for flag in ("truncated", "done"):
                 found.set(flag, torch.ones_like(found.get(flag)))
         self._is_still = self._is_still and torch.equal(found.get("pixels"), self._first_frame)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import logging
-from typing import Any, get_args
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -16,7 +16,7 @@ from crptpro.domains import GYMNASIUM_PREFIX, LONGEST_EPISODE_AGENT_STEPS, Domai
 from crptpro.envs.base import CheckedEnv, passed_on, read_frame
 from crptpro.envs.rendering import select_backend
 from crptpro.errors import CRPTproError
-from crptpro.values import MAX_SEED, Colors, Quality, as_int
+from crptpro.values import MAX_SEED, Colors, Quality, as_int, check_choices
 
 logger = logging.getLogger(__name__)
 
@@ -68,9 +68,7 @@ def make_env(
         "image_size": as_int(image_size, "image_size", minimum=1), "camera": domain.camera, "quality": quality,
         "action_repeat": resolve_action_repeat(domain, action_repeat), "physics_state": physics_state,
     }  # fmt: skip
-    for name, value, allowed in (("quality", quality, get_args(Quality)), ("colors", colors, get_args(Colors))):
-        if value not in allowed:
-            raise CRPTproError(f"{name} must be {' or '.join(map(repr, allowed))}, got {value!r}.")
+    check_choices(quality=quality, colors=colors)
     is_dm_control = domain.source in ("suite", "manipulation")
     reverses_background = colors == "reversed_background"
     if reverses_background and not is_dm_control:
@@ -91,7 +89,7 @@ def make_env(
         from crptpro.envs.gymnasium import make_gymnasium
 
         base = make_gymnasium(domain.task, render=render, **settings)
-    limit = LONGEST_EPISODE_AGENT_STEPS if domain.episode_env_steps is None else None
+    limit = episode_length(domain, action_repeat=action_repeat) or LONGEST_EPISODE_AGENT_STEPS
     base.watch(domain.task, agent_step_limit=limit, checks_frames=render or domain.source == "own")
     transforms: list[Transform] = []
     if colors == "reversed_image":
@@ -198,10 +196,12 @@ def _own(domain: Domain, **settings: Any) -> EnvBase:
 
 def _named_by(make: Any, settings: dict[str, Any]) -> dict[str, Any]:
     """Return the settings that ``make`` names and that no ``partial`` has bound."""
+    bound = set(getattr(make, "keywords", ()))
+    function = getattr(make, "func", make)
     # TorchRL's metaclass hides the signature of an environment's constructor.
-    parameters = inspect.signature(make.__init__ if inspect.isclass(make) else make).parameters
+    parameters = inspect.signature(function.__init__ if inspect.isclass(function) else make).parameters
     takes_all = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
-    wanted = {name for name in settings if takes_all or name in parameters} - set(getattr(make, "keywords", ()))
+    wanted = {name for name in settings if takes_all or name in parameters} - bound
     return {name: value for name, value in settings.items() if name in wanted}
 
 

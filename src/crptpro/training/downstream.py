@@ -310,8 +310,10 @@ def _make_agent(
 def _make_replay(
     run: Run, task: str | Domain, env: EnvBase, config: Any, generator: torch.Generator, *, is_complete: bool
 ) -> FrameReplay:
-    """Return the replay below the run's directory; a complete run needs none."""
-    path = None if run.run_dir is None or is_complete else run.run_dir / "replay"
+    """Return the replay below the run's directory; a complete run needs none, and gets one of a transition."""
+    if is_complete:
+        return make_replay(run, None, env, 1, generator=generator)
+    path = None if run.run_dir is None else run.run_dir / "replay"
     if path is not None and run.saved and not path.exists():
         raise CheckpointError(
             f"{run.run_dir} has done {run.saved['position']:,} env steps; to continue it needs its frames, and {path} "

@@ -72,7 +72,7 @@ def make_replay(run: Run, path: Path | None, env: EnvBase, capacity: int, **opti
     """Return the replay of an environment, in ``path`` or in RAM."""
     channels, height, width = env.observation_spec["pixels"].shape
     if path is not None and not run.saved:
-        for file in path.glob("*.memmap"):  # of an attempt without a checkpoint
+        for file in path.glob("*.memmap*"):  # of an attempt without a checkpoint
             file.unlink()
     return FrameReplay(
         capacity,

@@ -219,7 +219,9 @@ def pretrain_active(
         if run.run_dir is not None and not run.saved:
             needed = len(named) * (capacity + slack) * 3 * getattr(loss.encoder, "image_size", 84) ** 2
             logger.info("replays: %.2f GB in %s; they are kept", needed / 1e9, run.run_dir / "replay")
-            require_disk(run.run_dir, needed, "The replays of the domains")
+            # Those of an attempt without a checkpoint are replaced.
+            held = sum(file.stat().st_size for file in (run.run_dir / "replay").rglob("*.memmap*"))
+            require_disk(run.run_dir, max(0, needed - held), "The replays of the domains")
         recipe = dataclasses.replace(recipe, learning_rate=settings.learning_rate, updates=plan.encoder_updates)
         optimizer, schedule, targets = make_optimizer(loss, recipe)
         monitor = CollapseMonitor.of(loss)
@@ -311,7 +313,9 @@ class Explorer:
         # A finished run needs neither its replay, which may have been deleted, nor its last episode.
         self._is_finished = bool(run.saved.get("is_finished"))
         path = None if run.run_dir is None else dataset_path(run.run_dir / "replay", name)
-        self.replay = self._make_replay(run, None if self._is_finished else path, capacity, slack)
+        if self._is_finished:
+            path, capacity, slack = None, self.exploration.n_step, 0
+        self.replay = self._make_replay(run, path, capacity, slack)
         self._parts = {**self.learner.components(), "reward": self.reward, "generators": self.generators}
         if not self._is_finished:
             self._parts["replay"] = self.replay

@@ -187,11 +187,15 @@ class DenseShiftFeatures(Transform):
 
     def forget(self) -> None:
         """Drop all maps, and give their memory back."""
-        # That of the replay, so that no observation is overwritten between its draw and its use.
-        self._lock = getattr(self.replay, "_replay_lock", None) or threading.RLock()
+        self._own_lock = threading.RLock()
         self._held = torch.full((self.observations,), -1, dtype=torch.int64, device="cpu")
         self._maps: Tensor | None = None
         self._embeddings: Tensor | None = None
+
+    @property
+    def _lock(self) -> Any:
+        """The replay's lock, so that no observation is overwritten between its draw and its use."""
+        return getattr(self.replay, "_replay_lock", None) or self._own_lock
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -268,7 +272,7 @@ class DenseShiftFeatures(Transform):
         return copy
 
     def __getstate__(self) -> dict[str, Any]:
-        derived = ("_lock", "_held", "_maps", "_embeddings")
+        derived = ("_own_lock", "_held", "_maps", "_embeddings")
         return {key: value for key, value in super().__getstate__().items() if key not in derived}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
