@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from crptpro.directory_lock import DirectoryLock
+from crptpro.directory_lock import DirectoryLock, locked
 from crptpro.errors import CRPTproError, DatasetError
 from crptpro.logging import RunLogger
 
@@ -38,7 +38,7 @@ def test_a_released_directory_may_be_taken_again(tmp_path: Path, monkeypatch: py
     DirectoryLock(tmp_path / "new").release()
 
 
-@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOTSUP])
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS])
 def test_a_file_system_without_locks_is_not_taken_for_another_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, number: int
 ) -> None:
@@ -48,7 +48,9 @@ def test_a_file_system_without_locks_is_not_taken_for_another_process(
     monkeypatch.setattr(fcntl, "flock", no_locks)
     with DirectoryLock(tmp_path), DirectoryLock(tmp_path):
         pass
-    assert "cannot be locked" in caplog.text
+    with locked(tmp_path / "a"), locked(tmp_path / "a"):
+        pass
+    assert caplog.text.count("cannot be locked") == 4
 
 
 def test_a_directory_that_cannot_be_made_is_named(tmp_path: Path) -> None:

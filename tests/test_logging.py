@@ -167,7 +167,7 @@ def test_a_process_killed_while_logging_leaves_whole_rows_and_a_torn_last_one_is
 
 def test_a_full_disk_is_one_clear_error_without_half_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class HalfFile(io.FileIO):
-        def __init__(self, path: Path, mode: str, encoding: str) -> None:
+        def __init__(self, path: Path, mode: str, encoding: str = "") -> None:
             super().__init__(path, mode)
 
         def write(self, text: Any) -> int:

@@ -324,6 +324,8 @@ def test_an_unregistered_method_cannot_be_finetuned(saved: Path, data: Path) -> 
     edit_card(saved, lambda card: card.update(method="somebody-elses"))
     with pytest.raises(PretrainedError, match="not a registered method"):
         finetune(saved, data, updates=1)
+    with pytest.raises(PretrainedError, match="random-encoder was not trained by a loss"):
+        finetune(random_pretrained(**TINY), data, updates=1)
 
 
 # --- networks of one's own --------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import select
@@ -25,7 +26,11 @@ class _BarFriendlyHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         prefix = "" if record.levelno <= logging.INFO else f"{record.levelname.lower()}: "
-        tqdm.write(prefix + self.format(record), file=sys.stderr)
+        try:
+            tqdm.write(prefix + self.format(record), file=sys.stderr)
+        except OSError as reason:
+            if reason.errno != errno.EIO:  # of a terminal that was closed while the program goes on
+                raise
 
 
 def configure_logging() -> None:

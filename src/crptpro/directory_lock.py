@@ -1,9 +1,12 @@
-"""One writer per directory: a lock that ends with its process, however it ends."""
+"""Locks that end with their process, however it ends."""
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -13,6 +16,37 @@ from crptpro.values import as_path
 
 _LOG = logging.getLogger(__name__)
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
+
+
+@contextlib.contextmanager
+def locked(path: Path, *, poll_interval: float = 0.05) -> Iterator[None]:
+    """Wait for a lock file, and hold it; a file system without locks is announced."""
+    lock = FileLock(path, fallback_to_soft=False)  # a soft lock would outlive a kill
+    try:
+        lock.acquire(timeout=1e9, poll_interval=poll_interval)
+    except OSError as reason:
+        _announce(path, reason)
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@contextlib.contextmanager
+def refusal_leaves_nothing(directory: Path | None) -> Iterator[None]:
+    """Remove a directory that was made meanwhile, if an error leaves nothing but a lock in it."""
+    is_new = directory is not None and not directory.exists()
+    try:
+        yield
+    except Exception:
+        if (
+            directory is not None
+            and is_new
+            and directory.exists()
+            and {p.name for p in directory.iterdir()} <= {".lock"}
+        ):
+            shutil.rmtree(directory)
+        raise
 
 
 class DirectoryLock:
@@ -27,7 +61,7 @@ class DirectoryLock:
         self._lock: FileLock | None = None
         try:
             path.mkdir(parents=True, exist_ok=True)
-            lock = FileLock(path.resolve() / ".lock", is_singleton=True, thread_local=False)
+            lock = FileLock(path.resolve() / ".lock", is_singleton=True, thread_local=False, fallback_to_soft=False)
             if lock.is_locked and not is_reentrant:
                 raise error(f"This process is already writing to {path}: close it first, e.g. dataset.writer.close().")
             lock.acquire(blocking=False)
@@ -39,7 +73,7 @@ class DirectoryLock:
         except OSError as reason:
             if reason.errno not in _NO_LOCKS:
                 raise error(f"{path} cannot be written: {reason}.") from reason
-            _LOG.warning("%s cannot be locked (%s): make sure that no two processes write to it.", path, reason)
+            _announce(path, reason)
 
     def release(self) -> None:
         if self._lock is not None:
@@ -51,3 +85,9 @@ class DirectoryLock:
 
     def __exit__(self, *_: object) -> None:
         self.release()
+
+
+def _announce(path: Path, reason: OSError) -> None:
+    if reason.errno not in _NO_LOCKS:
+        raise reason
+    _LOG.warning("%s cannot be locked (%s): make sure that no two processes write to it.", path, reason)

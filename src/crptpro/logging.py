@@ -140,9 +140,7 @@ class RunLogger:
 
     def state_dict(self, streams: Iterable[str]) -> dict[str, int]:
         """Return the number of rows per stream, synced to disk, for a checkpoint."""
-        if self.path.exists():
-            with open(self.path, "rb") as file:
-                os.fsync(file.fileno())
+        self._sync()
         return {name: len(self.rows(name)) for name in streams}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
@@ -185,6 +183,8 @@ class RunLogger:
         self._mirrors = [mirror for mirror in self._mirrors if "logger" in vars(mirror)]  # that have begun
         self._mirror(lambda mirror: mirror.close())
         self._mirrors = []
+        if self._has_begun:
+            self._sync()
         self._lock.release()
 
     def _read(self) -> list[dict[str, Any]]:
@@ -212,6 +212,12 @@ class RunLogger:
         elif not path.exists() or path.read_bytes() != content.encode():
             write_whole(path, content)
         self._columns[stream] = columns
+
+    def _sync(self) -> None:
+        for path in (self.path, *(self.run_dir / f"{stream}.csv" for stream in self._columns)):
+            if path.exists():
+                with open(path, "rb") as file:
+                    os.fsync(file.fileno())
 
     def _mirror(self, call: Callable[[_Wandb | _TensorBoard], None]) -> None:
         for mirror in list(self._mirrors):
@@ -244,7 +250,7 @@ class _Wandb:
             "config": self.config,
             "id": _wandb_id(self.run_dir),
             "reinit": "create_new",
-            "settings": {"silent": True, "console": "off", "init_timeout": 60.0},
+            "settings": {"silent": True, "console": "off", "init_timeout": 60.0, "finish_timeout": 60.0},
             "log_env_packages": False,
             **self.options,
         }

@@ -106,6 +106,8 @@ class Pretrained:
                 f"The artifact was trained with {self.method!r}, which is not a registered method. Call "
                 "crptpro.objectives.register_method for its loss first."
             ) from reason
+        if method.loss_class is None:
+            raise PretrainedError(f"{self.method} was not trained by a loss: there is nothing to train further.")
         networks = copy.deepcopy(self._networks())
         heads = {name: networks[name] for name in HEADS if name in networks}
         for module in (networks["encoder"], *heads.values()):

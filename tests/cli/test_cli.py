@@ -231,6 +231,11 @@ def test_an_encoder_and_the_control_are_probed_with_table_and_csv(call: Call, da
     (("pretrain", "--method", "becl"), r"at least one domain, task or group \(A, B, C, D\)"),
     (("pretrain", "A", "--method", "apt-s"), r"one domain, got 3 \(cheetah, walker, quadruped\)"),
     (("pretrain", TASK, "--method", "proto-rl-c", "--queue-size", "7"), r"queue_size.* multiple"),
+    (("pretrain", "A", "--method", "apt-c", "--encoder", "widht=1"), r"An encoder has no option widht; it has "),
+    (("pretrain", "A", "--method", "apt-c", "--encoder", "channels=32"), r"channels and strides must be sequences"),
+    (("pretrain", "A", "--method", "proto-rl-c", "--loss", "offset=abc"), r"`offset` must be a number, got 'abc'"),
+    (("pretrain", "A", "--method", "proto-rl-c", "--loss", "temperature=None"), r"`temperature` must be a number"),
+    (("downstream", TASK, "--pretrained", "drq", "--initial-temperature", "0"), r"`initial_temperature` must be pos"),
     (("finetune", "absent", "absent"), r"absent"),
     (("downstream", "walker_rum", "--pretrained", "random-encoder"), r"'walker_rum'\. Nearest: walker_run"),
     (("downstream", TASK, "--pretrained", "absent"), r"absent does not exist"),
@@ -273,7 +278,7 @@ def test_datasets_that_do_not_fit_are_refused(call: Call, dataset: Path, encoder
     line = refused(call("pretrain", dataset, other, "--out", "out"))
     assert f"{dataset} has 16 px" in line
     assert f"{other} has 18 px" in line
-    assert "image_size 16, not 18" in refused(call("finetune", encoder, other, "--out", "out"))
+    assert "as (9, 18, 18); the encoder takes (9, 16, 16)" in refused(call("finetune", encoder, other, "--out", "out"))
     file = next(dataset.rglob("pixels.memmap"))
     os.truncate(file, file.stat().st_size - 1)
     assert str(file) in refused(call("pretrain", dataset, "--out", "out"))
@@ -291,7 +296,7 @@ def test_mirrors_begin_with_the_run(call: Call, monkeypatch: pytest.MonkeyPatch)
 
 def test_a_probe_that_is_refused_keeps_what_it_has_measured(call: Call, encoder: Path, dataset: Path) -> None:
     file, small, stateless = map(Path, ("probe.csv", "small", "stateless"))
-    assert "image_size 16, not 8" in refused(call("probe", encoder, toy_dataset(small, 8), "--csv", file))
+    assert "[*, 9, 16, 16], got (60, 9, 8, 8)" in refused(call("probe", encoder, toy_dataset(small, 8), "--csv", file))
     assert "absent does not exist" in refused(call("probe", "absent", dataset, "--csv", file))
     assert "draw more samples" in call("probe", "random-encoder", dataset, "--samples", 4, "--csv", file)[2]
     assert not file.exists()

@@ -134,7 +134,8 @@ def test_floating_pixels_in_the_unit_interval_are_never_scaled_twice_and_that_is
     ("act", "message"),
     [
         (lambda: PixelEncoder(3, image_size=21.5), r"`image_size` must be a whole number, got 21\.5"),
-        (lambda: PixelEncoder(3, channels=(8, 8), strides=(2,)), "equal length"),
+        (lambda: PixelEncoder(3, channels=(8, 8), strides=(2,)), "sequences of one length"),
+        (lambda: PixelEncoder(3, channels=8), "sequences of one length"),
         (lambda: PixelEncoder(3, image_size=5), "image_size 5 is too small"),
         (lambda: small().standardise(torch.zeros(3), torch.ones(3)), "one per feature"),
         (lambda: small().standardise(torch.full((288,), torch.nan), torch.ones(288)), "`mean` must hold 288 finite"),

@@ -260,6 +260,10 @@ def test_what_does_not_fit_a_run_is_refused_by_name(tmp_path: Path) -> None:
     for name, value in (("intrinsic_reward_coef", 0.1), ("features", "dense")):
         with pytest.raises(ValueError, match="drq trains its encoder: it has no bonus"):
             train(None, make_pretrained("drq"), **{name: value})
+    for options in ({"queue_size": 7}, {"knn_k": 100}):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            train(tmp_path / "new", **options)
+    assert not (tmp_path / "new" / "replay").exists()
     (tmp_path / "replay").rename(tmp_path / "elsewhere")
     with pytest.raises(CheckpointError, match=r"to continue it needs its frames, and .* is gone"):
         train(tmp_path)

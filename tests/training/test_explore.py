@@ -14,7 +14,7 @@ from torchrl.objectives import LossModule
 from toy_env import ToyEnv, record
 from toy_runs import EPISODE, kill, make_encoder, pretend_cpu, same_state, signalling, toy_domain
 
-from crptpro.errors import CheckpointError, CRPTproError
+from crptpro.errors import CheckpointError, CRPTproError, EnvCrashedError
 from crptpro.objectives import get_method
 from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training import ExploreConfig, ExploreResult, pretrain_active
@@ -135,6 +135,16 @@ def test_a_run_that_was_killed_before_its_first_checkpoint_begins_again_in_the_s
     assert run("apt-s", tmp_path, [LEFT]).env_steps == 112
 
 
+def test_an_environment_that_crashes_while_its_episode_is_repeated_is_named(tmp_path: Path) -> None:
+    def crash(count: int) -> None:
+        raise ValueError("the simulator exploded")
+
+    with pytest.raises(KeyboardInterrupt):
+        run("apt-s", tmp_path, [signalling("left", 15, signal.SIGINT)])
+    with pytest.raises(EnvCrashedError, match="the simulator exploded"):
+        run("apt-s", tmp_path, [toy_domain("left", on_step=crash)])
+
+
 def test_a_finished_run_gives_its_result_again_without_its_replays(tmp_path: Path) -> None:
     first = run("proto-rl-s", tmp_path)
     shutil.rmtree(tmp_path / "replay")
@@ -171,6 +181,7 @@ def test_a_run_of_other_settings_is_refused_by_name(tmp_path: Path) -> None:
     [
         ("apt-s", {"domains": DOMAINS}, "apt-s pre-trains on one domain, got 2"),
         ("proto-rl-c", {"domains": [LEFT, LEFT]}, "named twice"),
+        ("apt-s", {"domains": [toy_domain("my,env")]}, "cannot name columns"),
         ("proto-rl-c", {"env_steps": 10}, "nothing would be learned"),
         ("crptpro", {}, "learns from datasets and does not explore"),
         ("proto-rl-s", {"loss": "apt-s"}, "prototype reward needs a loss with prototypes; SimCLRLoss has none"),

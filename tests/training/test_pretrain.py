@@ -221,13 +221,14 @@ def test_a_run_follows_the_learning_rate_and_the_clipping_of_its_method() -> Non
 
 def test_loading_keeps_the_learning_rate_that_a_recorded_update_reads() -> None:
     loss, method = make_loss(), get_method("atc")
-    saved = make_optimizer(loss, method, cuda_graph=True)[0].state_dict()
+    saved = make_optimizer(loss, method, cuda_graph=False)[0].state_dict()
     optimizer = make_optimizer(loss, method, cuda_graph=True)[0]
     rate = optimizer.param_groups[0]["lr"]
     saved["param_groups"][0]["lr"] = torch.tensor(0.5)
     optimizer.load_state_dict(saved)
     assert optimizer.param_groups[0]["lr"] is rate
     assert rate.item() == 0.5
+    assert optimizer.param_groups[0]["capturable"]  # as it was built, whatever the saved one was
 
 
 def test_prototypes_are_scaled_to_unit_length_before_an_update() -> None:

@@ -99,6 +99,19 @@ def test_a_resumed_run_gives_the_numbers_and_the_record_of_an_uninterrupted_one(
         assert record(tmp_path / name / "train.csv") == record(tmp_path / "whole" / "train.csv")
 
 
+def test_ctrl_c_leaves_a_checkpoint_where_nobody_reads_the_log_any_more(tmp_path: Path) -> None:
+    python(f"""
+import os, pathlib, signal, test_run
+from crptpro.console import run_main
+unread, stderr = os.pipe()
+os.close(unread)  # as `2>&1 | tee log` does, which gets the same Ctrl-C
+os.dup2(stderr, 2)
+stop = lambda update: update == 7 and os.kill(os.getpid(), signal.SIGINT)
+run_main(lambda: test_run.walk(pathlib.Path({str(tmp_path)!r}), 18, on_update=stop))
+""")
+    assert first_update(tmp_path) == 8
+
+
 def test_a_crash_costs_the_updates_since_the_last_checkpoint_and_what_precedes_all_is_removed(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError):
         walk(tmp_path / "late", 18, on_update=crash_at(13))

@@ -11,7 +11,6 @@ import itertools
 import logging
 import os
 import re
-import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -27,6 +26,7 @@ from crptpro import training
 from crptpro.cli.reproduce import Reproduce
 from crptpro.console import run_main
 from crptpro.data import FrameDataset, collect_group
+from crptpro.directory_lock import refusal_leaves_nothing
 from crptpro.domains import GROUPS, PAPER_DOMAINS, TASKS, expand_groups, get_domain
 from crptpro.envs import make_env
 from crptpro.errors import CRPTproError, DatasetError
@@ -78,14 +78,8 @@ class Logging:
         mode = None if self.wandb == "auto" else self.wandb
         asked = {"project": self.wandb_project, "group": self.wandb_group, "tags": self.wandb_tags, "mode": mode}
         wandb = None if self.wandb == "off" else {name: value for name, value in asked.items() if value}
-        is_new = not run_dir.exists()
-        with RunLogger(run_dir, wandb=wandb, tensorboard=self.tensorboard) as logger:
-            try:
-                yield logger
-            except Exception:
-                if is_new and [path.name for path in run_dir.iterdir()] == [".lock"]:  # refused before its first row
-                    shutil.rmtree(run_dir)
-                raise
+        with refusal_leaves_nothing(run_dir), RunLogger(run_dir, wandb=wandb, tensorboard=self.tensorboard) as logger:
+            yield logger
 
 
 @dataclass(frozen=True)
@@ -188,7 +182,7 @@ class Pretraining(EncoderRun):
             return
         loss_options, encoder_options = named_values("--loss", self.loss), named_values("--encoder", self.encoder)
         seed_everything(self.config.seed)
-        loss = method.build(method.build_encoder(**images, **encoder_options), **loss_options)
+        loss = method.build(method.build_encoder(**images | encoder_options), **loss_options)
         with self.logging.records(self.out) as records:
             result = train(loss, sources, method=self.method, run_dir=self.out, config=self.config, records=records)
             self.keep(result, records)

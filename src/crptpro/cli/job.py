@@ -17,8 +17,8 @@ def _end_with(parent: int) -> None:
     """Stop at the next checkpoint when the command that started this job is gone."""
     while os.getppid() == parent:
         time.sleep(1)
-    print("the command that started this job is gone: leaving at the next checkpoint", flush=True)
     os.kill(os.getpid(), signal.SIGTERM)
+    print("the command that started this job is gone: leaving at the next checkpoint", flush=True)
 
 
 if __name__ == "__main__":

@@ -18,10 +18,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from filelock import FileLock
-
 from crptpro.artifact import CARD_FILE, WEIGHTS_FILE, read_json, write_json
 from crptpro.data.storage import PIXELS_FILE
+from crptpro.directory_lock import locked
 from crptpro.errors import RecordError
 from crptpro.plugins import loaded_plugins
 from crptpro.values import as_path
@@ -192,7 +191,7 @@ def write_cells(root: Path, experiment: str, scale: str, cells: Iterable[tuple[s
     path = root / EXPERIMENTS / f"{experiment}-{scale}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     new = [{"label": label, "job": key, "place": place} for label, key, place in cells]
-    with FileLock(path.parent / ".lock"):
+    with locked(path.parent / ".lock"):
         before = read_json(path, error=RecordError)["cells"] if path.exists() else []
         taken = [(cell["label"], cell["place"]) for cell in new]
         kept = [cell for cell in before if (cell["label"], cell["place"]) not in taken]

@@ -29,9 +29,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from filelock import FileLock
 
 from crptpro.artifact import read_json, write_json
+from crptpro.directory_lock import locked
 from crptpro.errors import CRPTproError, RecordError, SubmissionError
 from crptpro.experiments.jobs import CLOCK, DESCRIPTION, DONE, LOCK, LOG, OWN, Job, Plan, describe, directory_of
 from crptpro.free_memory import JOB_BYTES, JOBS_PER_GPU, free_bytes
@@ -98,7 +98,7 @@ class Work:
         where = f"{socket.gethostname()}, process {os.getpid()}, {self.device}, {self.threads} threads"
         print(f"--- {now}: {where}", flush=True)
         # Another command, or a killed job on its way to a checkpoint, may still hold it.
-        with FileLock(self.directory / LOCK, timeout=1e9, poll_interval=1):
+        with locked(self.directory / LOCK, poll_interval=1):
             if (self.directory / DONE).exists():
                 return ""
             torch.set_num_threads(self.threads)
@@ -454,11 +454,12 @@ class _Queue:
     def stop(self) -> None:
         """Stop all jobs at their next checkpoint and wait for them; interrupted once more, stop them at once."""
         self.is_stopping = True
-        if self.running:
-            logger.warning("Stopping at the next checkpoints; press Ctrl-C again to stop at once.")
         for seconds in (math.inf, LAST_WAIT_S):
             for handle, _ in self.running.values():
                 handle.stop(at_once=seconds < math.inf)
+            if self.running and seconds == math.inf:
+                with contextlib.suppress(OSError):  # nobody may read it any more
+                    logger.warning("Stopping at the next checkpoints; press Ctrl-C again to stop at once.")
             deadline = time.monotonic() + seconds
             with contextlib.suppress(KeyboardInterrupt, SystemExit):
                 while self.running and time.monotonic() < deadline:

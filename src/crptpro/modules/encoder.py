@@ -58,8 +58,8 @@ class PixelEncoder(nn.Module):
         standardised: bool = False,
     ) -> None:
         super().__init__()
-        if not len(channels) or len(channels) != len(strides):
-            raise ValueError(f"channels and strides must be non-empty, of equal length, got {channels} and {strides}.")
+        if any(isinstance(each, (int, str)) for each in (channels, strides)) or not 0 < len(channels) == len(strides):
+            raise ValueError(f"channels and strides must be sequences of one length, got {channels} and {strides}.")
         sizes = plain_sizes(in_channels=in_channels, image_size=image_size)
         self.in_channels, self.image_size = sizes.values()
         channels = [as_int(count, "channels", minimum=1) for count in channels]

@@ -94,20 +94,25 @@ class Method:
 
     def build_encoder(self, in_channels: int = 9, image_size: int = 84, **options: Any) -> PixelEncoder:
         """Build the encoder that the method trains; ``options`` override the method's own."""
+        _require_known("An encoder", options, PixelEncoder)
         return PixelEncoder(in_channels, image_size=image_size, **{**self.encoder_options, **options})
 
     def build(self, encoder: nn.Module, **options: Any) -> LossModule:
         """Build the loss on ``encoder``; ``options`` override the method's own; unknown ones raise a ``ValueError``."""
         if self.loss_class is None:
             raise CRPTproError(f"The method {self.name!r} pre-trains nothing; it is for downstream training.")
-        parameters = inspect.signature(self.loss_class.__init__).parameters
-        unknown = sorted(set(options) - set(parameters))
-        if unknown and not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
-            known = ", ".join(list(parameters)[2:])  # without self and the encoder
-            raise ValueError(f"The method {self.name!r} has no option {', '.join(unknown)}; it has {known}.")
+        _require_known(f"The method {self.name!r}", options, self.loss_class)
         loss = self.loss_class(encoder, **{**self.loss_options, **options})
         loss.method_name = self.name  # for method_of
         return loss
+
+
+def _require_known(owner: str, options: Mapping[str, Any], made: type) -> None:
+    parameters = inspect.signature(made.__init__).parameters  # type: ignore[misc]
+    unknown = sorted(set(options) - set(parameters))
+    if unknown and not any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+        known = ", ".join(list(parameters)[2:])  # without self and the first argument
+        raise ValueError(f"{owner} has no option {', '.join(unknown)}; it has {known}.")
 
 
 _NO_BONUS = {"intrinsic_reward_coef": 0.0}

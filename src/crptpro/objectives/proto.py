@@ -14,7 +14,7 @@ from crptpro.modules import Predictor, Projector, Prototypes
 from crptpro.modules.heads import require_one_latent_dim
 from crptpro.objectives import functional
 from crptpro.objectives.base import PretrainingLoss, require_positive
-from crptpro.values import as_int
+from crptpro.values import as_float, as_int
 
 
 class ProtoLoss(PretrainingLoss):
@@ -66,8 +66,10 @@ class ProtoLoss(PretrainingLoss):
         sinkhorn_iterations: int = 3,
     ) -> None:
         super().__init__()
+        offset = as_float(offset, "offset")
         if not offset > 1:
             raise ValueError(f"`offset` must exceed 1, the largest negative cosine, got {offset}.")
+        temperature, intr_loss_coef = as_float(temperature, "temperature"), as_float(intr_loss_coef, "intr_loss_coef")
         require_positive(temperature=temperature, assignment_temperature=assignment_temperature)
         projector = projector or Projector(cast(int, encoder.feature_dim), latent_dim)
         predictor = predictor or Predictor(latent_dim, hidden_dim)

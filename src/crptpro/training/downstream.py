@@ -27,6 +27,7 @@ from crptpro.logging import RunLogger
 from crptpro.modules import SquashedGaussianActor, TwinCritic, resolve_precision, set_compute_dtype, usable_device
 from crptpro.modules.precision import PRECISION_NAMES, Precision
 from crptpro.objectives import DrQLoss, RADSACLoss, get_method, method_names
+from crptpro.objectives.base import require_positive
 from crptpro.objectives.methods import DOWNSTREAM
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
 from crptpro.provenance import cpu_cores
@@ -107,6 +108,7 @@ class DownstreamConfig:
 
     def __post_init__(self) -> None:
         check_numbers(self, minima={"eval_workers": 0}, maxima={"discount": 1, "critic_tau": 1})
+        require_positive(initial_temperature=self.initial_temperature)
         if self.features not in ("auto", "dense", "dense-bf16", "reencode"):
             raise ValueError(f"`features` must be auto, dense, dense-bf16 or reencode, got {self.features!r}.")
         if self.replay_capacity is not None and self.replay_capacity < self.random_agent_steps:
@@ -180,6 +182,10 @@ def train_downstream(
     settings = settings.resolved(task, pretrained)
     if pretrained.method == "drq" and (settings.intrinsic_reward_coef > 0 or settings.features != "auto"):
         raise ValueError("drq trains its encoder: it has no bonus (`intrinsic_reward_coef`) and no kept `features`.")
+    if settings.intrinsic_reward_coef > 0 and pretrained.prototypes is not None:  # refused before anything is written
+        PrototypeReward(
+            None, pretrained.prototypes, knn_k=settings.knn_k, queue_size=settings.queue_size, queue=pretrained.queue
+        )
     name = task if isinstance(task, str) else task.task
     what = {"task": name, "pretrained": pretrained.identity()}
     device = usable_device(settings.device)

@@ -454,6 +454,9 @@ def _named(domains: str | Domain | Sequence[str | Domain], method: Method) -> di
     named = {domain.name: domain for domain in listed}
     if not named:
         raise CRPTproError("Name at least one domain to explore.")
+    for name in named:
+        if not name.isprintable() or {",", '"'} & set(name):
+            raise CRPTproError(f"The domain {name!r} cannot name columns of a record; rename it.")
     if len(named) < len(listed):
         raise CRPTproError(f"A domain is named twice: {', '.join(d.name for d in listed)}. Each has one agent.")
     if method.exploration is not None and method.exploration.is_single_domain and len(named) > 1:

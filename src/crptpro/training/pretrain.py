@@ -231,6 +231,7 @@ def make_optimizer(
         # A graph reads this tensor. A loaded one is on the CPU, and its value would be recorded as a constant.
         for group in optimizer.param_groups:
             group["lr"] = rate.copy_(group["lr"])
+            group["capturable"] = True
 
     if cuda_graph:
         optimizer.register_load_state_dict_post_hook(keep_rate)

@@ -21,8 +21,15 @@ from torch import Tensor, nn
 from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 
 from crptpro.artifact import require_disk
-from crptpro.directory_lock import DirectoryLock
-from crptpro.errors import CheckpointError, DiskSpaceError, NonFiniteError, is_disk_full
+from crptpro.directory_lock import DirectoryLock, refusal_leaves_nothing
+from crptpro.errors import (
+    CheckpointError,
+    DiskSpaceError,
+    EnvCrashedError,
+    NonFiniteError,
+    RenderingError,
+    is_disk_full,
+)
 from crptpro.logging import RunLogger
 from crptpro.progress import Progress
 from crptpro.provenance import provenance
@@ -153,6 +160,7 @@ class Run:
     def __enter__(self) -> Run:
         with contextlib.ExitStack() as stack:
             stack.enter_context(kept_global_rng())
+            stack.enter_context(refusal_leaves_nothing(self.run_dir))
             if self.run_dir is not None:
                 stack.enter_context(DirectoryLock(self.run_dir, error=CheckpointError, is_reentrant=True))
                 self._rotation = CheckpointRotation(self.run_dir / "checkpoints", keep_last=2)
@@ -166,7 +174,7 @@ class Run:
 
     def __exit__(self, *exception: object) -> None:
         self._progress.close()
-        self._stack.close()
+        self._stack.__exit__(*exception)  # type: ignore[arg-type]
         if self._signal is not None and exception[0] is None:  # it came after the last checkpoint that was due
             raise self._ended()
 
@@ -213,6 +221,9 @@ class Run:
             try:
                 self._checkpoint.load(self._latest, map_location="cpu")  # its GPU may have another number here
             except Exception as reason:
+                cause = reason.__cause__ or reason
+                if isinstance(cause, (EnvCrashedError, RenderingError, OSError)):  # not the checkpoint's fault
+                    raise cause from None
                 raise CheckpointError(f"The checkpoint {self._latest} does not fit this run: {reason}") from reason
             self.position = self.resumed_from = self._row_position = self.saved["position"]
             self.counters.update(self.saved["counters"])
@@ -264,7 +275,8 @@ class Run:
         if self._signal is not None and number == signal.SIGINT:
             raise KeyboardInterrupt
         self._signal = number
-        logger.warning("Stopping as soon as a checkpoint can be written; press Ctrl-C again to stop at once.")
+        with contextlib.suppress(OSError):  # a closed terminal, and a `tee` that got the same Ctrl-C, take no text
+            logger.warning("Stopping as soon as a checkpoint can be written; press Ctrl-C again to stop at once.")
 
     def advance(self, count: int) -> None:
         """Move the position, and the bar with it."""
