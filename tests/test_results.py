@@ -108,6 +108,10 @@ def sentences() -> Iterator[str]:
     yield f"means from 60,000 to 100,000 env steps are {means.mean():.0f} with it, {without:.0f} without"
     yield f"cut off after {min(ends):,} to {max(ends):,} env steps"
 
+    long = runs["`crptpro`"].loc["crptpro_seed_5"]
+    yield f"Its evaluations fall from {long[200_000]:.0f} at 200,000 env steps to {long[240_000]:.0f} at 240,000"
+    yield f"and rise to {long[340_000]:.0f} at 340,000"
+
     (paper,) = (row.scores["crptpro"] for row in UNSEEN if (row.group, row.task) == ("A", "finger_spin"))
     yield f"The paper has {paper} after 500,000 env steps"
     finger = dict(RESULTS["evaluations"]("finger_spin"))
