@@ -33,18 +33,13 @@ def locked(path: Path, *, poll_interval: float = 0.05) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def refusal_leaves_nothing(directory: Path | None) -> Iterator[None]:
+def refusal_leaves_nothing(directory: Path) -> Iterator[None]:
     """Remove a directory that was made meanwhile, if an error leaves nothing but a lock in it."""
-    is_new = directory is not None and not directory.exists()
+    is_new = not directory.exists()
     try:
         yield
     except Exception:
-        if (
-            directory is not None
-            and is_new
-            and directory.exists()
-            and {p.name for p in directory.iterdir()} <= {".lock"}
-        ):
+        if is_new and directory.exists() and {path.name for path in directory.iterdir()} <= {".lock"}:
             shutil.rmtree(directory)
         raise
 

@@ -160,8 +160,8 @@ class Run:
     def __enter__(self) -> Run:
         with contextlib.ExitStack() as stack:
             stack.enter_context(kept_global_rng())
-            stack.enter_context(refusal_leaves_nothing(self.run_dir))
             if self.run_dir is not None:
+                stack.enter_context(refusal_leaves_nothing(self.run_dir))
                 stack.enter_context(DirectoryLock(self.run_dir, error=CheckpointError, is_reentrant=True))
                 self._rotation = CheckpointRotation(self.run_dir / "checkpoints", keep_last=2)
                 self._find_checkpoint()
