@@ -121,7 +121,7 @@ def collect_group(
             if any(needs_gl(job.domain) for job in jobs):
                 # Checked once, for as many renderers as will run: some drivers hang when several start together.
                 select_backend(processes=workers)
-            for job in jobs:  # what cannot be built is refused before hours of the others
+            for job in jobs[1:]:  # what cannot be built is refused before hours of the others
                 job.make(render=False).close()
             for job in jobs:
                 job.writer.note_rendering(backend_card() if needs_gl(job.domain) else {})
