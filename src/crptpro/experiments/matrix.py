@@ -444,7 +444,7 @@ def _unseen(request: Request) -> Iterator[Cell]:
 def _colors(request: Request) -> Iterator[Cell]:
     """Tasks with the colours of the background reversed, without fine-tuning (section IV.C).
 
-    The paper does not say how it reverses them; whole images are the option.
+    The paper exchanges their RGB values and does not say what the background is; whole images are the option.
     """
     return _elsewhere(request, COLORS, request.methods or CROSS_DOMAIN, place={"colors": request.colors})
 

@@ -298,7 +298,11 @@ def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
     is_known = (table != "").any(axis=1)
     if is_known.any():
         table["the paper's"] = [*(printed for _, printed, *_ in BUDGETS), "not printed, at least 6 evaluations"]
-        page.table("Budgets beside the paper's.", table[is_known].reset_index())
+        page.table(
+            "Budgets beside the paper's. It prints neither DrQ's learning rate, batch and replay nor a render quality: "
+            "those are this library's.",
+            table[is_known].reset_index(),
+        )
     if differs:
         page.text(
             "This scale does not show which method is ahead after the full budget: methods that learn late look worse "
@@ -518,7 +522,8 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
         page.text(
             f"Brackets are {stats.CONFIDENCE:.0%} intervals ({stats.REPLICATES:,} stratified bootstrap replicates that "
             "resample encoders, then runs within them). With one encoder they describe it, not its method. For "
-            f"normally distributed runs of one task they cover the true mean this often, by number of runs: {held}.",
+            "independent, normally distributed runs of one task they cover the true mean this often, by number of "
+            f"runs: {held}. Runs that share an encoder are not independent: with two or three encoders it is less.",
             "warning",
         )
     if fewest.min() < stats.MIN_RUNS:
@@ -544,7 +549,7 @@ def _improvement(page: Page, runs: pd.DataFrame) -> None:
         rows.append({"other method": label, "runs of both": better.runs, "P(crptpro > other)": f"{better:.2f}"})
     page.table(
         "Probability that a run of crptpro scores higher than one of the other method on the same task; 0.5 is no "
-        "difference. Of two runs against two it can only be 0, 0.25, 0.5, 0.75 or 1.",
+        "difference. On one task, two runs against two give 0, 0.25, 0.5, 0.75 or 1.",
         rows,
     )
 

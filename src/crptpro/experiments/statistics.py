@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 MIN_RUNS = 5
 """A task with fewer runs has no interval: percentile intervals of fewer draws are far too narrow."""
 COVERAGE = {5: 0.84, 6: 0.86, 8: 0.89, 10: 0.90}
-"""Number of normal draws to the coverage of a 95 % percentile interval of their mean."""
+"""Number of independent normal draws to the coverage of a 95 % percentile interval of their mean."""
 CONFIDENCE, REPLICATES, SEED = 0.95, 2_000, 0  # of every interval; the order of the runs does not matter
 
 
@@ -88,7 +88,8 @@ def estimate(
 
     A replicate resamples the encoders, once for all tasks that share them, and then, in place of each run, a downstream
     run of the drawn encoder; tasks are kept (Davison & Hinkley, Bootstrap Methods and their Application, 1997, section
-    3.8). If all runs share one encoder, the interval is about that encoder only.
+    3.8). If all runs share one encoder, the interval is about that encoder only. Two methods are resampled
+    independently, also if they share encoders: their interval is then too wide.
 
     Args:
         statistic: an aggregate of this module; for two methods one that takes both.

@@ -47,7 +47,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class DownstreamConfig:
-    """How a task is learned, by one update per agent step. ``None`` means the method's own value, which is the paper's.
+    """How a task is learned, by one update per agent step. ``None`` means the method's own value.
 
     Source: CRPTpro, hyper-parameter table; Proto-RL's released agent.
     """

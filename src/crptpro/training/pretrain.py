@@ -37,7 +37,7 @@ METHOD_FIELDS = ("updates", "batch_size", "learning_rate", "warmup_updates", "en
 
 @dataclass(frozen=True)
 class PretrainConfig:
-    """How an encoder is pre-trained on datasets. ``None`` means the method's own value, which is the paper's."""
+    """How an encoder is pre-trained on datasets. ``None`` means the method's own value."""
 
     updates: int | None = None
     """encoder updates, over all domains (None: the method's; crptpro 50,000; fine-tuning 2,000)"""
