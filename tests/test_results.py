@@ -111,6 +111,9 @@ def sentences() -> Iterator[str]:
     long = runs["`crptpro`"].loc["crptpro_seed_5"]
     yield f"Its evaluations fall from {long[200_000]:.0f} at 200,000 env steps to {long[240_000]:.0f} at 240,000"
     yield f"and rise to {long[340_000]:.0f} at 340,000"
+    late = list(range(320_000, 420_000, 20_000))
+    theirs = runs[AUTHORS][late].mean(axis=1).iloc[0]
+    yield f"from 320,000 to 400,000 it has {long[late].mean():.0f}, the authors' run {theirs:.0f}"
 
     (paper,) = (row.scores["crptpro"] for row in UNSEEN if (row.group, row.task) == ("A", "finger_spin"))
     yield f"The paper has {paper} after 500,000 env steps"
