@@ -171,7 +171,7 @@ def get_domain(name: str | Domain) -> Domain:
     hint = f"Nearest: {', '.join(near)}." if near else f"Domains: {', '.join(PAPER_DOMAINS)}."
     raise UnknownNameError(
         f"There is no domain or task {name!r}. {hint} Gymnasium environments are written gymnasium:<id>; "
-        "register_domain adds your own."
+        "register_domain adds your own (on the command line: --plugin FILE.py)."
     )
 
 

@@ -104,7 +104,7 @@ class Pretrained:
         except UnknownNameError as reason:
             raise PretrainedError(
                 f"The artifact was trained with {self.method!r}, which is not a registered method. Call "
-                "crptpro.objectives.register_method for its loss first."
+                "crptpro.objectives.register_method for its loss first (on the command line: --plugin FILE.py)."
             ) from reason
         if method.loss_class is None:
             raise PretrainedError(f"{self.method} was not trained by a loss: there is nothing to train further.")

@@ -343,6 +343,11 @@ def test_a_dataset_takes_21_kb_per_transition(tmp_path: Path) -> None:
     assert size / 100 < 1.01 * (3 * 84 * 84) + 100
 
 
+def test_a_directory_is_opened_by_open(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match=r"FrameDataset\.open opens a directory"):
+        FrameDataset(tmp_path)  # type: ignore[arg-type]
+
+
 def test_what_an_unfinished_dataset_does_not_have_yet_is_refused(tmp_path: Path) -> None:
     unfinished = FrameDataset.create(tmp_path, domain="mine", transitions=10)
     for name in ("domain", "image_size", "frames", "transitions"):

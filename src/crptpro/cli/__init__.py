@@ -107,7 +107,7 @@ class Collect:
     out: Path = Path("data")
     """one directory per domain is made below this one"""
     transitions: int = 100_000
-    """transitions per domain (21 KB each)"""
+    """transitions per domain (21 KB each); a finished dataset does not grow"""
     seed: int = 0
     """the same seed gives the same data whatever the number of workers"""
     workers: Annotated[int, arg(help_behavior_hint=lambda cores: f"(default: one per core, {cores} here)")] = field(

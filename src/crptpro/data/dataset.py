@@ -59,6 +59,8 @@ class FrameDataset(ReplayBuffer):
     """
 
     def __init__(self, storage: FrameStorage, **options: Any):
+        if not isinstance(storage, FrameStorage):
+            raise TypeError(f"FrameDataset.open opens a directory; got {storage!r} as the storage.")
         parts = {"sampler": RandomSampler(), "writer": ImmutableDatasetWriter(), "collate_fn": as_it_is}
         super().__init__(storage=storage, **parts | options)
 
