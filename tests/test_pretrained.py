@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +24,7 @@ from toy_env import random_episode, write_dataset
 from crptpro import pretrained
 from crptpro.data import FrameDataset
 from crptpro.errors import CRPTproError, PretrainedError, UnknownNameError
-from crptpro.modules import PixelEncoder, SquashedGaussianActor
+from crptpro.modules import PixelEncoder, SquashedGaussianActor, register_network
 from crptpro.objectives import BeCLLoss, SimCLRLoss
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained, save_pretrained, shipped_encoders
 from crptpro.training import PretrainResult, finetune, pretrain, train_downstream
@@ -356,9 +358,7 @@ def test_a_users_own_networks_are_saved_and_need_their_class_to_come_back(tmp_pa
     loss = OwnLoss(OwnEncoder())
     loss.target_encoder_params.data.apply_(lambda value: value.fill_(3.0))
     path = save_pretrained(loss, tmp_path / "own")
-    with pytest.raises(PretrainedError, match=r"is a 'OwnEncoder'.*classes="):
-        load_pretrained(path)
-    loaded = load_pretrained(path, classes={"OwnEncoder": OwnEncoder})
+    loaded = load_pretrained(path)
     assert (loaded.method, loaded.projector) == ("OwnLoss", None)
     assert all_equal(loaded.encoder.state_dict(), loss.encoder.module.state_dict())
     assert all((value == 3.0).all() for value in loaded.target_encoder.state_dict().values())
@@ -366,3 +366,8 @@ def test_a_users_own_networks_are_saved_and_need_their_class_to_come_back(tmp_pa
     del loss.encoder.module.config
     with pytest.raises(PretrainedError, match=r"OwnEncoder without a `\.config`"):
         save_pretrained(loss, tmp_path / "other")
+    in_another_process = f"from crptpro.pretrained import load_pretrained\nload_pretrained({str(path)!r})"
+    refused = subprocess.run([sys.executable, "-c", in_another_process], capture_output=True, text=True)
+    assert "is a 'OwnEncoder', which is not registered. Call crptpro.modules.register_network" in refused.stderr
+    with pytest.raises(ValueError, match="PixelEncoder is a network of crptpro; give your class another name"):
+        register_network(type("PixelEncoder", (nn.Module,), {}))

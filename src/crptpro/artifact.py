@@ -160,6 +160,10 @@ def read_artifact(
     path = as_path(path).resolve()
     if not path.is_dir():
         raise error(f"{path} does not exist or is not a directory; expected one with {WEIGHTS_FILE} and {CARD_FILE}.")
+    if not (path / CARD_FILE).exists():
+        for inside in sorted(path.glob(f"*/{CARD_FILE}")):
+            if read_json(inside, error=error).get("format") == format_name:
+                raise error(f"{path} is no artifact. Did you mean {inside.parent}?")
     card = read_json(path / CARD_FILE, error=error)
     if card.get("format") != format_name:
         raise error(f"{path} is a {card.get('format', 'directory of unknown format')!r}, expected {format_name!r}.")

@@ -14,11 +14,28 @@ from typing import Any, TextIO, TypeVar
 
 import tyro
 from tqdm import tqdm
-from tyro.constructors import ConstructorRegistry
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec
 
 from crptpro.errors import CRPTproError, is_disk_full
+from crptpro.values import as_int
 
 _Config = TypeVar("_Config")
+_COUNTS = ConstructorRegistry()
+
+
+@_COUNTS.primitive_rule
+def _count(info: Any) -> PrimitiveConstructorSpec[int] | None:
+    """Read whole numbers as Python functions take them, ``1e5`` too."""
+    if info.type is not int:
+        return None
+
+    def read(words: list[str]) -> int:
+        try:
+            return int(words[0])
+        except ValueError:
+            return as_int(float(words[0]), "value")
+
+    return PrimitiveConstructorSpec(1, "INT", read, lambda value: isinstance(value, int), lambda value: [str(value)])
 
 
 class _BarFriendlyHandler(logging.Handler):
@@ -73,7 +90,8 @@ def run_main(main: Callable[[], object]) -> None:
     configure_logging()
     try:
         try:
-            main()
+            with _COUNTS:
+                main()
         finally:
             if sys.stdout is not None:
                 sys.stdout.flush()  # a broken pipe cannot be caught at the interpreter's exit

@@ -18,11 +18,11 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from crptpro import modules
 from crptpro.artifact import CARD_FILE, identity_of, read_artifact, write_artifact
 from crptpro.data import FrameDataset
 from crptpro.errors import PretrainedError, UnknownNameError
 from crptpro.modules import PixelEncoder
+from crptpro.modules.registry import describe_network, rebuild_networks
 from crptpro.objectives import get_method, method_names, method_of
 from crptpro.provenance import provenance
 from crptpro.seeding import derive_seed
@@ -37,7 +37,6 @@ NETWORKS = ("encoder", *HEADS, *TARGETS, "actor")
 SHIPPED = Path(__file__).parent / "encoders"
 """One artifact per directory; their names are what :func:`load_pretrained` takes."""
 
-_CLASSES = {name: entry for name, entry in vars(modules).items() if isinstance(entry, type)}
 _LOG = logging.getLogger(__name__)
 
 
@@ -64,8 +63,8 @@ class Pretrained:
 
     @property
     def method(self) -> str:
-        """Registered name of the method, or the class name of a loss that is not registered."""
-        return str(self.card.get("method", "unknown"))
+        """Registered name of the method, or the class name of a loss that is not registered, or of the encoder."""
+        return str(self.card.get("method", type(self.encoder).__name__))
 
     @property
     def label(self) -> str:
@@ -212,32 +211,29 @@ def save_pretrained(trained: Any, path: str | Path, *, slim: bool = False) -> Pa
         source = replace(source, **left_out)
     states: dict[str, Mapping[str, Tensor]] = {}
     described: dict[str, dict[str, Any]] = {}
-    classes: dict[str, type[nn.Module]] = {}
     for role, module in source._networks().items():
-        if not isinstance(config := getattr(module, "config", None), dict):
-            message = f"The {role} is a {type(module).__name__} without a `.config` of its arguments"
-            if role == "encoder":
-                raise PretrainedError(f"{message}; use crptpro.modules.PixelEncoder or give yours one.")
-            _LOG.warning("%s; it is not saved.", message)
+        if role == "encoder":
+            described[role] = describe_encoder(module)
+        elif (description := describe_network(module)) is not None:
+            described[role] = description
+        else:
+            _LOG.warning("The %s is a %s without a `.config`; it is not saved.", role, type(module).__name__)
             continue
         states[role] = module.state_dict()
-        described[role] = {"class": type(module).__name__, "config": config}
-        classes[type(module).__name__] = type(module)
     if source.queue is not None:
         states["queue"] = {"latents": source.queue}
     if source.rest:
         states["loss"] = source.rest
     card |= {"modules": described, "pixels": _pixel_facts(source.encoder), **provenance()}
-    check = partial(_rebuilt, path, classes)
+    check = partial(_rebuilt, path)
     return write_artifact(path, states, card=card, format_name=FORMAT, version=VERSION, check=check)
 
 
-def load_pretrained(path: str | Path, classes: Mapping[str, type[nn.Module]] | None = None) -> Pretrained:
+def load_pretrained(path: str | Path) -> Pretrained:
     """Read and verify an artifact; its networks are bit-equal to those saved, frozen, on the CPU.
 
-    Args:
-        path: directory written by :func:`save_pretrained`, or one of :func:`shipped_encoders`.
-        classes: class name to class, for networks that are not this library's.
+    ``path`` is a directory written by :func:`save_pretrained`, or one of :func:`shipped_encoders`. Networks of your own
+    class need :func:`~crptpro.modules.register_network`.
 
     Raises:
         PretrainedError: something is missing, truncated, tampered with, of another kind, or unknown.
@@ -247,18 +243,31 @@ def load_pretrained(path: str | Path, classes: Mapping[str, type[nn.Module]] | N
         if not (SHIPPED / path / CARD_FILE).exists():
             raise PretrainedError(
                 f"{path} does not exist, and no encoder of this name ships with crptpro; those that do: "
-                f"{', '.join(shipped_encoders()) or 'none'}."
+                f"{', '.join(shipped_encoders()) or 'none'}. Without pre-training: random-encoder or drq."
             )
         path = SHIPPED / path
-    if not (path / CARD_FILE).exists() and (path / "encoder" / CARD_FILE).exists():
-        raise PretrainedError(f"{path} is not a pretrained artifact. Did you mean {path / 'encoder'}?")
     card, tensors = read_artifact(path, format_name=FORMAT, version=VERSION, error=PretrainedError)
-    return _rebuilt(path, classes or {}, card, tensors)
+    return _rebuilt(path, card, tensors)
 
 
 def shipped_encoders() -> list[str]:
     """Return the names of the encoders that ship with the package, in alphabetical order."""
     return sorted(card.parent.name for card in SHIPPED.glob(f"*/{CARD_FILE}"))
+
+
+def require_encoder(loss: LossModule) -> None:
+    """Raise what :func:`save_pretrained` would about the encoder of a loss: before training."""
+    describe_encoder(_as_pretrained(loss).encoder)
+
+
+def describe_encoder(encoder: nn.Module) -> dict[str, Any]:
+    """Return class and arguments of an encoder; without a ``.config`` of them a PretrainedError."""
+    if (description := describe_network(encoder)) is None:
+        raise PretrainedError(
+            f"The encoder is a {type(encoder).__name__} without a `.config` of its arguments, so that it could not be "
+            "rebuilt; use crptpro.modules.PixelEncoder or give yours one."
+        )
+    return description
 
 
 def _as_pretrained(trained: Any) -> Pretrained:
@@ -333,39 +342,8 @@ def _target_state(loss: Any, target: str) -> dict[str, Tensor]:
     return {prefix.sub("", key, 1): value for key, value in loss.state_dict().items() if prefix.match(key)}
 
 
-def _rebuilt(
-    path: Path, classes: Mapping[str, type[nn.Module]], card: dict[str, Any], tensors: dict[str, Tensor]
-) -> Pretrained:
-    """Build the networks that a card describes around its tensors; nothing is drawn from the global generator."""
-    parts: dict[str, dict[str, Tensor]] = {}
-    for name, value in tensors.items():
-        role, key = name.split(".", 1)
-        parts.setdefault(role, {})[key] = value.float() if value.dtype == torch.bfloat16 else value
-    described = card.get("modules")
-    if not isinstance(described, dict) or "encoder" not in described:
-        raise PretrainedError(f"{path} holds {', '.join(sorted(parts)) or 'no weights'}, but no encoder.")
-    classes = {**_CLASSES, **classes}
-    networks: dict[str, Any] = {}
-    for role, description in described.items():
-        if role not in NETWORKS or not isinstance(description, dict):
-            raise PretrainedError(f"The card of {path} describes an unknown {role!r}; it is damaged or too new.")
-        name = str(description.get("class"))
-        if name not in classes:
-            raise PretrainedError(
-                f"The {role} in {path} is a {name!r}, which this library does not have. "
-                f"Pass load_pretrained(..., classes={{{name!r}: ...}})."
-            )
-        try:
-            # Without memory and initial weights, which the tensors replace; other classes may compute with them.
-            is_ours = classes[name] is _CLASSES.get(name)
-            with torch.random.fork_rng(devices=[]), torch.device("meta" if is_ours else "cpu"):
-                module = classes[name](**description.get("config", {}))
-            module.load_state_dict(parts.pop(role, {}), assign=True)
-        except (TypeError, ValueError) as reason:
-            raise PretrainedError(f"The card of {path} does not describe a {name}: {reason}") from reason
-        except RuntimeError as reason:
-            raise PretrainedError(f"The {role} in {path} is not the {name} of its card: {reason}") from reason
-        networks[role] = module.requires_grad_(False).eval()
+def _rebuilt(path: Path, card: dict[str, Any], tensors: dict[str, Tensor]) -> Pretrained:
+    networks, parts = rebuild_networks(path, card, tensors, roles=NETWORKS, error=PretrainedError)
     queue, rest = parts.pop("queue", {}).get("latents"), parts.pop("loss", {})
     if parts:
         raise PretrainedError(f"{path} holds weights its card does not describe: {', '.join(sorted(parts))}.")

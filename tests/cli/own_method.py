@@ -1,4 +1,4 @@
-"""Two methods that the library does not know, as a user writes them: one for datasets, one that explores."""
+"""Two methods and an encoder that the library does not know: one for datasets, one that explores."""
 
 from __future__ import annotations
 
@@ -7,11 +7,26 @@ import functools
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
 from torchrl.envs.transforms import Transform
 from torchrl.objectives import LossModule
 
-from crptpro.modules import PixelEncoder, Projector
+from crptpro.modules import Projector, register_network
 from crptpro.objectives import Exploration, register_method
+
+
+@register_network
+class SmallEncoder(nn.Module):
+    """One convolution and the mean over the image."""
+
+    def __init__(self, in_channels: int = 9, *, image_size: int = 84, width: int = 6) -> None:
+        super().__init__()
+        self.config = {"in_channels": in_channels, "image_size": image_size, "width": width}
+        self.in_channels, self.image_size, self.feature_dim = in_channels, image_size, width
+        self.conv = nn.Conv2d(in_channels, width, 3)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        return self.conv(pixels.float() / 255).mean((-2, -1))
 
 
 class SlownessLoss(LossModule):
@@ -20,7 +35,7 @@ class SlownessLoss(LossModule):
     in_keys = ("pixels", ("next", "pixels"))
     out_keys = ("loss_slow",)
 
-    def __init__(self, encoder: PixelEncoder, *, projector: Projector | None = None, margin: float = 1.0) -> None:
+    def __init__(self, encoder: nn.Module, *, projector: Projector | None = None, margin: float = 1.0) -> None:
         super().__init__()
         self.encoder, self.projector = encoder, projector or Projector(encoder.feature_dim, 4)
         self.margin = margin
@@ -46,7 +61,7 @@ class Activity(Transform):
 DEFAULTS = {"updates": 2, "batch_size": 4, "encoder_tau": None}
 SMALL = {"channels": (4, 4), "strides": (2, 1)}
 
-register_method("slowness", SlownessLoss, **DEFAULTS, encoder_options=SMALL)
+register_method("slowness", SlownessLoss, **DEFAULTS, encoder_class=SmallEncoder)
 register_method(
     "slowness-active",
     SlownessLoss,

@@ -20,7 +20,7 @@ from crptpro import plugins
 from crptpro.cli import main
 from crptpro.domains import Domain, register_domain
 from crptpro.envs import make_env
-from crptpro.pretrained import load_pretrained
+from crptpro.pretrained import SHIPPED, load_pretrained
 from crptpro.training import load_agent
 
 # --- help ---------------------------------------------------------------------------------------------------------
@@ -62,6 +62,7 @@ def test_the_installed_command_is_this_one() -> None:
     (("evaluate", "random-policy", "--episodes", "many"), "many"),
     (("collect", "walker", "--quality", "best"), "best"),
     (("dance",), "dance"),
+    (("collect", "walker", "--transitions", "1.5"), "whole number, got 1.5"),
 ])  # fmt: skip
 def test_arguments_that_the_parser_cannot_read_are_named_with_status_2(
     call: Call, arguments: tuple[str, ...], named: str
@@ -71,6 +72,10 @@ def test_arguments_that_the_parser_cannot_read_are_named_with_status_2(
     assert out == ""
     assert named in err
     assert "Traceback" not in err
+
+
+def test_the_version_is_that_of_the_distribution(call: Call) -> None:
+    assert call("--version")[:2] == (0, f"crptpro {importlib.metadata.version('crptpro')}\n")
 
 
 # --- the whole way ---------------------------------------------------------------------------------------------------
@@ -109,7 +114,8 @@ def test_every_command_works_without_a_simulator(call: Call, dataset: Path, monk
         assert record.read_bytes() == before
 
     # An agent acts in its own kind of environment, and is not taken for an encoder.
-    status, out, _ = call("evaluate", agent, "--episodes", 2, "--csv", file)
+    assert "Did you mean" in refused(call("evaluate", "down"))
+    status, out, _ = call("evaluate", agent, "--episodes", "2e0", "--csv", file)
     assert status == 0
     assert out.startswith(f"{TASK}: ")
     assert "over 2 episodes" in out
@@ -228,6 +234,8 @@ def test_an_encoder_and_the_control_are_probed_with_table_and_csv(call: Call, da
     (("pretrain", "walker", "--method", "proto-rl"), r"no method 'proto-rl'\. .*proto-rl-"),
     (("pretrain", "walker"), r"walker is not a directory.*`crptpro collect walker`"),
     (("pretrain", "data/walker", "--method", "proto-rl-c"), r"no domain or task 'data/walker'"),
+    (("pretrain", os.path.dirname(__file__), "--method", "proto-rl-c"), r"proto-rl-c explores and reads no dataset"),
+    (("pretrain", str(SHIPPED / "group-a")), r"group-a is a 'crptpro-pretrained', not a dataset"),
     (("pretrain", "--method", "becl"), r"at least one domain, task or group \(A, B, C, D\)"),
     (("pretrain", "A", "--method", "apt-s"), r"one domain, got 3 \(cheetah, walker, quadruped\)"),
     (("pretrain", TASK, "--method", "proto-rl-c", "--queue-size", "7"), r"queue_size.* multiple"),

@@ -19,6 +19,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 LINES = [line for page in PAGES for line in re.findall(r"(?m)^crptpro (.+)$", page.read_text())]
 COMMANDS = sorted({shlex.join(shlex.split(line, comments=True)) for line in LINES})
+(MY_ENCODER,) = re.findall(r"```python\n(# my_encoder.py.*?)```", (ROOT / "docs/own_parts.md").read_text(), re.DOTALL)
 PROGRAMS = [
     (page.name, block)
     for page in PAGES
@@ -31,6 +32,7 @@ PROGRAMS = [
 def test_a_command_is_read_without_complaint(line: str, call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     Path("recipes").symlink_to(ROOT / "recipes")
     Path("maze.py").touch()  # the reader's own
+    Path("my_encoder.py").write_text(MY_ENCODER)
     ran = []
     for command in vars(cli).values():
         if dataclasses.is_dataclass(command) and hasattr(command, "run"):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from command import FEW, SIZE, SMALL, TASK, Call, refused, rows
 
-from crptpro import doctor, plugins
+from crptpro import doctor, plugins, training
 from crptpro.data import FrameDataset
 from crptpro.modules import PixelEncoder
 from crptpro.objectives import get_method, method_names
@@ -19,10 +19,10 @@ METHODS = Path(__file__).with_name("own_method.py")
 ENVIRONMENT = Path(__file__).with_name("slow_env.py")
 
 
-def test_a_plugin_registers_a_method(call: Call, dataset: Path) -> None:
+def test_a_plugin_registers_a_method_on_an_encoder_of_its_own(call: Call, dataset: Path) -> None:
     assert "slowness" not in method_names()
     own = ("pretrain", dataset, "--out", "out", "--method", "slowness", "--log-interval", 1, "--plugin", METHODS)
-    assert call(*own)[0] == 0
+    assert call(*own, "--encoder", "width=5")[0] == 0
     assert {"slowness", "slowness-active"} <= set(method_names())  # what lists methods lists it
     loaded = load_pretrained("out/encoder")
     assert (loaded.method, loaded.card["training"]["updates"]) == ("slowness", 2)
@@ -30,6 +30,11 @@ def test_a_plugin_registers_a_method(call: Call, dataset: Path) -> None:
 
     assert call("finetune", "out/encoder", dataset, "--out", "fine", *FEW, "--plugin", METHODS)[0] == 0
     assert load_pretrained("fine/encoder").label == "slowness-finetune"
+
+    learn = ("downstream", TASK, "--pretrained", "out/encoder", "--out", "down", *SMALL)
+    assert call(*learn, "--plugin", METHODS)[0] == 0
+    assert call("evaluate", "down/agent", "--episodes", 1, "--plugin", METHODS)[0] == 0
+    assert training.load_agent("down/agent")[0].encoder.conv.weight.shape[0] == 5
 
     # In Python it is one line.
     loss = get_method("slowness").build(PixelEncoder(image_size=SIZE))

@@ -57,9 +57,9 @@ def same_actor(one: DownstreamResult, two: DownstreamResult) -> bool:
     return same_state(one.agent.actor, two.agent.actor)
 
 
-def loads(result: DownstreamResult, encoder: nn.Module | None = None) -> bool:
+def loads(result: DownstreamResult) -> bool:
     """Whether the agent that was saved acts as the one that was trained."""
-    agent, _ = load_agent(result.agent_path, encoder=encoder)
+    agent, _ = load_agent(result.agent_path)
     pixels = torch.randint(0, 256, (9, SIZE, SIZE), dtype=torch.uint8)
     return torch.equal(agent(pixels), result.agent(pixels))
 
@@ -232,14 +232,17 @@ def test_any_module_is_trained_saved_loaded_and_serves_as_a_frozen_encoder_that_
     loss = ProtoLoss(OwnEncoder(), num_prototypes=8, latent_dim=4, hidden_dim=8)
     trained = pretrain(loss, make_dataset(0, channels=9), updates=2, batch_size=4, progress=False)
     path = save_pretrained(trained, tmp_path / "encoder")
-    own = load_pretrained(path, classes={"OwnEncoder": OwnEncoder})
+    own = load_pretrained(path)
     with caplog.at_level("INFO", logger="crptpro"):
         result = train(tmp_path, own, env_steps=40)
     assert result.evaluations[-1]["updates"] == 8
     assert "re-encoding" in caplog.text
-    assert loads(result, OwnEncoder())
-    with pytest.raises(CheckpointError, match="acts on a OwnEncoder, which only its author can build"):
-        load_agent(tmp_path / "agent")
+    assert loads(result)
+    del own.encoder.config
+    with pytest.raises(PretrainedError, match=r"OwnEncoder without a `\.config`"):
+        train(tmp_path / "other", own)
+    assert not (tmp_path / "other").exists()
+    assert train(None, own, env_steps=20).env_steps == 20
 
 
 def test_what_does_not_fit_a_run_is_refused_by_name(tmp_path: Path) -> None:

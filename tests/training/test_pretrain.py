@@ -265,6 +265,12 @@ def test_both_views_are_of_one_image_under_shifts_of_up_to_four_pixels() -> None
     assert sum(a == b for a, b in zip(first, second)) < 30
 
 
+def test_a_loss_that_returns_a_tensor_is_told_what_to_return(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Brightness, "forward", lambda self, batch: self.head.weight.sum())
+    with pytest.raises(ValueError, match="returned a Tensor; a TensorDict of `loss_"):
+        run(Brightness(), 1)
+
+
 def test_one_buffer_given_twice_and_names_unfit_for_columns_are_refused() -> None:
     dataset = make_dataset(0)
     with pytest.raises(DatasetError, match="Dataset 1 is given twice as one object"):
@@ -317,6 +323,13 @@ def test_a_run_keeps_its_precision_on_another_machine(tmp_path: Path, monkeypatc
     run(make_loss(), 4, tmp_path / "run", precision="auto")
     pretend_cpu("", monkeypatch, tmp_path)
     assert run(make_loss(), 8, tmp_path / "run", precision="auto").training["settings"]["precision"] == "bf16"
+
+
+def test_auto_is_float32_for_a_loss_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pretend_cpu("amx_bf16", monkeypatch, tmp_path)
+    assert run(Brightness(), 2, precision="auto").training["settings"]["precision"] == "fp32"
+    with pytest.raises(RuntimeError, match="dtype"):  # its linear layer takes no bfloat16
+        run(Brightness(), 2, precision="bf16")
 
 
 def test_bf16_stays_within_the_spread_of_two_fp32_seeds_and_ends_with_the_run() -> None:

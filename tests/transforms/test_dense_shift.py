@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import re
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -15,6 +16,7 @@ from torchrl.envs import Compose, TransformedEnv
 from toy_env import rollout_of
 
 from crptpro.data import FrameReplay
+from crptpro.errors import CRPTproError
 from crptpro.modules import PixelEncoder
 from crptpro.transforms import DenseShiftFeatures, FrozenEncoder, RandomShift, choose_feature_mode, random_shift
 from crptpro.transforms.dense_shift import _crop_by_index, crop_features, dense_maps_bytes, dense_shift_maps
@@ -176,6 +178,20 @@ def test_projections_are_those_of_the_network_in_evaluation_and_leave_one_in_tra
     torch.testing.assert_close(td["next", "embedding"], expected, rtol=1e-5, atol=1e-5)
 
 
+def test_maps_that_may_not_fit_are_announced_and_those_that_cannot_be_are_refused(monkeypatch, caplog):
+    monkeypatch.setattr("crptpro.transforms.dense_shift.free_bytes", lambda device: 10)
+    (dense := dense_of(observations=12))(dense.replay.batch(1))
+    assert re.search(r"Dense maps of 12 observations take .* GB; 0.0 GB are free\. Fewer `observations`", caplog.text)
+
+    def refuse(*_, **__):
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory")
+
+    batch = (dense := dense_of()).replay.batch(1)
+    monkeypatch.setattr(torch, "empty", refuse)
+    with pytest.raises(CRPTproError, match="Dense maps of 12 observations take"):
+        dense(batch)
+
+
 def test_threads_that_sample_side_by_side_get_each_their_own():
     dense = dense_of(generator=None, observations=2)  # each needs the places of the others
     plain = {n: crops_and_features(dense.encoder, dense.replay.frames[n])[1] for n in range(12)}
@@ -305,11 +321,9 @@ def test_auto_takes_dense_maps_where_they_fit_and_says_why(encoder, dtype, avail
     assert "\n" not in reason
 
 
-def test_explicit_modes_are_obeyed_or_refused(caplog):
+def test_explicit_modes_are_obeyed_or_refused():
     assert choose_feature_mode("reencode", PixelEncoder(), 1, torch.float32, 2**40)[0] == "reencode"
     assert choose_feature_mode("dense", PixelEncoder(), 1000, torch.bfloat16, 2**40)[0] == "dense"
-    assert not caplog.records
     assert choose_feature_mode("dense", PixelEncoder(), 1000, torch.bfloat16, 2**20)[0] == "dense"
-    assert "may not fit: 0.4 GiB for 1000 observations, 0.0 GiB free" in caplog.text
     with pytest.raises(ValueError, match="Flatten"):
         choose_feature_mode("dense", nn.Flatten(), 1, torch.float32, 2**40)

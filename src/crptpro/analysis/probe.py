@@ -78,7 +78,10 @@ def probe_samples(
     samples = as_int(samples, "samples", minimum=1)
     frame_stack = dataset.frame_stack if frame_stack is None else as_int(frame_stack, "frame_stack", minimum=1)
     if "qpos" not in dataset.frames or "qvel" not in dataset.frames:
-        raise DatasetError(f"The dataset of {dataset.domain!r} stores no physical state (qpos, qvel).")
+        raise DatasetError(
+            f"The dataset of {dataset.domain!r} stores no physical state. Its environment must emit `qpos` and `qvel` "
+            "when it is made with physics_state."
+        )
     transitions = dataset.transitions
     generator = torch.Generator().manual_seed(derive_seed(seed, "probe", dataset.domain))
     chosen = torch.randperm(len(transitions), generator=generator)[:samples].sort().values

@@ -14,6 +14,7 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -34,7 +35,7 @@ from crptpro.logging import RunLogger
 from crptpro.modules import usable_device
 from crptpro.objectives import get_method
 from crptpro.plugins import load_plugins
-from crptpro.pretrained import load_pretrained, random_pretrained, save_pretrained
+from crptpro.pretrained import load_pretrained, random_pretrained, require_encoder, save_pretrained
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import seed_everything
 from crptpro.training.evaluate import episode_seed, run_episode
@@ -102,7 +103,7 @@ class Doctor:
 class Collect:
     """Let a uniform random policy fill one dataset per domain."""
 
-    domains: Annotated[Positional[tuple[str, ...]], arg(help_behavior_hint="(required)")]
+    domains: Annotated[Positional[tuple[str, ...]], arg(metavar="DOMAIN [DOMAIN ...]", help_behavior_hint="(required)")]
     """domains, tasks, or group letters, e.g. `walker cartpole`, `A`, `gymnasium:HalfCheetah-v5`"""
     out: Path = Path("data")
     """one directory per domain is made below this one"""
@@ -148,7 +149,7 @@ class EncoderRun:
 class Pretraining(EncoderRun):
     """Settings of `pretrain` for every method."""
 
-    sources: Annotated[Positional[tuple[str, ...]], arg(help_behavior_hint="")] = ()
+    sources: Annotated[Positional[tuple[str, ...]], arg(metavar="SOURCE [SOURCE ...]", help_behavior_hint="")] = ()
     """dataset directories, e.g. data/walker data/cartpole; for methods that explore domains, tasks or group letters"""
     method: str = "crptpro"
     """crptpro, atc or random-encoder (on datasets), proto-rl-c, proto-rl-s, apt-c, apt-s or becl (exploring), a preset
@@ -165,6 +166,11 @@ class Pretraining(EncoderRun):
         train: Any = training.pretrain if method.exploration is None else training.pretrain_active
         images: dict[str, int] = {}
         if method.exploration is not None:
+            for source in self.sources:
+                if "/" in source and os.path.isdir(source):
+                    raise CRPTproError(
+                        f"{self.method} explores and reads no dataset: instead of {source} name a domain."
+                    )
             sources: list[Any] = expand_groups(self.sources)
         else:
             sources = [as_path(source, "sources") for source in self.sources]
@@ -183,6 +189,7 @@ class Pretraining(EncoderRun):
         loss_options, encoder_options = named_values("--loss", self.loss), named_values("--encoder", self.encoder)
         seed_everything(self.config.seed)
         loss = method.build(method.build_encoder(**images | encoder_options), **loss_options)
+        require_encoder(loss)
         with self.logging.records(self.out) as records:
             result = train(loss, sources, method=self.method, run_dir=self.out, config=self.config, records=records)
             self.keep(result, records)
@@ -211,9 +218,9 @@ class Finetune(EncoderRun):
     The paper's --updates: pendulum and manipulation 2,000, cartpole 3,000, cheetah 1,000, walker 500.
     """
 
-    pretrained: Positional[str]
+    pretrained: Annotated[Positional[str], arg(metavar="ENCODER")]
     """directory of the pretrained encoder; the one that ships is slim, and cannot be trained further"""
-    dataset: Positional[Path]
+    dataset: Annotated[Positional[Path], arg(metavar="DATASET")]
     """dataset directory of the one domain"""
     config: Annotated[training.PretrainConfig, arg(name="")] = field(default_factory=training.PretrainConfig)
     """every number of the stage"""
@@ -229,9 +236,9 @@ class Finetune(EncoderRun):
 class Downstream:
     """Learn a task with SAC on a frozen encoder and the prototype-kNN bonus, or with DrQ from scratch."""
 
-    task: Positional[str]
+    task: Annotated[Positional[str], arg(metavar="TASK")]
     """task to learn, e.g. walker_run, reach_duplo, gymnasium:HalfCheetah-v5"""
-    pretrained: str
+    pretrained: Annotated[str, arg(metavar="ENCODER")]
     """directory of the pretrained encoder, the name of one that ships (group-a), `random-encoder` for the untrained
     control, or `drq` to learn the encoder with the task"""
     out: Path
@@ -254,7 +261,7 @@ class Downstream:
 class Evaluate:
     """Evaluate a trained agent, or the uniform random policy, for whole episodes."""
 
-    agent: Positional[str]
+    agent: Annotated[Positional[str], arg(metavar="AGENT")]
     """directory of an agent (OUT/agent of a downstream run), or `random-policy`"""
     task: str | None = None
     """task to act in (None: the agent's own)"""
@@ -286,8 +293,8 @@ class Evaluate:
         settings: dict[str, Any] = {name: usual[name] if given[name] is None else given[name] for name in names}
         settings["render"] = not is_random or video is not None  # the random policy needs no pixels
         if agent is not None:
-            encoder: Any = agent.encoder
-            settings |= {"image_size": encoder.image_size, "frame_stack": encoder.in_channels // 3}
+            settings["image_size"] = getattr(agent.encoder, "image_size", 84)
+            settings["frame_stack"] = getattr(agent.encoder, "in_channels", 9) // 3
         with contextlib.closing(make_env(task, seed=self.seed, **settings)) as env:
             action_dim = env.action_spec.shape[-1]
             if agent is not None and agent.actor.config["action_dim"] != action_dim:
@@ -308,7 +315,7 @@ class Evaluate:
             scores = training.summarize(episodes)
             print(
                 f"{task}: {scores['mean']:.1f} ± {scores['std']:.1f} "
-                f"({scores['min']:.1f} to {scores['max']:.1f}) over {len(episodes)} episodes",
+                f"({scores['min']:.1f} to {scores['max']:.1f}) over {len(episodes)} episode{'s' * (len(episodes) > 1)}",
                 flush=True,
             )
             if video is not None:
@@ -322,9 +329,11 @@ class Evaluate:
 class Probe:
     """Predict positions and velocities from frozen features by ridge regression, on held-out episodes."""
 
-    encoder: Positional[str]
+    encoder: Annotated[Positional[str], arg(metavar="ENCODER")]
     """directory of a pretrained encoder, or `random-encoder` for the untrained control"""
-    datasets: Annotated[Positional[tuple[Path, ...]], arg(help_behavior_hint="(required)")]
+    datasets: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="DATASET [DATASET ...]", help_behavior_hint="(required)")
+    ]
     """datasets, e.g. data/walker data/finger; each is probed alone, seen in pre-training or not"""
     samples: int = 2_000
     """observations per dataset; time and memory grow with their square"""
@@ -368,7 +377,7 @@ class Probe:
 class Report:
     """Write tables beside the paper's, figures and jobs as an HTML page, and as Markdown."""
 
-    directory: Positional[Path]
+    directory: Annotated[Positional[Path], arg(metavar="DIRECTORY")]
     """directory of `crptpro reproduce`, or any with downstream runs in or below it"""
     out: Path | None = None
     """directory of the report (None: DIRECTORY/report)"""
@@ -480,6 +489,9 @@ def main() -> None:
         for before, word in itertools.pairwise(["crptpro", *arguments]):
             if not word or re.fullmatch("--[^=]*=", word):
                 raise CRPTproError(f"An argument is empty: {word or before}. A path is at least a dot.")
+        if arguments == ["--version"]:
+            print(f"crptpro {version('crptpro')}")
+            return
         if arguments[:1] == ["measure"]:  # for jobs of `reproduce`
             from crptpro.experiments import measure
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import os
@@ -236,11 +237,13 @@ class EpisodeWriter(ImmutableDatasetWriter):
         if found and path / CARD_FILE not in found:
             raise DatasetError(f"{path} is not empty and not a collection. Choose another directory or empty it.")
         self._lock = DirectoryLock(path, error=DatasetError)
+        self._is_open = False
         try:
             self._resume()
         except BaseException:
             self.close()
             raise
+        self._is_open = True
 
     @property
     def transitions(self) -> int:
@@ -328,7 +331,13 @@ class EpisodeWriter(ImmutableDatasetWriter):
         self._save(render=dict(gl))
 
     def close(self) -> None:
-        """Free the directory; an unfinished dataset can be continued later."""
+        """Free the directory; an unfinished dataset can be continued later. One without an episode leaves nothing."""
+        if self._is_open and not self.episodes:
+            for name in (CARD_FILE, ".lock"):
+                (self.path / name).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # it is not empty
+                self.path.rmdir()
+        self._is_open = False
         self._lock.release()
 
     def _pending_columns(self) -> dict[str, Tensor]:
@@ -411,10 +420,8 @@ def _read(path: Path) -> dict[str, Any]:
     """Read the card of a dataset, which may be unfinished."""
     file = path / CARD_FILE
     card = read_json(file, error=DatasetError)
-    found = (card.get("format"), card.get("version"))
-    if found != (FORMAT, VERSION):
-        raise DatasetError(
-            f"{file} has format {found[0]!r}, version {found[1]!r}; this release reads {FORMAT!r}, {VERSION}. "
-            "Collect the dataset again."
-        )
+    if (kind := card.get("format")) != FORMAT:
+        raise DatasetError(f"{path} is a {kind!r}, not a dataset; `crptpro collect` makes one.")
+    if (version := card.get("version")) != VERSION:
+        raise DatasetError(f"{file} has version {version!r}; this release reads {VERSION}. Collect the dataset again.")
     return card

@@ -70,8 +70,9 @@ class Method:
     name: str
     loss_class: type[LossModule] | None  #: built as ``loss_class(encoder, **loss_options)``; None without pre-training
     loss_options: Mapping[str, Any] = field(default_factory=dict)  #: keyword arguments of ``loss_class``
-    #: Keyword arguments of :class:`~crptpro.modules.PixelEncoder`.
-    encoder_options: Mapping[str, Any] = field(default_factory=dict)
+    #: Built as ``encoder_class(in_channels, image_size=..., **encoder_options)``.
+    encoder_class: type[nn.Module] = PixelEncoder
+    encoder_options: Mapping[str, Any] = field(default_factory=dict)  #: keyword arguments of ``encoder_class``
     updates: int = 50_000  #: encoder updates in total, over all domains
     batch_size: int = 512  #: transitions per update
     learning_rate: float = 1e-4  #: of Adam; the peak of a schedule
@@ -92,10 +93,10 @@ class Method:
         if unknown := sorted(self.downstream.keys() - DOWNSTREAM.keys()):
             raise ValueError(f"A method has the downstream settings {', '.join(DOWNSTREAM)}, not {', '.join(unknown)}.")
 
-    def build_encoder(self, in_channels: int = 9, image_size: int = 84, **options: Any) -> PixelEncoder:
+    def build_encoder(self, in_channels: int = 9, image_size: int = 84, **options: Any) -> Any:
         """Build the encoder that the method trains; ``options`` override the method's own."""
-        _require_known("An encoder", options, PixelEncoder)
-        return PixelEncoder(in_channels, image_size=image_size, **{**self.encoder_options, **options})
+        _require_known("An encoder", options, self.encoder_class)
+        return self.encoder_class(in_channels, image_size=image_size, **{**self.encoder_options, **options})
 
     def build(self, encoder: nn.Module, **options: Any) -> LossModule:
         """Build the loss on ``encoder``; ``options`` override the method's own; unknown ones raise a ``ValueError``."""

@@ -15,13 +15,15 @@ from torchrl.objectives import SoftUpdate
 
 from crptpro.artifact import read_artifact, write_artifact
 from crptpro.errors import CheckpointError
-from crptpro.modules import PixelEncoder, SquashedGaussianActor, resolve_precision, set_compute_dtype
+from crptpro.modules import resolve_precision, set_compute_dtype
 from crptpro.modules.precision import evaluating
+from crptpro.modules.registry import describe_network, rebuild_networks
 from crptpro.objectives import RADSACLoss, SkillDDPGLoss
+from crptpro.pretrained import describe_encoder
 from crptpro.provenance import provenance
 from crptpro.training.compile import Update, accelerate
 
-AGENT_FORMAT, AGENT_VERSION = "crptpro-agent", 2
+AGENT_FORMAT, AGENT_VERSION = "crptpro-agent", 3
 
 
 class PixelAgent(nn.Module):
@@ -66,30 +68,23 @@ class PixelAgent(nn.Module):
 
 def save_agent(path: str | Path, agent: PixelAgent, *, card: Mapping[str, Any]) -> Path:
     """Write encoder and actor into a directory, whole or not at all; ``card`` is what else the reader should know."""
+    described = {"encoder": describe_encoder(agent.encoder), "actor": describe_network(agent.actor)}
+    content = {"modules": described, **card, **provenance()}
     modules = {"encoder": agent.encoder, "actor": agent.actor}
-    configs = {name: getattr(module, "config", None) for name, module in modules.items()}
-    content = {"modules": configs, "encoder_class": type(agent.encoder).__name__, **card, **provenance()}
     return write_artifact(path, modules, card=content, format_name=AGENT_FORMAT, version=AGENT_VERSION)
 
 
-def load_agent(path: str | Path, *, encoder: nn.Module | None = None) -> tuple[PixelAgent, dict[str, Any]]:
+def load_agent(path: str | Path) -> tuple[PixelAgent, dict[str, Any]]:
     """Rebuild an agent from its directory, to act in the precision it was trained in; return it and its card.
 
-    An encoder that is no :class:`~crptpro.modules.PixelEncoder` is needed as ``encoder``, a module of its class, whose
-    weights are loaded. A directory that is missing, damaged, or not an agent raises a ``CheckpointError``.
+    An encoder of your own class needs :func:`~crptpro.modules.register_network`. A directory that is missing, damaged,
+    or not an agent raises a ``CheckpointError``.
     """
     card, tensors = read_artifact(path, format_name=AGENT_FORMAT, version=AGENT_VERSION, error=CheckpointError)
-    if encoder is None and card.get("encoder_class") != PixelEncoder.__name__:
-        raise CheckpointError(
-            f"{path} acts on a {card.get('encoder_class')}, which only its author can build: pass encoder=."
-        )
+    networks, _ = rebuild_networks(path, card, tensors, roles=("encoder", "actor"), error=CheckpointError)
     try:
-        with torch.device("meta"):  # the tensors replace the initial weights
-            encoder = encoder or PixelEncoder(**card["modules"]["encoder"])
-            agent = PixelAgent(encoder, SquashedGaussianActor(**card["modules"]["actor"]))
-        agent.load_state_dict(tensors, assign=True)
-        dtype = resolve_precision(card.get("precision", "fp32"), "cpu")
-    except (KeyError, TypeError, ValueError, RuntimeError) as reason:
+        agent, dtype = PixelAgent(**networks), resolve_precision(card.get("precision", "fp32"), "cpu")
+    except (TypeError, ValueError) as reason:
         raise CheckpointError(f"{path} holds no agent that can be rebuilt: {reason!r}") from reason
     return set_compute_dtype(agent.requires_grad_(False).eval(), dtype), card
 

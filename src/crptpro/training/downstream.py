@@ -29,7 +29,7 @@ from crptpro.modules.precision import PRECISION_NAMES, Precision
 from crptpro.objectives import DrQLoss, RADSACLoss, get_method, method_names
 from crptpro.objectives.base import require_positive
 from crptpro.objectives.methods import DOWNSTREAM
-from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained
+from crptpro.pretrained import Pretrained, describe_encoder, load_pretrained, random_pretrained
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import derive_seed, seed_everything
 from crptpro.training.agent import PixelAgent, SACLearner, save_agent
@@ -164,7 +164,7 @@ def train_downstream(
     ``overrides`` are single settings of :class:`DownstreamConfig`; the rest as in :func:`~crptpro.training.pretrain`.
 
     Raises:
-        PretrainedError: the artifact cannot be read, or its networks do not fit together.
+        PretrainedError: the artifact cannot be read, its networks do not fit together, or the encoder cannot be saved.
         CheckpointError: ``run_dir`` holds a run of other settings (named), or one whose replay is gone.
         NonFiniteError: a loss, a weight, an action or a reward is not finite; the last checkpoint is kept.
         DiskSpaceError: the disk cannot hold the replay.
@@ -179,6 +179,8 @@ def train_downstream(
             )
         source, is_control = str(pretrained), str(pretrained) in ("drq", "random-encoder")
         pretrained = random_pretrained(settings.seed, method=source) if is_control else load_pretrained(source)
+    if run_dir is not None:
+        describe_encoder(pretrained.encoder)  # the agent can be saved
     settings = settings.resolved(task, pretrained)
     if pretrained.method == "drq" and (settings.intrinsic_reward_coef > 0 or settings.features != "auto"):
         raise ValueError("drq trains its encoder: it has no bonus (`intrinsic_reward_coef`) and no kept `features`.")
@@ -227,6 +229,12 @@ def train_downstream(
         counters.update(updates=0, episodes=0, last_evaluation=-1)
         run.keep(**learner.components(), generators=generators, evaluator=evaluator,
                  replay=None if is_complete else replay)  # fmt: skip
+
+        if settings.env_steps <= repeat * settings.random_agent_steps:
+            logger.warning(
+                "%s env steps end before the first update, which comes after %s random decisions of %d env steps each.",
+                f"{settings.env_steps:,}", f"{settings.random_agent_steps:,}", repeat,
+            )  # fmt: skip
 
         def start_evaluation() -> None:
             agent_steps = run.position // repeat
@@ -329,6 +337,9 @@ def _make_replay(
     # the end of an episode.
     longest = episode_length(task, action_repeat=config.action_repeat) or LONGEST_EPISODE_AGENT_STEPS
     slack = 2 * (config.checkpoint_interval_env_steps // config.action_repeat + longest) + SPARE_FRAMES
+    if path is not None and not run.saved:
+        size = (config.replay_capacity + slack) * 3 * env.observation_spec["pixels"].shape[-1] ** 2
+        logger.info("replay: %.2f GB in %s; it is kept", size / 1e9, path)
     return make_replay(run, path, env, config.replay_capacity, slack=slack, generator=generator)
 
 

@@ -26,7 +26,7 @@ from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CRPTproError
 from crptpro.logging import RunLogger
 from crptpro.modules import DeterministicActor, SquashedGaussianActor, TwinCritic, computing
-from crptpro.modules.precision import PRECISION_NAMES, Precision, resolve_precision, set_compute_dtype, usable_device
+from crptpro.modules.precision import PRECISION_NAMES, Precision, set_compute_dtype, usable_device
 from crptpro.objectives import AveragedSACLoss, Method, RADSACLoss, SkillDDPGLoss, get_method, method_of
 from crptpro.seeding import derive_seed
 from crptpro.training.agent import PixelAgent, SACLearner
@@ -40,6 +40,7 @@ from crptpro.training.pretrain import (
     make_optimizer,
     make_update,
     scalars,
+    training_dtype,
     write_row,
 )
 from crptpro.training.run import Generators, Run
@@ -81,7 +82,8 @@ class ExploreConfig:
     quality: Quality = "exact"
     """render quality"""
     precision: Precision = "auto"
-    """of convolutions and matrix products; auto is bf16 where faster. Deviation: the released code uses fp32"""
+    """of convolutions and matrix products; auto is bf16 where faster, fp32 for a loss of your own. Deviation: the
+    released code uses fp32"""
     device: str = "cpu"
     """device of all networks"""
     log_interval: int = 50
@@ -206,7 +208,7 @@ def pretrain_active(
     with contextlib.ExitStack() as stack:
         run = stack.enter_context(Run(run_dir, unit="env_steps", streams=("pretrain", "explore", "episodes"),
                                       records=records, config=settings, progress=progress))  # fmt: skip
-        dtype = resolve_precision(run.saved_setting("precision", settings.precision), device)
+        dtype = training_dtype(run, loss, settings.precision, device)
         stack.enter_context(computing(loss, dtype))
         run.require_same({
             **{k: v for k, v in dataclasses.asdict(settings).items() if k not in ("device", "log_interval")},

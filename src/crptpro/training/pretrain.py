@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, is_tensor_collection
 from torch import Tensor, nn
 from torchrl.data import RandomSampler, ReplayBuffer
 from torchrl.objectives import LossModule, SoftUpdate
@@ -22,6 +22,7 @@ from crptpro.logging import RunLogger
 from crptpro.modules import computing, resolve_precision, usable_device
 from crptpro.modules.precision import PRECISION_NAMES, Precision
 from crptpro.objectives import Method, get_method, method_of
+from crptpro.objectives.base import PretrainingLoss
 from crptpro.objectives.functional import prototype_metrics
 from crptpro.pretrained import Pretrained, class_name, load_pretrained, loss_options
 from crptpro.provenance import provenance
@@ -52,7 +53,8 @@ class PretrainConfig:
     seed: int = 0
     """seeds sampling, shifts, and what the loss draws"""
     precision: Precision = "auto"
-    """of convolutions and matrix products; auto is bf16 where faster. Deviation: the released code uses fp32"""
+    """of convolutions and matrix products; auto is bf16 where faster, fp32 for a loss of your own. Deviation: the
+    released code uses fp32"""
     compile: bool = False
     """compile the loss with torch.compile; changes rounding only"""
     cuda_graph: bool = False
@@ -147,7 +149,7 @@ def pretrain(
     with contextlib.ExitStack() as stack:
         run = stack.enter_context(Run(run_dir, unit="updates", streams=("pretrain",), records=records, config=settings,
                                       progress=progress))  # fmt: skip
-        dtype = resolve_precision(run.saved_setting("precision", settings.precision), device)
+        dtype = training_dtype(run, loss, settings.precision, device)
         stack.enter_context(computing(loss, dtype))
         buffers, generators = stack.enter_context(
             _opened(datasets, loss, batch_size=settings.batch_size, seed=settings.seed, device=device)
@@ -215,6 +217,13 @@ def finetune(pretrained: Pretrained | str | Path, datasets: Any, **options: Any)
 # --- what active pre-training shares ---------------------------------------------------------------------------------
 
 
+def training_dtype(run: Run, loss: LossModule, precision: Precision, device: torch.device) -> torch.dtype:
+    """Return the dtype that a loss trains in; ``"auto"`` is float32 where its own layers may not take bfloat16."""
+    if precision == "auto" and not isinstance(loss, PretrainingLoss):
+        return resolve_precision("fp32", device)
+    return resolve_precision(run.saved_setting("precision", precision), device)
+
+
 def make_optimizer(
     loss: LossModule, method: Method, *, cuda_graph: bool = False
 ) -> tuple[torch.optim.Adam, torch.optim.lr_scheduler.LambdaLR, SoftUpdate | None]:
@@ -280,6 +289,8 @@ def make_update(
 
 def total_loss(losses: TensorDictBase) -> Tensor:
     """Return the sum of the ``loss*`` terms, which must be scalars."""
+    if not is_tensor_collection(losses):
+        raise ValueError(f"The loss returned a {type(losses).__name__}; a TensorDict of `loss_*` entries is needed.")
     terms = {name: losses[name] for name in losses.keys() if name.startswith("loss")}  # noqa: SIM118
     if not terms:
         raise ValueError(f"The loss returned no `loss_*` entry, only {sorted(losses.keys())}: nothing to minimise.")

@@ -21,6 +21,8 @@ from torch import Tensor, nn
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.envs.transforms import Transform
 
+from crptpro.errors import CRPTproError
+from crptpro.free_memory import free_bytes
 from crptpro.modules import PixelEncoder
 from crptpro.modules.precision import device_of, evaluating
 from crptpro.transforms.base import Keys, require_pairs
@@ -137,13 +139,15 @@ class DenseShiftFeatures(Transform):
         dtype: of the kept maps; the encoder's compute dtype when None. bfloat16 halves the memory and rounds each
             feature to eight significant bits (exact if the encoder computes in bfloat16).
         generator: source of the offsets, which the state dict excludes; torch's global one when None.
-        observations: maps to keep; what the replay can hold when None. Fewer will do for a run that stores fewer.
+        observations: maps to keep, each 0.78 MB in float32 (default encoder); what the replay can hold when None.
+            Fewer will do for a run that stores fewer.
         in_keys: int64 ``[*]`` or ``[*, 1]``, numbers of observations; ``"number"`` and ``("next", "number")`` if None.
         out_keys: features ``[*, feature_dim]`` in the encoder's compute dtype, one key per observation; ``"features"``
             and ``("next", "features")`` if None.
 
     Raises:
         ValueError: an encoder without dense maps, key lists of unequal length, or a ``dtype`` unfit for the encoder's.
+        CRPTproError: at the first sample, memory that the device does not have. What is merely not free is a warning.
     """
 
     encoder: PixelEncoder
@@ -232,8 +236,7 @@ class DenseShiftFeatures(Transform):
     def _encode_missing(self, numbers: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return the maps and the projections, those of these observations among them."""
         if self._maps is None:
-            shape = (self.observations, *self.maps_shape)
-            self._maps = torch.empty(shape, dtype=self.dtype, device=device_of(self.encoder))
+            self._maps = self._new_maps()
         missing = numbers[self._held[numbers % self.observations] != numbers].unique()
         for number in missing.tolist():
             # One by one: a convolution may round differently in a batch, and then a resumed run would, too.
@@ -253,6 +256,20 @@ class DenseShiftFeatures(Transform):
                 "map to the same slot. Leave it out, or keep as many as the replay."
             )
         return self._maps, self._embeddings
+
+    def _new_maps(self) -> Tensor:
+        shape, device = (self.observations, *self.maps_shape), device_of(self.encoder) or torch.device("cpu")
+        needed, free = math.prod(shape) * self.dtype.itemsize, free_bytes(device)
+        size = (
+            f"Dense maps of {self.observations:,} observations take {needed / 1e9:.1f} GB; {free / 1e9:.1f} GB are free"
+        )
+        remedy = "Fewer `observations` take less, and maps in bfloat16 half of it."
+        if needed > free:  # the memory is taken as observations are sampled
+            logger.warning("%s. %s", size, remedy)
+        try:
+            return torch.empty(shape, dtype=self.dtype, device=device)
+        except RuntimeError as reason:
+            raise CRPTproError(f"{size}. {remedy}") from reason
 
     def _embed_all_shifts(self, projector: nn.Module, maps: Tensor) -> Tensor:
         side = torch.arange(2 * self.pad + 1, device="cpu")
@@ -312,8 +329,6 @@ def choose_feature_mode(
         return "reencode", f"re-encoding at every update: {error}"
     size = f"{needed / 2**30:.1f} GiB for {observations} observations, {available_bytes / 2**30:.1f} GiB free"
     if mode == "dense":
-        if needed > available_bytes:
-            logger.warning("The dense-shift cache was requested and may not fit: %s.", size)
         return "dense", f"dense-shift cache, as requested ({size})"
     budget = 0.8 * available_bytes
     if needed <= budget:
