@@ -255,9 +255,12 @@ def shipped_encoders() -> list[str]:
     return sorted(card.parent.name for card in SHIPPED.glob(f"*/{CARD_FILE}"))
 
 
-def require_encoder(loss: LossModule) -> None:
-    """Raise what :func:`save_pretrained` would about the encoder of a loss: before training."""
-    describe_encoder(_as_pretrained(loss).encoder)
+def require_saveable(loss: LossModule) -> None:
+    """Raise what :func:`save_pretrained` would about the networks of a loss: before training."""
+    networks = _as_pretrained(loss)._networks()
+    describe_encoder(networks.pop("encoder"))
+    for network in networks.values():
+        describe_network(network)
 
 
 def describe_encoder(encoder: nn.Module) -> dict[str, Any]:

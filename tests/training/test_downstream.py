@@ -121,6 +121,13 @@ def test_a_kill_during_the_last_evaluation_repeats_that_evaluation_alone(tmp_pat
     assert len(steps) == 2 * EPISODE
 
 
+def test_a_run_that_ends_before_its_first_update_is_announced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO", logger="crptpro"):
+        assert train(tmp_path, env_steps=20).evaluations[-1]["updates"] == 0
+    assert "20 env steps end before the first update, which comes after 12 random decisions of 2 env" in caplog.text
+    assert f"GB in {tmp_path / 'replay'}; it is kept" in caplog.text
+
+
 def test_a_budget_that_the_action_repeat_does_not_divide_is_rounded_up_and_can_be_asked_for_again(
     tmp_path: Path,
 ) -> None:

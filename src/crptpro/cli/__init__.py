@@ -35,7 +35,7 @@ from crptpro.logging import RunLogger
 from crptpro.modules import usable_device
 from crptpro.objectives import get_method
 from crptpro.plugins import load_plugins
-from crptpro.pretrained import load_pretrained, random_pretrained, require_encoder, save_pretrained
+from crptpro.pretrained import load_pretrained, random_pretrained, require_saveable, save_pretrained
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import seed_everything
 from crptpro.training.evaluate import episode_seed, run_episode
@@ -189,7 +189,7 @@ class Pretraining(EncoderRun):
         loss_options, encoder_options = named_values("--loss", self.loss), named_values("--encoder", self.encoder)
         seed_everything(self.config.seed)
         loss = method.build(method.build_encoder(**images | encoder_options), **loss_options)
-        require_encoder(loss)
+        require_saveable(loss)
         with self.logging.records(self.out) as records:
             result = train(loss, sources, method=self.method, run_dir=self.out, config=self.config, records=records)
             self.keep(result, records)
