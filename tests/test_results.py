@@ -10,7 +10,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from crptpro.experiments.published import UNSEEN
+from crptpro.experiments.published import SEEN, UNSEEN
 
 RESULTS = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "results.py"))
 RECORDS = RESULTS["RECORDS"]
@@ -111,9 +111,18 @@ def sentences() -> Iterator[str]:
     long = runs["`crptpro`"].loc["crptpro_seed_5"]
     yield f"Its evaluations fall from {long[200_000]:.0f} at 200,000 env steps to {long[240_000]:.0f} at 240,000"
     yield f"and rise to {long[340_000]:.0f} at 340,000"
-    late = list(range(320_000, 420_000, 20_000))
-    theirs = runs[AUTHORS][late].mean(axis=1).iloc[0]
-    yield f"from 320,000 to 400,000 it has {long[late].mean():.0f}, the authors' run {theirs:.0f}"
+    yield f"stay between {long.loc[340_000:].min():.0f} and {long.loc[340_000:].max():.0f}"
+    (paper,) = (row.scores["crptpro"] for row in SEEN if (row.group, row.task) == ("A", "cheetah_run"))
+    log, end = runs[AUTHORS].iloc[0], long[500_000]
+    yield f"there it returned {end:.0f}, the paper {paper}, the authors' run {log[500_000]:.0f}"
+    yield f"it returned {end:.0f} over ten episodes. The paper has {paper}, the authors' log {log[500_000]:.0f}"
+    late = list(range(420_000, 520_000, 20_000))
+    yield f"over the last five evaluations it returned {long[late].min():.0f} to {long[late].max():.0f}"
+    yield f"its mean is {long[late].mean():.0f}. The authors' run has {log[late].mean():.0f}"
+    drq = runs["DrQ, its authors' log"][late].mean(axis=1)
+    yield f"DrQ's ten runs {RESULTS['_spread'](drq)}"
+    yield f"[returned {end:.0f}](#one-of-the-runs-continued), the paper {paper}, the authors' log {log[500_000]:.0f}"
+    yield f"over the last five evaluations {long[late].mean():.0f}, the log {log[late].mean():.0f}"
 
     (paper,) = (row.scores["crptpro"] for row in UNSEEN if (row.group, row.task) == ("A", "finger_spin"))
     yield f"The paper has {paper} after 500,000 env steps"
