@@ -142,6 +142,12 @@ def sentences() -> Iterator[str]:
     yield f"At 20,000 env steps {more[0]} of its ten runs returned more than the mean of ours"
     yield f"than the mean of ours on the pre-trained encoder, at 60,000 {more[1]}."
 
+    evaluations = pd.read_csv(RESULTS["PAPER_SCALE"] / "walker_walk/crptpro_seed_0/eval.csv")
+    example = evaluations.groupby("env_steps")["episode_return"].mean()[20_000]
+    chance = pd.read_csv(RESULTS["PAPER_SCALE"] / "uniform_walker_walk.csv")["episode_return"].mean()
+    drq = RESULTS["_spread"](RESULTS["_published"]("walker_walk")[20_000])
+    yield f"One run of this command returned {example:.0f}; random actions return {chance:.0f}, DrQ's ten runs {drq}"
+
     returns = RESULTS["_control_returns"]()[0][20_000].unstack("run")
     bonus = returns.loc["crptpro"] - returns.loc["crptpro-no-bonus"]
     yield f"Each of the five seeds returned more with it, by {bonus.min():.0f} to {bonus.max():.0f}"
