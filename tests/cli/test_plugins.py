@@ -34,6 +34,7 @@ def test_a_plugin_registers_a_method_on_an_encoder_of_its_own(call: Call, datase
     learn = ("downstream", TASK, "--pretrained", "out/encoder", "--out", "down", *SMALL)
     assert call(*learn, "--plugin", METHODS)[0] == 0
     assert call("evaluate", "down/agent", "--episodes", 1, "--plugin", METHODS)[0] == 0
+    assert call("probe", "out/encoder", dataset, "--plugin", METHODS)[0] == 0
     assert training.load_agent("down/agent")[0].encoder.conv.weight.shape[0] == 5
 
     # In Python it is one line.

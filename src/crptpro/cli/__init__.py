@@ -33,6 +33,7 @@ from crptpro.envs import make_env
 from crptpro.errors import CRPTproError, DatasetError
 from crptpro.logging import RunLogger
 from crptpro.modules import usable_device
+from crptpro.modules.encoder import images_of
 from crptpro.objectives import get_method
 from crptpro.plugins import load_plugins
 from crptpro.pretrained import load_pretrained, random_pretrained, require_saveable, save_pretrained
@@ -293,8 +294,7 @@ class Evaluate:
         settings: dict[str, Any] = {name: usual[name] if given[name] is None else given[name] for name in names}
         settings["render"] = not is_random or video is not None  # the random policy needs no pixels
         if agent is not None:
-            settings["image_size"] = getattr(agent.encoder, "image_size", 84)
-            settings["frame_stack"] = getattr(agent.encoder, "in_channels", 9) // 3
+            settings |= images_of(agent.encoder)
         with contextlib.closing(make_env(task, seed=self.seed, **settings)) as env:
             action_dim = env.action_spec.shape[-1]
             if agent is not None and agent.actor.config["action_dim"] != action_dim:

@@ -26,6 +26,7 @@ from crptpro.artifact import read_json, write_json, write_whole
 from crptpro.data import FrameDataset, StoredReplay
 from crptpro.errors import RecordError
 from crptpro.modules import Projector
+from crptpro.modules.encoder import images_of
 from crptpro.modules.precision import device_of
 from crptpro.objectives import get_method
 from crptpro.pretrained import Pretrained, load_pretrained
@@ -54,7 +55,7 @@ def probe_rows(
     Raises:
         DatasetError: there is no physical state, or too little data to split.
     """
-    frame_stack = pretrained.encoder.in_channels // 3
+    frame_stack = images_of(pretrained.encoder)["frame_stack"]
     observed = probe_samples(dataset, samples=samples, seed=seed, frame_stack=frame_stack)
     is_control = pretrained.method.startswith("random-encoder")
     projector = _untrained_projector(pretrained) if is_control else pretrained.projector
@@ -129,7 +130,7 @@ def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
     A window has the same decisions of both sources; a source with too few of them has no row.
     """
     pretrained, explored = of.load(), load_pretrained(of.explorer)
-    frame_stack = pretrained.encoder.in_channels // 3
+    frame_stack = images_of(pretrained.encoder)["frame_stack"]
     training = explored.card["training"]
     decisions = {entry["domain"]: int(entry["agent_steps"]) for entry in training["datasets"]}
     fewest = min(decisions.values())
@@ -167,7 +168,7 @@ def embeddings(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
     from sklearn.decomposition import PCA
 
     pretrained = of.load()
-    frame_stack = pretrained.encoder.in_channels // 3
+    frame_stack = images_of(pretrained.encoder)["frame_stack"]
     pixels = {}
     for path in of.datasets:
         generator = torch.Generator().manual_seed(of.seed)

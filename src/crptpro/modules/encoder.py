@@ -176,6 +176,11 @@ class PixelEncoder(nn.Module):
         return x.contiguous()
 
 
+def images_of(encoder: object) -> dict[str, Any]:
+    """Return ``image_size`` and ``frame_stack`` of the images that an encoder takes: 84 and 3 if it does not say."""
+    return {"image_size": getattr(encoder, "image_size", 84), "frame_stack": getattr(encoder, "in_channels", 9) // 3}
+
+
 def _can_chunk(device: torch.device) -> bool:
     """Whether other threads may compute: autocast and functional transforms act on the calling thread alone."""
     return (

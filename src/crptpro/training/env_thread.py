@@ -17,6 +17,7 @@ from crptpro.data import FrameReplay
 from crptpro.domains import Domain, get_domain
 from crptpro.envs import make_env, needs_gl
 from crptpro.envs.rendering import select_backend
+from crptpro.modules.encoder import images_of
 from crptpro.provenance import cpu_cores
 from crptpro.training.run import Run
 from crptpro.workers import Inline, single_core_threads
@@ -41,8 +42,7 @@ class EnvThread:
             quality=config.quality,
             colors=getattr(config, "colors", "normal"),
             action_repeat=action_repeat,
-            image_size=getattr(encoder, "image_size", 84),
-            frame_stack=getattr(encoder, "in_channels", 9) // 3,
+            **images_of(encoder),
         )
         # A torch limited to one thread leaves the cores to others.
         has_cores = cpu_cores() > 1 and torch.get_num_threads() > 1

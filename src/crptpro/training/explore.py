@@ -26,6 +26,7 @@ from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CRPTproError
 from crptpro.logging import RunLogger
 from crptpro.modules import DeterministicActor, SquashedGaussianActor, TwinCritic, computing
+from crptpro.modules.encoder import images_of
 from crptpro.modules.precision import PRECISION_NAMES, Precision, set_compute_dtype, usable_device
 from crptpro.objectives import AveragedSACLoss, Method, RADSACLoss, SkillDDPGLoss, get_method, method_of
 from crptpro.seeding import derive_seed
@@ -219,7 +220,7 @@ def pretrain_active(
         capacity = min(settings.replay_capacity, plan.agent_steps)
         slack = 4 * (settings.checkpoint_interval_env_steps // sum(plan.repeats)) + SPARE_FRAMES
         if run.run_dir is not None and not run.saved:
-            needed = len(named) * (capacity + slack) * 3 * getattr(loss.encoder, "image_size", 84) ** 2
+            needed = len(named) * (capacity + slack) * 3 * images_of(loss.encoder)["image_size"] ** 2
             logger.info("replays: %.2f GB in %s; they are kept", needed / 1e9, run.run_dir / "replay")
             # Those of an attempt without a checkpoint are replaced.
             held = sum(file.stat().st_size for file in (run.run_dir / "replay").rglob("*.memmap*"))

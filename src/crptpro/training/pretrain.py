@@ -20,6 +20,7 @@ from crptpro.data import FrameDataset
 from crptpro.errors import CRPTproError, DatasetError
 from crptpro.logging import RunLogger
 from crptpro.modules import computing, resolve_precision, usable_device
+from crptpro.modules.encoder import images_of
 from crptpro.modules.precision import PRECISION_NAMES, Precision
 from crptpro.objectives import Method, get_method, method_of
 from crptpro.objectives.base import PretrainingLoss
@@ -373,8 +374,8 @@ def _opened(
     buffers: dict[str, ReplayBuffer] = {}
     for index, (name, dataset) in enumerate(given):
         if isinstance(dataset, (str, Path)):
-            channels = getattr(getattr(loss, "encoder", None), "in_channels", 9)
-            dataset = FrameDataset.open(dataset, frame_stack=channels // 3, device=device)
+            frame_stack = images_of(getattr(loss, "encoder", None))["frame_stack"]
+            dataset = FrameDataset.open(dataset, frame_stack=frame_stack, device=device)
         if not isinstance(dataset, ReplayBuffer):
             raise DatasetError(
                 f"Dataset {index} is a {type(dataset).__name__}; give a directory, a FrameDataset or a ReplayBuffer."
