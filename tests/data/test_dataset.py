@@ -304,15 +304,19 @@ def test_a_relative_path_stays_what_it_was_when_the_process_goes_elsewhere(
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
-def test_a_full_disk_is_named_and_what_was_kept_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kept", [0, 1])
+def test_a_full_disk_is_named_and_what_was_kept_continues(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kept: int
+) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    collect_toy(tmp_path / "disk", episodes=1)
+    if kept:
+        collect_toy(tmp_path / "disk", episodes=kept)
     dataset = FrameDataset.create(tmp_path / "disk", **collection_request())
     with monkeypatch.context() as patched:
         patched.setattr(os, "fsync", full)
-        with pytest.raises(DiskSpaceError, match="is full after 10 transitions"):
+        with pytest.raises(DiskSpaceError, match=f"is full after {10 * kept} transitions"):
             dataset.extend(random_episode(10, size=8, state=False))
     dataset.writer.close()
     collect_toy(tmp_path / "disk")

@@ -333,6 +333,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
     def close(self) -> None:
         """Free the directory; an unfinished dataset can be continued later. One without an episode leaves nothing."""
         if self._is_open and not self.episodes:
+            self._remove_rows()
             for name in (CARD_FILE, ".lock"):
                 (self.path / name).unlink(missing_ok=True)
             with contextlib.suppress(OSError):  # it is not empty
@@ -365,8 +366,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
             stale.unlink(missing_ok=True)
         state = _read(self.path) if (self.path / CARD_FILE).exists() else self.state
         if not state["episodes"]:
-            for part in ("frames", "transitions"):  # of an episode that was being written
-                shutil.rmtree(self.path / part, ignore_errors=True)
+            self._remove_rows()
             self._save()
             return
         _require_request(self.path, state["request"], self.request)
@@ -374,6 +374,11 @@ class EpisodeWriter(ImmutableDatasetWriter):
             require_size(path, min(expected, path.stat().st_size if path.exists() else 0), expected)
         self.state = state
         logger.info("%s: continuing after %d of %d transitions", self.path.name, self.transitions, self.target)
+
+    def _remove_rows(self) -> None:
+        """Remove what was written of the first episode."""
+        for part in ("frames", "transitions"):
+            shutil.rmtree(self.path / part, ignore_errors=True)
 
     def _save(self, **changes: Any) -> None:
         state = {**self.state, **changes}
