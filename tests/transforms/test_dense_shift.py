@@ -16,7 +16,6 @@ from torchrl.envs import Compose, TransformedEnv
 from toy_env import rollout_of
 
 from crptpro.data import FrameReplay
-from crptpro.errors import CRPTproError
 from crptpro.modules import PixelEncoder
 from crptpro.transforms import DenseShiftFeatures, FrozenEncoder, RandomShift, choose_feature_mode, random_shift
 from crptpro.transforms.dense_shift import _crop_by_index, crop_features, dense_maps_bytes, dense_shift_maps
@@ -178,18 +177,10 @@ def test_projections_are_those_of_the_network_in_evaluation_and_leave_one_in_tra
     torch.testing.assert_close(td["next", "embedding"], expected, rtol=1e-5, atol=1e-5)
 
 
-def test_maps_that_may_not_fit_are_announced_and_those_that_cannot_be_are_refused(monkeypatch, caplog):
+def test_maps_that_may_not_fit_are_announced(monkeypatch, caplog):
     monkeypatch.setattr("crptpro.transforms.dense_shift.free_bytes", lambda device: 10)
     (dense := dense_of(observations=12))(dense.replay.batch(1))
-    assert re.search(r"Dense maps of 12 observations take .* GB; 0.0 GB are free\. Fewer `observations`", caplog.text)
-
-    def refuse(*_, **__):
-        raise RuntimeError("DefaultCPUAllocator: can't allocate memory")
-
-    batch = (dense := dense_of()).replay.batch(1)
-    monkeypatch.setattr(torch, "empty", refuse)
-    with pytest.raises(CRPTproError, match="Dense maps of 12 observations take"):
-        dense(batch)
+    assert re.search(r"Dense maps of 12 observations take .* GB, but 0.0 GB are free\. Fewer `observ", caplog.text)
 
 
 def test_threads_that_sample_side_by_side_get_each_their_own():

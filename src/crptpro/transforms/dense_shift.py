@@ -21,7 +21,6 @@ from torch import Tensor, nn
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.envs.transforms import Transform
 
-from crptpro.errors import CRPTproError
 from crptpro.free_memory import free_bytes
 from crptpro.modules import PixelEncoder
 from crptpro.modules.precision import device_of, evaluating
@@ -147,7 +146,6 @@ class DenseShiftFeatures(Transform):
 
     Raises:
         ValueError: an encoder without dense maps, key lists of unequal length, or a ``dtype`` unfit for the encoder's.
-        CRPTproError: at the first sample, memory that the device does not have. What is merely not free is a warning.
     """
 
     encoder: PixelEncoder
@@ -260,16 +258,12 @@ class DenseShiftFeatures(Transform):
     def _new_maps(self) -> Tensor:
         shape, device = (self.observations, *self.maps_shape), device_of(self.encoder) or torch.device("cpu")
         needed, free = math.prod(shape) * self.dtype.itemsize, free_bytes(device)
-        size = (
-            f"Dense maps of {self.observations:,} observations take {needed / 1e9:.1f} GB; {free / 1e9:.1f} GB are free"
-        )
-        remedy = "Fewer `observations` take less, and maps in bfloat16 half of it."
-        if needed > free:  # the memory is taken as observations are sampled
-            logger.warning("%s. %s", size, remedy)
-        try:
-            return torch.empty(shape, dtype=self.dtype, device=device)
-        except RuntimeError as reason:
-            raise CRPTproError(f"{size}. {remedy}") from reason
+        if needed > free:  # the memory of a CPU is taken as observations are sampled
+            logger.warning(
+                "Dense maps of %s observations take %.1f GB, but %.1f GB are free. Fewer `observations` take less, and "
+                "maps in bfloat16 half of it.", f"{self.observations:,}", needed / 1e9, free / 1e9,
+            )  # fmt: skip
+        return torch.empty(shape, dtype=self.dtype, device=device)
 
     def _embed_all_shifts(self, projector: nn.Module, maps: Tensor) -> Tensor:
         side = torch.arange(2 * self.pad + 1, device="cpu")
