@@ -182,7 +182,14 @@ def cheetah_run_long() -> pd.DataFrame:
         row = {"cheetah_run": name, "runs": len(own)}
         row |= {f"{each[0]:,} to {each[-1]:,}": _over_runs(own[each].mean(axis=1, skipna=False)) for each in at}
         rows.append(row | {"500,000 env steps": _over_runs(own[500_000])})
-    return pd.DataFrame(rows)
+    logs = {"`crptpro`": PAPER_SCALE / "cheetah_run/crptpro_seed_5/episodes.csv",
+            "CRPTpro, its authors' log": RECORDS / "references/crptpro_cheetah_run_train.csv"}  # fmt: skip
+    for name, path in logs.items():
+        trained = pd.read_csv(path).query("env_steps > 0")
+        blocks = trained.groupby((trained["env_steps"] - 1) // 100_000)["episode_return"].mean()
+        means = dict(zip(list(rows[0])[2:7], blocks.map("{:.0f}".format), strict=True))
+        rows.append({"cheetah_run": f"{name}, training episodes", "runs": 1, **means})
+    return pd.DataFrame(rows).fillna("")
 
 
 def finger_spin_means() -> pd.DataFrame:
