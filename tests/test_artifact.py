@@ -186,13 +186,13 @@ def test_threads_that_write_one_file_leave_a_whole_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("damage", "message"), [
     (shutil.rmtree, "does not exist"),
-    (lambda p: (p / "card.json").unlink(), r"card\.json does not exist"),
+    (lambda p: (p / "card.json").unlink(), r"has no card\.json: it is no artifact"),
     (lambda p: (p / "card.json").write_text("{"), r"card\.json cannot be read as JSON"),
     (lambda p: (p / "card.json").write_text("[1]"), r"card\.json holds a list"),
     (lambda p: (p / "weights.safetensors").unlink(), r"weights\.safetensors is missing"),
     (lambda p: os.truncate(p / "weights.safetensors", 90), "truncated, damaged or replaced"),
     (lambda p: (p / "weights.safetensors").write_bytes(bytes(200)), "truncated, damaged or replaced"),
-    (lambda p: write_artifact(p, {}, card={}, format_name="test", version=3), "format version 3; .* reads up to 2"),
+    (lambda p: write_artifact(p, {}, card={}, format_name="test", version=3), "format version 3; this release reads 2"),
 ])  # fmt: skip
 def test_what_is_damaged_or_too_new_is_named(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
     write(tmp_path / "a")

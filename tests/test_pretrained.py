@@ -123,7 +123,7 @@ def test_what_cannot_be_rebuilt_is_refused_and_the_old_artifact_kept(saved: Path
     with pytest.raises(PretrainedError, match=r"encoder in .* is not the PixelEncoder of its card"):
         save_pretrained(loss, saved)
     loss.encoder.config["channels"] = object()
-    with pytest.raises(ValueError, match=r"modules\.encoder\.config\.channels"):
+    with pytest.raises(ValueError, match=r"PixelEncoder\.config\.channels"):
         save_pretrained(loss, saved)
     assert load_pretrained(saved).identity() == before
 

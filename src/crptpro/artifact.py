@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -161,14 +162,18 @@ def read_artifact(
     if not path.is_dir():
         raise error(f"{path} does not exist or is not a directory; expected one with {WEIGHTS_FILE} and {CARD_FILE}.")
     if not (path / CARD_FILE).exists():
-        for inside in sorted(path.glob(f"*/{CARD_FILE}")):
-            if read_json(inside, error=error).get("format") == format_name:
-                raise error(f"{path} is no artifact. Did you mean {inside.parent}?")
+        hint = ""
+        for inside in sorted(path.glob(f"[!.]*/{CARD_FILE}")):
+            with contextlib.suppress(CRPTproError):  # it is damaged
+                if read_json(inside).get("format") == format_name:
+                    hint = f" Did you mean {inside.parent}?"
+                    break
+        raise error(f"{path} has no {CARD_FILE}: it is no artifact.{hint}")
     card = read_json(path / CARD_FILE, error=error)
     if card.get("format") != format_name:
         raise error(f"{path} is a {card.get('format', 'directory of unknown format')!r}, expected {format_name!r}.")
-    if card.get("version", 0) > version:
-        raise error(f"{path} has format version {card['version']}; this crptpro reads up to {version}. Upgrade it.")
+    if (found := card.get("version")) != version:
+        raise error(f"{path} has format version {found}; this release reads {version}. Make it again, or upgrade.")
     weights = path / WEIGHTS_FILE
     try:
         content = weights.read_bytes()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import logging
 import os
@@ -33,7 +34,9 @@ def _count(info: Any) -> PrimitiveConstructorSpec[int] | None:
         try:
             return int(words[0])
         except ValueError:
-            return as_int(float(words[0]), "value")
+            with contextlib.suppress(ValueError):
+                return as_int(float(words[0]), "value")
+        raise ValueError(f"{words[0]!r} is not a whole number")
 
     return PrimitiveConstructorSpec(1, "INT", read, lambda value: isinstance(value, int), lambda value: [str(value)])
 

@@ -22,6 +22,7 @@ from crptpro.artifact import CARD_FILE, identity_of, read_artifact, write_artifa
 from crptpro.data import FrameDataset
 from crptpro.errors import PretrainedError, UnknownNameError
 from crptpro.modules import PixelEncoder
+from crptpro.modules.encoder import images_of
 from crptpro.modules.registry import describe_network, rebuild_networks
 from crptpro.objectives import get_method, method_names, method_of
 from crptpro.provenance import provenance
@@ -151,7 +152,7 @@ def random_pretrained(
     encoder.requires_grad_(False).eval()
     card: dict[str, Any] = {"method": method, "training": None, "seed": seed}
     if method == "random-encoder-standardised":
-        opened = _opened(datasets, encoder.in_channels // 3)
+        opened = _opened(datasets, images_of(encoder)["frame_stack"])
         encoder.standardise(*_feature_moments(encoder, opened, seed))
         shown = ("domain", "transitions", "seed", "quality", "colors")
         card["standardised_on"] = [{name: data.card[name] for name in shown if name in data.card} for data in opened]
@@ -200,7 +201,7 @@ def save_pretrained(trained: Any, path: str | Path, *, slim: bool = False) -> Pa
     """
     path = as_path(path)
     source = _as_pretrained(trained)
-    card = dict(source.card)
+    card = {"method": source.method, **source.card}
     if "weights_sha256" in card and (slim or "slim_of" in card):
         card["slim_of"] = source.identity()
     if slim:
@@ -209,17 +210,8 @@ def save_pretrained(trained: Any, path: str | Path, *, slim: bool = False) -> Pa
         if source.prototypes is None or source.projector is None:
             left_out |= dict.fromkeys(("projector", "prototypes", "queue"))
         source = replace(source, **left_out)
-    states: dict[str, Mapping[str, Tensor]] = {}
-    described: dict[str, dict[str, Any]] = {}
-    for role, module in source._networks().items():
-        if role == "encoder":
-            described[role] = describe_encoder(module)
-        elif (description := describe_network(module)) is not None:
-            described[role] = description
-        else:
-            _LOG.warning("The %s is a %s without a `.config`; it is not saved.", role, type(module).__name__)
-            continue
-        states[role] = module.state_dict()
+    described = _describe(source)
+    states: dict[str, Mapping[str, Tensor]] = {role: getattr(source, role).state_dict() for role in described}
     if source.queue is not None:
         states["queue"] = {"latents": source.queue}
     if source.rest:
@@ -255,22 +247,26 @@ def shipped_encoders() -> list[str]:
     return sorted(card.parent.name for card in SHIPPED.glob(f"*/{CARD_FILE}"))
 
 
-def require_saveable(loss: LossModule) -> None:
-    """Raise what :func:`save_pretrained` would about the networks of a loss: before training."""
-    networks = _as_pretrained(loss)._networks()
-    describe_encoder(networks.pop("encoder"))
-    for network in networks.values():
-        describe_network(network)
+def require_saveable(trained: Any) -> None:
+    """Raise before training what :func:`save_pretrained` would raise about networks of your own after it."""
+    source = _as_pretrained(trained)
+    described = _describe(source)
+    tensors = {f"{role}.{k}": v for role in described for k, v in getattr(source, role).state_dict().items()}
+    rebuild_networks("the artifact", {"modules": described}, tensors, roles=NETWORKS, error=PretrainedError)
 
 
-def describe_encoder(encoder: nn.Module) -> dict[str, Any]:
-    """Return class and arguments of an encoder; without a ``.config`` of them a PretrainedError."""
-    if (description := describe_network(encoder)) is None:
-        raise PretrainedError(
-            f"The encoder is a {type(encoder).__name__} without a `.config` of its arguments, so that it could not be "
-            "rebuilt; use crptpro.modules.PixelEncoder or give yours one."
-        )
-    return description
+def _describe(source: Pretrained) -> dict[str, dict[str, Any]]:
+    """Return class and arguments of every network that can be rebuilt; the encoder must be one of them."""
+    described = {}
+    for role, network in source._networks().items():
+        if (description := describe_network(network)) is not None:
+            described[role] = description
+            continue
+        message = f"The {role} is a {type(network).__name__} without a `.config` of its arguments"
+        if role == "encoder":
+            raise PretrainedError(f"{message}; use crptpro.modules.PixelEncoder or give yours one.")
+        _LOG.warning("%s; it is not saved.", message)
+    return described
 
 
 def _as_pretrained(trained: Any) -> Pretrained:
@@ -326,9 +322,7 @@ def loss_options(loss: nn.Module) -> dict[str, Any]:
 
 def _pixel_facts(encoder: nn.Module) -> dict[str, Any]:
     config = getattr(encoder, "config", {})
-    facts = {name: config.get(name) for name in ("image_size", "in_channels", "pixel_scale", "pixel_offset")}
-    channels = facts["in_channels"]
-    return facts | {"frame_stack": None if channels is None else channels // 3}
+    return {name: config.get(name) for name in ("in_channels", "pixel_scale", "pixel_offset")} | images_of(encoder)
 
 
 def _unwrapped(module: Any) -> nn.Module | None:

@@ -22,7 +22,7 @@ class SmallEncoder(nn.Module):
     def __init__(self, in_channels: int = 9, *, image_size: int = 84, width: int = 6) -> None:
         super().__init__()
         self.config = {"in_channels": in_channels, "image_size": image_size, "width": width}
-        self.image_size, self.feature_dim = image_size, width
+        self.feature_dim = width
         self.conv = nn.Conv2d(in_channels, width, 3)
 
     def forward(self, pixels: Tensor) -> Tensor:

@@ -62,7 +62,7 @@ def test_the_installed_command_is_this_one() -> None:
     (("evaluate", "random-policy", "--episodes", "many"), "many"),
     (("collect", "walker", "--quality", "best"), "best"),
     (("dance",), "dance"),
-    (("collect", "walker", "--transitions", "1.5"), "whole number, got 1.5"),
+    (("collect", "walker", "--transitions", "1.5"), "'1.5' is not a whole number"),
 ])  # fmt: skip
 def test_arguments_that_the_parser_cannot_read_are_named_with_status_2(
     call: Call, arguments: tuple[str, ...], named: str
@@ -235,7 +235,7 @@ def test_an_encoder_and_the_control_are_probed_with_table_and_csv(call: Call, da
     (("pretrain", "walker"), r"walker is not a directory.*`crptpro collect walker`"),
     (("pretrain", "data/walker", "--method", "proto-rl-c"), r"no domain or task 'data/walker'"),
     (("pretrain", os.path.dirname(__file__), "--method", "proto-rl-c"), r"proto-rl-c explores and reads no dataset"),
-    (("pretrain", str(SHIPPED / "group-a")), r"group-a is a 'crptpro-pretrained', not a dataset"),
+    (("pretrain", str(SHIPPED / "group-a")), r"group-a has the format 'crptpro-pretrained': it is not a dataset"),
     (("pretrain", "--method", "becl"), r"at least one domain, task or group \(A, B, C, D\)"),
     (("pretrain", "A", "--method", "apt-s"), r"one domain, got 3 \(cheetah, walker, quadruped\)"),
     (("pretrain", TASK, "--method", "proto-rl-c", "--queue-size", "7"), r"queue_size.* multiple"),

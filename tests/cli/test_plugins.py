@@ -22,7 +22,7 @@ ENVIRONMENT = Path(__file__).with_name("slow_env.py")
 def test_a_plugin_registers_a_method_on_an_encoder_of_its_own(call: Call, dataset: Path) -> None:
     assert "slowness" not in method_names()
     own = ("pretrain", dataset, "--out", "out", "--method", "slowness", "--log-interval", 1, "--plugin", METHODS)
-    assert call(*own, "--encoder", "width=5")[0] == 0
+    assert call(*own, "--encoder", "width=5")[0] == 0  # images of 16 pixels, as its `config` says
     assert {"slowness", "slowness-active"} <= set(method_names())  # what lists methods lists it
     loaded = load_pretrained("out/encoder")
     assert (loaded.method, loaded.card["training"]["updates"]) == ("slowness", 2)

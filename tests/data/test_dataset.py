@@ -138,7 +138,7 @@ def test_a_missing_or_truncated_file_is_named(duplicate: Path, file: str) -> Non
 
 
 @pytest.mark.parametrize(("changes", "message"), [
-    ({"format": "safetensors"}, "is a 'safetensors', not a dataset"),
+    ({"format": "safetensors"}, "has the format 'safetensors': it is not a dataset"),
     ({"version": 99}, "version 99; this release reads"),
     ({"frames": 5}, "pixels.memmap is longer than it should be"),
 ])  # fmt: skip
@@ -253,11 +253,13 @@ def test_another_request_is_refused(tmp_path: Path, finished: bool, asked: dict[
 
 @pytest.mark.parametrize("left", [[], [".lock"], [".lock", ".card.json.77.partial"], [CARD_FILE]])
 def test_what_holds_no_episode_yet_blocks_no_request(tmp_path: Path, left: list[str]) -> None:
-    other = FrameDataset.create(tmp_path / "other", **collection_request(seed=5))
     for name in left:
-        (tmp_path / name).write_text((tmp_path / "other" / name).read_text() if left == [CARD_FILE] else '{"format"')
-    other.writer.close()
-    assert not other.path.exists()
+        (tmp_path / name).write_text('{"format"')
+    if left == [CARD_FILE]:
+        (tmp_path / CARD_FILE).unlink()
+        dataset = FrameDataset.create(tmp_path, **collection_request(seed=5))
+        dataset.writer.note_rendering({})  # which writes the card
+        dataset.writer.close()
     assert len(FrameDataset.open(collect_toy(tmp_path))) == 27
     assert not list(tmp_path.glob(".*.partial"))
 

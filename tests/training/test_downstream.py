@@ -124,7 +124,7 @@ def test_a_kill_during_the_last_evaluation_repeats_that_evaluation_alone(tmp_pat
 def test_a_run_that_ends_before_its_first_update_is_announced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("INFO", logger="crptpro"):
         assert train(tmp_path, env_steps=20).evaluations[-1]["updates"] == 0
-    assert "20 env steps end before the first update, which comes after 12 random decisions of 2 env" in caplog.text
+    assert "20 env steps end before the first update, which comes after 12 decisions of 2 env" in caplog.text
     assert f"GB in {tmp_path / 'replay'}; it is kept" in caplog.text
 
 
@@ -245,6 +245,9 @@ def test_any_module_is_trained_saved_loaded_and_serves_as_a_frozen_encoder_that_
     assert result.evaluations[-1]["updates"] == 8
     assert "re-encoding" in caplog.text
     assert loads(result)
+    own.encoder.config = {"width": 3}
+    with pytest.raises(PretrainedError, match=r"does not describe a OwnEncoder: .*unexpected keyword argument 'width'"):
+        train(tmp_path / "other", own)
     del own.encoder.config
     with pytest.raises(PretrainedError, match=r"OwnEncoder without a `\.config`"):
         train(tmp_path / "other", own)

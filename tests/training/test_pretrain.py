@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.objectives import LossModule
 from toy_env import random_episode, record, write_dataset
@@ -20,7 +20,7 @@ from toy_runs import SIZE, make_dataset, make_datasets, make_encoder, make_loss,
 
 from crptpro.data import FrameDataset
 from crptpro.errors import CheckpointError, CRPTproError, DatasetError
-from crptpro.objectives import ATCLoss, SimCLRLoss, get_method
+from crptpro.objectives import ATCLoss, ProtoLoss, SimCLRLoss, get_method
 from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training import PretrainConfig, PretrainResult, Run, finetune, pretrain
 from crptpro.training.pretrain import make_optimizer
@@ -50,6 +50,18 @@ class Brightness(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         target = tensordict["pixels"].float().mean((1, 2, 3)).unsqueeze(1) / 255
         return TensorDict({"loss_brightness": (self.head(self.encoder(tensordict["pixels"])) - target).square().mean()})
+
+
+class Headed(nn.Module):
+    """An encoder of one's own around the library's."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder, self.feature_dim = make_encoder(), 6
+        self.head = nn.Linear(self.encoder.feature_dim, 6)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        return self.head(self.encoder(pixels))
 
 
 def watched(loss: LossModule) -> list[TensorDictBase]:
@@ -325,11 +337,14 @@ def test_a_run_keeps_its_precision_on_another_machine(tmp_path: Path, monkeypatc
     assert run(make_loss(), 8, tmp_path / "run", precision="auto").training["settings"]["precision"] == "bf16"
 
 
-def test_auto_is_float32_for_a_loss_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_auto_is_float32_for_a_loss_or_an_encoder_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pretend_cpu("amx_bf16", monkeypatch, tmp_path)
     assert run(Brightness(), 2, precision="auto").training["settings"]["precision"] == "fp32"
     with pytest.raises(RuntimeError, match="dtype"):  # its linear layer takes no bfloat16
         run(Brightness(), 2, precision="bf16")
+    own = ProtoLoss(Headed(), num_prototypes=8, latent_dim=4, hidden_dim=8)
+    assert run(own, 2, precision="auto").training["settings"]["precision"] == "fp32"
+    assert run(make_loss(), 2, precision="auto").training["settings"]["precision"] == "bf16"
 
 
 def test_bf16_stays_within_the_spread_of_two_fp32_seeds_and_ends_with_the_run() -> None:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import copy
 import pickle
-import re
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -177,12 +176,6 @@ def test_projections_are_those_of_the_network_in_evaluation_and_leave_one_in_tra
     torch.testing.assert_close(td["next", "embedding"], expected, rtol=1e-5, atol=1e-5)
 
 
-def test_maps_that_may_not_fit_are_announced(monkeypatch, caplog):
-    monkeypatch.setattr("crptpro.transforms.dense_shift.free_bytes", lambda device: 10)
-    (dense := dense_of(observations=12))(dense.replay.batch(1))
-    assert re.search(r"Dense maps of 12 observations take .* GB, but 0.0 GB are free\. Fewer `observ", caplog.text)
-
-
 def test_threads_that_sample_side_by_side_get_each_their_own():
     dense = dense_of(generator=None, observations=2)  # each needs the places of the others
     plain = {n: crops_and_features(dense.encoder, dense.replay.frames[n])[1] for n in range(12)}
@@ -312,9 +305,11 @@ def test_auto_takes_dense_maps_where_they_fit_and_says_why(encoder, dtype, avail
     assert "\n" not in reason
 
 
-def test_explicit_modes_are_obeyed_or_refused():
+def test_explicit_modes_are_obeyed_or_refused(caplog):
     assert choose_feature_mode("reencode", PixelEncoder(), 1, torch.float32, 2**40)[0] == "reencode"
     assert choose_feature_mode("dense", PixelEncoder(), 1000, torch.bfloat16, 2**40)[0] == "dense"
+    assert not caplog.records
     assert choose_feature_mode("dense", PixelEncoder(), 1000, torch.bfloat16, 2**20)[0] == "dense"
+    assert "may not fit: 0.4 GiB for 1000 observations, 0.0 GiB free" in caplog.text
     with pytest.raises(ValueError, match="Flatten"):
         choose_feature_mode("dense", nn.Flatten(), 1, torch.float32, 2**40)

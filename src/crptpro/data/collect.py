@@ -22,6 +22,7 @@ from torchrl.modules import RandomPolicy
 
 from crptpro.artifact import require_disk
 from crptpro.data.dataset import FrameDataset
+from crptpro.directory_lock import refusal_leaves_nothing
 from crptpro.domains import Domain, expand_groups, get_domain
 from crptpro.envs import episode_length, make_env, needs_gl, resolve_action_repeat
 from crptpro.envs.base import passed_on
@@ -109,6 +110,7 @@ def collect_group(
             sizes = {"image_size": image_size, "action_repeat": repeat}
             settings: dict[str, Any] = {**sizes, "quality": quality, "colors": colors}
             about = {"task": domain.task, "seed": seed, "camera": domain.camera, **settings}
+            stack.enter_context(refusal_leaves_nothing(path))
             dataset = FrameDataset.create(path, domain=domain.name, transitions=transitions, **about)
             if dataset.is_complete:
                 logger.info("%s: %s is complete", domain.name, path)

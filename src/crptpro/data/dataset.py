@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 import os
@@ -237,13 +236,11 @@ class EpisodeWriter(ImmutableDatasetWriter):
         if found and path / CARD_FILE not in found:
             raise DatasetError(f"{path} is not empty and not a collection. Choose another directory or empty it.")
         self._lock = DirectoryLock(path, error=DatasetError)
-        self._is_open = False
         try:
             self._resume()
         except BaseException:
             self.close()
             raise
-        self._is_open = True
 
     @property
     def transitions(self) -> int:
@@ -302,6 +299,8 @@ class EpisodeWriter(ImmutableDatasetWriter):
             )
         total = self.transitions + len(columns["transitions/row"])
         try:
+            if not self.episodes:
+                self._save()  # rows without a card would not be recognised after a kill
             for name, values in columns.items():
                 rows = self.transitions + (self.episodes if name.startswith("frames/") else 0)
                 _append(self.path / f"{name}.memmap", values, rows)
@@ -331,14 +330,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
         self._save(render=dict(gl))
 
     def close(self) -> None:
-        """Free the directory; an unfinished dataset can be continued later. One without an episode leaves nothing."""
-        if self._is_open and not self.episodes:
-            self._remove_rows()
-            for name in (CARD_FILE, ".lock"):
-                (self.path / name).unlink(missing_ok=True)
-            with contextlib.suppress(OSError):  # it is not empty
-                self.path.rmdir()
-        self._is_open = False
+        """Free the directory; an unfinished dataset can be continued later."""
         self._lock.release()
 
     def _pending_columns(self) -> dict[str, Tensor]:
@@ -366,19 +358,14 @@ class EpisodeWriter(ImmutableDatasetWriter):
             stale.unlink(missing_ok=True)
         state = _read(self.path) if (self.path / CARD_FILE).exists() else self.state
         if not state["episodes"]:
-            self._remove_rows()
-            self._save()
+            for part in ("frames", "transitions"):  # of an episode that was being written
+                shutil.rmtree(self.path / part, ignore_errors=True)
             return
         _require_request(self.path, state["request"], self.request)
         for path, expected in _sizes(self.path, state).items():
             require_size(path, min(expected, path.stat().st_size if path.exists() else 0), expected)
         self.state = state
         logger.info("%s: continuing after %d of %d transitions", self.path.name, self.transitions, self.target)
-
-    def _remove_rows(self) -> None:
-        """Remove what was written of the first episode."""
-        for part in ("frames", "transitions"):
-            shutil.rmtree(self.path / part, ignore_errors=True)
 
     def _save(self, **changes: Any) -> None:
         state = {**self.state, **changes}
@@ -426,7 +413,7 @@ def _read(path: Path) -> dict[str, Any]:
     file = path / CARD_FILE
     card = read_json(file, error=DatasetError)
     if (kind := card.get("format")) != FORMAT:
-        raise DatasetError(f"{path} is a {kind!r}, not a dataset; `crptpro collect` makes one.")
+        raise DatasetError(f"{path} has the format {kind!r}: it is not a dataset; `crptpro collect` makes one.")
     if (version := card.get("version")) != VERSION:
         raise DatasetError(f"{file} has version {version!r}; this release reads {VERSION}. Collect the dataset again.")
     return card

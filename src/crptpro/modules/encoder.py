@@ -177,8 +177,13 @@ class PixelEncoder(nn.Module):
 
 
 def images_of(encoder: object) -> dict[str, Any]:
-    """Return ``image_size`` and ``frame_stack`` of the images that an encoder takes: 84 and 3 if it does not say."""
-    return {"image_size": getattr(encoder, "image_size", 84), "frame_stack": getattr(encoder, "in_channels", 9) // 3}
+    """Return ``image_size`` and ``frame_stack`` of the images that an encoder takes: 84 and 3 if it does not say.
+
+    It says so by attributes ``image_size`` and ``in_channels``, or by entries of its ``config``.
+    """
+    said: dict[str, Any] = {"image_size": 84, "in_channels": 9} | (getattr(encoder, "config", None) or {})
+    size, channels = (getattr(encoder, name, said[name]) for name in ("image_size", "in_channels"))
+    return {"image_size": size, "frame_stack": channels // 3}
 
 
 def _can_chunk(device: torch.device) -> bool:

@@ -21,15 +21,19 @@ CPUINFO = Path("/proc/cpuinfo")
 _Module = TypeVar("_Module", bound=nn.Module)
 
 
-def resolve_precision(precision: Precision, device: torch.device | str) -> torch.dtype:
+def resolve_precision(precision: Precision, device: torch.device | str, *modules: nn.Module | None) -> torch.dtype:
     """Return the compute dtype of a precision for a device; an unknown name raises a ``ValueError``.
 
-    ``"auto"`` is bf16 where that is faster: CUDA of compute capability 8 or newer, AMX, or AMD's AVX512-BF16.
+    ``"auto"`` is bf16 where that is faster: CUDA of compute capability 8 or newer, AMX, or AMD's AVX512-BF16. It is
+    fp32 if one of the ``modules`` is not of this library's classes: their layers may not take bfloat16.
     float32 on a CUDA device disables TF32 for the whole process, so that fp32 means the same on every device.
     """
     if precision not in ("auto", "fp32", "bf16"):
         raise ValueError(f"precision must be 'auto', 'fp32' or 'bf16', got {precision!r}.")
     device = torch.device(device)
+    own = [each for each in modules if each is not None and not type(each).__module__.startswith("crptpro.")]
+    if precision == "auto" and own:
+        precision = "fp32"
     if precision == "bf16" or (precision == "auto" and _is_faster_in_bf16(device)):
         return torch.bfloat16
     if device.type == "cuda":

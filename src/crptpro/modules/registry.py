@@ -12,17 +12,15 @@ from crptpro.errors import CRPTproError
 from crptpro.modules.actor_critic import DeterministicActor, SquashedGaussianActor, TwinCritic
 from crptpro.modules.encoder import PixelEncoder
 from crptpro.modules.heads import AnchorHead, Predictor, Projector, Prototypes, SkillHead
+from crptpro.values import as_plain
 
 _Network = TypeVar("_Network", bound=type[nn.Module])
 
-_OURS: dict[str, type[nn.Module]] = {
-    network.__name__: network
-    for network in (
-        AnchorHead, DeterministicActor, PixelEncoder, Predictor, Projector, Prototypes, SkillHead,
-        SquashedGaussianActor, TwinCritic,
-    )
-}  # fmt: skip
-_OWN: dict[str, type[nn.Module]] = {}
+_OURS = (
+    AnchorHead, DeterministicActor, PixelEncoder, Predictor, Projector, Prototypes, SkillHead, SquashedGaussianActor,
+    TwinCritic,
+)  # fmt: skip
+_CLASSES: dict[str, type[nn.Module]] = {network.__name__: network for network in _OURS}
 
 
 def register_network(network: _Network) -> _Network:
@@ -31,17 +29,21 @@ def register_network(network: _Network) -> _Network:
     An object's attribute ``config`` must hold the keyword arguments that rebuild it. The last registration of a name
     counts; a name of this library's networks raises a ``ValueError``.
     """
-    if network.__name__ in _OURS and network is not _OURS[network.__name__]:
+    if _CLASSES.get(network.__name__, network) in _OURS and network not in _OURS:
         raise ValueError(f"{network.__name__} is a network of crptpro; give your class another name.")
-    _OWN[network.__name__] = network
+    _CLASSES[network.__name__] = network
     return network
 
 
 def describe_network(network: nn.Module) -> dict[str, Any] | None:
-    """Return class and arguments of a network, for a card; ``None`` without ``config``. Its class is registered."""
+    """Return class and arguments of a network, for a card; ``None`` without ``config``. Its class is registered.
+
+    A ``ValueError`` names an argument that JSON cannot hold.
+    """
     if not isinstance(config := getattr(network, "config", None), dict):
         return None
-    return {"class": register_network(type(network)).__name__, "config": config}
+    name = register_network(type(network)).__name__
+    return {"class": name, "config": as_plain(config, f"{name}.config")}
 
 
 def rebuild_networks(
@@ -69,15 +71,14 @@ def rebuild_networks(
         if role not in roles or not isinstance(description, dict):
             raise error(f"The card of {path} describes an unknown {role!r}; it is damaged or too new.")
         name = str(description.get("class"))
-        network_class = _OURS.get(name) or _OWN.get(name)
-        if network_class is None:
+        if (network_class := _CLASSES.get(name)) is None:
             raise error(
                 f"The {role} in {path} is a {name!r}, which is not registered. Call "
                 "crptpro.modules.register_network for its class first (on the command line: --plugin FILE.py)."
             )
         try:
             # Without memory and initial weights, which the tensors replace; other classes may compute with them.
-            with torch.random.fork_rng(devices=[]), torch.device("meta" if name in _OURS else "cpu"):
+            with torch.random.fork_rng(devices=[]), torch.device("meta" if network_class in _OURS else "cpu"):
                 network = network_class(**description.get("config", {}))
             network.load_state_dict(parts.pop(role, {}), assign=True)
         except (TypeError, ValueError) as reason:

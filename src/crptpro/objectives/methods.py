@@ -88,6 +88,10 @@ class Method:
 
     def __post_init__(self) -> None:
         check_numbers(self, minima={"updates": 0, "warmup_updates": 0}, maxima={"encoder_tau": 1})
+        if self.loss_class is None and self.encoder_class is not PixelEncoder:
+            raise ValueError(
+                "Without a loss there is nothing to train an encoder of your own; see Pretrained(encoder)."
+            )
         if self.schedule not in ("constant", "warmup_cosine"):
             raise ValueError(f"`schedule` must be 'constant' or 'warmup_cosine', got {self.schedule!r}.")
         if unknown := sorted(self.downstream.keys() - DOWNSTREAM.keys()):
@@ -95,8 +99,9 @@ class Method:
 
     def build_encoder(self, in_channels: int = 9, image_size: int = 84, **options: Any) -> Any:
         """Build the encoder that the method trains; ``options`` override the method's own."""
+        options = {"image_size": image_size, **self.encoder_options, **options}
         _require_known("An encoder", options, self.encoder_class)
-        return self.encoder_class(in_channels, image_size=image_size, **{**self.encoder_options, **options})
+        return self.encoder_class(in_channels, **options)
 
     def build(self, encoder: nn.Module, **options: Any) -> LossModule:
         """Build the loss on ``encoder``; ``options`` override the method's own; unknown ones raise a ``ValueError``."""

@@ -19,7 +19,6 @@ from crptpro.modules import resolve_precision, set_compute_dtype
 from crptpro.modules.precision import evaluating
 from crptpro.modules.registry import describe_network, rebuild_networks
 from crptpro.objectives import RADSACLoss, SkillDDPGLoss
-from crptpro.pretrained import describe_encoder
 from crptpro.provenance import provenance
 from crptpro.training.compile import Update, accelerate
 
@@ -68,10 +67,11 @@ class PixelAgent(nn.Module):
 
 def save_agent(path: str | Path, agent: PixelAgent, *, card: Mapping[str, Any]) -> Path:
     """Write encoder and actor into a directory, whole or not at all; ``card`` is what else the reader should know."""
-    described = {"encoder": describe_encoder(agent.encoder), "actor": describe_network(agent.actor)}
-    content = {"modules": described, **card, **provenance()}
     modules = {"encoder": agent.encoder, "actor": agent.actor}
-    return write_artifact(path, modules, card=content, format_name=AGENT_FORMAT, version=AGENT_VERSION)
+    described = {role: describe_network(network) for role, network in modules.items()}
+    content = {"modules": described, **card, **provenance()}
+    check = functools.partial(_rebuilt, path)
+    return write_artifact(path, modules, card=content, format_name=AGENT_FORMAT, version=AGENT_VERSION, check=check)
 
 
 def load_agent(path: str | Path) -> tuple[PixelAgent, dict[str, Any]]:
@@ -81,12 +81,16 @@ def load_agent(path: str | Path) -> tuple[PixelAgent, dict[str, Any]]:
     or not an agent raises a ``CheckpointError``.
     """
     card, tensors = read_artifact(path, format_name=AGENT_FORMAT, version=AGENT_VERSION, error=CheckpointError)
+    return _rebuilt(path, card, tensors), card
+
+
+def _rebuilt(path: str | Path, card: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> PixelAgent:
     networks, _ = rebuild_networks(path, card, tensors, roles=("encoder", "actor"), error=CheckpointError)
     try:
         agent, dtype = PixelAgent(**networks), resolve_precision(card.get("precision", "fp32"), "cpu")
     except (TypeError, ValueError) as reason:
         raise CheckpointError(f"{path} holds no agent that can be rebuilt: {reason!r}") from reason
-    return set_compute_dtype(agent.requires_grad_(False).eval(), dtype), card
+    return set_compute_dtype(agent.eval(), dtype)
 
 
 class SACLearner:

@@ -29,7 +29,7 @@ from crptpro.modules.precision import PRECISION_NAMES, Precision
 from crptpro.objectives import DrQLoss, RADSACLoss, get_method, method_names
 from crptpro.objectives.base import require_positive
 from crptpro.objectives.methods import DOWNSTREAM
-from crptpro.pretrained import Pretrained, describe_encoder, load_pretrained, random_pretrained
+from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained, require_saveable
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import derive_seed, seed_everything
 from crptpro.training.agent import PixelAgent, SACLearner, save_agent
@@ -98,7 +98,8 @@ class DownstreamConfig:
     colors: Colors = "normal"
     """colours of the task: reversed_background are the paper's unseen ones, reversed_image works everywhere"""
     precision: Precision = "auto"
-    """of convolutions and matrix products; auto is bf16 where faster. Deviation: the released code uses fp32"""
+    """of convolutions and matrix products; auto is bf16 where faster, fp32 for your own networks. Deviation: the
+    released code uses fp32"""
     compile: bool = False
     """compile the losses with torch.compile; changes rounding only"""
     cuda_graph: bool = False
@@ -180,7 +181,7 @@ def train_downstream(
         source, is_control = str(pretrained), str(pretrained) in ("drq", "random-encoder")
         pretrained = random_pretrained(settings.seed, method=source) if is_control else load_pretrained(source)
     if run_dir is not None:
-        describe_encoder(pretrained.encoder)  # the agent can be saved
+        require_saveable(pretrained)
     settings = settings.resolved(task, pretrained)
     if pretrained.method == "drq" and (settings.intrinsic_reward_coef > 0 or settings.features != "auto"):
         raise ValueError("drq trains its encoder: it has no bonus (`intrinsic_reward_coef`) and no kept `features`.")
@@ -195,7 +196,8 @@ def train_downstream(
     with contextlib.ExitStack() as stack:
         run = stack.enter_context(Run(run_dir, unit="env_steps", streams=("train", "episodes", "eval"), records=records,
                                       config={**what, **dataclasses.asdict(settings)}, progress=progress))  # fmt: skip
-        dtype = resolve_precision(run.saved_setting("precision", settings.precision), device)
+        networks = (pretrained.encoder, pretrained.projector, pretrained.prototypes)
+        dtype = resolve_precision(run.saved_setting("precision", settings.precision), device, *networks)
         # The budget may grow, and machines differ; everything else decides the numbers of the run.
         free = ("env_steps", "eval_workers", "compile", "device")
         run.require_same({
@@ -230,9 +232,9 @@ def train_downstream(
         run.keep(**learner.components(), generators=generators, evaluator=evaluator,
                  replay=None if is_complete else replay)  # fmt: skip
 
-        if settings.env_steps <= repeat * settings.random_agent_steps:
+        if run.position < settings.env_steps <= repeat * settings.random_agent_steps:
             logger.warning(
-                "%s env steps end before the first update, which comes after %s random decisions of %d env steps each.",
+                "%s env steps end before the first update, which comes after %s decisions of %d env steps each.",
                 f"{settings.env_steps:,}", f"{settings.random_agent_steps:,}", repeat,
             )  # fmt: skip
 

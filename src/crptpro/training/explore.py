@@ -83,7 +83,7 @@ class ExploreConfig:
     quality: Quality = "exact"
     """render quality"""
     precision: Precision = "auto"
-    """of convolutions and matrix products; auto is bf16 where faster, fp32 for a loss of your own. Deviation: the
+    """of convolutions and matrix products; auto is bf16 where faster, fp32 for your own loss or network. Deviation: the
     released code uses fp32"""
     device: str = "cpu"
     """device of all networks"""

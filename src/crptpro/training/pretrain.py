@@ -23,9 +23,8 @@ from crptpro.modules import computing, resolve_precision, usable_device
 from crptpro.modules.encoder import images_of
 from crptpro.modules.precision import PRECISION_NAMES, Precision
 from crptpro.objectives import Method, get_method, method_of
-from crptpro.objectives.base import PretrainingLoss
 from crptpro.objectives.functional import prototype_metrics
-from crptpro.pretrained import Pretrained, class_name, load_pretrained, loss_options
+from crptpro.pretrained import HEADS, Pretrained, class_name, load_pretrained, loss_options
 from crptpro.provenance import provenance
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.compile import Update, accelerate
@@ -54,7 +53,7 @@ class PretrainConfig:
     seed: int = 0
     """seeds sampling, shifts, and what the loss draws"""
     precision: Precision = "auto"
-    """of convolutions and matrix products; auto is bf16 where faster, fp32 for a loss of your own. Deviation: the
+    """of convolutions and matrix products; auto is bf16 where faster, fp32 for your own loss or network. Deviation: the
     released code uses fp32"""
     compile: bool = False
     """compile the loss with torch.compile; changes rounding only"""
@@ -219,10 +218,9 @@ def finetune(pretrained: Pretrained | str | Path, datasets: Any, **options: Any)
 
 
 def training_dtype(run: Run, loss: LossModule, precision: Precision, device: torch.device) -> torch.dtype:
-    """Return the dtype that a loss trains in; ``"auto"`` is float32 where its own layers may not take bfloat16."""
-    if precision == "auto" and not isinstance(loss, PretrainingLoss):
-        return resolve_precision("fp32", device)
-    return resolve_precision(run.saved_setting("precision", precision), device)
+    """Return the dtype that a loss trains in; see :func:`~crptpro.modules.resolve_precision`."""
+    networks = (getattr(loss, role, None) for role in ("encoder", *HEADS))
+    return resolve_precision(run.saved_setting("precision", precision), device, loss, *networks)
 
 
 def make_optimizer(

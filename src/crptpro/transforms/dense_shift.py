@@ -21,7 +21,6 @@ from torch import Tensor, nn
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.envs.transforms import Transform
 
-from crptpro.free_memory import free_bytes
 from crptpro.modules import PixelEncoder
 from crptpro.modules.precision import device_of, evaluating
 from crptpro.transforms.base import Keys, require_pairs
@@ -234,7 +233,8 @@ class DenseShiftFeatures(Transform):
     def _encode_missing(self, numbers: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return the maps and the projections, those of these observations among them."""
         if self._maps is None:
-            self._maps = self._new_maps()
+            shape = (self.observations, *self.maps_shape)
+            self._maps = torch.empty(shape, dtype=self.dtype, device=device_of(self.encoder))
         missing = numbers[self._held[numbers % self.observations] != numbers].unique()
         for number in missing.tolist():
             # One by one: a convolution may round differently in a batch, and then a resumed run would, too.
@@ -254,16 +254,6 @@ class DenseShiftFeatures(Transform):
                 "map to the same slot. Leave it out, or keep as many as the replay."
             )
         return self._maps, self._embeddings
-
-    def _new_maps(self) -> Tensor:
-        shape, device = (self.observations, *self.maps_shape), device_of(self.encoder) or torch.device("cpu")
-        needed, free = math.prod(shape) * self.dtype.itemsize, free_bytes(device)
-        if needed > free:  # the memory of a CPU is taken as observations are sampled
-            logger.warning(
-                "Dense maps of %s observations take %.1f GB, but %.1f GB are free. Fewer `observations` take less, and "
-                "maps in bfloat16 half of it.", f"{self.observations:,}", needed / 1e9, free / 1e9,
-            )  # fmt: skip
-        return torch.empty(shape, dtype=self.dtype, device=device)
 
     def _embed_all_shifts(self, projector: nn.Module, maps: Tensor) -> Tensor:
         side = torch.arange(2 * self.pad + 1, device="cpu")
@@ -323,6 +313,8 @@ def choose_feature_mode(
         return "reencode", f"re-encoding at every update: {error}"
     size = f"{needed / 2**30:.1f} GiB for {observations} observations, {available_bytes / 2**30:.1f} GiB free"
     if mode == "dense":
+        if needed > available_bytes:
+            logger.warning("The dense-shift cache was requested and may not fit: %s.", size)
         return "dense", f"dense-shift cache, as requested ({size})"
     budget = 0.8 * available_bytes
     if needed <= budget:
