@@ -181,7 +181,7 @@ def train_downstream(
         source, is_control = str(pretrained), str(pretrained) in ("drq", "random-encoder")
         pretrained = random_pretrained(settings.seed, method=source) if is_control else load_pretrained(source)
     if run_dir is not None:
-        require_saveable(pretrained)
+        require_saveable(Pretrained(pretrained.encoder))  # the agent will hold it
     settings = settings.resolved(task, pretrained)
     if pretrained.method == "drq" and (settings.intrinsic_reward_coef > 0 or settings.features != "auto"):
         raise ValueError("drq trains its encoder: it has no bonus (`intrinsic_reward_coef`) and no kept `features`.")
