@@ -34,6 +34,7 @@ from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training import DownstreamConfig, DownstreamResult, PixelAgent, load_agent, pretrain, train_downstream
 from crptpro.training.agent import save_agent
+from crptpro.training.downstream import most_observations
 
 SMALL = DownstreamConfig(
     env_steps=120, batch_size=8, replay_capacity=40, random_agent_steps=12, queue_size=16, hidden_dim=16,
@@ -119,6 +120,13 @@ def test_a_kill_during_the_last_evaluation_repeats_that_evaluation_alone(tmp_pat
     steps: list[int] = []
     assert train(tmp_path, task=toy_domain("toy", on_step=steps.append)).evaluations[-1]["env_steps"] == 120
     assert len(steps) == 2 * EPISODE
+
+
+@pytest.mark.parametrize(("task", "most"), [
+    ("walker_walk", 10_000 + 20 + 200), ("reach_duplo", 10_000 + 80 + 200), ("lqr_2_1", 20_000), (TOY, 20_000),
+])  # fmt: skip
+def test_dense_maps_are_for_as_many_observations_as_a_budget_can_store(task: Any, most: int) -> None:
+    assert most_observations(task, 20_000, 2) == most
 
 
 def test_a_run_that_ends_before_its_first_update_is_announced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

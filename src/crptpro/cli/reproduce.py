@@ -217,7 +217,7 @@ def memory_text(plan: Plan, jobs: int) -> str:
     from crptpro.transforms.dense_shift import dense_maps_bytes  # late, as it imports TorchRL
 
     runs = [job.facts for job in plan.missing if job.kind == "run" and job.needs]  # without DrQ's
-    slots = max((min(facts["replay_capacity"], facts["env_steps"]) for facts in runs), default=0)
+    slots = max((min(facts["replay_capacity"], facts["env_steps"] // 2) for facts in runs), default=0)
     needed = dense_maps_bytes(PixelEncoder(), slots, resolve_precision("auto", "cpu"), latent_dim=128)
     free = free_bytes(torch.device("cpu"))
     if needed <= 0.8 * free / jobs:

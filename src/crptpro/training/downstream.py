@@ -223,6 +223,7 @@ def train_downstream(
         is_complete = bool(run.saved.get("is_finished")) and run.saved["position"] >= settings.env_steps
         replay = _make_replay(run, task, env.env, settings, generators["replay"], is_complete=is_complete)
         attach_transforms(replay, pretrained, encoder, settings, generators, run, dtype=dtype,
+                          observations=most_observations(task, settings.env_steps, repeat),
                           reserved_bytes=evaluator.workers * WORKER_BYTES)  # fmt: skip
         dense = next((each for each in replay.transform if isinstance(each, DenseShiftFeatures)), None)
         if dense is not None:  # its replay refers to it, too: the maps would stay until cycles are collected
@@ -345,6 +346,15 @@ def _make_replay(
     return make_replay(run, path, env, config.replay_capacity, slack=slack, generator=generator)
 
 
+def most_observations(task: str | Domain, env_steps: int, action_repeat: int) -> int:
+    """Return how many observations a run stores at most: one for each agent step, and one more for each episode."""
+    agent_steps, length = -(-env_steps // action_repeat), episode_length(task, action_repeat=action_repeat)
+    if length is None or get_domain(task).source not in ("suite", "manipulation"):
+        return 2 * agent_steps  # an episode may end after any step
+    # dm_control's have one length. A smaller budget before, which cut an episode, has one episode more.
+    return agent_steps + -(-agent_steps // length) + max(16, agent_steps // 50)
+
+
 def attach_transforms(
     replay: FrameReplay,
     pretrained: Pretrained,
@@ -354,12 +364,14 @@ def attach_transforms(
     run: Run,
     *,
     dtype: torch.dtype,
+    observations: int,
     reserved_bytes: int,
 ) -> None:
     """Attach to the replay what turns a sample into the learner's batch.
 
     DrQ reads two shifts of every image. SAC on a frozen encoder reads features under a random shift: crops of dense
-    maps, or the shifted image encoded again. The bonus is added to the sampled reward.
+    maps, or the shifted image encoded again. The bonus is added to the sampled reward. ``observations`` is how many the
+    run stores at most.
     """
     device = torch.device(config.device)
     shift: dict[str, Any] = {"pad": SHIFT_PAD, "generator": generators["shift"]}
@@ -380,7 +392,7 @@ def attach_transforms(
     setting = run.settings["features"]
     is_rounded = setting == "dense-bf16"
     map_dtype = torch.bfloat16 if is_rounded else dtype
-    slots = min(replay.window, 2 * -(-config.env_steps // config.action_repeat))
+    slots = min(replay.window, observations)
     mode, reason = choose_feature_mode(
         "dense" if is_rounded else setting, encoder, slots, map_dtype,
         available_bytes=max(0, free_bytes(device) - reserved_bytes),
