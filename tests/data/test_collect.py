@@ -133,7 +133,7 @@ def test_what_cannot_be_meant_is_refused(
 
 def test_what_the_disk_cannot_hold_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(DiskSpaceError, match=r"Collecting toy-fixed, toy-variable needs .* GB"):
-        collect_group([FIXED, VARIABLE], tmp_path, transitions=10**9)
+        collect_group([FIXED, VARIABLE], tmp_path / "data", transitions=10**9)
     assert not list(tmp_path.iterdir())
     assert len(FrameDataset.open(collect_random(FIXED, tmp_path, transitions=5, **SMALL))) == 5
 

@@ -101,6 +101,7 @@ def collect_group(
     paths: dict[str, Path] = {}
     jobs: list[_Job] = []
     with ExitStack() as stack:
+        stack.enter_context(refusal_leaves_nothing(root))
         for domain in map(get_domain, expand_groups(domains)):
             path = dataset_path(root, domain.name)
             if path in paths.values():
