@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pandas as pd
@@ -114,13 +115,15 @@ def test_an_impossible_request_leaves_nothing_behind(call: Call, arguments: tupl
 def test_what_a_launcher_or_the_disk_lacks_is_said_after_the_plan(call: Call, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     monkeypatch.setattr("shutil.which", lambda name: None)
+    disk = SimpleNamespace(free=10**12)
+    monkeypatch.setattr("shutil.disk_usage", lambda path: disk)
     part = ("reproduce", "seen", "--scale", "paper", *PART)
     for launcher, missing in (("ray", "pip install 'crptpro[ray]'"), ("slurm", "needs sbatch and srun")):
         status, out, err = call(*part, "--launcher", launcher)
         assert status == 1
         assert "downstream runs" in out
         assert missing in err
-    monkeypatch.setattr("shutil.disk_usage", lambda path: type("Usage", (), {"free": 10**9})())
+    disk.free = 10**9
     assert "has 1.00 GB free" in call(*part)[2]
     assert list(Path().iterdir()) == []
 

@@ -275,6 +275,8 @@ def test_a_directory_with_something_else_or_another_writer_is_left_alone(tmp_pat
         FrameDataset.create(tmp_path / "toy", **collection_request())
     first.writer.close()
     FrameDataset.create(tmp_path / "toy", **collection_request()).writer.close()
+    with pytest.raises(DatasetError, match="is closed"):  # its lock may be another's by now
+        first.extend(random_episode(5, size=8))
 
 
 def test_facts_of_any_kind_are_the_same_request_when_they_are_repeated(tmp_path: Path) -> None:

@@ -231,6 +231,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
         self.state: dict[str, Any] = {"format": FORMAT, "version": VERSION, "request": request, "columns": {}}
         self.state |= {"transitions": 0, "episodes": 0, "render": {}}
         self._pending: list[Rows] = []
+        self._is_closed = False
         # The lock, and half a card, are what a kill at the very start leaves.
         found = [each for each in path.glob("*") if each.name != ".lock" and each.suffix != ".partial"]
         if found and path / CARD_FILE not in found:
@@ -263,6 +264,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
         before = self.transitions
         if before >= self.target:
             raise DatasetError(f"{self.path} is complete and read-only; collect another one.")
+        self._require_open()
         channels = self.state["columns"]["frames/pixels"][1][0] if before else 3
         extra: list[Any] = [name for name in ("qpos", "qvel") if name in data and data.get(name).shape[-1]]
         extra += [("next", name) for name in extra]
@@ -287,6 +289,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
         """Write the running episode; if the environment has not ended it, its last transition is truncated."""
         if not self._pending:
             return
+        self._require_open()
         columns = self._pending_columns()
         self._pending = []
         described = {
@@ -331,7 +334,12 @@ class EpisodeWriter(ImmutableDatasetWriter):
 
     def close(self) -> None:
         """Free the directory; an unfinished dataset can be continued later."""
+        self._is_closed = True
         self._lock.release()
+
+    def _require_open(self) -> None:
+        if self._is_closed:
+            raise DatasetError(f"The writer of {self.path} is closed; FrameDataset.create opens a new one.")
 
     def _pending_columns(self) -> dict[str, Tensor]:
         """Return the rows of the running episode by file."""

@@ -452,6 +452,7 @@ def _record_evaluation(
         run.write("eval", {**row, "method": method}, episode=e.episode, **counters)
     scores = summarize(episodes)
     logger.info(
-        "%s: %s env steps, %s updates, return %.1f ± %.1f over %d episodes",
-        task, f"{counters['env_steps']:,}", f"{counters['updates']:,}", scores["mean"], scores["std"], len(episodes),
+        "%s: %s env steps, %s updates, return %.1f ± %.1f over %s",
+        task, f"{counters['env_steps']:,}", f"{counters['updates']:,}", scores["mean"], scores["std"],
+        "1 episode" if len(episodes) == 1 else f"{len(episodes)} episodes",
     )  # fmt: skip
