@@ -70,10 +70,11 @@ def sentences() -> Iterator[str]:
     each = means.str.findall(r"[(, ](\d+)").map(lambda runs: " and ".join(", ".join(runs).rsplit(", ", 1)))
     yield f"{each['`crptpro-no-bonus`']} on the pre-trained encoder, {each['`random-encoder`']} on untrained ones"
     yield from verdict("cheetah_run", "`crptpro-no-bonus`", [60_000, 80_000, 100_000])
-    yield f"with standardised features one run returned {means['`random-encoder-standardised`']} over these evaluations"
+    alone = means["`random-encoder-standardised`"]
+    yield f"with standardised features, one run averaged {alone} over these evaluations"
     both = RESULTS["cheetah_run_means"]().set_index("cheetah_run")["evaluations at 60,000 and 80,000 env steps"]
     bonus, none = (both[name].split()[0] for name in ("`crptpro`", "`crptpro-no-bonus`"))
-    yield f"the runs with bonus average {bonus}, those without {none}"
+    yield f"the runs with the bonus average {bonus}, those without it {none}"
     files = sorted(RESULTS["PAPER_SCALE"].glob("cheetah_run/*/train.csv"))
     runs = {path.parent.name: pd.read_csv(path) for path in files}
     near = pd.Series({name: run["env_steps"][run["entropy"] >= 3].max() for name, run in runs.items()})
@@ -86,11 +87,11 @@ def sentences() -> Iterator[str]:
     ours, authors = (runs[name][list(range(20_000, 120_000, 20_000))] for name in ("`crptpro`", AUTHORS))
     within = authors.iloc[0].between(ours.min(), ours.max())
     count = "all five" if within.all() else within.sum()
-    yield f"It lies within our runs with bonus at {count} evaluations"
+    yield f"It lies within the range of our runs with the bonus at {count} evaluations"
     pairs = [runs[name][[60_000, 80_000]].mean(axis=1) for name in ("`crptpro`", "`crptpro-no-bonus`")]
     gpu, cpu = ([own.iloc[part].mean() for own, part in zip(pairs, at, strict=True)]
                 for at in ((slice(3), slice(1)), (slice(3, None), slice(1, None))))  # fmt: skip
-    yield f"three GPU runs with bonus average {gpu[0]:.0f}, the three CPU runs {cpu[0]:.0f}"
+    yield f"three GPU runs with the bonus average {gpu[0]:.0f}, the three CPU runs {cpu[0]:.0f}"
     yield f"one GPU run has {gpu[1]:.0f}, two CPU runs {cpu[1]:.0f}"
     drq = runs["DrQ, its authors' log"][[60_000, 80_000, 100_000]].mean(axis=1)
     yield f"From 60,000 to 100,000 env steps its runs average {RESULTS['_spread'](drq)}"
@@ -102,11 +103,11 @@ def sentences() -> Iterator[str]:
     theirs = authors[[60_000, 80_000, 100_000]].mean(axis=1).iloc[0]
     all_of_theirs = runs[AUTHORS].loc[:, 60_000:100_000].mean(axis=1).iloc[0]
     yield f"The authors' run has {theirs:.0f} ({all_of_theirs:.0f} over all its evaluations there"
-    yield f"three new ones have {means.mean():.0f}, the authors' run {theirs:.0f}"
+    yield f"three new ones average {means.mean():.0f}, the authors' run {theirs:.0f}"
     log = "[the authors' log](#a-task-with-the-settings-of-the-paper)"
     yield f"env steps is {means.mean():.0f}, that of {log} {theirs:.0f}"
     without = runs["`crptpro-no-bonus`"][[60_000, 80_000, 100_000]].mean(axis=1).mean()
-    yield f"the three complete runs with bonus average {means.mean():.0f}, those without {without:.0f}"
+    yield f"the three complete runs with the bonus average {means.mean():.0f}, those without it {without:.0f}"
     yield f"means from 60,000 to 100,000 env steps are {means.mean():.0f} with it, {without:.0f} without"
     yield f"cut off after {min(ends):,} to {max(ends):,} env steps"
 
@@ -119,7 +120,7 @@ def sentences() -> Iterator[str]:
     record = RESULTS["PAPER_SCALE"] / "cheetah_run/crptpro_seed_5"
     episodes = pd.read_csv(record / "eval.csv").query("env_steps == 500_000")["episode_return"]
     yield f"it returned {end:.0f}, over ten episodes between {episodes.min():.0f} and {episodes.max():.0f}"
-    yield f"The paper has {paper}, without saying over what; the authors' log has {log[500_000]:.0f}"
+    yield f"The paper reports {paper}, without saying over what; the authors' log has {log[500_000]:.0f}"
     yield f"this evaluation is {'the highest of all' if end == long.max() else 'not the highest'}"
     late = list(range(420_000, 520_000, 20_000))
     drq = RESULTS["_spread"](runs["DrQ, its authors' log"][late].mean(axis=1))
@@ -134,7 +135,7 @@ def sentences() -> Iterator[str]:
     yield f"of the authors' run rise from {theirs[0]} to {theirs[1]}"
 
     (paper,) = (row.scores["crptpro"] for row in UNSEEN if (row.group, row.task) == ("A", "finger_spin"))
-    yield f"The paper has {paper} after 500,000 env steps"
+    yield f"The paper reports {paper} after 500,000 env steps"
     finger = dict(RESULTS["evaluations"]("finger_spin"))
     ours, untrained = (finger[name].mean() for name in ("`crptpro`", "`random-encoder`"))
     best, best_untrained = (finger[name][60_000].max() for name in ("`crptpro`", "`random-encoder`"))
