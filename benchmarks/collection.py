@@ -48,7 +48,7 @@ class Settings(measure.Settings):
     workers: tuple[int, ...] = (1, 2)
     """numbers of collecting processes; none to leave this part out"""
     worker_transitions: int = 4_000
-    """how much each number of them collects of the first domain, best a multiple of the largest number times 500"""
+    """transitions of the first domain for each number of processes, best a multiple of the largest one times 500"""
 
 
 def main(settings: Settings) -> None:
@@ -97,7 +97,7 @@ def compare_collecting(domain: str, settings: Settings, place: Path) -> dict[str
 
 
 def collecting(domain: str, root: Path, transitions: int, settings: Settings, **options: Any) -> Callable[[], Any]:
-    """Return a call that collects a dataset in a directory of its own."""
+    """Return a call that collects a dataset, each time into a new directory."""
     numbers = itertools.count()
     sizes = {"transitions": transitions, "image_size": settings.image_size, "progress": False}
     return lambda: collect_random(domain, root / str(next(numbers)), **sizes, **options)
@@ -106,7 +106,7 @@ def collecting(domain: str, root: Path, transitions: int, settings: Settings, **
 def torchrl_env(domain: str, image_size: int) -> EnvBase:
     """Build TorchRL's environment at the image size, camera and action repeat that this library uses.
 
-    ``DMControlEnv`` hands ``render_kwargs`` on to dm_control's task, which refuses it, so the size is given to the
+    ``DMControlEnv`` passes ``render_kwargs`` on to dm_control's task, which refuses it, so the size is given to the
     wrapper below it, ``DMControlWrapper``; they are the same environment otherwise.
     """
     found = get_domain(domain)

@@ -1,4 +1,4 @@
-"""Everything that needs a CUDA device: parity of the fast ways, updates with every switch, a sustained run.
+"""Everything that needs a CUDA device: parity of the fast paths, updates with every switch, a sustained run.
 
 ``python -m benchmarks.gpu`` prints, on synthetic frames that the device holds:
 
@@ -60,7 +60,7 @@ class Settings(UpdateSettings):
     rounds: int = 15
     """timed calls of each candidate, taken in turns"""
     updates_per_call: int = 20
-    """updates between two looks at the clock"""
+    """updates per timed call"""
     transitions: int = 5_000
     """of each of three datasets, which every candidate holds on the device, 21 KB each, and of the replay"""
     parity_updates: int = 20
@@ -75,7 +75,7 @@ class Settings(UpdateSettings):
 
     @property
     def ways(self) -> dict[str, Switches]:
-        """Switches of a pre-training that this machine has, and that are not to change what is computed."""
+        """Switches of a pre-training that this machine supports and that must not change what is computed."""
         found: dict[str, Switches] = {"recorded": {"cuda_graph": True}} if self.device == "cuda" else {}
         if self.compile:
             found["compiled"] = {"compile": True}
@@ -132,7 +132,7 @@ def check_parity(settings: Settings, paths: list[Path]) -> list[dict[str, Any]]:
     for check in checks:
         verdict = "ok" if check["passed"] else "**FAILED**"
         print(f"| {check['check']} | {check['difference']:.1e} | {check['allowed']:.0e} | {verdict} |")
-    torch.cuda.empty_cache()  # the other sections run in processes of their own
+    torch.cuda.empty_cache()  # the other sections run in their own processes
     return checks
 
 
@@ -152,8 +152,8 @@ def check_batches(settings: Settings, path: Path) -> dict[str, Any]:
 def check_weights(name: str, train: Callable[..., nn.Module], **switches: bool) -> dict[str, Any]:
     """Compare the weights of a training with switches and of one without, from the same start on the same batches.
 
-    A GPU may add up gradients in another order each time, so the plain training is done twice: what differs by no more
-    than three times as much as it does from itself passes too.
+    A GPU may add up gradients in another order each time, so the plain training is done twice: a difference of up to
+    three times that of its two runs passes too.
     """
     reference, again, fast = (entries(train(**some)) for some in ({}, {}, switches))
     tolerance = COMPILED_TOLERANCE if "compile" in switches else RECORDED_TOLERANCE
@@ -169,7 +169,7 @@ def entries(module: nn.Module) -> Tensor:
 
 
 def time_updates(settings: Settings, item: str, more: dict[str, Switches], **common: Any) -> dict[str, Any]:
-    """Time loops with switches in turns, many updates between two looks at the clock."""
+    """Time loops with switches in turns, many updates per timed call."""
     candidates: dict[str, Switches] = {"fp32": FP32, "TF32": {**FP32, "tf32": True}, "bf16": BF16, **more}
     common |= {"device": settings.device, "batch_size": settings.batch_size, **settings.sizes}
     common["passes"] = settings.updates_per_call

@@ -1,8 +1,7 @@
-"""The library's loops as users call them, held at every pass: what :class:`benchmarks.measure.Loop` runs.
+"""The library's loops as users call them, paused at every pass: what :class:`benchmarks.measure.Loop` runs.
 
-``python -m benchmarks.loops ITEM SETTINGS`` holds its loop, prints a JSON object of seconds per pass by what they were
-spent on, and goes on when it reads a line. Nothing of a loop is copied here: clocks are put around public methods that
-it calls.
+``python -m benchmarks.loops ITEM SETTINGS`` pauses its loop, prints a JSON object of seconds per pass by what they were
+spent on, and continues when it reads a line. No code of a loop is copied here: public methods that it calls are timed.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ def fresh_pretrained(*, image_size: int, prototypes: int) -> Pretrained:
 
 
 class Laps:
-    """Seconds of a loop by what they were spent on; ``hold`` is told their means every ``passes`` passes."""
+    """Seconds of a loop by what they were spent on; ``hold`` gets their means every ``passes`` passes."""
 
     def __init__(self, hold: Hold, passes: int) -> None:
         self.hold, self.passes, self.done = hold, passes, 0
@@ -52,7 +51,7 @@ class Laps:
         self.since = time.perf_counter()
 
     def lap(self, name: str, *, waits: bool = False) -> None:
-        """Say what the time since the last lap was spent on."""
+        """Attribute the time since the last lap to ``name``."""
         if waits and torch.cuda.is_initialized():
             torch.cuda.synchronize()
         now = time.perf_counter()
@@ -70,7 +69,7 @@ class Laps:
             self.since = time.perf_counter()
 
     def clock(self, owner: type, name: str, before: Callable[..., None], after: str = "") -> Any:
-        """Call ``before`` when a method begins; what it takes is the lap ``after``, if that is named."""
+        """Call ``before`` when a method begins, and record its duration as the lap ``after``, if given."""
         method = getattr(owner, name)
 
         @functools.wraps(method)
@@ -92,7 +91,7 @@ def pretraining(
     laps = Laps(hold, passes)
 
     def begin(_: FrameDataset, count: int) -> None:
-        if count == batch_size:  # otherwise it only has a look at what the dataset holds
+        if count == batch_size:  # other samples only inspect the dataset
             laps.begin("update")
 
     with laps.clock(FrameDataset, "sample", begin):

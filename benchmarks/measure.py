@@ -1,4 +1,4 @@
-"""Fair timing: candidates take turns, medians are compared, and the machine is written down."""
+"""Fair timing: candidates take turns, medians are compared, and the machine is recorded."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ ROOT = Path(__file__).parents[1]
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What every benchmark is told."""
+    """Settings of every benchmark."""
 
     image_size: int = 84
     """height and width in pixels"""
     scratch: Path | None = None
-    """where frames are written for the time being, not a RAM disk; the system's temporary directory by default"""
+    """directory of temporary frames, not on a RAM disk; the system's temporary directory by default"""
     out: Path = ROOT / "build" / "benchmarks"
     """directory of the JSON file"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class UpdateSettings(Settings):
-    """What every benchmark of updates is told."""
+    """Settings of every benchmark of updates."""
 
     batch_size: int = 512
     """transitions per update"""
     prototypes: int = 512
-    """of the pre-training loss and of the bonus"""
+    """number in the pre-training loss and in the bonus"""
 
     @property
     def sizes(self) -> dict[str, Any]:
-        """What every network and image is sized by."""
+        """Sizes of every network and image."""
         return {"image_size": self.image_size, "prototypes": self.prototypes}
 
 
 class Loop:
-    """One of :mod:`benchmarks.loops` in a process of its own; a call lets it go on and returns seconds per unit.
+    """One of :mod:`benchmarks.loops` in its own process; a call continues it and returns seconds per unit.
 
     Args:
         item: name.
@@ -68,7 +68,7 @@ class Loop:
         self.laps = self._read()
 
     def __call__(self) -> float:
-        """Do one unit, or the mean of some."""
+        """Run one unit, or several and take the mean."""
         assert self.process.stdin is not None
         self.process.stdin.write("\n")
         self.process.stdin.flush()
@@ -92,9 +92,9 @@ def compare(
     candidates: Mapping[str, Callable[[], Any]], *, unit: str, rounds: int, warmup: int = 2, per_call: int = 1,
     to: str | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Time candidates in turns, so that whatever else the machine does meets all of them alike.
+    """Time candidates in turns, so that other load on the machine affects all of them alike.
 
-    Times are per unit of work: a call does ``per_call`` of them, a :class:`Loop` says itself how long one took. Prints
+    Times are per unit of work: a call does ``per_call`` of them, a :class:`Loop` returns how long one took. Prints
     times and their ratios to the candidate ``to`` (the last one by default), and returns what it prints.
     """
     seconds: dict[str, list[float]] = {name: [] for name in candidates}
@@ -125,7 +125,7 @@ def run_sections(name: str, settings: Any, sections: Mapping[Any, Callable[[], A
     for section in settings.only:
         print(f"\n## {section}\n", flush=True)
         results[section] = sections[section]()
-        # At once: what has been measured must not be lost with a section for which memory is too small.
+        # After each section: one that runs out of memory must not lose what has been measured.
         save(name, settings, results)
     return results
 
@@ -152,5 +152,5 @@ def save(name: str, settings: Settings, results: Mapping[str, Any]) -> None:
 
 
 def _without_place(argument: Any) -> str:
-    """Results are published: where a directory lies on one machine is nobody's business, its name may be."""
+    """Return only the name of an absolute path: published results do not show the directories of a machine."""
     return Path(argument).name if Path(argument).is_absolute() else str(argument)

@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.memory`` runs every stage in a process of its own and watches it and its children from outside.
 Memory means anonymous memory, beyond the page cache: the frames on disk are mapped, and their pages are given back
-whenever something else wants the memory. Collection renders; other pixels are drifting pictures. The processes that
+whenever something else needs the memory. Collection renders; other pixels are drifting pictures. The processes that
 evaluate a downstream run come on top, 0.5 GB each.
 """
 

@@ -1,6 +1,6 @@
-"""The method as its equations have it: float32, eager, nothing done for speed.
+"""The method as its equations state it: float32, eager, nothing optimised for speed.
 
-The yardstick of ``benchmarks.updates``. Tests hold its losses and gradients against the library's. The encoder is
+The reference of ``benchmarks.updates``. Tests compare its losses and gradients with the library's. The encoder is
 ``nn.Conv2d`` on contiguous NCHW images, Adam is torch's default, and every observation is encoded anew at every update.
 The small networks are float32 copies of ours, and the terms of the pre-training loss are our pure functions.
 

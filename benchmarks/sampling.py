@@ -32,7 +32,7 @@ from crptpro.data import FrameDataset
 STACK = 3
 OURS = "crptpro `FrameDataset.sample`"
 MORE = ("number", ("next", "number"), "index")
-"""What our samples have beside the others'."""
+"""Entries that only our samples have."""
 Sample = Callable[[], TensorDictBase]
 
 
@@ -68,7 +68,7 @@ def catframes(dataset: FrameDataset, batch_size: int, storage: LazyMemmapStorage
         buffer.extend(rows.set("frame", frames[:-1]).set(("next", "frame"), frames[1:]))
 
     def sample() -> TensorDictBase:
-        with warnings.catch_warnings():  # the sampler it comes with does not name the time axis it asks for
+        with warnings.catch_warnings():  # its sampler does not name the time axis that it needs
             warnings.filterwarnings("ignore", message="The last dimension of the tensordict")
             return buffer.sample()
 

@@ -20,7 +20,7 @@ ACTION_DIM = 6
 LENGTH = 500
 """Transitions of an episode."""
 _PATCHES = 12
-"""Side of the noise that is blown up to an image: patches of a few pixels, as rendered scenes have."""
+"""Side of the noise that is upscaled to an image: patches of a few pixels, as rendered scenes have."""
 
 
 class DriftingEnv(EnvBase):

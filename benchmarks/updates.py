@@ -71,7 +71,7 @@ class Settings(UpdateSettings):
 
     @property
     def common(self) -> dict[str, Any]:
-        """What every loop in a process of its own is given."""
+        """Settings of every loop that runs in its own process."""
         return {**self.sizes, "batch_size": self.batch_size, "threads": self.threads}
 
 
@@ -101,7 +101,7 @@ def time_pretraining(settings: Settings, datasets: list[Path]) -> dict[str, Any]
         theirs = peer_update(
             settings.peer, store, batch_size=settings.batch_size, prototypes=settings.prototypes, task_agnostic=True
         )
-        candidates["released agent"] = lambda: theirs(2)  # an even number: every gate of the schedules is open
+        candidates["released agent"] = lambda: theirs(2)  # even: all with an update frequency of 2 runs
     with ExitStack() as stack:
         for precision in precisions():
             candidates[f"ours {precision}"] = stack.enter_context(

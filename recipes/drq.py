@@ -30,7 +30,7 @@ class Config:
     seed: int = 0
     """seeds everything"""
     downstream: DownstreamConfig = field(default_factory=DownstreamConfig)
-    """every number (default: DrQ's)"""
+    """all settings (default: DrQ's)"""
 
 
 def main(config: Config) -> None:

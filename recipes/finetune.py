@@ -53,7 +53,7 @@ def main(config: Config) -> None:
     task = config.task or get_domain(config.domain).task
     get_domain(task)  # an unknown name ends the recipe here, not hours later
     pretrained = load_pretrained(config.pretrained)
-    pretrained.build_loss()  # what cannot be trained further ends it here, too
+    pretrained.build_loss()  # so does an artifact that cannot be trained further
     dataset = collect_random(
         config.domain,
         config.out / "data",

@@ -44,7 +44,7 @@ DOWNSTREAM = DownstreamConfig(env_steps=12_000, eval_interval_env_steps=12_000, 
 
 @dataclass
 class Config:
-    """Every number of the small run; a different value of the paper is in brackets."""
+    """Every number of the small run; the paper's value is in brackets where it differs."""
 
     out: Path = Path("runs/quickstart")
     """everything is written below this directory"""

@@ -186,7 +186,7 @@ def test_threads_that_write_one_file_leave_a_whole_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("damage", "message"), [
     (shutil.rmtree, "does not exist"),
-    (lambda p: (p / "card.json").unlink(), r"has no card\.json: it is no artifact"),
+    (lambda p: (p / "card.json").unlink(), r"has no card\.json: it is not an artifact"),
     (lambda p: (p / "card.json").write_text("{"), r"card\.json cannot be read as JSON"),
     (lambda p: (p / "card.json").write_text("[1]"), r"card\.json holds a list"),
     (lambda p: (p / "weights.safetensors").unlink(), r"weights\.safetensors is missing"),

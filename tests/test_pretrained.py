@@ -142,7 +142,7 @@ def test_slim_leaves_out_what_only_training_reads_and_is_named_as_what_it_comes_
     again = load_pretrained(save_pretrained(slim, tmp_path / "slim", slim=True))
     assert again.identity() == slim.identity() == whole.identity()
     assert slim.card["training"] == whole.card["training"]
-    with pytest.raises(PretrainedError, match="saved slim: it lacks"):
+    with pytest.raises(PretrainedError, match="saved slim: it does not hold"):
         slim.build_loss()
 
 

@@ -1,4 +1,4 @@
-"""``python -m crptpro``: the command where it is not on the path."""
+"""``python -m crptpro``: the command line where ``crptpro`` is not on the PATH."""
 
 from crptpro.cli import main
 

@@ -22,9 +22,9 @@ CARD_FILE = "card.json"
 
 
 def write_whole(path: str | Path, content: str | bytes) -> Path:
-    """Write a file, text in UTF-8, beside ``path`` and rename it into place: nobody sees half of it. Returns ``path``.
+    """Write a file (text as UTF-8) beside ``path`` and rename it into place: no reader sees a partial file.
 
-    A full disk is a DiskSpaceError, another failure an OSError with the path; what was there before is kept.
+    Returns ``path``. A full disk raises a DiskSpaceError, another failure an OSError with the path; the old file stays.
     """
     path = as_path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -68,7 +68,7 @@ def require_disk(
     what: str,
     remedy: str = "Free space, choose another directory, or request less.",
 ) -> None:
-    """Raise a DiskSpaceError if the disk under ``path`` cannot hold something with 5 % to spare."""
+    """Raise a DiskSpaceError if the disk under ``path`` cannot hold ``needed_bytes`` with 5 % to spare."""
     probe = as_path(path).absolute()
     while not probe.exists():
         probe = probe.parent
@@ -95,12 +95,12 @@ def write_artifact(
     renames leaves it as ``.NAME.previous`` until the next write.)
 
     ``modules`` maps names to networks or their state dicts; tensors are stored as ``name.key``. ``format``, ``version``
-    and ``weights_sha256`` are added to the plain facts of ``card``. Returns ``path``.
+    and ``weights_sha256`` are added to the entries of ``card``. Returns ``path``.
 
     Raises:
-        CRPTproError: there is something else at ``path``, or in it beside an artifact, or it is the working directory;
-            it is left alone.
-        ValueError: a fact that cannot be stored as JSON.
+        CRPTproError: ``path`` is the working directory, is not an artifact of this format, or holds other files too; it
+            is left unchanged.
+        ValueError: an entry of ``card`` cannot be stored as JSON.
         DiskSpaceError: the disk is full; an artifact there is kept.
     """
     from safetensors.torch import save
@@ -168,12 +168,12 @@ def read_artifact(
                 if read_json(inside).get("format") == format_name:
                     hint = f" Did you mean {inside.parent}?"
                     break
-        raise error(f"{path} has no {CARD_FILE}: it is no artifact.{hint}")
+        raise error(f"{path} has no {CARD_FILE}: it is not an artifact.{hint}")
     card = read_json(path / CARD_FILE, error=error)
     if card.get("format") != format_name:
         raise error(f"{path} is a {card.get('format', 'directory of unknown format')!r}, expected {format_name!r}.")
     if (found := card.get("version")) != version:
-        raise error(f"{path} has format version {found}; this release reads {version}. Make it again, or upgrade.")
+        raise error(f"{path} has format version {found}; this release reads {version}. Create it again, or upgrade.")
     weights = path / WEIGHTS_FILE
     try:
         content = weights.read_bytes()

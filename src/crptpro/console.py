@@ -26,7 +26,7 @@ _COUNTS = ConstructorRegistry()
 
 @_COUNTS.primitive_rule
 def _count(info: Any) -> PrimitiveConstructorSpec[int] | None:
-    """Read whole numbers as Python functions take them, ``1e5`` too."""
+    """Parse whole numbers as the Python functions accept them, ``1e5`` too."""
     if info.type is not int:
         return None
 
@@ -49,7 +49,7 @@ class _BarFriendlyHandler(logging.Handler):
         try:
             tqdm.write(prefix + self.format(record), file=sys.stderr)
         except OSError as reason:
-            if reason.errno != errno.EIO:  # of a terminal that was closed while the program goes on
+            if reason.errno != errno.EIO:  # the terminal was closed while the program goes on
                 raise
 
 
@@ -63,10 +63,10 @@ def configure_logging() -> None:
 
 
 def parse(config: type[_Config], description: str | None) -> _Config:
-    """Return the settings of a recipe, a dataclass, from the command line.
+    """Parse the settings of a recipe, a dataclass, from the command line.
 
-    Its fields that are dataclasses are stages. A stage has no option of a name that the recipe has itself, such as
-    ``seed``: the recipe sets it for all of them.
+    Its fields that are dataclasses are stages. A setting that the recipe itself has, such as ``seed``, is not an option
+    of the stages: the recipe sets it for all of them.
     """
     shared, registry, is_within = {field.name for field in fields(config)}, ConstructorRegistry(), False  # type: ignore[arg-type]
 
@@ -75,7 +75,7 @@ def parse(config: type[_Config], description: str | None) -> _Config:
         nonlocal is_within
         if is_within or info.type is config or not is_dataclass(info.type):
             return None
-        is_within = True  # what follows asks every rule, this one too
+        is_within = True  # the next call tries every rule, including this one
         usual: Any = ConstructorRegistry.get_struct_spec(info)
         is_within = False
         return replace(usual, fields=tuple(field for field in usual.fields if field.name not in shared))
@@ -125,7 +125,7 @@ def _is_closed_pipe(stream: TextIO) -> bool:
 
 
 def _is_expected(error: BaseException) -> bool:
-    """Whether a user can act on an error: it is no defect."""
+    """Whether an error is one that a user can act on, not a defect."""
     if isinstance(error, CRPTproError):
         return True
     if isinstance(error, OSError):

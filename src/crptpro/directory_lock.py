@@ -1,4 +1,4 @@
-"""Locks that end with their process, however it ends."""
+"""Locks that are released when their process ends, however it ends."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS)
 
 @contextlib.contextmanager
 def locked(path: Path, *, poll_interval: float = 0.05) -> Iterator[None]:
-    """Wait for a lock file, and hold it; a file system without locks is announced."""
+    """Hold a lock file in the block, after waiting for it; a file system without locks only causes a warning."""
     lock = FileLock(path, fallback_to_soft=False)  # a soft lock would outlive a kill
     try:
         lock.acquire(timeout=1e9, poll_interval=poll_interval)
@@ -34,7 +34,7 @@ def locked(path: Path, *, poll_interval: float = 0.05) -> Iterator[None]:
 
 @contextlib.contextmanager
 def refusal_leaves_nothing(directory: Path) -> Iterator[None]:
-    """Remove a directory that was made meanwhile, if an error leaves nothing but a lock in it."""
+    """Remove a directory that was created in the block, if an error leaves nothing but a lock in it."""
     is_new = not directory.exists()
     try:
         yield
@@ -47,7 +47,7 @@ def refusal_leaves_nothing(directory: Path) -> Iterator[None]:
 class DirectoryLock:
     """Locks ``directory`` for this process, so that no two processes write one record; a kill frees it too.
 
-    It is taken at construction, which raises ``error`` if the directory is held already, or cannot be written.
+    It is taken at construction, which raises ``error`` if the directory is locked already, or cannot be written.
     Re-entrant holders in one process, a run's record and its training loop, share the lock.
     """
 

@@ -129,7 +129,7 @@ def _check_machine(free_ram: int, free_disk: int, gpus: Sequence[str]) -> list[F
         remedy = "End other programs, or use smaller batches and a smaller replay."
         findings.append(Finding("error" if free_ram < 1.5 * _GB else "warning", what, remedy))
     if free_disk < 7 * _GB:
-        what = f"{free_disk / _GB:.1f} GB of disk are free here; three domains of 100,000 transitions take 6."
+        what = f"{free_disk / _GB:.1f} GB of disk are free here; three domains of 100,000 transitions take 6 GB."
         remedy = "Free space, write to another disk, or collect fewer transitions."
         findings.append(Finding("error" if free_disk < 0.5 * _GB else "warning", what, remedy))
     remedy = "Repair its driver (nvidia-smi), or hide it with CUDA_VISIBLE_DEVICES; --device cpu always works."
@@ -147,7 +147,7 @@ def _check_rendering(names: Sequence[str], *, has_gpu: bool) -> tuple[list[str],
         backend = rendering.select_backend() if any(map(needs_gl, names)) else None
     except RenderingError as reason:
         remedy = "Unset MUJOCO_GL, or repair that backend." if "MUJOCO_GL" in os.environ else ""
-        return ["rendering: nothing renders"], [Finding("error", str(reason), remedy)]
+        return ["rendering: no backend renders"], [Finding("error", str(reason), remedy)]
     gl = rendering.backend_card() if backend else {}
     place = f"with {backend} ({gl['gl_renderer']}, {gl['gl_kind']})" if backend else "without GL"
     facts, findings = [f"rendering {place}, milliseconds per agent step (physics and one image)"], []
@@ -166,7 +166,7 @@ def _check_rendering(names: Sequence[str], *, has_gpu: bool) -> tuple[list[str],
 
 
 def render_domains(names: Sequence[str], backend: str | None, timeout_s: float) -> list[dict[str, Any]]:
-    """Return :func:`check_domain` of each name, one by one in processes with a time limit."""
+    """Run :func:`check_domain` on each name, one by one in processes with a time limit."""
     from crptpro.envs.rendering import run_isolated
 
     plugins = [part for name in loaded_plugins() for part in (FLAG, name)]
@@ -186,7 +186,7 @@ def render_domains(names: Sequence[str], backend: str | None, timeout_s: float) 
 
 
 def check_domain(name: str) -> dict[str, Any]:
-    """Step a domain at random and look at its pixels.
+    """Step a domain at random and check its pixels.
 
     Returns ``domain`` and ``error``: why it failed, or what is wrong with its images, otherwise empty. With an error,
     ``remedy``. Without one, wall-clock milliseconds: ``reset_ms`` of the first reset, which makes the render context,

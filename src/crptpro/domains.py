@@ -28,7 +28,7 @@ class Domain:
 
     ``make`` builds your own environment, an unbatched TorchRL one on the CPU. It gets, by keyword, those of ``seed``,
     ``image_size``, ``action_repeat``, ``camera``, ``quality`` and ``physics_state`` that its signature names. If
-    it repeats actions by itself, say so by the domain's ``action_repeat``. ``pixels`` is one RGB image ``[H, W, 3]`` or
+    it repeats actions itself, give the domain that ``action_repeat``. ``pixels`` is one RGB image ``[H, W, 3]`` or
     ``[3, H, W]`` with ``H = W = image_size``, uint8; ``action`` is a float vector in [-1, 1]; the reward has shape
     ``[1]``. Without ``truncated`` in its ``done_spec``, episodes end by termination alone. With ``physics_state`` it
     may emit ``qpos`` and ``qvel``; entries that its transforms read back (``step_count``) stay, others are dropped. Its
@@ -38,7 +38,7 @@ class Domain:
 
     name: str  #: of the domain, and of its dataset directory
     task: str  #: used for collection, a name for :func:`crptpro.envs.make_env`
-    action_repeat: int = 1  #: env steps per agent step; others can be asked for if ``make`` takes it as an argument
+    action_repeat: int = 1  #: env steps per agent step; others can be requested if ``make`` takes it as an argument
     camera: int | str | None = 0  #: index or name of the camera; ``None`` leaves it to the environment
     make: Callable[..., EnvBase] | None = None
     episode_env_steps: int | None = None  #: after which an episode is truncated; if ``None``, after 1000 agent steps
@@ -135,7 +135,7 @@ def register_domain(domain: Domain) -> Domain:
 
     A name that several domains share means the one registered last. A worker process starts without registered
     domains: pass the ``Domain`` itself, or call ``register_domain`` at the top level of the module that defines
-    ``make``. A domain with a name or letter of the paper's raises a ``CRPTproError``.
+    ``make``. A name of the paper's, or with the prefix ``gymnasium:``, raises a ``CRPTproError``.
     """
     for name in (domain.name, domain.task):
         if name in {*PAPER_DOMAINS, *TASKS, *GROUPS} or name.startswith(GYMNASIUM_PREFIX):
@@ -148,8 +148,8 @@ def register_domain(domain: Domain) -> Domain:
 def get_domain(name: str | Domain) -> Domain:
     """Return the domain of a domain or task name, built in or registered, or of ``gymnasium:<id>``.
 
-    A task name gives its domain with that task; a ``Domain`` is returned as it is. An unknown name is an
-    ``UnknownNameError`` with the nearest known ones.
+    A task name gives its domain with that task; a ``Domain`` is returned unchanged. An unknown name
+    raises an ``UnknownNameError`` with the nearest known ones.
 
     Examples:
         >>> get_domain("cheetah").task
@@ -178,7 +178,7 @@ def get_domain(name: str | Domain) -> Domain:
 def expand_groups(names: Named | Iterable[Named]) -> list[Named]:
     """Replace group letters by their domains, keeping order and dropping repeats.
 
-    No name, or an unknown one, is an ``UnknownNameError``; a :class:`Domain` stays. A text is one name.
+    No name, or an unknown one, raises an ``UnknownNameError``; a :class:`Domain` is kept. A string is one name.
 
     Examples:
         >>> expand_groups(["D", "walker", "finger"])

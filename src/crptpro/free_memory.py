@@ -1,4 +1,4 @@
-"""The memory that a process may still take, in a container or batch job too."""
+"""The memory that is free for this process, also in a container or a batch job."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _FILES = (
 )
 
 
-# Environment variables of jobs that share a machine. A job's dense maps grow while it runs, so that the memory which is
-# free at its start is not its own.
+# Environment variables of jobs that share a machine. A job's dense maps grow while it runs, so that another job may
+# need the memory that is free at its start.
 JOB_BYTES, JOBS_PER_GPU = "CRPTPRO_JOB_BYTES", "CRPTPRO_JOBS_PER_GPU"
 
 

@@ -175,7 +175,7 @@ class RunLogger:
         self.load_state_dict(dict.fromkeys(streams, 0))
 
     def writes_into(self, directory: str | Path) -> bool:
-        """Whether the record is inside ``directory``: only then all of it belongs to that directory's run."""
+        """Whether the record is inside ``directory``: only then does all of it belong to that directory's run."""
         return self.run_dir.resolve().is_relative_to(Path(directory).resolve())
 
     def close(self) -> None:

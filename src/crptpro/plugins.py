@@ -1,4 +1,4 @@
-"""Modules of the user, imported before a command runs, so that their domains and methods are known."""
+"""Modules of the user, imported before a command runs, so that their domains and methods are registered."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _loaded: list[str] = []
 
 
 def load_plugin(name: str) -> None:
-    """Import a module, installed or of the working directory, or a Python file, a path that ends in ``.py``.
+    """Import a module, installed or in the working directory, or a Python file, a path that ends in ``.py``.
 
-    What is missing, imports what is missing, or is a file with the name of another module, raises a ``CRPTproError``.
+    A missing module or dependency, or a file with the name of another module, raises a ``CRPTproError``.
     """
     path = as_path(name, FLAG)
     is_file = path.suffix == ".py"

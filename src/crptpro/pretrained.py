@@ -52,11 +52,11 @@ class Pretrained:
     projector: nn.Module | None = None  #: features to latents
     predictor: nn.Module | None = None  #: latents to latents, online branch
     prototypes: nn.Module | None = None  #: unit vectors in the latent space
-    target_encoder: nn.Module | None = None  #: slow copy of the encoder
-    target_projector: nn.Module | None = None  #: slow copy of the projector
+    target_encoder: nn.Module | None = None  #: moving average of the encoder
+    target_projector: nn.Module | None = None  #: moving average of the projector
     queue: Tensor | None = None  #: candidate latents ``[Q, D]``
     actor: nn.Module | None = None  #: the exploring policy, for methods whose downstream runs start from it
-    card: dict[str, Any] = field(default_factory=dict)  #: how it was made
+    card: dict[str, Any] = field(default_factory=dict)  #: how it was trained
     #: Remaining state of the loss (further heads, coefficients), for fine-tuning.
     rest: dict[str, Tensor] = field(default_factory=dict, repr=False)
     #: Checksum of the networks as they were read, which is what the card identifies.
@@ -93,11 +93,11 @@ class Pretrained:
     def build_loss(self) -> LossModule:
         """Build the loss that this was trained with, as trainable copies of all networks, targets included.
 
-        A PretrainedError if its method is not registered or does not take these networks, or they were saved slim.
+        Raises a PretrainedError if its method is not registered or does not take these networks, or if saved slim.
         """
         if self.card.get("slim"):
             raise PretrainedError(
-                "The artifact was saved slim: it lacks the networks that training reads. Take the one with all of them."
+                "The artifact was saved slim: it does not hold the networks that training needs. Use the full one."
             )
         try:
             method: Any = get_method(self.method)
@@ -135,7 +135,7 @@ def random_pretrained(
         seed: of the initialisation; the global generator is left as it was.
         method: ``"random-encoder"``; ``"random-encoder-standardised"``, whose features have mean 0 and deviation 1 on
             ``datasets``; or ``"drq"``, which trains it.
-        datasets: directories or :class:`~crptpro.data.FrameDataset`, or one of them; the standardised one needs one.
+        datasets: one or several directories or :class:`~crptpro.data.FrameDataset`, for the standardised control.
         **encoder_config: arguments of :class:`~crptpro.modules.PixelEncoder`.
 
     Examples:
@@ -169,7 +169,7 @@ def _opened(datasets: Iterable[Any], frame_stack: int) -> list[FrameDataset]:
 
 @torch.no_grad()
 def _feature_moments(encoder: PixelEncoder, datasets: Sequence[FrameDataset], seed: int) -> tuple[Tensor, Tensor]:
-    """Return mean and deviation of every feature over 2048 random observations, as many of each dataset."""
+    """Return mean and deviation of every feature over 2048 random observations, equally many of each dataset."""
     features = []
     for index, dataset in enumerate(datasets):
         generator = torch.Generator("cpu").manual_seed(derive_seed(seed, "standardise", index))
@@ -182,7 +182,7 @@ def _feature_moments(encoder: PixelEncoder, datasets: Sequence[FrameDataset], se
 
 
 def save_pretrained(trained: Any, path: str | Path, *, slim: bool = False) -> Path:
-    """Write what was trained as a directory: ``weights.safetensors`` and ``card.json``.
+    """Write a trained encoder as a directory: ``weights.safetensors`` and ``card.json``.
 
     It is read back and rebuilt before it replaces anything.
 
@@ -195,7 +195,7 @@ def save_pretrained(trained: Any, path: str | Path, *, slim: bool = False) -> Pa
             projector. Learning a task from it gives the same numbers; fine-tuning from it is refused.
 
     Raises:
-        PretrainedError: no encoder that can be rebuilt, or ``path`` is another kind of directory.
+        CRPTproError: no encoder that can be rebuilt (a ``PretrainedError``), or ``path`` holds something else.
         ValueError: a network was built with something that cannot be stored as JSON.
         DiskSpaceError: the disk is full; an artifact there is kept.
     """
@@ -248,7 +248,7 @@ def shipped_encoders() -> list[str]:
 
 
 def require_saveable(trained: Any) -> None:
-    """Raise before training what :func:`save_pretrained` would raise about networks of your own after it."""
+    """Raise before training what :func:`save_pretrained` would raise after it about networks of your own."""
     source = _as_pretrained(trained)
     described = _describe(source)
     tensors = {f"{role}.{k}": v for role in described for k, v in getattr(source, role).state_dict().items()}

@@ -11,7 +11,7 @@ logger = logging.getLogger(__name__)
 
 
 class Progress:
-    """Shows progress from ``done`` to ``total`` units; a log file gets ``lines`` over the whole."""
+    """Shows progress from ``done`` to ``total`` units; a log file gets ``lines`` lines in total."""
 
     def __init__(
         self, total: int, done: int, unit: str, *, label: str = "", is_shown: bool = True, lines: int = 20
@@ -29,7 +29,7 @@ class Progress:
         self.done = done
 
     def show(self, **values: float) -> None:
-        """Put values beside the bar, or write a line if one is due."""
+        """Show values beside the bar, or log a line if one is due."""
         texts = [f"{name} {value:.4g}" for name, value in values.items()]
         if not self._bar.disable:
             self._bar.set_postfix_str(", ".join(texts), refresh=False)

@@ -33,7 +33,7 @@ def versions() -> dict[str, str]:
 
 @cache
 def hardware() -> dict[str, Any]:
-    """Return what decides how long work takes here.
+    """Return the hardware, which determines run times.
 
     ``cpu_instructions`` are those that torch uses: virtual processors of one model may differ threefold in speed.
     ``gpus`` are names, or why torch cannot use one.
@@ -59,7 +59,7 @@ def cpu_cores() -> int:
 def _gpu_name(index: int) -> str:
     try:
         return torch.cuda.get_device_name(index)
-    except Exception as reason:  # a driver that is broken, or older than torch wants
+    except Exception as reason:  # a driver that is broken, or older than torch requires
         return f"{UNUSABLE}: {(str(reason).splitlines() or [type(reason).__name__])[0]}"
 
 

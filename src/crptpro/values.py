@@ -50,7 +50,7 @@ def as_int(value: Any, name: str, *, minimum: int | None = None, maximum: int | 
 
 
 def as_float(value: Any, name: str, *, minimum: float | None = None, maximum: float | None = None) -> float:
-    """Return a coefficient or rate as a plain finite ``float``; a ValueError as of :func:`as_int`."""
+    """Return a coefficient or rate as a plain finite ``float``; a ValueError as in :func:`as_int`."""
     try:
         number = float(_scalar(value))
     except (TypeError, ValueError, OverflowError):
@@ -74,9 +74,9 @@ def as_path(value: str | os.PathLike[str], name: str = "path") -> Path:
 
 
 def as_plain(value: Any, name: str) -> Any:
-    """Return a setting, or a whole card of them, as what JSON holds: numbers, texts, lists, dicts with string keys.
+    """Return a setting, or a whole card of them, as what JSON holds: numbers, strings, lists, dicts with string keys.
 
-    NumPy and torch scalars become numbers, arrays and tensors lists, dataclasses dicts, paths and dtypes texts. An
+    NumPy and torch scalars become numbers, arrays and tensors lists, dataclasses dicts, paths and dtypes strings. An
     entry that has no such form raises a ``ValueError`` with its name.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -132,7 +132,7 @@ def read_entry(reader: object, tensordict: TensorDictBase, key: NestedKey) -> Te
 
 
 def _scalar(value: Any) -> Any:
-    """Return the Python number of a scalar; what is no number, a bool or an array raises a TypeError here or later."""
+    """Return the Python number of a scalar; a bool, an array or a non-number raises a TypeError here or later."""
     number = value.item() if getattr(value, "ndim", None) == 0 else value
     if isinstance(number, (bool, str, bytes)) or getattr(number, "ndim", 0) > 0:
         raise TypeError

@@ -67,7 +67,7 @@ def single_core_threads(count: int, name: str) -> ThreadPoolExecutor:
 
 
 class WorkerPool(ProcessPoolExecutor):
-    """An executor whose processes call ``prepare(*arguments)`` first, and ignore Ctrl-C: their parent decides."""
+    """An executor whose processes call ``prepare(*arguments)`` first, and ignore Ctrl-C, which their parent handles."""
 
     def __init__(self, workers: int, prepare: Callable[..., None], *arguments: Any) -> None:
         main = sys.modules["__main__"]

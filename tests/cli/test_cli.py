@@ -286,7 +286,7 @@ def test_datasets_that_do_not_fit_are_refused(call: Call, dataset: Path, encoder
     line = refused(call("pretrain", dataset, other, "--out", "out"))
     assert f"{dataset} has 16 px" in line
     assert f"{other} has 18 px" in line
-    assert "as (9, 18, 18); the encoder takes (9, 16, 16)" in refused(call("finetune", encoder, other, "--out", "out"))
+    assert "(9, 18, 18); the encoder takes (9, 16, 16)" in refused(call("finetune", encoder, other, "--out", "out"))
     file = next(dataset.rglob("pixels.memmap"))
     os.truncate(file, file.stat().st_size - 1)
     assert str(file) in refused(call("pretrain", dataset, "--out", "out"))

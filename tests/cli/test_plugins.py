@@ -90,7 +90,7 @@ def test_a_plugins_environment_is_collected_and_learned_with_evaluation_workers(
     assert {row["agent_steps"] for row in rows("again.csv")} == {"5"}  # with the agent's own action repeat
     status, _, err = call("evaluate", "run/agent", "--task", TASK, "--episodes", 1)
     assert status == 1
-    assert "takes no action_repeat: an agent step is 1 env step(s), not 4. Ask for action_repeat=1" in err
+    assert "takes no action_repeat: an agent step is 1 env step(s), not 4. Use action_repeat=1" in err
     status, _, err = call("evaluate", "run/agent", "--task", TASK, "--episodes", 1, "--action-repeat", 1)
     assert status == 1
     assert f"trained for 1 actions ({task}), {TASK} has 2" in err

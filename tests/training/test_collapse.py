@@ -44,7 +44,7 @@ UNIFORM = math.log(512)
         (
             [*[UNIFORM] * 5, 5.0, 5.0],
             [*["plateau"] * 4, "dead", "dead", "learning"],
-            [("INFO", "plateau"), ("ERROR", "DEAD RUN"), ("WARNING", "after it was called dead")],
+            [("INFO", "plateau"), ("ERROR", "DEAD RUN"), ("WARNING", "after it was declared dead")],
             [{"entered": 100, "left": 600}],
         ),
     ],

@@ -274,7 +274,7 @@ def test_what_does_not_fit_a_run_is_refused_by_name(tmp_path: Path) -> None:
     assert not (tmp_path / "new" / "episodes.csv").exists()
     with pytest.raises(CheckpointError, match="pretrained was"):
         train(tmp_path, make_pretrained("proto-rl-c"))
-    with pytest.raises(PretrainedError, match=r"A Flatten is no saved encoder: give what save_pretrained"):
+    with pytest.raises(PretrainedError, match=r"A Flatten is not a saved encoder: pass what save_pretrained"):
         train(None, nn.Flatten())
     with pytest.raises(PretrainedError, match="cannot be built in another process"):
         train(None, task=signalling("toy", -1, signal.SIGTERM), eval_workers=2)

@@ -326,7 +326,7 @@ def test_the_stacks_that_an_open_dataset_samples_must_fit_the_encoder_whatever_i
         assert run(make_loss(channels=channels), 2, datasets=path).updates == 2
     single = FrameDataset.open(path, frame_stack=1)
     assert run(make_loss(channels=3), 2, datasets=single).updates == 2
-    with pytest.raises(DatasetError, match=r"as \(3, 16, 16\); the encoder takes \(9, 16, 16\)\..*samples stacks"):
+    with pytest.raises(DatasetError, match=r"shape \(3, 16, 16\); the encoder takes \(9, 16, 16\)\..*samples stacks"):
         run(make_loss(channels=9), 2, datasets=single)
 
 

@@ -25,7 +25,7 @@ class Joint(NamedTuple):
 def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
     """Return the joints behind a domain's ``qpos`` and ``qvel``, in order.
 
-    ``None`` where they are not known: a custom environment, or one without a MuJoCo model. A ``RenderingError`` if
+    ``None`` if they are unknown: a custom environment, or one without a MuJoCo model. Raises a ``RenderingError`` if
     dm_control cannot be loaded because no backend renders.
     """
     try:
@@ -37,7 +37,7 @@ def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
         from crptpro.envs.dm_control import load_dm_env
         from crptpro.envs.rendering import select_backend
 
-        select_backend()  # importing dm_control fixes it
+        select_backend()  # importing dm_control fixes the backend
         env = load_dm_env(domain)
         model = env.physics.model.ptr
     elif domain.source == "gymnasium":
@@ -58,11 +58,11 @@ def joints_of(domain: str | Domain) -> tuple[Joint, ...] | None:
 
 
 def position_coordinates(qpos: Tensor, joints: Sequence[Joint] | None) -> tuple[list[str], Tensor]:
-    """Return names, and positions as float64 ``[N, len(names)]`` that are continuous where the picture is.
+    """Return names, and positions as float64 ``[N, len(names)]`` that change continuously with the image.
 
     Slides and limited hinges are kept. A hinge without limits becomes its sine and cosine. The orientation of a ball or
-    free joint becomes the first two columns of its rotation matrix, which determine it. Without joints that fit,
-    ``qpos`` (``[N, nq]``: metres, radians, quaternions w, x, y, z) is returned unchanged.
+    free joint becomes the first two columns of its rotation matrix, which determine it. If the joints do not
+    match, ``qpos`` (``[N, nq]``: metres, radians, quaternions w, x, y, z) is returned unchanged.
     """
     qpos = qpos.double()
     sizes = [_SIZES[joint.kind][0] for joint in joints or ()]

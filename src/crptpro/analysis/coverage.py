@@ -16,12 +16,12 @@ def coverage(embeddings: Tensor, *, k: int = 12) -> float:
     (arXiv 2102.11271). The paper plots "a particle-based estimator" and states neither k, nor the number of
     observations, nor the encoder: these are this project's choice. The value falls with the number of observations:
     compare equal numbers. It is 0 if all embeddings are equal, and at most log 3 for unit vectors. Embeddings are
-    ``[N, D]``; N up to ``k``, the number of neighbours, raises a ``ValueError``.
+    ``[N, D]``; N of at most ``k``, the number of neighbours, raises a ``ValueError``.
     """
     if len(embeddings) <= k:
         raise ValueError(f"{k} neighbours need more than {k} observations, got {len(embeddings)}.")
     total = 0.0
-    for part in embeddings.split(64):  # the differences to all neighbours of all would not fit
+    for part in embeddings.split(64):  # the differences to all neighbours would not fit in memory
         distances = knn_distances(part, embeddings, k=k + 1)[:, 1:]  # the nearest is the observation itself
         total += float(particle_entropy(distances).double().sum())
     return total / len(embeddings)

@@ -39,7 +39,7 @@ def effective_rank(features: Tensor) -> float:
     mean = features.mean(0, dtype=torch.float64)
     gram = gram_matrix(features, mean, torch.ones_like(mean))
     singular = np.sqrt(np.linalg.eigvalsh(gram).clip(min=0))
-    # The Gram matrix has half of the digits: smaller values are rounding errors.
+    # From a Gram matrix, singular values have half the significant digits: smaller ones are rounding errors.
     singular = singular[singular > 1e-7 * singular.max()]
     if not len(singular):
         return 0.0

@@ -18,7 +18,7 @@ from crptpro.seeding import derive_seed
 from crptpro.values import as_int
 
 HELD_OUT = 0.25
-"""Fraction of the episodes that is held out, and of the other episodes that choose the penalty."""
+"""Fraction of the episodes that is held out, and of the others that is used to choose the penalty."""
 LEAST_SPREAD = 1e-3
 """Standard deviation (m, rad, m/s, rad/s; 1 for sines and rotations) below which a coordinate counts as constant."""
 PENALTIES = tuple(10.0**power for power in range(-6, 3))
@@ -27,14 +27,14 @@ PENALTIES = tuple(10.0**power for power in range(-6, 3))
 
 @dataclass(frozen=True)
 class ProbeSamples:
-    """Observations of one domain with their states, and their split; no episode is in two of its parts."""
+    """Observations of one domain with their states, split into parts that share no episode."""
 
     pixels: Tensor  #: uint8 ``[N, C, H, W]``
     targets: Tensor  #: float64 ``[N, T]``, positions and velocities
     names: list[tuple[str, str]]  #: of the targets: ``"position"`` or ``"velocity"``, and the coordinate
-    train: Tensor  #: rows to fit
-    validation: Tensor  #: rows that choose the penalty
-    test: Tensor  #: rows that judge
+    train: Tensor  #: rows to fit on
+    validation: Tensor  #: rows to choose the penalty on
+    test: Tensor  #: rows to score
     held_out_episodes: int  #: number of episodes in ``test``
 
 
@@ -42,9 +42,9 @@ class ProbeSamples:
 class ProbeResult:
     """How well one kind of embedding of one domain predicts the state.
 
-    Positions and velocities are R2 on held-out episodes by coordinate. ``left_out`` are kind and coordinate of those
-    that hardly vary in the training or in the held-out episodes. Rank and cosine are those of
-    :mod:`crptpro.analysis.embeddings`.
+    ``positions`` and ``velocities`` map coordinates to R2 on held-out episodes. ``left_out`` lists kind and name of the
+    coordinates that hardly vary in the training or in the held-out episodes. ``effective_rank`` and ``mean_cosine``
+    (over pairs) describe the spread of the embeddings.
     """
 
     positions: dict[str, float]
@@ -67,7 +67,7 @@ class ProbeResult:
 def probe_samples(
     dataset: FrameDataset, *, samples: int = 2_000, seed: int = 0, frame_stack: int | None = None
 ) -> ProbeSamples:
-    """Draw observations and states of a dataset, and divide its episodes.
+    """Draw observations and states of a dataset, and split its episodes.
 
     The same seed draws the same observations and splits, whatever the colours of the dataset. ``samples`` are drawn
     without replacement; all transitions if there are fewer. ``frame_stack`` is the dataset's if ``None``.

@@ -47,8 +47,8 @@ logger = logging.getLogger(__name__)
 DESCRIPTION = """Cross-domain random pre-training with prototypes for reinforcement learning from pixels.
 Start with `crptpro doctor`, then collect, pretrain and downstream; each stage continues where it was killed.
 Or `crptpro reproduce` a whole experiment of the paper.
-With `--plugin FILE.py` (or a module) any command runs a file of yours first: methods and domains that it registers
-then have names here."""
+With `--plugin FILE.py` (or a module) any command first runs your file: methods and domains that it registers can then
+be named."""
 
 NamedValues = Annotated[tuple[str, ...], arg(metavar="[NAME=VALUE ...]", help_behavior_hint="(default: the method's)")]
 
@@ -70,7 +70,7 @@ class Logging:
 
     @contextlib.contextmanager
     def records(self, run_dir: Path) -> Iterator[RunLogger | None]:
-        """Open the record of a run with its mirrors; without mirrors the run makes its own."""
+        """Open the record of a run with its mirrors; without mirrors yields ``None``: the run then opens its own."""
         if self.wandb == "off" and (self.wandb_project or self.wandb_group or self.wandb_tags):
             raise CRPTproError("A W&B project, group or tag needs --logging.wandb: auto, offline or online.")
         if self.wandb == "off" and not self.tensorboard:
@@ -102,12 +102,12 @@ class Doctor:
 
 @dataclass(frozen=True)
 class Collect:
-    """Let a uniform random policy fill one dataset per domain."""
+    """Collect one dataset per domain with a uniform random policy."""
 
     domains: Annotated[Positional[tuple[str, ...]], arg(metavar="DOMAIN [DOMAIN ...]", help_behavior_hint="(required)")]
     """domains, tasks, or group letters, e.g. `walker cartpole`, `A`, `gymnasium:HalfCheetah-v5`"""
     out: Path = Path("data")
-    """one directory per domain is made below this one"""
+    """parent directory: each domain gets a directory in it"""
     transitions: int = 100_000
     """transitions per domain (21 KB each); a finished dataset does not grow"""
     seed: int = 0
@@ -201,7 +201,7 @@ class Pretrain(Pretraining):
     """Pre-train one encoder for several domains on their datasets, one update per domain in turn."""
 
     config: Annotated[training.PretrainConfig, arg(name="")] = field(default_factory=training.PretrainConfig)
-    """every number of the stage"""
+    """all settings of the stage"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,7 +209,7 @@ class Explore(Pretraining):
     """Pre-train one encoder on what exploring agents see: one decision per domain in turn."""
 
     config: Annotated[training.ExploreConfig, arg(name="")] = field(default_factory=training.ExploreConfig)
-    """every number of the stage"""
+    """all settings of the stage"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,7 +224,7 @@ class Finetune(EncoderRun):
     dataset: Annotated[Positional[Path], arg(metavar="DATASET")]
     """dataset directory of the one domain"""
     config: Annotated[training.PretrainConfig, arg(name="")] = field(default_factory=training.PretrainConfig)
-    """every number of the stage"""
+    """all settings of the stage"""
 
     def run(self) -> None:
         pretrained = load_pretrained(self.pretrained)
@@ -245,7 +245,7 @@ class Downstream:
     out: Path
     """run directory: eval.csv, train.csv, checkpoints, and the agent in OUT/agent"""
     config: Annotated[training.DownstreamConfig, arg(name="")] = field(default_factory=training.DownstreamConfig)
-    """every number of the stage"""
+    """all settings of the stage"""
     logging: Logging = field(default_factory=Logging)
     """Weights & Biases and TensorBoard"""
 
@@ -267,7 +267,7 @@ class Evaluate:
     task: str | None = None
     """task to act in (None: the agent's own)"""
     episodes: int = 10
-    """whole episodes"""
+    """number of whole episodes"""
     seed: int = 0
     """seeds the episodes"""
     quality: Quality | None = None
@@ -342,7 +342,7 @@ class Probe:
     csv: Path | None = None
     """write every number here, each coordinate's R2 among them"""
     device: str = "cpu"
-    """where the encoder runs"""
+    """device of the encoder"""
 
     def run(self) -> None:
         from crptpro.experiments import measure
@@ -389,7 +389,7 @@ class Report:
 
 
 def require_video(path: Path | None) -> Path | None:
-    """Refuse a video that cannot be written, before any work; makes nothing."""
+    """Return the path of a video; one that cannot be written is refused before any work. Creates nothing."""
     path = require_writable(path, "--video")
     if path is None:
         return None
@@ -405,16 +405,16 @@ def require_video(path: Path | None) -> Path | None:
 
 
 def write_video(frames: Sequence[torch.Tensor], path: Path) -> None:
-    """Write RGB pictures, uint8 ``[3, H, W]``, as an MP4 at 25 pictures a second."""
+    """Write RGB images, uint8 ``[3, H, W]``, as an MP4 at 25 images per second."""
     import imageio.v2 as imageio
 
-    # Nearest-neighbour enlargement keeps 84 pixels visible on a screen; the codec wants even sizes.
+    # Nearest-neighbour upscaling makes 84 pixels visible on a screen; the codec needs even sizes.
     large = torch.stack(list(frames)).repeat_interleave(4, -1).repeat_interleave(4, -2)
     aside = path.with_name(f".{path.name}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        pictures = list(large.permute(0, 2, 3, 1).numpy())
-        imageio.mimwrite(aside, pictures, format="FFMPEG", fps=25, macro_block_size=4)
+        images = list(large.permute(0, 2, 3, 1).numpy())
+        imageio.mimwrite(aside, images, format="FFMPEG", fps=25, macro_block_size=4)
         aside.replace(path)
     except (OSError, RuntimeError, ValueError) as reason:
         raise CRPTproError(f"--video {path} was not written: {reason}") from reason
@@ -449,8 +449,8 @@ def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
     for path in datasets:
         if not path.exists() and str(path) in (*GROUPS, *PAPER_DOMAINS, *TASKS):
             raise DatasetError(
-                f"{path} is not a directory. This method learns from datasets: `crptpro collect {path}` makes them, "
-                "data/... by default."
+                f"{path} is not a directory. This method learns from datasets: `crptpro collect {path}` makes one, "
+                "by default in data/."
             )
         dataset = FrameDataset.open(path)
         formats[path] = (dataset.image_size, dataset.frame_stack)
@@ -461,7 +461,7 @@ def image_format(datasets: Sequence[Path]) -> tuple[int, int]:
 
 
 def require_writable(path: Path | None, option: str) -> Path | None:
-    """Return a path with ``~`` expanded; one that no file can have is refused before any work. Makes nothing."""
+    """Return a path with ``~`` expanded; one that cannot be written is refused before any work. Creates nothing."""
     if path is None:
         return None
     path = as_path(path, option)
@@ -469,12 +469,12 @@ def require_writable(path: Path | None, option: str) -> Path | None:
         raise CRPTproError(f"{option} {path} is not a regular file; name one.")
     parent = next(parent for parent in path.absolute().parents if parent.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-        raise CRPTproError(f"{option} {path} cannot be written: {parent} is a file, or not yours to write to.")
+        raise CRPTproError(f"{option} {path} cannot be written: {parent} is a file, or you may not write to it.")
     return path
 
 
 def pretrain_command(arguments: Sequence[str]) -> type[Pretrain] | type[Explore]:
-    """Return the settings of ``pretrain`` for the method that the command line names."""
+    """Return the settings class of ``pretrain`` for the method that the command line names."""
     words = " ".join(arguments).replace("=", " ").split()
     names = [after for word, after in itertools.pairwise(words) if word == "--method"]
     explores = names and "pretrain" in arguments and get_method(names[-1]).exploration is not None
@@ -488,7 +488,7 @@ def main() -> None:
         arguments = load_plugins(sys.argv[1:])
         for before, word in itertools.pairwise(["crptpro", *arguments]):
             if not word or re.fullmatch("--[^=]*=", word):
-                raise CRPTproError(f"An argument is empty: {word or before}. A path is at least a dot.")
+                raise CRPTproError(f"An argument is empty: {word or before}. For the working directory write a dot.")
         if arguments == ["--version"]:
             print(f"crptpro {version('crptpro')}")
             return

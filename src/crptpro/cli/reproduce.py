@@ -24,14 +24,14 @@ from crptpro.provenance import cpu_cores
 from crptpro.values import as_path
 
 ALL = "all"
-_ITS_OWN = arg(help_behavior_hint="(default: the experiment's)")
+_EXPERIMENTS_DEFAULT = arg(help_behavior_hint="(default: the experiment's)")
 _LAUNCHERS = {
     "partition": ("slurm",), "hours": ("slurm",), "memory_gb": ("slurm",), "sbatch": ("slurm",),
     "ray_address": ("ray",), "jobs_per_gpu": ("local", "ray"),
 }  # fmt: skip
 """Options that only some launchers read."""
 PAPER_RUNS = 6
-"""Evaluations that the paper's numbers of CRPTpro are over, at the least; it says no number for the others."""
+"""Least number of evaluations behind the paper's scores of CRPTpro; for other methods it states none."""
 
 
 @dataclass(frozen=True)
@@ -39,48 +39,48 @@ class Reproduce:
     """Reproduce an experiment of the paper: print the plan, then run whatever job is missing.
 
     Experiments: seen, unseen, colors, finetune, efficiency, ablation, sensitivity, prototypes, coverage, stability,
-    visualize, probe, or all. Whatever is finished, by this or another experiment, is used again; interrupted,
-    the same command continues. At the end `crptpro report ROOT` makes tables and figures of it. The default of at most
-    three runs on one encoder is below the paper's six evaluations or more: --encoder-seeds 0 1 has six.
+    visualize, probe, or all. Finished jobs are reused, also those of other experiments; after an interruption the same
+    command resumes. `crptpro report ROOT` then makes tables and figures. The default of at most three runs on one
+    encoder is below the paper's six or more evaluations: --encoder-seeds 0 1 gives six.
     """
 
     experiments: Annotated[
         Positional[tuple[str, ...]], arg(metavar="EXPERIMENT [EXPERIMENT ...]", help_behavior_hint="(required)")
     ]
-    """which, e.g. `seen`, or several, or `all`"""
+    """one or several experiments, e.g. `seen`, or `all`"""
     scale: Literal["tiny", "small", "paper"]
     """tiny shows in minutes that everything runs; small fits two CPU cores; paper has the paper's numbers"""
-    methods: Annotated[tuple[str, ...], _ITS_OWN] = ()
+    methods: Annotated[tuple[str, ...], _EXPERIMENTS_DEFAULT] = ()
     """only these methods, e.g. `crptpro drq random-encoder`"""
-    groups: Annotated[tuple[str, ...], _ITS_OWN] = ()
+    groups: Annotated[tuple[str, ...], _EXPERIMENTS_DEFAULT] = ()
     """only these pre-training groups, of A B C D"""
-    tasks: Annotated[tuple[str, ...], _ITS_OWN] = ()
+    tasks: Annotated[tuple[str, ...], _EXPERIMENTS_DEFAULT] = ()
     """only these tasks, e.g. `walker_run`"""
     seeds: Annotated[tuple[int, ...], arg(help_behavior_hint="(default: as many as the scale has, from 0)")] = ()
-    """of downstream runs on each encoder"""
+    """seeds of the downstream runs on each encoder"""
     encoder_seeds: tuple[int, ...] = (0,)
-    """of data and pre-training"""
+    """seeds of data and pre-training"""
     colors_by: Literal["background", "image"] = "background"
     """what the experiment `colors` reverses: the background or the whole image"""
     out: Annotated[str, arg(metavar="PATH")] = "runs/reproduce"
-    """ROOT, where everything is kept and found again"""
+    """ROOT, the directory of all jobs and results; finished jobs in it are reused"""
     dry_run: bool = False
     """print the plan and run nothing"""
     device: str = "cpu"
-    """of networks: cpu, cuda (jobs share this machine's GPUs, or have one of the cluster's), or cuda:1"""
+    """device of the networks: cpu, cuda (jobs share this machine's GPUs, or get one of the cluster's), or cuda:1"""
     launcher: Literal["local", "slurm", "ray"] = "local"
     """local: processes here; slurm, ray: a cluster whose nodes share ROOT"""
     jobs: int | None = None
-    """most jobs at a time, each with its own memory (None: one per core, or as many as the GPUs take by
-    --jobs-per-gpu, which is also the most here; on a cluster 16)"""
+    """most jobs at a time, each with its own memory (None: one per core, or --jobs-per-gpu for each GPU,
+    which is also the most here; on a cluster 16)"""
     cores_per_job: int | None = None
-    """cores of each job (None: this machine's divided by jobs; on a cluster 1, beside a GPU 4)"""
+    """cores of each job (None: this machine's divided by jobs; on a cluster 1, or 4 with a GPU)"""
     jobs_per_gpu: int = 1
     """local, ray: how many jobs share a GPU"""
     partition: str | None = None
     """slurm: partition (None: the cluster's)"""
     hours: float = 24.0
-    """slurm: time limit of a job; one that reaches it is queued again and continues"""
+    """slurm: time limit of a job; one that reaches it is requeued and resumes"""
     memory_gb: float = 16.0
     """slurm: memory of a job"""
     sbatch: Annotated[tuple[str, ...], arg(help_behavior_hint="(default: none)")] = ()
@@ -106,7 +106,7 @@ class Reproduce:
         disk = sum(after for after, _ in sizes) + sum(working)
         print(f"{', '.join(wanted)} at scale {self.scale} in {root}\n")
         print(plan_text(plan, root, disk, jobs), flush=True)
-        # As many runs, which keep dense maps, are there at a time.
+        # At most this many runs, which keep dense maps, share the memory.
         sharing = min(jobs, max(1, sum(job.kind == "run" for job in plan.missing)))
         if self.launcher == "local" and self.device == "cpu" and (hint := memory_text(plan, sharing)):
             print(hint, flush=True)
@@ -119,8 +119,8 @@ class Reproduce:
                 print(f"\nNot part of {name}, and left out: {', '.join(names)}.")
         if self.dry_run:
             return
-        require_disk(root, disk, "What this plan has yet to make")
-        # It may fail, and nothing is written yet.
+        require_disk(root, disk, "The rest of this plan")
+        # Created before anything is written, because it may fail.
         launcher = self._launcher(slurm, gpus, sharing) if plan.missing else None
         for name, cells in wanted.items():
             write_cells(root, name, self.scale, [(cell.label, cell.job.key, cell.place) for cell in cells])
@@ -154,7 +154,7 @@ class Reproduce:
         )  # fmt: skip
 
     def _wanted(self, request: Request) -> dict[str, list[Cell]]:
-        """Return cells by experiment. A named experiment must have some; ``all`` means those that have some."""
+        """Return cells by experiment. A named experiment must have cells; ``all`` means those that have any."""
         for name in self.experiments or ("",):
             if name not in (*EXPERIMENTS, ALL):
                 raise UnknownNameError(
@@ -179,7 +179,7 @@ class Reproduce:
 
 
 def left_out(request: Request, cells: Sequence[Cell]) -> list[str]:
-    """Return the requested methods, groups and tasks that no cell has: an experiment may have no place for them."""
+    """Return the requested methods, groups and tasks that are in no cell: not every experiment covers them."""
     found = {re.split("[ ,]", cell.label)[0] for cell in cells}
     for cell in cells:
         found |= {cell.place.get(name) for name in ("group", "task", "domain")}
@@ -213,7 +213,7 @@ def plan_text(plan: Plan, root: Path, disk: int, jobs: int) -> str:
 
 
 def memory_text(plan: Plan, jobs: int) -> str:
-    """Return why fewer jobs at a time may be faster: their runs could keep dense maps. Empty if they can as it is."""
+    """Return a hint that fewer jobs at a time may be faster, as their runs could keep dense maps; empty if all can."""
     from crptpro.transforms.dense_shift import dense_maps_bytes  # late, as it imports TorchRL
 
     runs = [job.facts for job in plan.missing if job.kind == "run" and job.needs]  # without DrQ's
@@ -223,7 +223,7 @@ def memory_text(plan: Plan, jobs: int) -> str:
     if needed <= 0.8 * free / jobs:
         return ""
     fitting = int(0.8 * free / needed)
-    advice = f"they fit with --jobs {fitting}" if fitting else "this machine has too little for one"
+    advice = f"they fit with --jobs {fitting}" if fitting else "this machine has too little memory for one"
     return (
         f"Each job may take {free / jobs / 1e9:.1f} GB of memory. A run whose dense maps ({needed / 1e9:.1f} GB) do "
         f"not fit encodes again at every update, which is several times slower; {advice}."

@@ -35,7 +35,7 @@ from crptpro.workers import SPAWN, Inline, WorkerPool, can_be_sent
 
 logger = logging.getLogger(__name__)
 
-STALL_S = 300.0  # without a step of any worker they count as hung
+STALL_S = 300.0  # workers count as hung after this long without a step of any
 _AGAIN = "What was collected is kept: run the same command again"
 
 
@@ -67,26 +67,26 @@ def collect_group(
     ``make`` no other process can import, e.g. one defined in a notebook, is collected in this process.
 
     An episode is a rollout of ``RandomPolicy``, not a batch of a TorchRL ``Collector``, which resets before the next
-    episode's seeds are known; made to do this, it took 8 % more CPU time with walker (84 x 84, software GL).
+    episode's seeds are known; adapted to this, it took 8 % more CPU time with walker (84 x 84, software GL).
 
     Args:
         domains: domain names, task names, letters of the paper's groups, ``gymnasium:<id>``, or
             :class:`~crptpro.domains.Domain` objects.
-        root: a directory ``root/<domain name>`` is made for each domain.
+        root: parent of the directories ``root/<domain name>``, one per domain.
         transitions: transitions per domain (agent steps; 21 KB each at 84 x 84).
-        seed: of the episodes, each with the domain and its index.
+        seed: seeds every episode, together with its domain and index.
         workers: processes, each rendering on one core; 1 is this process.
-        quality: as of :func:`crptpro.envs.make_env`.
+        quality: as in :func:`crptpro.envs.make_env`.
         colors: likewise; the episodes are the same in all colours.
         image_size: H = W, pixels.
-        action_repeat: env steps per agent step; the domain's (2; 1 of your own) if ``None``.
-        progress: show a progress line per domain (log lines where the output is no terminal).
+        action_repeat: env steps per agent step; the domain's (2; 1 for your own) if ``None``.
+        progress: show a progress line per domain (log lines where the output is not a terminal).
 
     Returns:
         The directory of each domain's dataset, by name.
 
     Raises:
-        DatasetError: a directory holds something else than the requested dataset.
+        DatasetError: a directory holds something other than the requested dataset.
         DiskSpaceError: the disk cannot hold it; no frame is written, and a smaller request may use the same directory.
         UnknownNameError: an unknown domain.
         ValueError: an impossible number or path.
@@ -124,7 +124,7 @@ def collect_group(
             if any(needs_gl(job.domain) for job in jobs):
                 # Checked once, for as many renderers as will run: some drivers hang when several start together.
                 select_backend(processes=workers)
-            for job in jobs[1:]:  # what cannot be built is refused before hours of the others
+            for job in jobs[1:]:  # an environment that cannot be built is refused before hours of collecting
                 job.make(render=False).close()
             for job in jobs:
                 job.writer.note_rendering(backend_card() if needs_gl(job.domain) else {})
@@ -163,7 +163,7 @@ class _Job(NamedTuple):
 
 
 def _announce(jobs: list[_Job], root: Path, image_size: int) -> None:
-    """Say how much will be written (action and state take at most 1 kB), and refuse what the disk cannot hold."""
+    """Log how much will be written (action and state take at most 1 kB), and refuse what the disk cannot hold."""
     sizes = {}
     for job in jobs:
         missing = job.writer.missing
@@ -174,17 +174,17 @@ def _announce(jobs: list[_Job], root: Path, image_size: int) -> None:
 
 
 def _collect(job: _Job, seed: int, workers: int, progress: bool) -> None:
-    """Collect one dataset; its episodes are planned, and appended, in the order of their indices."""
+    """Collect one dataset; episodes are planned, and appended, in the order of their indices."""
     name, dataset, writer, length = job.domain.name, job.dataset, job.writer, job.length
     if workers > 1 and not can_be_sent(job.make):
         workers = 1
         logger.warning(
-            "%s is collected in this process: no other one can import its `make`, no function of a module.", name
+            "%s is collected in this process: no other one can import its `make`; define it in a module.", name
         )
     bar = Progress(writer.target, writer.transitions, "transitions", label=name, is_shown=progress, lines=10)
     steps = SPAWN.RawValue("q", 0)  # of all workers
     queue: deque[tuple[str, Future[bytes]]] = deque()
-    ahead = 2 * workers if workers > 1 else 1  # episodes under way
+    ahead = 2 * workers if workers > 1 else 1  # episodes in flight
     with ExitStack() as stack:
         if workers > 1:
             pool: Any = WorkerPool(workers, _prepare, job.make, steps)
@@ -217,7 +217,7 @@ def _collect(job: _Job, seed: int, workers: int, progress: bool) -> None:
 
 @contextmanager
 def _failures_explained(title: str) -> Iterator[None]:
-    """Say of a failure in the body what was collected, and what can be done."""
+    """Say in an error of the body which episode failed and what the user can do."""
     try:
         yield
     except BrokenProcessPool:
@@ -236,7 +236,7 @@ def _failures_explained(title: str) -> Iterator[None]:
 
 
 def _wait(future: Future, title: str, steps: Any) -> None:
-    """Wait for an episode as long as any worker makes steps."""
+    """Wait for an episode as long as any worker makes progress."""
     seen, seen_s = -1, 0.0
     while not wait([future], 1.0).done:
         if steps.value != seen:
@@ -261,7 +261,7 @@ def _prepare(make: Callable[[], EnvBase], steps: Any) -> None:
 
 
 def _roll(name: str, plan: dict[str, int]) -> bytes:
-    """Return a planned episode, pickled: torch would send its tensors as open files."""
+    """Return a planned episode, pickled: torch would otherwise send its tensors as open files."""
     global _env
     # Exceptions of any class are passed on as one that can be pickled.
     with passed_on(name, "rollout"), kept_global_rng():

@@ -41,9 +41,9 @@ class FrameDataset(ReplayBuffer):
       observations' newest frames.
 
     Frames are mapped from disk without write access: processes may share a dataset, and threads an object.
-    :meth:`open` reads a finished dataset; :meth:`create` begins or continues one, and ``extend`` fills it with what
-    :class:`~crptpro.data.FrameReplay` takes, but each episode must begin at its reset. A program that continues one
-    draws other episodes than before if it seeds by the number of those that are there::
+    :meth:`open` reads a finished dataset; :meth:`create` begins or continues one, and ``extend`` takes what
+    :class:`~crptpro.data.FrameReplay` takes, but each episode must begin at its reset. A program that resumes does not
+    repeat episodes if it seeds by the number of those already stored::
 
         dataset = FrameDataset.create("data/mine", domain="mine", transitions=10_000)
         torch.manual_seed(env.set_seed(dataset.writer.episodes))
@@ -73,8 +73,8 @@ class FrameDataset(ReplayBuffer):
         Args:
             path: its directory.
             frame_stack: k, frames per stack.
-            device: ``"cpu"`` maps the frames from disk; another device holds a copy and samples it, with a generator
-                on the same device.
+            device: ``"cpu"`` maps the frames from disk; another device holds a copy, from which it samples with a
+                generator on that device.
             **options: see the class.
 
         Raises:
@@ -88,9 +88,9 @@ class FrameDataset(ReplayBuffer):
     ) -> FrameDataset:
         """Begin a dataset, or continue one that was interrupted; a complete one is opened.
 
-        It can be sampled after ``transitions``; the last episode is cut to fit. ``about`` holds further facts for the
-        card that every attempt must repeat: ``task``, ``seed``, ``action_repeat``, ... Another content or writer of the
-        directory raises a DatasetError.
+        It can be sampled once it has all ``transitions``; the last episode is cut to fit. ``about`` holds further
+        entries of the card that every attempt must repeat: ``task``, ``seed``, ``action_repeat``, ... A directory with
+        other content or another writer raises a DatasetError.
         """
         path = as_path(path).absolute()
         usual = {"task": domain, "seed": 0, "action_repeat": 1, "camera": None, "quality": "exact", "colors": "normal"}
@@ -113,7 +113,7 @@ class FrameDataset(ReplayBuffer):
 
     @property
     def is_complete(self) -> bool:
-        """Whether all requested transitions are there."""
+        """Whether all requested transitions are stored."""
         return bool(self.card)
 
     @property
@@ -152,7 +152,7 @@ class FrameDataset(ReplayBuffer):
 class FrameStorage(StackStorage):
     """The rows of a dataset, read-only; copies and other processes map the files again.
 
-    An episode of T transitions has T + 1 frames, so the frames of a transition and its successor are rows up to
+    An episode of T transitions has T + 1 frames: those of a transition's observation and the next one are rows up to
     ``row`` and ``row + 1`` of the same episode.
     """
 
@@ -165,7 +165,7 @@ class FrameStorage(StackStorage):
             self.load()
 
     def load(self) -> None:
-        """Map the files of a complete dataset; a DatasetError if it is none."""
+        """Map the files of a complete dataset; anything else raises a DatasetError."""
         path = self.path
         if not path.is_dir():
             raise DatasetError(f"{path} is not a directory. A dataset is made by collect_random or `crptpro collect`.")
@@ -220,9 +220,9 @@ class FrameStorage(StackStorage):
 class EpisodeWriter(ImmutableDatasetWriter):
     """Appends episodes 0, 1, 2, ... to a directory until they hold the requested transitions.
 
-    The rows of an episode are on the disk before the card counts them; what a kill left behind them is cut off by the
-    next. Until an episode is durable another request replaces this one. The directory is locked until the dataset is
-    complete or :meth:`close` is called.
+    An episode's rows are on disk before the card counts them; the next episode overwrites rows that a kill left
+    uncounted. Until the first episode is durable, another request replaces this one. The directory is locked until the
+    dataset is complete or :meth:`close` is called.
     """
 
     def __init__(self, path: Path, request: dict[str, Any]):
@@ -232,7 +232,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
         self.state |= {"transitions": 0, "episodes": 0, "render": {}}
         self._pending: list[Rows] = []
         self._is_closed = False
-        # The lock, and half a card, are what a kill at the very start leaves.
+        # A kill at the very start leaves the lock and perhaps a partial card.
         found = [each for each in path.glob("*") if each.name != ".lock" and each.suffix != ".partial"]
         if found and path / CARD_FILE not in found:
             raise DatasetError(f"{path} is not empty and not a collection. Choose another directory or empty it.")
@@ -260,7 +260,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
         return self.target - self.transitions - sum(len(part.following) for part in self._pending)
 
     def extend(self, data: TensorDictBase) -> Tensor:
-        """Take transitions as a replay does, except for surplus ones; returns the indices of durable ones, int64."""
+        """Append transitions as a replay does, except surplus ones; returns the indices of those now durable, int64."""
         before = self.transitions
         if before >= self.target:
             raise DatasetError(f"{self.path} is complete and read-only; collect another one.")
@@ -286,7 +286,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
     add = extend
 
     def end_episode(self) -> None:
-        """Write the running episode; if the environment has not ended it, its last transition is truncated."""
+        """Write the running episode; if the environment has not ended it, its last transition is marked truncated."""
         if not self._pending:
             return
         self._require_open()
@@ -321,7 +321,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
             self._storage.load()  # read back before it is reported as complete
 
     def note_rendering(self, gl: Mapping[str, Any]) -> None:
-        """Note for the card what renders the frames; another ``backend`` or ``gl_renderer`` than before is refused."""
+        """Record in the card what renders the frames; a ``backend`` or ``gl_renderer`` other than before is refused."""
         before = self.state["render"]
         for name in ("backend", "gl_renderer"):
             if name in before and gl.get(name, before[name]) != before[name]:
@@ -333,7 +333,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
         self._save(render=dict(gl))
 
     def close(self) -> None:
-        """Free the directory; an unfinished dataset can be continued later."""
+        """Unlock the directory; an unfinished dataset can be continued later."""
         self._is_closed = True
         self._lock.release()
 
@@ -385,7 +385,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
 
 
 def _append(path: Path, values: Tensor, rows: int) -> None:
-    """Write rows behind the first ``rows`` of a file, through to the disk."""
+    """Write rows after the first ``rows`` of a file, dropping any others, and sync it to disk."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with open(path, "ab") as file:
         file.truncate(rows * (values.nbytes // len(values)))
@@ -403,7 +403,7 @@ def _sizes(path: Path, state: Mapping[str, Any]) -> dict[Path, int]:
 
 
 def _require_request(path: Path, found: Mapping[str, Any], request: Mapping[str, Any]) -> None:
-    """Compare the request that a directory was filled for with the one that is made now."""
+    """Require that a directory was filled for the same request."""
     differing = [
         f"{name} {found.get(name)!r} there, {value!r} requested"
         for name, value in request.items()

@@ -1,4 +1,4 @@
-"""The replay buffer of online learning: a ring in which each frame is stored once."""
+"""The replay buffer of online learning: a ring buffer in which each frame is stored once."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ class FrameReplay(ReplayBuffer):
     Deviation: url_benchmark draws an episode uniformly, and then an anchor in it; here every anchor is equally likely.
 
     A ring on disk is its own checkpoint: :meth:`state_dict` holds a few counters, and loading it restores the content,
-    if at most ``slack`` frames were written since; for the last two of checkpoints every n transitions, ``2 * n`` (plus
-    a frame per episode) are enough. Copies and pickles hold their frames in RAM. Threads may share one buffer.
+    if at most ``slack`` frames were written since. With checkpoints every n transitions, ``2 * n`` (plus a frame per
+    episode) suffice for the last two. Copies and pickles hold their frames in RAM. Threads may share one buffer.
 
     Args:
         capacity: most transitions that can be sampled; episodes below 50 transitions lower it, for their extra frame.
@@ -63,7 +63,7 @@ class FrameReplay(ReplayBuffer):
         extra_columns: further entries of a transition's root, such as a skill: name to ``(shape, dtype)``.
         n_step: n, agent steps from an observation to the next one of a sample.
         discount: gamma of the n-step return.
-        returns_pixels: ``False`` leaves the stacks out of samples, for a transform that has features by number.
+        returns_pixels: ``False`` leaves the stacks out of samples, for a transform that looks up features by number.
         **options: of TorchRL's ``ReplayBuffer``: ``batch_size``, ``generator``, ``transform``.
 
     Raises:
@@ -109,7 +109,7 @@ class FrameReplay(ReplayBuffer):
 
     @property
     def window(self) -> int:
-        """Frames within which all sampled observations and the newest one are; their numbers differ modulo this."""
+        """Frames that span the newest observation and all that can be sampled; their numbers differ modulo this."""
         return self._storage.window
 
     @property
@@ -136,7 +136,7 @@ class FrameReplay(ReplayBuffer):
     def loads(self, path: str | Path) -> None:
         """Restore what TorchRL's ``dumps`` wrote."""
         super().loads(path)
-        self._transform.load_state_dict(self._transform.state_dict())  # features of the numbers before are dropped
+        self._transform.load_state_dict(self._transform.state_dict())  # drops features of the earlier numbers
 
     def share(self, shared: bool = True) -> FrameReplay:
         """Refuse to be shared: other processes would fill copies of it."""
@@ -148,8 +148,8 @@ class FrameReplay(ReplayBuffer):
 class StoredReplay(StackStorage):
     """The observations in the files of a :class:`FrameReplay`, oldest first, read-only.
 
-    ``path`` is the replay's directory, which nobody may be writing to. A DatasetError without a replay of square RGB
-    frames, or a transition in it.
+    ``path`` is the replay's directory, which no process may be writing to. Without a replay of square RGB frames, or
+    without a transition in it, a DatasetError is raised.
     """
 
     def __init__(self, path: str | Path, *, frame_stack: int = 3) -> None:
@@ -161,7 +161,7 @@ class StoredReplay(StackStorage):
         self.step = map_rows(path / "step.memmap", torch.int32, (), rows)
         size = math.isqrt(len(map_rows(path / "pixels.memmap", torch.uint8, ())) // (3 * rows))
         self.pixels = map_rows(path / "pixels.memmap", torch.uint8, (3, size, size), rows)
-        # `number` counts from 1. Transitions that were overwritten, and rows never written (0), point elsewhere.
+        # `number` counts from 1. `row_of` is 0 where never written, and before `oldest` for overwritten transitions.
         end = int(number.max())
         oldest = max(0, end - rows)
         starts = torch.cat([row_of[:1], row_of[row_of > 0]]).unique()

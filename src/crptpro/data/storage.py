@@ -26,7 +26,7 @@ _MAP_NORESERVE = getattr(mmap, "MAP_NORESERVE", 0x4000)
 
 
 def map_rows(path: Path, dtype: torch.dtype, shape: Sequence[int], rows: int | None = None) -> Tensor:
-    """Map a raw file of rows (by default all that it has); writing to the tensor leaves the file alone."""
+    """Map a raw file of rows (by default all that it has); writes to the tensor do not change the file."""
     row_bytes = math.prod(shape) * dtype.itemsize
     try:
         with open(path, "rb") as file:
@@ -69,7 +69,7 @@ class Rows(NamedTuple):
 
     @property
     def last_stack(self) -> Tensor:
-        """The stack that the last transition leads to, as far as it is given."""
+        """The stack that the last transition leads to, of as many frames as were given."""
         return torch.cat([self.stacks[-1, self.following.shape[1] :], self.following[-1]])
 
     def part(self, first: int, end: int) -> Rows:
@@ -79,8 +79,8 @@ class Rows(NamedTuple):
     def pieces(self, last: Tensor | None) -> Iterator[tuple[bool, Rows]]:
         """Split where episodes begin; yields whether a piece begins one, and its rows.
 
-        A row continues the one before, or the running episode of newest stack ``last``, if that was not done and led to
-        the stack that this one begins with.
+        A row continues the one before, or the running episode whose newest stack is ``last``, if that was not done and
+        led to this row's stack.
         """
         channels, length = self.following.shape[1], len(self.following)
         starts = [0]
@@ -95,7 +95,7 @@ class Rows(NamedTuple):
             yield first in starts, self.part(first, end)
 
     def first_frames(self) -> Tensor:
-        """Return the first observation's frames without those that an episode's start repeats, ``[s, C, H, W]``."""
+        """Return the first observation's frames without the repeats that pad an episode's start, ``[s, C, H, W]``."""
         frames = self.stacks[0].reshape(-1, *self.following.shape[1:])
         while len(frames) > 1 and torch.equal(frames[0], frames[1]):
             frames = frames[1:]
@@ -207,8 +207,8 @@ class StackStorage(Storage):
 class RingStorage(StackStorage):
     """Frame rows in a ring of ``window + slack`` rows, and the valid transitions among them.
 
-    A row holds one frame, and the transition that starts at it, if any; ``columns`` has the shape and dtype of each of
-    its quantities. A transition is valid while it is among the newest ``capacity`` and all its frames are among the
+    A row holds one frame, and the transition that starts at it, if any; ``columns`` maps the names of their entries to
+    shape and dtype. A transition is valid while it is among the newest ``capacity`` and all its frames are among the
     newest ``window`` rows. So an earlier state needs no row that was overwritten since, if at most ``slack`` rows were.
     """
 
@@ -242,9 +242,9 @@ class RingStorage(StackStorage):
         specs = {**columns, **{name: ((), dtype) for name, dtype in own.items()}}
         if self.path is not None and (numbers := self.path / "number.memmap").exists():
             missing = [f"{name}.memmap" for name in specs if not (self.path / f"{name}.memmap").exists()]
-            if missing and map_rows(numbers, torch.int64, ()).any():  # otherwise it was being made
+            if missing and map_rows(numbers, torch.int64, ()).any():  # otherwise its creation was interrupted
                 raise CheckpointError(
-                    f"{', '.join(missing)} of the replay in {self.path} is missing. Put it back, ask for the "
+                    f"{', '.join(missing)} of the replay in {self.path} is missing. Put it back, request the "
                     "same columns, or remove the directory to begin again."
                 )
         # Counters only grow; modulo the number of rows they are slots. `oldest` is the first valid transition.
@@ -301,7 +301,7 @@ class RingStorage(StackStorage):
         column, slot, count = self.content[name], start % self.rows, len(values)
         if (room := self.rows - slot) >= count:
             column[slot : slot + count] = values
-        else:  # round the ring
+        else:  # wraps around the ring
             column[slot:] = values[:room]
             self._put(name, start + room, values[room:])
 
@@ -370,7 +370,7 @@ class RingStorage(StackStorage):
         if self.path is None:
             used = min(self.frames, self.rows)
             return state | {"content": {name: column[:used].clone() for name, column in self.content.items()}}
-        for name in self.content:  # only a crash of the machine makes a difference
+        for name in self.content:  # matters only if the machine crashes
             with open(self.path / f"{name}.memmap", "r+b") as file:
                 os.fsync(file.fileno())
         return state
@@ -421,7 +421,7 @@ class RingStorage(StackStorage):
 
 
 def map_file(path: Path, dtype: torch.dtype, shape: tuple[int, ...]) -> Tensor:
-    """Map a file that writing to the tensor changes; a new one has all its bytes reserved, or is not made."""
+    """Map a file for reading and writing; a new one is created with all its bytes reserved, or not at all."""
     size = math.prod(shape) * dtype.itemsize
     partial = path.with_name(f".{path.name}.partial")
     try:

@@ -1,4 +1,4 @@
-"""A task's name to a TorchRL environment that emits uint8 frame stacks."""
+"""TorchRL environments of tasks, which emit stacks of uint8 frames."""
 
 from crptpro.envs.factory import episode_length, make_env, needs_gl, resolve_action_repeat
 

@@ -32,7 +32,7 @@ _open: weakref.WeakSet[EnvBase] = weakref.WeakSet()
 
 
 class CheckedEnv:
-    """Mixin of the class that steps an environment.
+    """Mixin for the class that steps an environment.
 
     - An exception of the environment's code is raised as :class:`~crptpro.errors.EnvCrashedError`.
     - An action, reward or physical state that is not finite raises :class:`~crptpro.errors.NonFiniteError`.
@@ -147,11 +147,11 @@ def passed_on(name: str, call: str) -> Iterator[None]:
 
 
 class SimulatorEnv(CheckedEnv, GymLikeEnv):
-    """Mixin of TorchRL's wrappers of simulators: scales the action, and draws one frame per agent step.
+    """Mixin for TorchRL's wrappers of simulators: scales the action, and renders one frame per agent step.
 
-    TorchRL's ``from_pixels`` draws every env step of a repeated action. A subclass writes ``_render``, which returns an
-    image, and ``_simulation``, which may have ``qpos`` and ``qvel``. The settings are those of
-    :func:`crptpro.envs.make_env`; ``name`` is the name in messages, ``low`` to ``high`` its actions.
+    TorchRL's ``from_pixels`` renders every env step of a repeated action. A subclass implements ``_render``, which
+    returns an image, and ``_simulation``, whose result may have ``qpos`` and ``qvel``. The settings are those of
+    :func:`crptpro.envs.make_env`; ``name`` is the name in messages, ``low`` and ``high`` bound its actions.
     """
 
     def __init__(
@@ -221,7 +221,7 @@ def resize(frame: Tensor, size: int) -> Tensor:
 def read_frame(image: Any, name: str) -> Tensor:
     """Copy an RGB image of the environment ``name``, ``[H, W, 3]`` or ``[3, H, W]``, to a frame, uint8 ``[3, H, W]``.
 
-    Anything else is an ``EnvOutputError``.
+    Anything else raises an ``EnvOutputError``.
     """
     wrong = ""
     if not isinstance(image, (np.ndarray, Tensor)):
@@ -243,7 +243,7 @@ def read_frame(image: Any, name: str) -> Tensor:
 
 
 def action_range(low: np.ndarray, high: np.ndarray, dtype: Any, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower end and half the width of an environment's action bounds; without bounds they are -1 and 1.
+    """Return lower bounds and half-widths of an environment's actions; actions without bounds get [-1, 1].
 
     Bounds that [-1, 1] cannot be mapped to raise a ``CRPTproError``.
     """

@@ -35,7 +35,7 @@ def load_dm_env(domain: Domain) -> dm_env.Environment:
     """Load ``domain.task`` from dm_control with a constant seed, without the camera observations of composer tasks."""
     from dm_control import suite
 
-    with warnings.catch_warnings():  # its import shows every DeprecationWarning of the process from then on
+    with warnings.catch_warnings():  # its import makes every later DeprecationWarning visible
         from dm_control import manipulation
     route_mujoco_warnings()
     if domain.source == "manipulation":
@@ -47,12 +47,12 @@ def load_dm_env(domain: Domain) -> dm_env.Environment:
     # In the suite, lqr_2_1 is the task lqr_2_1 of the domain lqr.
     tasks = {f"{name}_{task.removeprefix(f'{name}_')}": (name, task) for name, task in suite.ALL_TASKS}
     if domain.task not in tasks:
-        raise UnknownNameError(f"Domain {domain.name!r} has the task {domain.task!r}, which the suite lacks.")
+        raise UnknownNameError(f"Domain {domain.name!r} has the task {domain.task!r}, which the suite does not have.")
     return suite.load(*tasks[domain.task], task_kwargs={"random": 0})
 
 
 def route_mujoco_warnings() -> None:
-    """Log MuJoCo's warnings, which it would print and write to a file; call it after importing dm_control."""
+    """Log MuJoCo's warnings, instead of printing and writing them to a file; call it after importing dm_control."""
     import mujoco
 
     def log(message: str | bytes) -> None:
@@ -66,7 +66,7 @@ def reverse_background(model: Any) -> None:
     """Reverse the RGB values of the background of a ``mujoco.MjModel`` in place, before its render context is made.
 
     The paper does not define the background. Here it is the skybox, and the planes and height fields that are fixed to
-    the scenery (floor, walls, terrain), except for materials and textures that something else uses too.
+    the world (floor, walls, terrain), except for materials and textures that something else uses too.
     """
     import mujoco
 
@@ -150,7 +150,7 @@ class DMControlPixelEnv(SimulatorEnv, DMControlWrapper):
             thread.call(context._platform_make_current)  # dm_control ignores the contexts of other libraries
 
     def _prepare(self) -> None:
-        """Set what a render context reads only when it is made."""
+        """Set the model options that a render context reads only at its creation."""
         self._camera, self._model = None, self._env.physics.model
         visual = self._model.vis
         if self._shadow_size is not None:

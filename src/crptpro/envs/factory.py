@@ -47,7 +47,7 @@ def make_env(
         task: a name that :func:`crptpro.domains.get_domain` knows, or a :class:`~crptpro.domains.Domain`.
         seed: of the first episode, from 0 to 2**32 - 1.
         image_size: H = W, pixels.
-        action_repeat: env steps per agent step; ``None`` takes the domain's (2; 1 of your own).
+        action_repeat: env steps per agent step; ``None`` takes the domain's (2; 1 for your own).
         frame_stack: frames per observation.
         quality: ``"fast"`` renders smaller shadow maps, up to twice as fast on software GL, with fewer than 1 % of the
             pixels changed (quadruped_escape: 8 %).
@@ -173,7 +173,7 @@ def _own(domain: Domain, **settings: Any) -> EnvBase:
     if settings["action_repeat"] != domain.action_repeat and "action_repeat" not in named:
         raise CRPTproError(
             f"The make of domain {domain.name!r} takes no action_repeat: an agent step is {domain.action_repeat} env "
-            f"step(s), not {settings['action_repeat']}. Ask for action_repeat={domain.action_repeat}."
+            f"step(s), not {settings['action_repeat']}. Use action_repeat={domain.action_repeat}."
         )
     with passed_on(domain.task, "make"):
         env = make(**named)

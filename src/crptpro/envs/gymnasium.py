@@ -57,7 +57,7 @@ class GymnasiumPixelEnv(SimulatorEnv, GymWrapper):
 
     def _output_transform(self, step_outputs_tuple: Any) -> tuple[Any, ...]:
         observation, reward, terminated, truncated, _ = step_outputs_tuple
-        # A time limit that coincides with a real end is a real end.
+        # A time limit that coincides with a termination counts as a termination.
         ends = bool(terminated), bool(truncated and not terminated), bool(terminated or truncated)
         return (observation, float(reward), *ends, {})
 
@@ -109,7 +109,7 @@ def make_gymnasium(
 
 
 def _fix_free_camera(env: Any) -> None:
-    """Point the free camera at the model's default pose; the first rendered state differs after a resumption."""
+    """Point the free camera at the model's default pose, not the first rendered state, which differs after a resume."""
     renderer = getattr(env.unwrapped, "mujoco_renderer", None)
     config = getattr(renderer, "default_cam_config", None) or {}
     if renderer is None or "lookat" in config:

@@ -73,7 +73,7 @@ PROBE_COMMAND = (sys.executable, "-c", _PROBE)
 def select_backend(*, processes: int = 1) -> str:
     """Choose the GL backend, test that it renders, and set ``MUJOCO_GL``; call it before importing dm_control.
 
-    A ``MUJOCO_GL`` of the user is tested and kept. Otherwise EGL, OSMesa and (with a display) GLFW are tried in this
+    A user's ``MUJOCO_GL`` is tested and kept. Otherwise EGL, OSMesa and (with a display) GLFW are tried in this
     order. The test is a frame with content from each of ``processes`` simultaneous processes (parallel collection needs
     several), by default within 60 s. It counts for this process and its children, on this machine and for one
     ``MUJOCO_EGL_DEVICE_ID``. With software GL, ``LP_NUM_THREADS=1`` is set unless the user has set it: more threads
@@ -196,7 +196,7 @@ def run_isolated(
     """Run commands simultaneously with ``MUJOCO_GL=backend`` if given, and kill those that exceed the time limit.
 
     Returns exit status (``None``: killed), standard output and standard error of each. Output goes to files, not pipes,
-    and a killed process is waited for only shortly, because one that hangs in the kernel cannot be reaped.
+    and a killed process is waited for only briefly, because one that hangs in the kernel cannot be reaped.
     """
     environment = {**os.environ, **({"MUJOCO_GL": backend} if backend else {})}
     if "OpenGL" in sys.modules:  # dm_control or mujoco has set it for the backend of this process

@@ -56,10 +56,10 @@ def draw(
 ) -> Any:
     """Draw panels with one legend below.
 
-    ``points`` has columns ``label``, ``x`` (numbers, or names of places in order) and ``y``; optionally ``panel`` (its
-    title), ``line`` (one of a label's curves), ``n`` (runs, for the legend), ``low`` and ``high`` (an interval), and
-    ``thin``. ``x`` and ``y`` name the axes and their units. ``kind`` is ``"line"``, or ``"cloud"`` of points. ``marks``
-    are heights of dashed lines in the first panel, by their names.
+    ``points`` has columns ``label``, ``x`` (numbers, or ordered names) and ``y``; optionally ``panel`` (its title),
+    ``line`` (one of a label's curves), ``n`` (runs, for the legend), ``low`` and ``high`` (an interval), and ``thin``
+    (a thin line without legend). ``x`` and ``y`` name the axes and their units. ``kind`` is ``"line"``, or ``"cloud"``
+    of points. ``marks`` maps names to the heights of dashed lines in the first panel.
     """
     import matplotlib as mpl
     from matplotlib.figure import Figure

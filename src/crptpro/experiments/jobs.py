@@ -123,7 +123,7 @@ class Plan:
 
     jobs: tuple[Job, ...]
     missing: tuple[Job, ...]
-    incomplete: tuple[Job, ...] = ()  # missing ones that were finished, and whose outputs were removed
+    incomplete: tuple[Job, ...] = ()  # missing ones that were finished, but whose outputs were removed
 
 
 def make_plan(wanted: Iterable[Job], root: Path) -> Plan:
@@ -153,7 +153,7 @@ def make_plan(wanted: Iterable[Job], root: Path) -> Plan:
 def describe(root: Path, plan: Plan) -> None:
     """Write ``job.json`` of every job, and empty the directory of a finished job that has to run again."""
     for job in plan.incomplete:
-        if is_finished(root, job):  # otherwise another command has begun it anew
+        if is_finished(root, job):  # otherwise another command has restarted it
             shutil.rmtree(directory_of(root, job.key))
     for job in plan.jobs:
         path = directory_of(root, job.key) / DESCRIPTION

@@ -46,7 +46,7 @@ WITH_DEVICE = ("encoder", "explored", "finetuned", "run", "probe", "coverage", "
 MAX_REQUEUES = 1_000  # of a Slurm job at its time limit; it makes progress each time
 POLL_S = 0.2
 REFUSED_S = 60.0  # pause after a queue refused a job
-LAST_WAIT_S = 10.0  # for jobs that were told to stop at once
+LAST_WAIT_S = 10.0  # wait for jobs that are stopped at once
 SLURM_POLL_S = 10.0  # between polls of jobs that stop; submitit alone polls every ten minutes
 
 
@@ -55,7 +55,7 @@ SLURM_POLL_S = 10.0  # between polls of jobs that stop; submitit alone polls eve
 
 @dataclass(frozen=True)
 class Work:
-    """A job to run, and its resources: everything that travels to its machine."""
+    """A job to run, and its resources: everything that is sent to its machine."""
 
     root: str
     key: str
@@ -97,7 +97,7 @@ class Work:
         now = datetime.datetime.now(datetime.UTC).isoformat(sep=" ", timespec="seconds")
         where = f"{socket.gethostname()}, process {os.getpid()}, {self.device}, {self.threads} threads"
         print(f"--- {now}: {where}", flush=True)
-        # Another command, or a killed job on its way to a checkpoint, may still hold it.
+        # Another command, or a killed job on its way to a checkpoint, may still hold the lock.
         with locked(self.directory / LOCK, poll_interval=1):
             if (self.directory / DONE).exists():
                 return ""
@@ -126,7 +126,7 @@ class Work:
 
 
 def _clock(directory: Path) -> dict[str, float]:
-    """Begin an attempt. A killed one is taken to have lasted until the last change of a file of the job."""
+    """Begin an attempt. An earlier one that was killed counts until the last change of one of the job's files."""
     clock = {"seconds": 0.0, "attempts": 0}
     with contextlib.suppress(RecordError):
         clock = read_json(directory / CLOCK, error=RecordError)
@@ -172,7 +172,7 @@ class LocalLauncher:
         self._running: list[_Process] = []
 
     def start(self, work: Work, *, is_exclusive: bool) -> _Process:
-        """Start a job on the GPU that has the fewest."""
+        """Start a job on the GPU that has the fewest jobs."""
         self._running = [each for each in self._running if each.process.poll() is None]
         loads = Counter(each.gpu for each in self._running)
         gpu = min(self.gpus, key=lambda name: loads[name], default="")
@@ -245,12 +245,12 @@ class _SlurmJob:
     folder: Path
     log: Path
     is_stopping: bool = False
-    looked: float = -math.inf
+    polled: float = -math.inf
 
     def poll(self) -> str | None:
-        is_due = self.is_stopping and time.monotonic() - self.looked > SLURM_POLL_S
+        is_due = self.is_stopping and time.monotonic() - self.polled > SLURM_POLL_S
         if is_due:
-            self.looked = time.monotonic()
+            self.polled = time.monotonic()
         if not self.job.done(force_check=is_due):
             return None
         reason = ""
@@ -294,7 +294,7 @@ class RayLauncher:
                 "`ray start --head` printed, as --ray-address HOST:6379, or ray://HOST:10001."
             ) from reason
         self._ray = ray
-        # A worker process ends with its job, so that the next job starts afresh.
+        # A worker process ends with its job, so that the next job has a fresh one.
         self._run = ray.remote(max_retries=0, max_calls=1, num_gpus=gpus)(_run_here)
 
     def start(self, work: Work, *, is_exclusive: bool) -> _RayJob:
@@ -340,17 +340,17 @@ def run_jobs(
     """Run every missing job of a plan as soon as all jobs that it needs are finished; returns what is not finished.
 
     At most ``jobs`` run at a time, with ``cores`` each; an exclusive job starts when no other can. Each of the
-    ``attempts`` at a job continues the one before. Ctrl-C, SIGTERM and SIGHUP stop all jobs at their next checkpoint, a
+    ``attempts`` at a job resumes the one before. Ctrl-C, SIGTERM and SIGHUP stop all jobs at their next checkpoint, a
     second one at once; KeyboardInterrupt or SystemExit is raised when all jobs have ended. A queue that refuses the
     first job raises a ``SubmissionError``.
     """
     describe(root, plan)
     usual = Work(str(root.resolve()), "", device, threads=cores, workers=cores, plugins=loaded_plugins())
     queue = _Queue(plan, usual, launcher, jobs, attempts)
-    with _signals_end_it():
+    with _signals_interrupt():
         try:
             while queue.running or queue.ready():
-                queue.look()
+                queue.poll()
                 if not queue.start():
                     time.sleep(POLL_S)
         except BaseException:
@@ -368,7 +368,7 @@ def leave(number: int, frame: object) -> None:
 
 
 @contextlib.contextmanager
-def _signals_end_it() -> Iterator[None]:
+def _signals_interrupt() -> Iterator[None]:
     """Let SIGTERM and SIGHUP interrupt like Ctrl-C; a signal that the caller ignores (nohup) stays ignored."""
     numbers = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) is not signal.SIG_IGN]
     is_main = threading.current_thread() is threading.main_thread()
@@ -426,7 +426,7 @@ class _Queue:
             self.running[job] = handle, time.monotonic()
         return bool(chosen)
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Collect finished jobs."""
         for job, (handle, began) in list(self.running.items()):
             lost = handle.poll()
@@ -458,12 +458,12 @@ class _Queue:
             for handle, _ in self.running.values():
                 handle.stop(at_once=seconds < math.inf)
             if self.running and seconds == math.inf:
-                with contextlib.suppress(OSError):  # nobody may read it any more
+                with contextlib.suppress(OSError):  # the terminal may be closed
                     logger.warning("Stopping at the next checkpoints; press Ctrl-C again to stop at once.")
             deadline = time.monotonic() + seconds
             with contextlib.suppress(KeyboardInterrupt, SystemExit):
                 while self.running and time.monotonic() < deadline:
-                    self.look()
+                    self.poll()
                     time.sleep(POLL_S)
 
 

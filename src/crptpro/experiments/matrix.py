@@ -46,13 +46,13 @@ VARIANTS: dict[str, tuple[tuple[str, Settings], ...]] = {
 SINGLE_DISPERSION = {"cheetah": 1e-3, "hopper": 5e-4}
 """Proto-RL(S)'s weight of the dispersion loss in the paper's ablation, which has these two domains."""
 SINGLE_DOMAIN = {"A": "walker", "B": "pendulum", "C": "finger", "D": "walker"}
-"""The domain of a group that represents an (S) method where one encoder is enough; B's and C's are the paper's."""
+"""The domain of a group on which an (S) method trains where one encoder is enough; B's and C's are the paper's."""
 PROBED_UNSEEN = {
     "A": ("finger", "pendulum"), "B": ("finger", "walker"), "C": ("walker", "pendulum"), "D": ("cheetah", "finger"),
 }  # fmt: skip
 """Domains outside a group on which its encoders are probed."""
 
-SEEDS = 1_000  # seeds of each level are below it: DrQ combines both levels in one seed, and all of them differ
+SEEDS = 1_000  # bound on the seeds of each level, so that DrQ's seeds, which combine both levels, all differ
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ SMALL = Scale(
     capacities=(5_000, 20_000),
     probe_samples=2_000,
     timing_updates=25,
-    paper_timing_updates=7,  # as many rows
+    paper_timing_updates=7,  # about as many transitions
     coverage_samples=512,
 )  # fmt: skip
 """A fifth of the data, 6 % of the updates, 4 % of the env steps, a quarter of the batch: a day on two CPU cores."""
@@ -130,14 +130,14 @@ TINY = Scale(
     },
     seeds=1,
     alphas=(5e-2,),
-    capacities=(130,),  # the data is there
+    capacities=(130,),  # equal to ``transitions``: no further data
     probe_samples=60,
     probe_transitions=1_100,  # three episodes; one has 500 decisions
     timing_updates=2,
     coverage_samples=32,
     embedded_samples=8,
 )  # fmt: skip
-"""Minutes; it only shows that everything runs."""
+"""Takes minutes and only shows that everything runs."""
 SCALES: dict[str, Scale] = {scale.name: scale for scale in (TINY, SMALL, PAPER)}
 
 
@@ -145,7 +145,7 @@ class Cell(NamedTuple):
     """One number of an experiment."""
 
     label: str  # the system or variant, a row of the tables: "crptpro", "proto-rl-c with dispersion"
-    job: Job  # that gives it
+    job: Job  # that produces it
     place: Settings  # such as {"group": "A", "task": "walker_run", "encoder_seed": 0, "seed": 0}
 
 
@@ -154,8 +154,8 @@ class Request:
     """The requested part of an experiment, and its scale; an empty field is the experiment's own choice.
 
     Encoder seeds are the first level (collection, exploration, pre-training), seeds the second: downstream runs on each
-    encoder. Device and threads matter only to timings, whose jobs are alone on their machine. An unknown name is an
-    ``UnknownNameError``; a repeated or missing seed, or one outside [0, :data:`SEEDS`), a ``CRPTproError``.
+    encoder. Device and threads matter only to timings, whose jobs are alone on their machine. An unknown name raises
+    an ``UnknownNameError``; a repeated or missing seed, or one outside [0, :data:`SEEDS`), a ``CRPTproError``.
     """
 
     scale: Scale
@@ -244,7 +244,7 @@ def _dataset_of(job: Job) -> str:
 
 
 def dataset(scale: Scale, domain: str, seed: int, transitions: int | None = None) -> Job:
-    """Return the collection of a domain's random transitions, in ``<job>/<domain>``."""
+    """Return the job that collects a domain's random transitions, in ``<job>/<domain>``."""
     name, transitions = get_domain(domain).name, transitions or scale.transitions
     command = ["collect", name, "--out", OWN, *options(transitions=transitions, seed=seed, quality=scale.quality)]
     facts = {"domain": name, "transitions": transitions, "seed": seed, "quality": scale.quality or "exact"}
@@ -253,7 +253,7 @@ def dataset(scale: Scale, domain: str, seed: int, transitions: int | None = None
 
 
 def encoder(scale: Scale, system: str, domains: Iterable[str], seed: int, *, loss: Settings = NONE) -> Job:
-    """Return a system's encoder for domains, in ``<job>/encoder``; ``loss`` replaces options of the scale."""
+    """Return the job of a system's encoder for domains, ``<job>/encoder``; ``loss`` replaces options of the scale."""
     method = pretraining_of(system)
     names = [get_domain(domain).name for domain in domains]
     title = f"{method.name} {'+'.join(names)} seed {seed}"
@@ -264,7 +264,7 @@ def encoder(scale: Scale, system: str, domains: Iterable[str], seed: int, *, los
     if method.loss_class is None:
         command = ["pretrain", *map(_dataset_of, data), *where, *options(seed=seed)]
         return Job("untrained", title if data else f"seed {seed}", tuple(command), facts, data)
-    # A default of the method's loss is no option: it would make the same encoder another job.
+    # A default of the method's loss is left out: as an option it would make another job of the same encoder.
     defaults = {**_loss_defaults(method), **method.loss_options}
     chosen = {**scale.loss.get(method.loss_class.__name__, {}), **loss}
     settings = {"loss": {k: v for k, v in chosen.items() if k not in defaults or defaults[k] != v}, **scale.training}
@@ -290,7 +290,7 @@ def encoder_for_task(
 ) -> Job | None:
     """Return a system's encoder for a task of a group; ``None`` for DrQ, which trains its own.
 
-    The (S) methods have one per domain, and fine-tuning continues the group's on the task's domain.
+    The (S) methods have one per domain; fine-tuning trains the group's encoder further on the task's domain.
     """
     domain = get_domain(task).name
     if system == DRQ:
@@ -307,7 +307,7 @@ def encoder_for_task(
 
 
 def run(scale: Scale, system: str, task: str, base: Job | None, seed: int, *, colors: str = "normal") -> Job:
-    """Return a system's learning of a task; the job's directory is the run directory.
+    """Return a system's downstream run on a task; the job's directory is the run directory.
 
     ``base`` is the frozen encoder, or ``None`` for DrQ. Runs of several tasks with one seed share nothing else.
     """
@@ -400,7 +400,7 @@ def _experiment(title: str) -> Callable[[Callable[[Request], Iterator[Cell]]], N
 def _scores(
     request: Request, group: str, task: str, system: str, *, label: str = "", place: Settings = NONE, **how: Any
 ) -> Iterator[Cell]:
-    """Yield the runs of a system on a task of, or after, a group: every downstream seed on every encoder.
+    """Yield the runs of a system on a task with a group's encoders: every downstream seed on every encoder.
 
     Where there is no encoder to share (DrQ), the encoder seeds count as further seeds of the run, so that every
     system has as many runs.
@@ -420,7 +420,7 @@ def _table(request: Request, tasks: Iterable[tuple[str, str]], systems: Iterable
         yield from _scores(request, group, task, system, **how)
 
 
-def _elsewhere(request: Request, rows: Iterable[ScoreRow], systems: Iterable[str], **how: Any) -> Iterator[Cell]:
+def _paper_rows(request: Request, rows: Iterable[ScoreRow], systems: Iterable[str], **how: Any) -> Iterator[Cell]:
     """Yield the runs on the requested rows of a table of the paper; no encoder is fine-tuned on them."""
     groups, tasks = request.groups or GROUPS, request.tasks or TASKS
     wanted = [(row.group, row.task) for row in rows if row.group in groups and row.task in tasks]
@@ -437,7 +437,7 @@ def _seen(request: Request) -> Iterator[Cell]:
 def _unseen(request: Request) -> Iterator[Cell]:
     """Tasks of domains that the encoder never saw, without fine-tuning (section IV.C)."""
     systems = [system for system in request.methods or CROSS_DOMAIN if not is_single_domain(system)]
-    return _elsewhere(request, UNSEEN, systems)
+    return _paper_rows(request, UNSEEN, systems)
 
 
 @_experiment("Reversed background colours")
@@ -446,7 +446,7 @@ def _colors(request: Request) -> Iterator[Cell]:
 
     The paper exchanges their RGB values and does not say what the background is; whole images are the option.
     """
-    return _elsewhere(request, COLORS, request.methods or CROSS_DOMAIN, place={"colors": request.colors})
+    return _paper_rows(request, COLORS, request.methods or CROSS_DOMAIN, place={"colors": request.colors})
 
 
 @_experiment("Fine-tuning on one domain")
@@ -567,8 +567,8 @@ def _probe(request: Request) -> Iterator[Cell]:
     for group, seed in product(request.groups or "A", request.encoder_seeds):
         for system in request.methods or (*PRETRAINED, RANDOM):
             for domain in requested or (*GROUPS[group], *PROBED_UNSEEN[group]):
-                home = domain if system == FINETUNE else SINGLE_DOMAIN[group]
-                trained = encoder_for_task(scale, system, GROUPS[group], get_domain(home).task, seed)
+                base_domain = domain if system == FINETUNE else SINGLE_DOMAIN[group]
+                trained = encoder_for_task(scale, system, GROUPS[group], get_domain(base_domain).task, seed)
                 if trained is None or system == NO_BONUS:
                     continue  # no encoder of its own
                 job = probe(scale, trained, dataset(scale, domain, seed, scale.probe_transitions))

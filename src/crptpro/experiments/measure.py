@@ -34,7 +34,7 @@ from crptpro.seeding import derive_seed
 from crptpro.training.explore import plan_exploration
 
 StageOf = Callable[[Sequence[str]], type]  # returns the dataclass of the stage that a command line names
-WINDOWS = 5  # parts of a timing; their median is robust against one hiccup of the machine
+WINDOWS = 5  # parts of a timing; their median is robust against one slow part
 RANDOM_AGENT_STEPS = 24  # random decisions per domain before a timed exploration, instead of the method's own
 COVERAGE_WINDOWS = 10  # of the training; fewer if a window would have fewer decisions of a domain than samples
 
@@ -200,8 +200,8 @@ def timing(
     """Write the cost of training encoders, from a timed part of it: OUT/timing.csv.
 
     A training is a `pretrain ...` command without --out and --device, once with the settings of this scale and once
-    with the paper's; the costs of several add up. As many updates are timed as warm up before. Without `paper_updates`
-    the paper's hours stay open, unless both commands are the same.
+    with the paper's; the costs of several add up. As many updates are timed as were run to warm up. Without
+    `paper_updates` the paper's hours are NaN, unless both commands are the same.
     """
     torch.set_num_threads(threads)
     rows = []
@@ -222,7 +222,7 @@ def timing(
 
 
 def _cost(stage_of: StageOf, command: str, updates: int, out: Path, device: str) -> dict[str, Any]:
-    """Return the budget of a training, and what some updates of it take; without any, its hours are NaN."""
+    """Return a training's budget, and its hours projected from some timed updates; NaN without any."""
     words = shlex.split(command)
     stage: Any = tyro.cli(stage_of(words), args=[*words[1:], "--out", str(out), "--device", device])
     method, sources = get_method(stage.method), stage.sources

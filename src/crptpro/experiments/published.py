@@ -100,7 +100,7 @@ COLORS = _rows(
 
 
 def published_score(method: str, group: str, task: str, colors: str = "normal") -> Score | None:
-    """Return what the paper printed for a method at a place; ``None`` where it printed nothing.
+    """Return the score that the paper printed for a method, group, task and colours; ``None`` if it printed none.
 
     DrQ trains its own encoder, so that its score belongs to a task whatever the group.
     """
@@ -132,7 +132,7 @@ EFFICIENCY: Mapping[str, EfficiencyRow] = {
 FINETUNE_UPDATES: Mapping[str, int] = {
     "pendulum": 2_000, "manipulation": 2_000, "cartpole": 3_000, "cheetah": 1_000, "walker": 500,
 }  # fmt: skip
-"""Domain to encoder updates of fine-tuning the group A encoder, section IV.D; with the 50,000 before them 58,500."""
+"""Domain to encoder updates of fine-tuning the group A encoder, section IV.D; in all 58,500 with pre-training."""
 
 
 class PrototypeMetrics(NamedTuple):

@@ -123,7 +123,7 @@ class Page:
 
 
 def _markdown(text: Any) -> str:
-    """Escape a text, so that it makes no HTML, link, line or table cell of its own."""
+    """Escape a text, so that it cannot form HTML, a link, a line or a table cell."""
     escaped = re.sub(r"([\\`*\[\]|])", r"\\\1", html.escape(str(text), quote=False))
     return re.sub(r"\s*[\r\n]\s*", " · ", escaped)
 
@@ -168,7 +168,7 @@ def _records(
 def _needed(keys: Iterable[str], jobs: pd.DataFrame, *kinds: str) -> list[str]:
     """Return jobs and everything that they need, each once; of some kinds only, if any are named."""
     found = [key for key in dict.fromkeys(keys) if key in jobs.index]
-    for key in found:  # which grows
+    for key in found:  # grows while it is iterated
         found += [needed for needed in jobs.loc[key, "needs"] if needed in jobs.index and needed not in found]
     return [key for key in found if not kinds or jobs.loc[key, "kind"] in kinds]
 
@@ -280,7 +280,7 @@ BUDGETS = (
     ("replay of DrQ and Proto-RL", "100,000", "replay_capacity", "run", "drq|proto-rl"),
     ("render quality", "exact", "quality", "dataset", ""),
 )
-"""Budget, the paper's, and where it is found: fact, and patterns of the jobs' kinds and methods."""
+"""Name, the paper's value, and the source of ours: a fact, and patterns of the jobs' kinds and methods."""
 
 
 def _limits(page: Page, cells: pd.DataFrame, jobs: pd.DataFrame) -> None:
@@ -834,7 +834,7 @@ def _probes(page: Page, rows: pd.DataFrame) -> None:
     means = means.assign(at=means["domain"] + colors, encoder=means["label"] + groups, seen=seen)
     for embedding, (measure, (title, digits)) in product(means["embedding"].unique(), MEASURES.items()):
         own = means[(means["embedding"] == embedding) & (means["measure"] == measure)]
-        if own.empty:  # as the R2 of positions that hardly vary
+        if own.empty:  # e.g. the R2 of positions that hardly vary
             continue
         places = own.groupby(["encoder", "group", "at"], sort=False)
         counts = places["job"].nunique()

@@ -89,7 +89,7 @@ def estimate(
     A replicate resamples the encoders, once for all tasks that share them, and then, in place of each run, a downstream
     run of the drawn encoder; tasks are kept (Davison & Hinkley, Bootstrap Methods and their Application, 1997, section
     3.8). If all runs share one encoder, the interval is about that encoder only. Two methods are resampled
-    independently, also if they share encoders: their interval is then too wide.
+    independently, even if they share encoders: their interval is then too wide.
 
     Args:
         statistic: an aggregate of this module; for two methods one that takes both.
@@ -97,7 +97,7 @@ def estimate(
             encoder is its own), and the numbers, which are finite. Two methods have the same tasks. A run under several
             tasks is resampled jointly in all of them.
         columns: numbers to aggregate: one score, or the points of a curve.
-        replicates: of the bootstrap.
+        replicates: number of bootstrap replicates.
         seed: of the bootstrap.
     """
     samples = [[task for _, task in method.sort_values(["encoder", "run"]).groupby("task")] for method in methods]

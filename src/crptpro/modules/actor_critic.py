@@ -174,9 +174,9 @@ class DeterministicActor(LinearNetwork):
     def sample(
         self, inputs: Tensor, *, noise_clip: float | None = None, generator: torch.Generator | None = None
     ) -> Tensor:
-        """Return an action ``[*, A]`` in [-1 + 1e-6, 1 - 1e-6] with noise, of at most ``noise_clip`` in size.
+        """Return an action ``[*, A]`` in [-1 + 1e-6, 1 - 1e-6] with noise of at most ``noise_clip`` in magnitude.
 
-        The noise is drawn from ``generator`` (torch's global one if None). The gradient ignores the bounds.
+        The noise is drawn from ``generator`` (torch's global one if None). The bounds have a straight-through gradient.
         """
         mean = self(inputs)
         noise = self.noise_std * standard_normal_like(mean, generator)
@@ -187,10 +187,10 @@ class DeterministicActor(LinearNetwork):
 
 
 def squashed_gaussian(loc: Tensor, scale: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    r"""Reparameterised tanh-Gaussian sample ``[*, A]`` and its log-density ``[*]``, of mean, deviation and noise.
+    r"""Reparameterised tanh-Gaussian sample ``[*, A]`` and its log-density ``[*]``, from mean, deviation and noise.
 
     :math:`\log\pi(a) = \sum_A \log\mathcal N(u;\mu,\sigma) - 2(\log 2 - u - \mathrm{softplus}(-2u))` with
-    :math:`u = \mu + \sigma\epsilon`: finite, with the right gradient, also where tanh rounds to 1.
+    :math:`u = \mu + \sigma\epsilon`: finite, with the correct gradient, even where tanh rounds to 1.
     """
     pre_tanh = loc + scale * noise
     log_normal = -0.5 * noise.square() - scale.log() - 0.5 * math.log(2 * math.pi)

@@ -95,7 +95,7 @@ class PixelEncoder(nn.Module):
 
     @torch.no_grad()
     def standardise(self, mean: Tensor, scale: Tensor) -> PixelEncoder:
-        """Output ``(features - mean) / scale``, finite ``[feature_dim]``, from now on, saved as state; returns self."""
+        """From now on output ``(features - mean) / scale``; both are finite ``[feature_dim]``, saved as buffers."""
         for name, value in (("mean", mean), ("scale", scale)):
             value = torch.as_tensor(value).to(self.convs[0].weight)
             if value.shape != (self.feature_dim,) or not bool(value.isfinite().all()):
@@ -117,7 +117,7 @@ class PixelEncoder(nn.Module):
         return self.standardised(self.feature_map(pixels).flatten(-3))
 
     def standardised(self, features: Tensor) -> Tensor:
-        """Shift and scale raw features ``[*, feature_dim]`` if :meth:`standardise` was called; their dtype stays."""
+        """Shift and scale raw features ``[*, feature_dim]`` if :meth:`standardise` was called; their dtype is kept."""
         if not self.config["standardised"]:
             return features
         centred = features.to(self.feature_mean.dtype) - self.feature_mean
@@ -177,12 +177,12 @@ class PixelEncoder(nn.Module):
 
 
 def images_of(encoder: object) -> dict[str, Any]:
-    """Return ``image_size`` and ``frame_stack`` of the images that an encoder takes: 84 and 3 if it does not say.
+    """Return ``image_size`` and ``frame_stack`` of the images that an encoder takes, by default 84 and 3.
 
-    It says so by attributes ``image_size`` and ``in_channels``, or by entries of its ``config``.
+    They are read from its attributes ``image_size`` and ``in_channels``, or from these entries of its ``config``.
     """
-    said: dict[str, Any] = {"image_size": 84, "in_channels": 9} | (getattr(encoder, "config", None) or {})
-    size, channels = (getattr(encoder, name, said[name]) for name in ("image_size", "in_channels"))
+    declared: dict[str, Any] = {"image_size": 84, "in_channels": 9} | (getattr(encoder, "config", None) or {})
+    size, channels = (getattr(encoder, name, declared[name]) for name in ("image_size", "in_channels"))
     return {"image_size": size, "frame_stack": channels // 3}
 
 

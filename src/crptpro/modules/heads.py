@@ -19,7 +19,7 @@ WeightInit = Literal["orthogonal", "kaiming"]
 
 @torch.no_grad()
 def init_weights_(layer: nn.Linear | nn.Conv2d, init: WeightInit = "orthogonal", gain: float = 1.0) -> None:
-    """Set an orthogonal flattened kernel, times ``gain``, or a normal one of variance 2 / fan-in; and zero bias."""
+    """Set a kernel orthogonal when flattened, times ``gain``, or normal of variance 2 / fan-in; and zero bias."""
     if init not in get_args(WeightInit):
         raise ValueError(f"init must be one of {', '.join(get_args(WeightInit))}, got {init!r}.")
     if init == "kaiming":
@@ -120,7 +120,7 @@ class Prototypes(nn.Module):
 
 
 class AnchorHead(nn.Module):
-    r"""ATC's head of the anchors, :math:`W(a + \mathrm{MLP}(a))`, online branch only, with PyTorch's initialisation.
+    r"""ATC's head on the anchors, :math:`W(a + \mathrm{MLP}(a))`, online branch only, with PyTorch's initialisation.
 
     Source: astooke/rlpyt ``rlpyt/ul/models/ul/atc_models.py`` (ATC, arXiv 2009.08319).
     """

@@ -98,7 +98,7 @@ def linear_in(inputs: Tensor, layer: nn.Linear, compute_dtype: torch.dtype) -> T
 
 @contextlib.contextmanager
 def evaluating(module: nn.Module) -> Iterator[None]:
-    """Let a network compute in evaluation mode in the block: one that is being trained may normalise or drop out."""
+    """Put a network in evaluation mode for the block: in training mode it may use batch statistics or dropout."""
     training = [each for each in module.modules() if each.training]
     for each in training:
         each.training = False

@@ -24,7 +24,7 @@ _CLASSES: dict[str, type[nn.Module]] = {network.__name__: network for network in
 
 
 def register_network(network: _Network) -> _Network:
-    """Let artifacts be loaded that hold networks of your own class; a call or a decorator, which returns the class.
+    """Register a network class of your own, so that artifacts that hold it can be loaded; also as a decorator.
 
     An object's attribute ``config`` must hold the keyword arguments that rebuild it. The last registration of a name
     counts; a name of this library's networks raises a ``ValueError``.
@@ -56,8 +56,8 @@ def rebuild_networks(
 ) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
     """Build the frozen networks that the card of an artifact describes around its tensors, ``role.key``.
 
-    Returns the networks by role, and the other tensors. Nothing is drawn from the global generator. ``error`` says what
-    is missing, unknown or does not fit.
+    Returns the networks by role, and the other tensors. Nothing is drawn from the global generator. Raises ``error``,
+    which says what is missing, unknown or does not fit.
     """
     parts: dict[str, dict[str, Tensor]] = {}
     for name, value in tensors.items():
@@ -77,7 +77,7 @@ def rebuild_networks(
                 "crptpro.modules.register_network for its class first (on the command line: --plugin FILE.py)."
             )
         try:
-            # Without memory and initial weights, which the tensors replace; other classes may compute with them.
+            # On "meta" no weights are allocated or drawn; other classes may compute with theirs when they are built.
             with torch.random.fork_rng(devices=[]), torch.device("meta" if network_class in _OURS else "cpu"):
                 network = network_class(**description.get("config", {}))
             network.load_state_dict(parts.pop(role, {}), assign=True)

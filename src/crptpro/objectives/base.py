@@ -17,9 +17,9 @@ from crptpro.values import as_float, read_entry
 
 
 class NetworkLoss(LossModule):
-    """A loss whose networks hold its parameters, also once it was copied or moved; re-initialising updates the targets.
+    """A loss whose networks hold its parameters, also after a copy or a move; re-initialising updates the targets.
 
-    They are therefore called as they are; only a target's parameters have to be put into a network, for a block. A
+    They are therefore called directly; only a target's parameters have to be swapped into a network, for a block. A
     subclass converts its networks and lists the outputs of ``forward``.
     """
 
@@ -32,7 +32,7 @@ class NetworkLoss(LossModule):
 
     def _convert(self, targets: Sequence[str] = (), **networks: nn.Module) -> None:
         with warnings.catch_warnings():
-            # TorchRL wants annotations of names that are only made and read by name.
+            # TorchRL expects class annotations, but these attributes are created and read by name only.
             warnings.filterwarnings("ignore", "The name .* wasn't part of the annotations")
             for name, network in networks.items():
                 self.convert_to_functional(network, name, create_target_params=name in targets)
@@ -77,7 +77,7 @@ class NetworkLoss(LossModule):
 
 
 class PretrainingLoss(NetworkLoss):
-    """A self-supervised loss on pairs of consecutive observations; its targets are moved by ``SoftUpdate``."""
+    """A self-supervised loss on pairs of consecutive observations; its targets are updated by ``SoftUpdate``."""
 
     @dataclass
     class _AcceptedKeys:
@@ -94,7 +94,7 @@ class PretrainingLoss(NetworkLoss):
 
     @property
     def views(self) -> dict[NestedKey, NestedKey]:
-        """Entries that training loops make by a second augmentation of another: ``{"pixels_view": "pixels"}``."""
+        """Entries that training loops create by a second augmentation of another: ``{"pixels_view": "pixels"}``."""
         return {}
 
     def _register_coefficients(self, **values: float | None) -> None:
@@ -125,7 +125,7 @@ def require_positive(**values: float | None) -> None:
 
 
 def skills_of(one_hot: Tensor, rows: int) -> Tensor:
-    """Return the number of each one-hot skill ``[B, K]``; other skills, such as integers, raise a ``ValueError``."""
+    """Return the index of each one-hot skill ``[B, K]``; other skills, such as integers, raise a ``ValueError``."""
     if one_hot.ndim != 2 or len(one_hot) != rows or one_hot.shape[-1] < 2:
         raise ValueError(
             f"Skills must be one-hot, [{rows}, K] with K of at least 2, got {list(one_hot.shape)}; "

@@ -18,7 +18,7 @@ from crptpro.objectives.functional import becl_loss, info_nce, mean_pairwise_cos
 
 
 class ContrastiveLoss(PretrainingLoss):
-    """Gives ``loss_contrast`` (nats) and, detached, ``embedding_cosine`` (pairwise mean) of augmented images."""
+    """Returns ``loss_contrast`` (nats) and, detached, ``embedding_cosine`` (pairwise mean) of augmented images."""
 
     default_out_keys = ("loss_contrast", "embedding_cosine")
 

@@ -69,8 +69,8 @@ def prototype_dispersion(
 def knn_distances(queries: Tensor, keys: Tensor, *, k: int) -> Tensor:
     """Euclidean distances ``[N, k]`` of queries ``[N, D]`` to the k nearest of keys ``[K, D]``, ascending.
 
-    They are found by a matrix product, which is inexact near zero, and recomputed from differences, so that a key equal
-    to the query is at exactly 0. Fewer keys than ``k`` raise a ``ValueError``.
+    They are found by a matrix product, which is inexact near zero, and recomputed from differences: a key equal to the
+    query is at exactly 0. Fewer keys than ``k`` raise a ``ValueError``.
     """
     if not 1 <= k <= keys.shape[0]:
         raise ValueError(f"k must be between 1 and the number of keys {keys.shape[0]}, got {k}.")
@@ -147,8 +147,8 @@ def becl_loss(
     r"""Behaviour contrastive loss (Rooshy-yang/BeCL ``agent/becl.py``); the reward is ``exp(-loss)`` per row.
 
     :math:`\ell_i = -\log(pos_i / (\sum_{j\ne i} e^{s_{ij}} + \epsilon) + \epsilon)` of the cosines of features ``[B,
-    D]`` over the temperature, less the row's maximum. The positive is the first other row with the same of the skills
-    ``[B]``, or without one the first other row, as in the released code. B is at least 2.
+    D]`` over the temperature, less the row's maximum. The positive is the first other row with the same skill
+    (``skills`` ``[B]``), or else the first other row, as in the released code. B is at least 2.
     """
     count = features.shape[0]
     if count < 2:
@@ -172,7 +172,7 @@ def assignment_entropy(assignments: Tensor) -> Tensor:
 
 @torch.no_grad()
 def prototypes_in_use(assignments: Tensor) -> Tensor:
-    """Number of prototypes with the largest assignment in a row of ``[B, M]`` or more; arbitrary after a collapse."""
+    """Number of prototypes with the largest assignment in some row of ``[B, M]``; arbitrary after a collapse."""
     used = assignments.new_zeros(assignments.shape[-1])
     return used.index_fill(0, assignments.argmax(dim=-1), 1.0).sum()
 

@@ -43,7 +43,7 @@ class Exploration:
     env_steps: int = 200_000  #: over all domains, random phases included
     is_single_domain: bool = False  #: the (S) variants: pre-trained on one domain only
     encoder_update_interval: int = 2  #: agent steps between two encoder updates
-    encoder_updates_each: int = 1  #: encoder updates every time, each on a fresh batch
+    encoder_updates_each: int = 1  #: encoder updates after each interval, each on a fresh batch
     agent_update_interval: int = 1  #: agent steps between two updates of the agent
     encodes_before_update: bool = False  #: reward and agent see features from before the encoder update of the step
     transfers_actor: bool = False  #: the downstream agent starts from the exploring actor
@@ -156,7 +156,7 @@ _BECL = Method(
 
 _preset = functools.partial(replace, is_preset=True)
 
-# A loss built by hand is trained by the first row of its class that is no preset and does not explore.
+# A loss built by hand is trained by the first row of its class that is not a preset and does not explore.
 TABLE = (
     _CRPTPRO,
     _preset(_CRPTPRO, name="crptpro-no-bonus", updates=0, starts_from="crptpro", downstream=_NO_BONUS),
@@ -221,7 +221,7 @@ def method_of(loss: LossModule) -> Method:
     if (named := _METHODS.get(getattr(loss, "method_name", None) or "")) is not None:
         return named
     loss_class = type(loss)
-    # Whether somebody who built a loss by hand lets it explore is not known.
+    # It is not known whether a loss built by hand will explore.
     listed = [row for row in _METHODS.values() if not row.is_preset and row.exploration is None]
     found = next((row for base in loss_class.__mro__ for row in listed if row.loss_class is base), None)
     if found is not None and found.loss_class is loss_class:

@@ -46,16 +46,16 @@ class RADSACLoss(NetworkLoss, SACLoss):
     * ``loss_actor`` = mean(alpha log pi(a|h) - min(Q1, Q2)(h, a)), gradient to the actor only;
     * ``loss_alpha`` = mean(exp(log_alpha) * sg(-log pi - target_entropy)), gradient to ``log_alpha`` only.
 
-    With the ``steps_to_next_obs`` of TorchRL's ``MultiStepTransform`` in the batch, gamma is raised to the number n of
-    steps; it is not an in_key. Features never receive a gradient.
+    With the ``steps_to_next_obs`` of TorchRL's ``MultiStepTransform`` in the batch, gamma is raised to the number of
+    agent steps; it is not an in_key. Features never receive a gradient.
 
     Differences from ``SACLoss``: squared error; alpha in place of its logarithm in the temperature loss; the log-std
     squash and pre-tanh log-probability of
     :class:`~crptpro.modules.SquashedGaussianActor`; one critic network with two outputs and a shared trunk; and
-    separate :meth:`critic_loss` and :meth:`actor_and_temperature_loss`, because the actor learns every second time,
-    against the updated critic.
+    separate :meth:`critic_loss` and :meth:`actor_and_temperature_loss`, because the actor learns at every second
+    update, against the updated critic.
 
-    Deviation: the released code always bootstraps; here ``terminated`` cuts it, which no task of the paper has.
+    Deviation: the released code always bootstraps; here ``terminated`` stops it, which no task of the paper sets.
 
     ``forward`` returns the losses and, detached, ``alpha``, ``entropy`` (-log pi, nats), ``q_mean``, ``target_q_mean``,
     ``td_error`` (mean over rows of the larger of the two heads' absolute errors).
@@ -105,8 +105,8 @@ class RADSACLoss(NetworkLoss, SACLoss):
         super().__init__(
             policy,
             TensorDictModule(critic, [*views, "action"], ["state_action_value"]),
-            # With any other count SACLoss stacks copies of the parameters, and initialises those of a single module
-            # again, without orthogonal initialisation.
+            # With any other count SACLoss stacks copies of the parameters, and re-initialises those of a single
+            # module without orthogonal initialisation.
             num_qvalue_nets=0,
             alpha_init=float(alpha_init),
             target_entropy=-float(actor.action_dim) if target_entropy is None else target_entropy,
@@ -146,7 +146,7 @@ class RADSACLoss(NetworkLoss, SACLoss):
         }
         return TensorDict(out, batch_size=[])
 
-    # Under SACLoss' own names, with its results.
+    # Methods with SACLoss's names and return values.
 
     def qvalue_v2_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """``loss_qvalue``, and the diagnostics of :meth:`critic_loss`."""
@@ -258,7 +258,7 @@ class DrQLoss(AveragedSACLoss):
 class SkillDDPGLoss(NetworkLoss):
     r"""DDPG of the unsupervised RL benchmark (rll-research/url_benchmark ``agent/ddpg.py``; BeCL's own agent).
 
-    With :math:`s = [h, z]` the features of an observation and its skill, :math:`s^+ = [h^+, z]` n steps later:
+    With :math:`s = [h, z]` the features of an observation and its skill, :math:`s^+ = [h^+, z]` n agent steps later:
 
     * :math:`y = R_n + \gamma^n (1 - \mathrm{terminated}) \min(Q_1', Q_2')(s^+, a^+)`, where :math:`R_n` is
       ``("next", "reward")`` and n is ``steps_to_next_obs``, 1 without that entry;

@@ -1,4 +1,4 @@
-"""The agent on pixels, and the learners that step its optimisers."""
+"""The agent on pixels, and the learner that steps its optimisers."""
 
 from __future__ import annotations
 
@@ -60,13 +60,13 @@ class PixelAgent(nn.Module):
         return action.squeeze(0).float().cpu().clamp(-1, 1)
 
     def snapshot(self) -> PixelAgent:
-        """Return the agent as it is now; an encoder that is trained is copied, a frozen one is shared."""
+        """Return a copy of the agent; an encoder that is trained is copied, a frozen one is shared."""
         is_trained = any(parameter.requires_grad for parameter in self.encoder.parameters())
         return copy.deepcopy(self, {} if is_trained else {id(self.encoder): self.encoder})
 
 
 def save_agent(path: str | Path, agent: PixelAgent, *, card: Mapping[str, Any]) -> Path:
-    """Write encoder and actor into a directory, whole or not at all; ``card`` is what else the reader should know."""
+    """Write encoder and actor into a directory, whole or not at all; ``card`` holds further entries of the card."""
     modules = {"encoder": agent.encoder, "actor": agent.actor}
     described = {role: describe_network(network) for role, network in modules.items()}
     content = {"modules": described, **card, **provenance()}
@@ -94,11 +94,11 @@ def _rebuilt(path: str | Path, card: Mapping[str, Any], tensors: Mapping[str, Te
 
 
 class SACLearner:
-    """Steps critic, actor and temperature, and moves the target critic, on the reference schedule.
+    """Steps critic, actor and temperature, and updates the target critic, on the schedule of the released agents.
 
     Each of the three has its own Adam, as in Proto-RL's and CRPTpro's released agents. Actor, temperature and target,
-    whose EMA rate is ``critic_tau``, move at every ``interval``-th update; it is 1 in the source of ``SkillDDPGLoss``,
-    which has no temperature.
+    whose EMA rate is ``critic_tau``, are updated at every ``interval``-th update; it is 1 in the source of
+    ``SkillDDPGLoss``, which has no temperature.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class SACLearner:
         }
 
     def update(self, batch: TensorDictBase, *, agent_update: int) -> TensorDictBase:
-        """Do the update of this number on a batch with features and rewards; returns detached scalars."""
+        """Do update number ``agent_update`` on a batch with features and rewards; returns detached scalars."""
         return self._updates[agent_update % self.interval != 0](batch)
 
     def _update(self, critic_only: bool, batch: TensorDictBase) -> TensorDictBase:

@@ -1,4 +1,4 @@
-"""A plateau or a dead run: the prototype loss at ln(M), or embeddings that all point one way."""
+"""Detection of plateaus and dead runs: a prototype loss of ln(M), or embeddings that all point one way."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MAX_COSINE = 0.99
 
 
 class CollapseMonitor:
-    """Watch a pre-training run for collapse and announce what it sees.
+    """Watch a pre-training run for collapse and log what it finds.
 
     A comparative loss of ln(M) (6.238 for 512 prototypes) means that predictions or assignments are uniform; a mean
     pairwise cosine above 0.99 means that every observation has the same embedding. Small trials of the
@@ -37,14 +37,13 @@ class CollapseMonitor:
 
     @classmethod
     def of(cls, loss: nn.Module) -> CollapseMonitor:
-        """Return the monitor of a loss."""
         weight = getattr(getattr(loss, "prototypes", None), "weight", None)
         return cls(None if weight is None else len(weight))
 
     def observe(self, updates: int, *, comp: float | None, cosines: Mapping[str, float]) -> str:
-        """Take a measurement after ``updates`` updates, and return the state after it.
+        """Record a measurement after ``updates`` updates, and return the new state.
 
-        ``comp`` is the comparative loss in nats, ``cosines`` the pairwise one of each domain (their mean decides).
+        ``comp`` is the comparative loss in nats, ``cosines`` the mean pairwise one of each domain (their mean decides).
         """
         self.cosines = dict(cosines)
         reasons = self._reasons(comp)
@@ -54,13 +53,13 @@ class CollapseMonitor:
                 self.state = "plateau"
                 self.plateaus.append({"entered": updates, "left": None})
                 logger.info(
-                    "Update %d: plateau (%s). Expected to pass; called dead after %d updates of it.",
+                    "Update %d: plateau (%s). Expected to pass; declared dead after %d updates.",
                     updates, reasons, self.patience_updates,
                 )  # fmt: skip
         elif not reasons and self.outside_since is not None:
             level, recovery = logging.INFO, ""
             if self.state == "dead":
-                level, recovery = logging.WARNING, " (after it was called dead)"
+                level, recovery = logging.WARNING, " (after it was declared dead)"
             length = self.outside_since - entered
             logger.log(level, "Update %d: left the plateau after %d updates%s.", self.outside_since, length, recovery)
             self.plateaus[-1]["left"] = self.outside_since
@@ -76,7 +75,7 @@ class CollapseMonitor:
         return self.state
 
     def finish(self) -> dict[str, Any]:
-        """Announce how training ended and return the verdict as plain values."""
+        """Log how training ended and return the verdict as plain values."""
         collapsed = sorted(domain for domain, cosine in self.cosines.items() if cosine > MAX_COSINE)
         if self.state == "dead":
             logger.error("Training ended. DEAD RUN: do not use this encoder; check the data and the temperatures.")

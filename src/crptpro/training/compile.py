@@ -26,7 +26,7 @@ def accelerate(
     neither switch was timed beside the plain update.
 
     Raises:
-        ValueError: ``cuda_graph`` on a ``device`` that is no GPU.
+        ValueError: ``cuda_graph`` on a ``device`` that is not a GPU.
         CompileError: a call of the update fails in PyTorch, most likely while it is compiled or recorded.
     """
     if cuda_graph and torch.device(device).type != "cuda":
@@ -48,7 +48,7 @@ def accelerate(
             return out.clone() if cuda_graph else out
         except torch.OutOfMemoryError:
             raise
-        except RuntimeError as reason:  # as the compiler's own errors are
+        except RuntimeError as reason:  # the compiler's own errors are RuntimeErrors
             what = (str(reason).strip().splitlines() or [type(reason).__name__])[0]
             raise CompileError(
                 f"The update cannot be compiled or recorded: {what} `compile` needs a C++ compiler (CXX=...), on a GPU "

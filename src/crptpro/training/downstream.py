@@ -65,7 +65,7 @@ class DownstreamConfig:
     knn_k: int = 3
     """the bonus is the distance to the k-th nearest candidate"""
     queue_size: int | None = None
-    """candidates kept, a multiple of the number of prototypes (None: as many as the artifact brings, else 2,048)"""
+    """candidates kept, a multiple of the number of prototypes (None: as many as the artifact holds, else 2,048)"""
     hidden_dim: int = 1_024
     """width of the two hidden layers of actor and critic"""
     discount: float = 0.99
@@ -73,7 +73,7 @@ class DownstreamConfig:
     learning_rate: float | None = None
     """of the Adam optimisers of actor, critic and temperature (None: the method's; 1e-4, drq 1e-3)"""
     initial_temperature: float = 0.1
-    """SAC's alpha at the start"""
+    """SAC's initial alpha"""
     critic_tau: float = 0.01
     """EMA rate of the target critic, at every second update"""
     action_repeat: int | None = None
@@ -86,7 +86,7 @@ class DownstreamConfig:
     eval_episodes: int = 10
     """episodes per evaluation"""
     eval_workers: int | None = None
-    """processes that evaluate meanwhile, 0.5 GB each; 0 evaluates in between (None: one per core if that helps)"""
+    """processes that evaluate during training, 0.5 GB each; 0 interrupts training (None: one per core if that helps)"""
     checkpoint_interval_env_steps: int = 5_000
     """simulator steps between two checkpoints, taken at episode ends"""
     log_interval_env_steps: int = 1_000
@@ -119,7 +119,7 @@ class DownstreamConfig:
             )
 
     def resolved(self, task: str | Domain, pretrained: Pretrained) -> Any:
-        """Return the settings with the method's and the domain's values where they were left open."""
+        """Return the settings with the method's and the domain's values where they are ``None``."""
         known = pretrained.method in method_names(presets=True)
         own = DOWNSTREAM | dict(get_method(pretrained.method).downstream if known else {})
         values: dict[str, Any] = {name: value for name, value in own.items() if getattr(self, name) is None}
@@ -166,7 +166,7 @@ def train_downstream(
 
     Raises:
         PretrainedError: the artifact cannot be read, its networks do not fit together, or the encoder cannot be saved.
-        CheckpointError: ``run_dir`` holds a run of other settings (named), or one whose replay is gone.
+        CheckpointError: ``run_dir`` holds a run of other settings (named), or one whose replay is missing.
         NonFiniteError: a loss, a weight, an action or a reward is not finite; the last checkpoint is kept.
         DiskSpaceError: the disk cannot hold the replay.
     """
@@ -175,7 +175,7 @@ def train_downstream(
         if not isinstance(pretrained, (str, Path)):
             kind = type(pretrained).__name__
             raise PretrainedError(
-                f"A {kind} is no saved encoder: give what save_pretrained(result, path) returns, or "
+                f"A {kind} is not a saved encoder: pass what save_pretrained(result, path) returns, or "
                 "Pretrained(encoder)."
             )
         source, is_control = str(pretrained), str(pretrained) in ("drq", "random-encoder")
@@ -210,7 +210,7 @@ def train_downstream(
         stack.callback(env.close)
         encoder = _frozen_copy(pretrained.encoder, device, dtype)
         actor, action_dim = pretrained.actor, env.env.action_spec.shape[-1]
-        # Proto-RL(S): it begins as the actor that explored the task's own domain.
+        # Proto-RL(S): it starts as the actor that explored the task's own domain.
         domains = [each["domain"] for each in (pretrained.card.get("training") or {}).get("datasets", ())]
         has_explored = isinstance(actor, SquashedGaussianActor) and actor.config["action_dim"] == action_dim
         has_explored = has_explored and (not domains or get_domain(task).name in domains)
@@ -263,7 +263,7 @@ def train_downstream(
                     else:  # encoded once, for the policy and for the batches that will contain it
                         features = dense.unshifted(number)
                     td["action"] = agent.explore(features, generators["policy"])
-                step = env.step(td)  # the next observation is drawn while the update computes
+                step = env.step(td)  # the next observation is rendered while the update computes
                 if learns:
                     # The sample has features under random shifts, and the bonus is part of its reward.
                     batch = replay.sample(settings.batch_size).to(device)
@@ -327,7 +327,7 @@ def _make_agent(
 def _make_replay(
     run: Run, task: str | Domain, env: EnvBase, config: Any, generator: torch.Generator, *, is_complete: bool
 ) -> FrameReplay:
-    """Return the replay below the run's directory; a complete run needs none, and gets one of a transition."""
+    """Return the replay in the run's directory; a complete run needs none, and gets one of capacity 1."""
     if is_complete:
         return make_replay(run, None, env, 1, generator=generator)
     path = None if run.run_dir is None else run.run_dir / "replay"
@@ -336,8 +336,7 @@ def _make_replay(
             f"{run.run_dir} has done {run.saved['position']:,} env steps; to continue it needs its frames, and {path} "
             "is gone. Put it back, or start in another run directory."
         )
-    # A checkpoint holds counters and no frames: the frames of the last two must outlive the next one, which comes with
-    # the end of an episode.
+    # A checkpoint holds counters, not frames: frames of the last two must be kept until the next, at an episode's end.
     longest = episode_length(task, action_repeat=config.action_repeat) or LONGEST_EPISODE_AGENT_STEPS
     slack = 2 * (config.checkpoint_interval_env_steps // config.action_repeat + longest) + SPARE_FRAMES
     if path is not None and not run.saved:
@@ -351,7 +350,7 @@ def most_observations(task: str | Domain, env_steps: int, action_repeat: int) ->
     agent_steps, length = -(-env_steps // action_repeat), episode_length(task, action_repeat=action_repeat)
     if length is None or get_domain(task).source not in ("suite", "manipulation"):
         return 2 * agent_steps  # an episode may end after any step
-    # dm_control's have one length. A smaller budget before, which cut an episode, has one episode more.
+    # dm_control's have one length. An earlier smaller budget, which cut an episode, adds one.
     return agent_steps + -(-agent_steps // length) + max(16, agent_steps // 50)
 
 
@@ -399,12 +398,12 @@ def attach_transforms(
         latent_dim=prototypes.weight.shape[1] if keeps_projections else None,
     )  # fmt: skip
     logger.info("features: %s", reason)
-    # The two ways round differently in bfloat16: a run that is continued keeps its own.
+    # The two modes round differently in bfloat16: a resumed run keeps its mode.
     run.settings["features"] = setting if is_rounded else mode
     if mode == "reencode":
         keeps_projections = False
-        # Features, 40 times as large as a frame, need not move. TorchRL's DeviceCastTransform waits for the GPU at
-        # every sample if the machine has one and `device` is the CPU.
+        # Features, 40 times as large as a frame, need not move. TorchRL's DeviceCastTransform synchronises with the GPU
+        # at every sample if the machine has one and `device` is the CPU.
         replay.append_transform(lambda sample: sample.to(device))
         replay.append_transform(RandomShift(in_keys=pixels, **shift))
         replay.append_transform(FrozenEncoder(encoder, in_keys=pixels, out_keys=features))
@@ -440,7 +439,7 @@ def _eval_workers(task: str, make_this_env: Callable[[], EnvBase], config: Any) 
             )
         return config.eval_workers
     episodes = (-(-config.env_steps // config.eval_interval_env_steps) + 1) * config.eval_episodes
-    workers = min(cpu_cores(), torch.get_num_threads())  # a torch limited to one thread leaves the cores to others
+    workers = min(cpu_cores(), torch.get_num_threads())  # torch limited to one thread leaves the cores to other work
     return workers if workers > 1 and episodes >= 20 else 0  # starting one takes as long as an episode
 
 

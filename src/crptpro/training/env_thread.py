@@ -30,7 +30,7 @@ class EnvThread:
 
     MuJoCo lets other threads run while it simulates and renders: the next observation is rendered while an update
     computes. This changes no number. Without spare cores, and with GLFW, the caller's thread does everything.
-    ``make_env`` builds another one like ``env``, which shows the images that the encoder takes.
+    ``make_env`` builds another one like ``env``, with images of the encoder's size and frame stack.
     """
 
     def __init__(self, task: str | Domain, encoder: Any, config: Any, *, seed: int, action_repeat: int) -> None:
@@ -44,7 +44,7 @@ class EnvThread:
             action_repeat=action_repeat,
             **images_of(encoder),
         )
-        # A torch limited to one thread leaves the cores to others.
+        # If torch is limited to one thread, the cores are for other work.
         has_cores = cpu_cores() > 1 and torch.get_num_threads() > 1
         runs_ahead = has_cores and not (needs_gl(domain) and select_backend() == "glfw")
         self._thread = single_core_threads(1, "environment") if runs_ahead else Inline()
@@ -56,7 +56,7 @@ class EnvThread:
         return self._thread.submit(self.env.reset).result()
 
     def step(self, td: TensorDictBase) -> Future[TensorDictBase]:
-        """Begin the step of ``td["action"]``; ``td`` may not change until the result is there."""
+        """Begin the step of ``td["action"]``; ``td`` may not change until the result is available."""
         return self._thread.submit(self.env.step, td)
 
     def uniform_action(self, generator: torch.Generator) -> Tensor:

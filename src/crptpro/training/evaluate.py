@@ -1,4 +1,4 @@
-"""Deterministic evaluation of whole episodes, each from its own seed, during training or alone."""
+"""Deterministic evaluation of whole episodes, each from its own seed, during training or on its own."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from crptpro.workers import WorkerPool, can_be_sent
 logger = logging.getLogger(__name__)
 
 Policy = Callable[[Any], Any]
-"""Maps one observation, uint8 ``[C, H, W]``, to one action, float32 ``[A]`` in ``[-1, 1]``; or a policy of TorchRL."""
+"""Maps one observation, uint8 ``[C, H, W]``, to one action, float32 ``[A]`` in ``[-1, 1]``; or a TorchRL policy."""
 WORKER_BYTES = 500_000_000
 
 
@@ -57,7 +57,7 @@ def evaluate(
     progress: bool = True,
     on_episode: Callable[[Episode], Any] = lambda episode: None,
 ) -> list[Episode]:
-    """Run a policy for whole episodes and return every episode's own return.
+    """Run a policy for whole episodes and return one result per episode.
 
     Every episode has its own seed, so that neither earlier evaluations nor the number of processes change a result.
     The environment is unbatched, with ``pixels`` uint8 ``[C, H, W]`` and without an intrinsic reward. ``on_episode`` is
@@ -82,7 +82,7 @@ def evaluate(
 def run_episode(
     policy: Policy, env: EnvBase, *, episode: int, seed: int, on_frame: Callable[[Tensor], Any] | None = None
 ) -> Episode:
-    """Run one episode of :func:`evaluate`; ``on_frame`` is called with every RGB picture, uint8 ``[3, H, W]``."""
+    """Run one episode of :func:`evaluate`; ``on_frame`` is called with every RGB image, uint8 ``[3, H, W]``."""
     env.set_seed(seed)
     td = env.reset()
     episode_return, agent_steps, done = 0.0, 0, False
@@ -110,7 +110,7 @@ def run_episode(
 
 
 def episode_seed(seed: int, episode: int) -> int:
-    """Return what the environment of an evaluation's episode is seeded with."""
+    """Return the seed of the environment in an episode of an evaluation."""
     return derive_seed(seed, "episode", episode)
 
 
@@ -158,7 +158,7 @@ class Evaluator:
         self._pending: tuple[PixelAgent, dict[str, int], int, list[Future[Episode]]] | None = None
 
     def start(self, **counters: int) -> None:
-        """Evaluate the run's agent as it is now; ``counters``, with ``env_steps``, say where the run is."""
+        """Evaluate the run's current agent; ``counters``, with ``env_steps``, say how far the run is."""
         self.finish()
         self._begin(self.agent.snapshot(), counters)
         if not self.workers:
@@ -173,17 +173,17 @@ class Evaluator:
             seeds = [episode_seed(seed, episode) for episode in range(self.episodes)]
             try:
                 futures = [self._pool.submit(_evaluate, sent, *numbered) for numbered in enumerate(seeds)]
-            except (BrokenProcessPool, OSError) as reason:  # died since the evaluation before, or cannot be started
+            except (BrokenProcessPool, OSError) as reason:  # died since the last evaluation, or cannot be started
                 self._give_up(reason)
         self._pending = (agent, counters, seed, futures)
 
     def poll(self) -> None:
-        """Deliver the evaluation that is under way if it has ended."""
+        """Deliver the pending evaluation if it has ended."""
         if self._pending is not None and all(future.done() for future in self._pending[-1]):
             self.finish()
 
     def finish(self) -> None:
-        """Wait for the evaluation that is under way, if any, and deliver its episodes."""
+        """Wait for the pending evaluation, if any, and deliver its episodes."""
         if self._pending is None:
             return
         agent, counters, seed, futures = self._pending
@@ -195,9 +195,9 @@ class Evaluator:
         if not futures:
             self._env = self._env or self.make_env()
             threads = torch.get_num_threads()
-            torch.set_num_threads(1)  # as in the workers: sums of another order may round another way
+            torch.set_num_threads(1)  # as in the workers: another order of summation may round differently
             try:
-                agent = copy.deepcopy(agent).cpu()  # a GPU may round otherwise than the workers
+                agent = copy.deepcopy(agent).cpu()  # a GPU may round differently from the workers
                 episodes = evaluate(agent, self._env, episodes=self.episodes, seed=seed, progress=self.progress)
             finally:
                 torch.set_num_threads(threads)
@@ -209,7 +209,7 @@ class Evaluator:
         self.workers = 0
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the evaluation that is under way: its episodes are not in the record yet."""
+        """Return the pending evaluation, whose episodes are not in the record yet."""
         if self._pending is None:
             return {}
         agent, counters, *_ = self._pending

@@ -109,7 +109,7 @@ class ExplorationPlan:
     agent_steps: int  # decisions of each domain
     first_update: int  # decision of a domain from which on updates follow
     encoder_update_interval: int  # in a domain's own decisions
-    encoder_updates_each: int  # encoder updates every time
+    encoder_updates_each: int  # encoder updates after each interval
 
     @property
     def decisions(self) -> int:
@@ -244,12 +244,12 @@ def pretrain_active(
         for _ in run.until(plan.env_steps, checkpoint_interval=settings.checkpoint_interval_env_steps):
             explorer = min(explorers, key=lambda each: each.agent_steps)  # they take turns
             agent_step = explorer.agent_steps
-            explorer.begin_step()  # the next observation is drawn while the updates compute
+            explorer.begin_step()  # the next observation is rendered while the updates compute
             learns = agent_step >= plan.first_update
             trains_encoder = learns and agent_step % plan.encoder_update_interval == 0
             trains_agent = learns and agent_step % exploration.agent_update_interval == 0
             for left in reversed(range(plan.encoder_updates_each if trains_encoder else 0)):
-                # The replay's transform is the random shift, another one for every image.
+                # The replay's transform is the random shift, drawn anew for every image.
                 batch = explorer.replay.sample(settings.batch_size).to(device)
                 if exploration.encodes_before_update and not left:
                     batch = explorer.encode(batch)
@@ -292,7 +292,7 @@ def _described(reward: Any) -> Any:
 class Explorer:
     """One domain of an active pre-training: its environment, replay, agent and intrinsic reward.
 
-    A checkpoint holds no simulator state: the running episode is repeated from its seed with the same actions. A
+    A checkpoint holds no simulator state: the running episode is replayed from its seed with the same actions. A
     non-deterministic environment does not reproduce it, which is logged as a warning.
     """
 
@@ -364,7 +364,7 @@ class Explorer:
         return {"intrinsic_reward": intrinsic.mean(), **dict(losses.items())}
 
     def candidates(self) -> Tensor | None:
-        """Return the candidates of a prototype reward, the one that is overwritten next first."""
+        """Return the candidates of a prototype reward, oldest first."""
         if not isinstance(self.reward, PrototypeReward):
             return None
         return self.reward.queue.roll(-int(self.reward.queue_pointer), 0).clone()
@@ -377,7 +377,7 @@ class Explorer:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore :meth:`state_dict`; the episode that was under way is repeated."""
+        """Restore :meth:`state_dict`; the episode that was running is replayed."""
         self.agent_steps, self.episodes, self.skill = state["counters"]
         for name, part in self._parts.items():
             part.load_state_dict(state[name])

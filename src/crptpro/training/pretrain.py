@@ -60,7 +60,7 @@ class PretrainConfig:
     cuda_graph: bool = False
     """on a GPU, record the whole update as a CUDA graph and replay it"""
     device: str = "cpu"
-    """where to train; a GPU holds a copy of the datasets' frames"""
+    """device to train on; a GPU holds a copy of the datasets' frames"""
     log_interval: int = 100
     """updates between two rows of the record"""
     checkpoint_interval: int | None = None
@@ -85,7 +85,7 @@ class PretrainResult:
     updates: int
     """encoder updates in total, over all domains and resumptions"""
     resumed_from: int
-    """where this call continued, in updates (in env steps for an active method); 0 for a fresh run"""
+    """position that this call resumed from, in updates (env steps for an active method); 0 for a fresh run"""
     metrics: dict[str, Any]
     """the last row of the record"""
     collapse: dict[str, Any]
@@ -130,8 +130,8 @@ def pretrain(
         CRPTproError: ``method`` explores, or takes the encoder of another method.
         CheckpointError: ``run_dir`` holds a run of other settings (named), or another process is running in it.
         NonFiniteError: a loss or a weight is not finite; the last checkpoint is kept.
-        DatasetError: a dataset is unusable, shows other images than the encoder takes, or lacks an entry.
-        ValueError: naming an impossible setting.
+        DatasetError: a dataset is unusable, lacks an entry, or has images of another shape than the encoder takes.
+        ValueError: a setting is impossible; the message names it.
     """
     recipe = method_of(loss) if method is None else get_method(method)
     if started_from is None and recipe.starts_from is not None:
@@ -186,7 +186,7 @@ def pretrain(
             if run.every(settings.log_interval):
                 write_row(run, loss, monitor, run.position)
         run.finish()
-        if run.means("pretrain"):  # after the checkpoint: a longer run takes this shorter row back
+        if run.means("pretrain"):  # after the checkpoint, so that a longer run replaces this shorter row
             write_row(run, loss, monitor, run.position)
         facts = {"device": str(device), "datasets": datasets_facts}
         return PretrainResult(**ending(run, loss, recipe, monitor, run.position, facts))
@@ -195,12 +195,12 @@ def pretrain(
 def finetune(pretrained: Pretrained | str | Path, datasets: Any, **options: Any) -> PretrainResult:
     """Train a pretrained artifact further, e.g. on the random data of one more domain.
 
-    All networks continue from what was saved, targets and prototypes included; Adam starts anew. ``pretrained`` is an
+    All networks start from what was saved, targets and prototypes included; Adam is reset. ``pretrained`` is an
     artifact or its directory; ``datasets`` and ``options`` are those of :func:`pretrain`. The result's card also says
     how the artifact was trained before.
 
     Raises:
-        PretrainedError: the artifact cannot be read, or its loss cannot be built again, as that of a slim one.
+        PretrainedError: the artifact cannot be read, or its loss cannot be rebuilt, as for a slim one.
     """
     if not isinstance(pretrained, Pretrained):
         pretrained = load_pretrained(pretrained)
@@ -268,7 +268,7 @@ def make_optimizer(
 def make_update(
     loss: LossModule, optimizer: torch.optim.Adam, targets: SoftUpdate | None, *, grad_clip: float | None
 ) -> Update:
-    """Return what one update does with a batch; it reads no value back to the host."""
+    """Return a function that does one update on a batch, without host synchronisation."""
     before_update = getattr(loss, "before_update", lambda: None)  # normalises the prototypes
 
     def update(batch: TensorDictBase) -> TensorDictBase:
@@ -300,7 +300,7 @@ def total_loss(losses: TensorDictBase) -> Tensor:
 
 
 def scalars(losses: TensorDictBase, domain: str) -> dict[str, Tensor]:
-    """Return what a row shows of an update: every scalar, their sum, and loss and cosine by domain."""
+    """Return the scalars of an update for a row: every output, the total loss, and loss and cosine by domain."""
     values = {n: v.reshape(()) for n, v in losses.items() if isinstance(v, Tensor) and v.numel() == 1}
     values["loss"] = values[f"loss/{domain}"] = total_loss(losses)
     if "embedding_cosine" in values:
@@ -310,7 +310,7 @@ def scalars(losses: TensorDictBase, domain: str) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def write_row(run: Run, loss: LossModule, monitor: CollapseMonitor, updates: int) -> None:
-    """Write a row of the ``pretrain`` record with the prototypes' spread, and let the monitor judge it."""
+    """Write a row of the ``pretrain`` record with the prototypes' spread, and pass it to the monitor."""
     means = run.means("pretrain")
     extra = {}
     weight = getattr(getattr(loss, "prototypes", None), "weight", None)
@@ -328,7 +328,7 @@ def write_row(run: Run, loss: LossModule, monitor: CollapseMonitor, updates: int
 
 
 def describe_loss(loss: LossModule) -> dict[str, Any]:
-    """Return a loss's class, options and tensor shapes, which a checkpoint must agree with."""
+    """Return a loss's class, options and tensor shapes, which must agree with those of a checkpoint."""
     shapes = {
         f"shape of {name}": f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
         for name, value in loss.state_dict().items()
@@ -340,7 +340,7 @@ def describe_loss(loss: LossModule) -> dict[str, Any]:
 def ending(
     run: Run, loss: LossModule, method: Method, monitor: CollapseMonitor, updates: int, facts: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the fields of a :class:`PretrainResult`, and announce how training ended."""
+    """Return the fields of a :class:`PretrainResult`, and log how training ended."""
     collapse, rows = monitor.finish(), run.rows("pretrain")
     last = rows[-1] if rows else {}  # the record of a finished run may be gone
     metrics = {name: value for name, value in last.items() if name not in (run.unit, "updates", "unix_time_s")}
@@ -363,7 +363,7 @@ def ending(
 def _opened(
     datasets: Any, loss: LossModule, *, batch_size: int, seed: int, device: torch.device
 ) -> Iterator[tuple[dict[str, ReplayBuffer], Generators]]:
-    """Yield buffers by domain, with the random shift that the loss wants, and the generators that they draw from."""
+    """Yield buffers by domain, with the random shift that the loss needs, and the generators that they draw from."""
     if isinstance(datasets, (str, Path)) or hasattr(datasets, "sample"):
         datasets = [datasets]
     given = list(datasets.items() if isinstance(datasets, Mapping) else ((None, dataset) for dataset in datasets))
@@ -384,7 +384,7 @@ def _opened(
         if not name.isprintable() or {",", '"'} & set(name):
             raise DatasetError(f"The dataset {name!r} cannot name columns of a record; rename it.")
         buffers[name if name not in buffers else f"{name}_{index}"] = dataset
-    # TorchRL draws indices where the storage is, and its generator must be there, too.
+    # TorchRL draws indices on the storage's device, so its generator must be on it, too.
     devices = {f"sample/{name}": getattr(buffer.storage, "device", None) for name, buffer in buffers.items()}
     generators = Generators(seed, "shift", *devices, devices=devices)
     with contextlib.ExitStack() as stack:
@@ -422,7 +422,7 @@ def _shift_for(
             if found == (3, size, size):
                 remedy = "A FrameReplay that is extended by single frames (replay.extend(buffer[:])) samples stacks."
             raise DatasetError(
-                f"The dataset {name!r} shows {key!r} as {found}; the encoder takes {(channels, size, size)}. {remedy}"
+                f"Dataset {name!r} has {key!r} of shape {found}; the encoder takes {(channels, size, size)}. {remedy}"
             )
     second_views = [view for view, key in views.items() if key in images]
     read = [*(views[view] for view in second_views), *images]
@@ -430,7 +430,7 @@ def _shift_for(
 
 
 def _facts(name: str, buffer: ReplayBuffer) -> dict[str, Any]:
-    """Return what the card of an encoder says about a dataset, and what must agree for a run to be continued."""
+    """Return a dataset's entries in the card of an encoder, which must agree for a run to be resumed."""
     card = getattr(buffer, "card", {})
     shown = ("domain", "task", "transitions", "episodes", "action_repeat", "image_size", "seed", "quality", "colors")
     return {"domain": name, "transitions": len(buffer), **{k: card[k] for k in shown if k in card}}

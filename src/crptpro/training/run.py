@@ -184,13 +184,13 @@ class Run:
         return time.monotonic() - self._started
 
     def saved_setting(self, name: str, value: Any) -> Any:
-        """Return a setting; one that is ``"auto"`` is what the interrupted run resolved it to on its machine."""
+        """Return a setting; ``"auto"`` becomes the value that the interrupted run resolved it to on its machine."""
         return self.saved.get("settings", {}).get(name, value) if value == "auto" else value
 
     def require_same(self, settings: Mapping[str, Any]) -> None:
-        """Name everything that decides the numbers of the run; a run of other settings is refused by name.
+        """Set everything that decides the run's numbers; a saved run of other settings is refused, naming them.
 
-        What a checkpoint could not store raises a ``ValueError`` that names it.
+        A setting that a checkpoint cannot store raises a ``ValueError``.
         """
         self.settings = as_plain(settings, "settings")
         if not self.saved:
@@ -219,7 +219,7 @@ class Run:
                 self._checkpoint.register(name, component)
         if self.saved:
             try:
-                self._checkpoint.load(self._latest, map_location="cpu")  # its GPU may have another number here
+                self._checkpoint.load(self._latest, map_location="cpu")  # its GPU may have another index here
             except Exception as reason:
                 cause = reason.__cause__ or reason
                 if isinstance(cause, (EnvCrashedError, RenderingError, OSError)):  # not the checkpoint's fault
@@ -229,7 +229,7 @@ class Run:
             self.counters.update(self.saved["counters"])
             if self.records is not None and self.saved["record"] is not None:
                 self.records.load_state_dict(self.saved["record"])
-            logger.info("Continues from %s %s.", f"{self.position:,}", self.unit)
+            logger.info("Resuming from %s %s.", f"{self.position:,}", self.unit)
         elif self.records is not None and self.run_dir is not None and self.records.writes_into(self.run_dir):
             self.records.begin_again(self.streams)
         self._saved_time = self._row_time = time.monotonic()
@@ -288,16 +288,16 @@ class Run:
         return self.position // interval > (self.position - self._last_advance) // interval
 
     def show(self, **values: float) -> None:
-        """Put values beside the bar; in a log file a line at every twentieth of the run."""
+        """Show values beside the bar; in a log file a line at every twentieth of the run."""
         self._progress.show(**values)
 
     def finish(self) -> None:
-        """Write the last checkpoint, of a complete run."""
+        """Write the last checkpoint, which marks the run as complete."""
         if not (self.saved.get("is_finished") and self.saved["position"] == self.position):
             self.save(is_finished=True)
 
     def log(self, values: Mapping[str, Tensor | float] | TensorDictBase, stream: str | None = None) -> None:
-        """Take scalars of one update into the means of a stream's next row; the first stream's by default.
+        """Add scalars of one update to the means of a stream's next row; the first stream's by default.
 
         On a CPU, a loss that is not finite ends the run at once with a NonFiniteError; on a GPU the next row or
         checkpoint does, without a host synchronisation here.
@@ -356,7 +356,7 @@ class Run:
         return self._rows[stream] if self.records is None else self.records.rows(stream)
 
     def save(self, *, is_finished: bool = False) -> None:
-        """Write a checkpoint of everything that :meth:`keep` was given, unless it is not finite; two are kept."""
+        """Write a checkpoint of the components of :meth:`keep`, whose parameters must be finite; two are kept."""
         for stream in self.streams:
             self.means(stream)
         for module in self._modules:
@@ -367,7 +367,7 @@ class Run:
         if self.run_dir is None:
             return
         # Checked before, because TorchRL maps the files that it writes: a disk that fills up would end the process by a
-        # bus error. It holds the new checkpoint twice for a moment; the first has the parameters and Adam's moments.
+        # bus error. The new checkpoint is on disk twice for a moment; the first has the parameters and Adam's moments.
         sizes = [path.stat().st_size for path in self._rotation.directory.glob("checkpoint-*")]
         first = 3 * sum(parameter.nbytes for module in self._modules for parameter in module.parameters())
         remedy = "Earlier ones are kept; free space and run the same command again."

@@ -22,8 +22,8 @@ def require_pairs(transform: Transform) -> None:
 class PixelTransform(Transform):
     """Computes one entry from each image entry, in replay batches and in environments.
 
-    Without ``out_keys`` the images are replaced. A subclass writes ``_apply_transform`` and, if it is not that of the
-    image, :meth:`written_spec`.
+    Without ``out_keys`` the images are replaced. A subclass implements ``_apply_transform`` and, if the output has
+    another spec than the image, :meth:`written_spec`.
     """
 
     def __init__(self, in_keys: Keys, out_keys: Keys | None = None) -> None:

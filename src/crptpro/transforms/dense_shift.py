@@ -1,6 +1,6 @@
 """Features of all 81 random shifts of an image as crops of a few dense maps: the same numbers, encoded once.
 
-An un-padded convolutional encoder with total stride S makes of a shifted image a crop of its map of the larger,
+An un-padded convolutional encoder with total stride S maps a shifted image to a crop of its map of the larger,
 border-replicated image. Shifts that differ by a multiple of S share one map ("phase"): the shift (dy, dx) is the crop
 at (dy // S, dx // S) of the map of phase (dy % S, dx % S), as in the shift-and-stitch of OverFeat (Sermanet et al.
 2013, https://arxiv.org/abs/1312.6229).
@@ -79,9 +79,9 @@ def dense_shift_maps(
 def crop_features(maps: Tensor, rows: Tensor, offsets: Tensor, out: Tensor, *, pad: int = 4) -> Tensor:
     """Read the features of one shift per image, int64 ``offsets`` ``[B, 2]``, from the maps at ``rows`` ``[B]``.
 
-    Writes into ``out`` ``[B, feature_dim]``, of the maps' dtype or float32 of bfloat16 maps, and returns it: what
-    ``encoder(random_shift(pixels, offsets, pad=pad))`` is, not standardised. In float32 it is equal bit for bit where
-    the convolution's order of summation does not depend on the image size (oneDNN on x86), otherwise to about 1e-6 of
+    Fills and returns ``out`` ``[B, feature_dim]``, of the maps' dtype (or float32 for bfloat16 maps): the value of
+    ``encoder(random_shift(pixels, offsets, pad=pad))``, not standardised. In float32 it is equal bit for bit where
+    the convolution's order of summation does not depend on the image size (oneDNN on x86); otherwise to about 1e-6 of
     the largest feature.
     """
     phases, channels = math.isqrt(maps.shape[1]), maps.shape[2]
@@ -121,7 +121,7 @@ class DenseShiftFeatures(Transform):
     """Write a frozen encoder's features of randomly shifted observations into a replay batch.
 
     Attached to a :class:`~crptpro.data.FrameReplay` it does what ``RandomShift`` and ``FrozenEncoder`` would, with the
-    same shifts from the same generator and the same bits, but encodes each observation once, when it is first sampled.
+    same shifts from the same generator and the same bits. It encodes each observation only once, when first sampled.
     Its dense maps are kept until the replay has overwritten it; no state dictionary, copy or pickle holds them. If the
     transform is not attached, call :meth:`forget` after loading a state of the replay.
 
@@ -129,8 +129,8 @@ class DenseShiftFeatures(Transform):
 
     Args:
         encoder: frozen, see :func:`dense_shift_geometry`; its weights must not change from now on.
-        replay: a :class:`~crptpro.data.FrameReplay`, or what else has ``observations(numbers)``, uint8
-            ``[B, C, H, W]``, and a ``window``: those that it holds at once have numbers that differ modulo this.
+        replay: a :class:`~crptpro.data.FrameReplay`, or any object with ``observations(numbers)``, uint8
+            ``[B, C, H, W]``, and a ``window``: the observations held at once have numbers that differ modulo this.
         pad: largest shift in pixels.
         projector: its float32 output for all ``(2 * pad + 1)**2`` shifts of an observation is kept too, and
             ``("next", "embedding")`` is written, ``[*, D]`` of the observation of the last in key; None for neither.
@@ -172,7 +172,7 @@ class DenseShiftFeatures(Transform):
         self.dtype = computed if dtype is None else dtype
         if computed != self.dtype and (self.dtype, computed) != (torch.bfloat16, torch.float32):
             raise ValueError(f"maps in {self.dtype} are read as {self.dtype}, or bfloat16 as float32; got {computed}.")
-        # Hidden from nn.Module: the networks are somebody else's, and no part of a replay's state.
+        # Hidden from nn.Module: the caller owns the networks, which are not part of a replay's state.
         self.__dict__["encoder"] = encoder
         self.__dict__["projector"] = projector
         if not hasattr(replay, "observations") or (observations is None and not hasattr(replay, "window")):
@@ -187,7 +187,7 @@ class DenseShiftFeatures(Transform):
         self.forget()
 
     def forget(self) -> None:
-        """Drop all maps, and give their memory back."""
+        """Drop all maps, and free their memory."""
         self._own_lock = threading.RLock()
         self._held = torch.full((self.observations,), -1, dtype=torch.int64, device="cpu")
         self._maps: Tensor | None = None
@@ -231,7 +231,7 @@ class DenseShiftFeatures(Transform):
         return value.reshape(-1).cpu(), value.shape
 
     def _encode_missing(self, numbers: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return the maps and the projections, those of these observations among them."""
+        """Return all maps and projections, after encoding those of these observations that are missing."""
         if self._maps is None:
             shape = (self.observations, *self.maps_shape)
             self._maps = torch.empty(shape, dtype=self.dtype, device=device_of(self.encoder))
@@ -281,7 +281,7 @@ class DenseShiftFeatures(Transform):
         self.forget()
 
     def _load_from_state_dict(self, *args: Any) -> None:
-        self.forget()  # whoever loads a state may number observations anew
+        self.forget()  # the loaded state may number observations differently
 
     def transform_output_spec(self, output_spec: TensorSpec) -> TensorSpec:
         raise NotImplementedError("DenseShiftFeatures reads a replay batch; on an environment use FrozenEncoder.")
@@ -298,10 +298,10 @@ def choose_feature_mode(
 ) -> tuple[Literal["dense", "reencode"], str]:
     """Choose dense maps or re-encoding of shifted images, which give the same features; returns mode and reason.
 
-    ``"auto"`` chooses dense maps for a suitable encoder if four fifths of the free memory, ``available_bytes``, hold
-    the maps of ``observations`` in ``dtype`` and, with ``latent_dim``, their projections; the rest is for networks,
-    batches and the page cache. Shifts are of up to 4 pixels. ``"dense"`` for an unsuitable encoder raises a
-    ``ValueError``.
+    ``"auto"`` chooses dense maps for a suitable encoder if they fit in four fifths of the free memory,
+    ``available_bytes``: the maps of ``observations`` in ``dtype`` and, with ``latent_dim``, their projections. The rest
+    is for networks, batches and the page cache. Shifts are of up to 4 pixels. ``"dense"`` for an unsuitable encoder
+    raises a ``ValueError``.
     """
     if mode == "reencode":
         return "reencode", "re-encoding at every update, as requested"

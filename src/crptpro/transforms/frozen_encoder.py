@@ -31,7 +31,7 @@ class FrozenEncoder(PixelTransform):
 
     def __init__(self, encoder: nn.Module, *, in_keys: Keys = "pixels", out_keys: Keys = "features") -> None:
         super().__init__(in_keys, out_keys)
-        # Hidden from nn.Module: the network is somebody else's, and no part of a replay's state.
+        # Hidden from nn.Module: the caller owns the network, which is not part of a replay's state.
         self.__dict__["encoder"] = encoder
 
     @torch.no_grad()

@@ -72,7 +72,7 @@ class IntrinsicReward(Transform):
         intrinsic = self.intrinsic_reward(rows, *extra)
         if self.coef is None:
             return tensordict.set(self.out_keys[0], intrinsic.reshape(*features.shape[:-1], 1))
-        # The result is on the networks' device: that of a GPU goes on without being waited for.
+        # The result stays on the networks' device, so that a GPU need not be synchronised.
         reward = read_entry(self, tensordict, self.reward_key).to(intrinsic.device)
         intrinsic = intrinsic.to(reward.dtype).view_as(reward)
         tensordict.set(self.out_keys[0], intrinsic)
@@ -103,7 +103,7 @@ class PrototypeReward(IntrinsicReward):
     its copies in Q are its neighbours: about 8 % of a batch of 512 with 512 prototypes and k = 3. Empty rows of Q are
     at distance 1. Rows that are not finite are never drawn.
     Deviation: Eq. 11 prints projections without normalisation; they are normalised here, as in the released agent,
-    whose pre-training also hands its Q over. Here Q starts from zeros unless ``queue`` is given.
+    which also takes Q over from pre-training. Here Q starts from zeros unless ``queue`` is given.
 
     Args:
         projector: frozen map from features to latents; None if ``in_keys`` already names projections.
@@ -204,7 +204,7 @@ class ParticleReward(IntrinsicReward):
     and ``RMS`` of rll-research/url_benchmark). ``options`` are :class:`~crptpro.transforms.rewards.IntrinsicReward`'s.
 
     Deviation: a batch smaller than k uses all its rows, and a single row gets 0; the published code fails. While all
-    distances are 0 the reward is 0; there it is NaN.
+    distances are 0 the reward is 0, in the published code NaN.
     """
 
     distance_mean: Tensor
@@ -247,7 +247,7 @@ class ContrastiveReward(IntrinsicReward):
 
     Deviation: a batch of one gets 0; the published code fails.
 
-    ``head`` gives the embeddings, ``skill_key`` is the one-hot skill ``[*, K]`` at the root, others are a
+    ``head`` gives the embeddings, ``skill_key`` is the one-hot skill ``[*, K]`` at the root, others raise a
     ``ValueError``; ``options`` are :class:`~crptpro.transforms.rewards.IntrinsicReward`'s.
     """
 
