@@ -158,7 +158,7 @@ def becl_loss(
     similarity = (unit @ unit.T / temperature).masked_fill(itself, float("-inf"))
     weights = (similarity - similarity.amax(dim=1, keepdim=True).detach()).exp()  # diagonal: exactly 0
     same_skill = (skills.unsqueeze(0) == skills.unsqueeze(1)) & ~itself
-    # argmax of 0/1 (2 for a match) picks the first match, else the first off-diagonal row.
+    # argmax of 0/1 (3 for a match) picks the first match, else the first off-diagonal row.
     positive = (same_skill.int() * 2 + (~itself).int()).argmax(dim=1, keepdim=True)
     quotient = weights.gather(1, positive).squeeze(1) / (weights.sum(dim=1) + eps)
     return _reduced(-(quotient + eps).log(), reduction)
