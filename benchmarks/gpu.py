@@ -3,7 +3,7 @@
 ``python -m benchmarks.gpu`` prints, on synthetic frames that the device holds:
 
 * ``parity``: the device's samples and shifts against the CPU's; compiled and recorded updates against plain ones.
-* ``pretrain``: one update of ``pretrain(...)``: float32, TF32, bfloat16, compiled, recorded as a CUDA graph, both.
+* ``pretrain``: one update of ``pretrain(...)``: float32, bfloat16, compiled, recorded as a CUDA graph, both.
 * ``downstream``: one update of ``train_downstream(...)``, dense features, with the same switches.
 * ``sustained``: ``pretrain(...)`` with its log, what 50,000 updates take, and its peak memory.
 
@@ -170,7 +170,7 @@ def entries(module: nn.Module) -> Tensor:
 
 def time_updates(settings: Settings, item: str, more: dict[str, Switches], **common: Any) -> dict[str, Any]:
     """Time loops with switches in turns, many updates per timed call."""
-    candidates: dict[str, Switches] = {"fp32": FP32, "TF32": {**FP32, "tf32": True}, "bf16": BF16, **more}
+    candidates: dict[str, Switches] = {"fp32": FP32, "bf16": BF16, **more}
     common |= {"device": settings.device, "batch_size": settings.batch_size, **settings.sizes}
     common["passes"] = settings.updates_per_call
     with ExitStack() as stack:

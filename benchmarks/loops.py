@@ -159,8 +159,6 @@ def main(item: str, settings: dict[str, Any]) -> None:
             raise SystemExit(0)
 
     torch.set_num_threads(settings.pop("threads", torch.get_num_threads()))
-    if settings.pop("tf32", False):
-        torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
     ITEMS[item](hold, **settings)
 
 

@@ -171,6 +171,23 @@ def test_after_a_kill_between_the_two_renames_the_same_write_succeeds(
     assert value_of(tmp_path / "a") == 2
 
 
+def test_a_second_rename_that_fails_leaves_the_old_artifact(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path / "a", 1.0)
+    rename = os.rename
+
+    def refused(old: Path, new: Path) -> None:
+        if "writing" in Path(old).name:
+            raise OSError(errno.EIO, "the disk is gone")
+        rename(old, new)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(artifact.os, "rename", refused)
+        with pytest.raises(OSError, match="the disk is gone"):
+            write(tmp_path / "a", 2.0)
+    assert value_of(tmp_path / "a") == 1
+    assert [each.name for each in tmp_path.iterdir()] == ["a"]
+
+
 def test_threads_that_write_one_file_leave_a_whole_one(tmp_path: Path) -> None:
     path, contents = tmp_path / "a.txt", [str(digit) * 100_000 for digit in range(4)]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import shutil
@@ -371,3 +372,30 @@ def test_a_users_own_networks_are_saved_and_need_their_class_to_come_back(tmp_pa
     assert "is a 'OwnEncoder', which is not registered. Call crptpro.modules.register_network" in refused.stderr
     with pytest.raises(ValueError, match="PixelEncoder is a network of crptpro; give your class another name"):
         register_network(type("PixelEncoder", (nn.Module,), {}))
+
+
+class Margin(LossModule):
+    """A loss with options, of which it keeps one under another name."""
+
+    def __init__(self, encoder: nn.Module, scale: float = 2.0, margin: float = 1.0) -> None:
+        super().__init__()
+        self.convert_to_functional(encoder, "network")
+        self.__dict__["encoder"] = encoder
+        self.scale, self._margin = scale, margin
+
+
+def test_an_option_of_a_users_loss_that_cannot_be_read_back_is_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = save_pretrained(Margin(OwnEncoder(), scale=3.0, margin=0.2), tmp_path / "own")
+    assert "margin of Margin: not recorded, so fine-tuning takes the default" in caplog.text
+    assert load_pretrained(path).card["loss"]["config"] == {"scale": 3.0}
+    caplog.clear()
+    save_pretrained(make_loss(), tmp_path / "ours")
+    assert not caplog.text
+
+
+def test_an_encoder_that_its_loss_did_not_train_is_not_saved(tmp_path: Path) -> None:
+    with pytest.raises(PretrainedError, match="has none of its parameters, so it was not trained with it"):
+        save_pretrained(copy.deepcopy(Margin(OwnEncoder())), tmp_path / "own")
+    save_pretrained(copy.deepcopy(make_loss()), tmp_path / "ours")

@@ -139,7 +139,12 @@ def write_artifact(
         if path.exists():
             shutil.rmtree(previous, ignore_errors=True)
             os.rename(path, previous)
-        os.rename(temporary, path)
+        try:
+            os.rename(temporary, path)
+        except OSError:
+            if previous.exists():
+                os.rename(previous, path)
+            raise
         shutil.rmtree(previous, ignore_errors=True)
     except (OSError, DiskSpaceError) as reason:
         raise writing_error(path, reason) from reason

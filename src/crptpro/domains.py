@@ -33,7 +33,8 @@ class Domain:
     ``[1]``. Without ``truncated`` in its ``done_spec``, episodes end by termination alone. With ``physics_state`` it
     may emit ``qpos`` and ``qvel``; entries that its transforms read back (``step_count``) stay, others are dropped. Its
     ``set_seed`` must make the next ``reset`` reproducible. For worker processes ``make`` must be a function at a
-    module's top level or a ``functools.partial`` of one.
+    module's top level or a ``functools.partial`` of one. If MuJoCo renders, it calls
+    :func:`crptpro.envs.select_backend` before it imports dm_control.
     """
 
     name: str  #: of the domain, and of its dataset directory
@@ -135,10 +136,10 @@ def register_domain(domain: Domain) -> Domain:
 
     A name that several domains share means the one registered last. A worker process starts without registered
     domains: pass the ``Domain`` itself, or call ``register_domain`` at the top level of the module that defines
-    ``make``. A name of the paper's, or with the prefix ``gymnasium:``, raises a ``CRPTproError``.
+    ``make``. A built-in name, or one with the prefix ``gymnasium:``, raises a ``CRPTproError``.
     """
     for name in (domain.name, domain.task):
-        if name in {*PAPER_DOMAINS, *TASKS, *GROUPS} or name.startswith(GYMNASIUM_PREFIX):
+        if name in {*_BUILT_IN, *GROUPS} or name.startswith(GYMNASIUM_PREFIX):
             raise CRPTproError(f"{name!r} is one of the built-in names; register the domain under another one.")
     for key in (domain.task, domain.name):
         _registered[key] = domain

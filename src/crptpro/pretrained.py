@@ -56,7 +56,7 @@ class Pretrained:
     target_projector: nn.Module | None = None  #: moving average of the projector
     queue: Tensor | None = None  #: candidate latents ``[Q, D]``
     actor: nn.Module | None = None  #: the exploring policy, for methods whose downstream runs start from it
-    card: dict[str, Any] = field(default_factory=dict)  #: how it was trained
+    card: dict[str, Any] = field(default_factory=dict, repr=False)  #: how it was trained
     #: Remaining state of the loss (further heads, coefficients), for fine-tuning.
     rest: dict[str, Tensor] = field(default_factory=dict, repr=False)
     #: Checksum of the networks as they were read, which is what the card identifies.
@@ -93,6 +93,7 @@ class Pretrained:
     def build_loss(self) -> LossModule:
         """Build the loss that this was trained with, as trainable copies of all networks, targets included.
 
+        TorchRL's ``SoftUpdate`` begins by copying the online networks into the targets; :func:`finetune` keeps them.
         Raises a PretrainedError if its method is not registered or does not take these networks, or if saved slim.
         """
         if self.card.get("slim"):
@@ -284,6 +285,12 @@ def _as_pretrained(trained: Any) -> Pretrained:
             f"{type(loss).__name__} has no `.encoder`, which a pre-training loss exposes. An encoder alone: "
             "Pretrained(encoder)."
         )
+    trained_here, own = [{p.data_ptr() for p in module.parameters()} for module in (loss, encoder)]
+    if own and trained_here and trained_here.isdisjoint(own):
+        raise PretrainedError(
+            f"The `.encoder` of this {type(loss).__name__} has none of its parameters, so it was not trained with it:  "
+            "a deep copy of a LossModule may be so. Save the original."
+        )
     heads: dict[str, Any] = {role: _unwrapped(getattr(loss, role, None)) for role in HEADS}
     targets = {}
     for target, online in zip(TARGETS, (encoder, heads["projector"])):
@@ -307,16 +314,23 @@ def class_name(loss: nn.Module) -> str:
 
 
 def loss_options(loss: nn.Module) -> dict[str, Any]:
-    """Return the plain options of a loss's constructor, read back from the attributes of the same names."""
+    """Return the plain options of a loss's constructor: its ``config``, or the attributes of the same names."""
     if isinstance(config := getattr(loss, "config", None), dict):
         return config
-    options = {}
-    for name in inspect.signature(type(loss).__init__).parameters:
-        value = getattr(loss, name, inspect.Parameter.empty)
+    options, unknown = {}, []
+    for name, parameter in inspect.signature(type(loss).__init__).parameters.items():
+        value = getattr(loss, name, parameter.empty)
         if isinstance(value, Tensor) and value.ndim == 0:
             value = value.item()
         if isinstance(value, int | float | str) or (value is None and name not in HEADS):
             options[name] = value
+        elif value is parameter.empty and parameter.default is not parameter.empty and name not in HEADS:
+            unknown.append(name)
+    if unknown and not type(loss).__module__.startswith("crptpro."):  # ours only build heads from theirs
+        _LOG.warning(
+            "%s of %s: not recorded, so fine-tuning takes the default. Keep each option as an attribute of its name, "
+            "or all of them in a dict `config`.", ", ".join(unknown), type(loss).__name__,
+        )  # fmt: skip
     return options
 
 

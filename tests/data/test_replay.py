@@ -18,7 +18,7 @@ import torch
 import toy_env
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
-from torchrl.data import PrioritizedSampler, SamplerWithoutReplacement
+from torchrl.data import PrioritizedSampler, SamplerWithoutReplacement, SliceSampler
 from torchrl.envs import CatFrames, SerialEnv, Transform, TransformedEnv
 from torchrl.modules import RandomPolicy
 from toy_env import ToyEnv, rollout_of, variable_length
@@ -285,6 +285,35 @@ def test_what_a_frame_replay_would_store_wrongly_is_refused() -> None:
         small(n_step=2, sampler=SamplerWithoutReplacement())
     with pytest.raises(DatasetError, match="belongs to one process"):
         small().share()
+
+
+@pytest.mark.parametrize("key", [{"traj_key": "episode"}, {"end_key": ("next", "done")}])
+def test_slices_of_torchrls_sampler_are_of_one_episode_in_order_and_read_no_other_stacks(
+    monkeypatch: pytest.MonkeyPatch, key: dict[str, Any]
+) -> None:
+    sampler = SliceSampler(slice_len=4, truncated_key=None, **key)
+    replay = small(40, sampler=sampler, batch_size=64)
+    driver = Driver(replay, length=9).write(100)  # the newest episode is still running
+    driver.check()
+    assert [buffer[:].get("pixels", None) is not None for buffer in (replay, replay.storage)] == [True, False]
+    gathered, gather = [], storage.gather_stacks
+
+    def watched(frames: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+        gathered.append(len(rows))
+        return gather(frames, rows)
+
+    monkeypatch.setattr(storage, "gather_stacks", watched)
+    for _ in range(20):
+        numbers = replay.sample()["number"].view(-1, 4)
+        assert (numbers.diff(dim=1) == 1).all()
+    assert max(gathered) == 64
+
+
+def test_rollouts_that_are_stored_one_after_another_are_told_apart_by_their_episode() -> None:
+    replay = small(50)
+    for _ in range(2):
+        replay.extend(rollout_of(torch.stack([frame(n) for n in range(5)])))  # not done
+    assert replay[:]["episode"].unique(return_counts=True)[1].tolist() == [4, 4]
 
 
 def test_a_collector_may_fill_a_replay_and_count_what_it_wrote() -> None:

@@ -171,8 +171,9 @@ def test_a_standardised_encoder_gives_features_of_mean_zero_and_deviation_one(dt
     assert torch.equal(copy.deepcopy(encoder)(pixels()), encoder(pixels()))
 
 
-def test_gradients_per_sample_by_functional_transforms_equal_those_one_by_one() -> None:
-    encoder, images = small(), pixels(3)
+@pytest.mark.parametrize("scale", [None, 255])
+def test_gradients_per_sample_by_functional_transforms_equal_those_one_by_one(scale: int | None) -> None:
+    encoder, images = small(), pixels(3) if scale is None else pixels(3) / scale
     parameters = dict(encoder.named_parameters())
 
     def loss(values: dict[str, Tensor], image: Tensor) -> Tensor:

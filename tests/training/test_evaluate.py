@@ -10,8 +10,10 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule
-from torchrl.modules import RandomPolicy
+from tensordict.nn import InteractionType, TensorDictModule
+from torchrl.data import Unbounded
+from torchrl.envs import TensorDictPrimer, TransformedEnv
+from torchrl.modules import ProbabilisticActor, RandomPolicy, TanhNormal
 from toy_env import PoisonedEnv, ToyEnv, fixed_length
 from toy_runs import EPISODE, SIZE, make_encoder, toy_domain
 
@@ -58,6 +60,27 @@ def test_a_policy_of_torchrl_acts_as_the_function_that_it_wraps() -> None:
     wrapped = TensorDictModule(agent, ["pixels"], ["action"])
     assert evaluate(wrapped, env, episodes=1, seed=5, progress=False) == expected
     assert len(evaluate(RandomPolicy(env.full_action_spec), env, episodes=1, progress=False)) == 1
+
+
+class Counting(torch.nn.Module):
+    """A recurrent policy whose state counts its calls, and whose action is drawn."""
+
+    def forward(self, pixels: torch.Tensor, state: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        self.seen.append(int(state))
+        return torch.zeros(2), torch.full((2,), 0.3), state + 1
+
+
+def test_a_policy_of_torchrl_keeps_its_recurrent_state_and_acts_by_its_mode() -> None:
+    env = TransformedEnv(make_toy_env(), TensorDictPrimer(state=Unbounded((1,)), default_value=0.0))
+    network = Counting()
+    network.seen = []
+    module = TensorDictModule(network, ["pixels", "state"], ["loc", "scale", ("next", "state")])
+    policy = ProbabilisticActor(
+        module, in_keys=["loc", "scale"], distribution_class=TanhNormal, default_interaction_type=InteractionType.RANDOM
+    )
+    returns = [evaluate(policy, env, episodes=1, seed=3, progress=False)[0].episode_return for _ in range(2)]
+    assert network.seen == 2 * list(range(EPISODE))
+    assert returns[0] == returns[1] == evaluate(lambda _: torch.zeros(2), env, episodes=1, seed=3)[0].episode_return
 
 
 @pytest.mark.parametrize(("policy", "got"), [

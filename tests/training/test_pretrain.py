@@ -24,6 +24,7 @@ from crptpro.objectives import ATCLoss, ProtoLoss, SimCLRLoss, get_method
 from crptpro.pretrained import load_pretrained, save_pretrained
 from crptpro.training import PretrainConfig, PretrainResult, Run, finetune, pretrain
 from crptpro.training.pretrain import make_optimizer
+from crptpro.transforms import RandomShift
 
 SETTINGS = PretrainConfig(
     batch_size=8, learning_rate=1e-3, seed=3, log_interval=4, checkpoint_interval=5, precision="fp32"
@@ -275,6 +276,41 @@ def test_both_views_are_of_one_image_under_shifts_of_up_to_four_pixels() -> None
     for found in (first, second):
         assert {row for row, _ in found} == {column for _, column in found} == set(range(-4, 5))
     assert sum(a == b for a, b in zip(first, second)) < 30
+
+
+class Masked(Brightness):
+    """Reads further entries than images."""
+
+    in_keys = ("pixels", ("next", "pixels"), "mask", "volume", "row")
+
+
+def test_only_images_are_shifted() -> None:
+    buffer = make_dataset(0)
+    pixels = buffer[:]["pixels"]
+    batches = watched(loss := Masked())
+    volume = torch.rand(60, 2, 4, 4)
+    other = ReplayBuffer(storage=LazyTensorStorage(60))
+    other.extend(buffer[:].update({"mask": pixels[:, :1], "volume": volume, "row": torch.arange(60)}))
+    run(loss, 1, datasets=other)
+    batch = batches[0]
+    assert torch.equal(batch["mask"], pixels[batch["row"], :1])
+    assert torch.equal(batch["volume"], volume[batch["row"]])
+    assert not torch.equal(batch["pixels"], pixels[batch["row"]])
+
+
+def test_a_dataset_that_shifts_its_images_itself_is_refused() -> None:
+    buffer = make_dataset(0)
+    buffer.append_transform(RandomShift(in_keys=["pixels"]))
+    with pytest.raises(DatasetError, match="'dark' shifts its images, as pretrain does: remove its RandomShift"):
+        run(Brightness(), 1, datasets={"dark": buffer})
+
+
+def test_every_dataset_has_a_name_of_its_own() -> None:
+    datasets = [make_dataset(0) for _ in range(3)]
+    for dataset, domain in zip(datasets, ("maze_2", "maze", "maze")):
+        dataset.card = {"domain": domain}
+    result = run(make_loss(), 3, datasets=datasets)
+    assert {"loss/maze_2", "loss/maze", "loss/maze_2_2"} <= result.metrics.keys()
 
 
 def test_a_loss_that_returns_a_tensor_is_told_what_to_return(monkeypatch: pytest.MonkeyPatch) -> None:

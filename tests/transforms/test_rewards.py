@@ -47,6 +47,15 @@ def kth_distance(z, queue, k):
     return torch.tensor(rows)
 
 
+def test_batches_too_small_for_the_prototypes_are_announced_once_and_a_single_row_is_no_candidate(caplog):
+    transform = on_latents()
+    for rows in (4, 3, 3, 1):
+        found = transform(batch(rows))["next", "intrinsic_reward"]
+    assert found.tolist() == [[0.0]]
+    assert transform.queue_pointer == 3 * M
+    assert caplog.text.count("The prototype reward will mostly be 0: 8 prototypes") == 1
+
+
 def test_the_prototype_reward_equals_the_formula_typed_again():
     """kth smallest of ||z_i - Q_l||, l2-normalised z, after the candidates went in (CRPTpro proto.py)."""
     projector, prototypes = Projector(10, D), prototypes_of(scale=7.0)  # their length makes no difference

@@ -14,6 +14,7 @@ from tyro.conf import Positional, arg
 
 from crptpro.artifact import read_json, require_disk
 from crptpro.domains import get_domain
+from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.experiments import launch
 from crptpro.experiments.jobs import DONE, JOBS, KINDS, Plan, bytes_of, make_plan, write_cells
@@ -214,10 +215,13 @@ def plan_text(plan: Plan, root: Path, disk: int, jobs: int) -> str:
 
 def memory_text(plan: Plan, jobs: int) -> str:
     """Return a hint that fewer jobs at a time may be faster, as their runs could keep dense maps; empty if all can."""
-    from crptpro.transforms.dense_shift import dense_maps_bytes  # late, as it imports TorchRL
+    from crptpro.training.downstream import most_observations  # late, as they import TorchRL
+    from crptpro.transforms.dense_shift import dense_maps_bytes
 
-    runs = [job.facts for job in plan.missing if job.kind == "run" and job.needs]  # without DrQ's
-    slots = max((min(facts["replay_capacity"], facts["env_steps"] // 2) for facts in runs), default=0)
+    slots = 0
+    for facts in (job.facts for job in plan.missing if job.kind == "run" and job.needs):  # without DrQ's
+        stored = most_observations(facts["task"], facts["env_steps"], resolve_action_repeat(facts["task"]))
+        slots = max(slots, min(facts["replay_capacity"] * 51 // 50, stored))
     needed = dense_maps_bytes(PixelEncoder(), slots, resolve_precision("auto", "cpu"), latent_dim=128)
     free = free_bytes(torch.device("cpu"))
     if needed <= 0.8 * free / jobs:

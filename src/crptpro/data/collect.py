@@ -223,7 +223,7 @@ def _failures_explained(title: str) -> Iterator[None]:
     except BrokenProcessPool:
         raise WorkerLostError(
             f"A process that collected {title} has died. Out of memory is the usual cause: use fewer workers. Or a "
-            f'script lacks `if __name__ == "__main__":` around its main program. {_AGAIN}.'
+            f'script lacks `if __name__ == "__main__":` around its main program, or defines `make` in it. {_AGAIN}.'
         ) from None
     except OSError as reason:
         raise CRPTproError(

@@ -13,11 +13,11 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import ImmutableDatasetWriter, RandomSampler, ReplayBuffer
+from torchrl.data import ImmutableDatasetWriter, RandomSampler
 
 from crptpro.artifact import CARD_FILE, read_json, write_json
 from crptpro.data.replay import as_it_is
-from crptpro.data.storage import Rows, StackStorage, map_rows, read_rows, require_size
+from crptpro.data.storage import Rows, StackBuffer, StackStorage, map_rows, read_rows, require_size
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import DatasetError, DiskSpaceError, is_disk_full
 from crptpro.provenance import provenance
@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 FORMAT, VERSION = "crptpro-frames", 2
 
 
-class FrameDataset(ReplayBuffer):
+class FrameDataset(StackBuffer):
     """The frames of one domain, sampled as pairs of consecutive stacks (x_t, x_t+1).
 
     ``sample(B)`` draws uniformly, with replacement, from all transitions and returns a TensorDict ``[B]`` with

@@ -10,14 +10,14 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import ImmutableDatasetWriter, PrioritizedSampler, RandomSampler, ReplayBuffer
+from torchrl.data import ImmutableDatasetWriter, PrioritizedSampler, RandomSampler
 
-from crptpro.data.storage import RingStorage, StackStorage, map_rows, read_rows, stack_rows
+from crptpro.data.storage import RingStorage, StackBuffer, StackStorage, map_rows, read_rows, stack_rows
 from crptpro.errors import DatasetError
 from crptpro.values import as_int, as_path
 
 
-class FrameReplay(ReplayBuffer):
+class FrameReplay(StackBuffer):
     """TorchRL replay buffer whose frames are stored once, in RAM or on disk.
 
     40,000 transitions of 84 x 84 frames take 0.85 GB instead of the 5.1 GB of stored stacks. It takes what TorchRL
@@ -41,7 +41,8 @@ class FrameReplay(ReplayBuffer):
       never crosses an episode nor the place where the ring is being overwritten;
     - ``action``, the ``extra_columns``, ``("next", "reward" | "done" | "terminated" | "truncated")`` ``[B, 1]``;
     - ``index`` (0 is the oldest transition) and ``number``, ``("next", "number")``, int64 ``[B]``: how many frames were
-      stored before the observation's newest one. A number is never used again; :meth:`observations` reads it.
+      stored before the observation's newest one. A number is never used again; :meth:`observations` reads it;
+    - ``episode``, int64 ``[B]``, equal within an episode and greater in later ones, for TorchRL's ``SliceSampler``.
 
     With ``n_step`` above 1 only windows of n transitions are drawn that are in one episode and in the ring; none is cut
     short. ``("next", ...)`` is then n agent steps ahead, with the last transition's flags; the reward is the sum of

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, is_tensor_collection
 from torch import Tensor
+from torchrl.data import ReplayBuffer
 from torchrl.data.replay_buffers.storages import Storage
 
 from crptpro.artifact import require_disk
@@ -169,6 +170,7 @@ class StackStorage(Storage):
     frame_stack: int
     device = torch.device("cpu")
     returns_pixels = True
+    _is_full = False  # index 0 is always the oldest: a slice of TorchRL's samplers never wraps around
 
     def columns_at(self, index: Tensor, **how: Any) -> TensorDict:
         """Return everything but pixels of transitions ``[B]``, with both observations' numbers."""
@@ -176,6 +178,12 @@ class StackStorage(Storage):
 
     def __len__(self) -> int:
         return self.max_size
+
+    def __getitem__(self, index: Any) -> TensorDict:
+        """Return single transitions; ``[:]``, from which TorchRL's samplers read columns, is without pixels."""
+        if isinstance(index, slice) and index == slice(None):
+            return self.columns_at(torch.arange(len(self), device=self.device), n_step=1)
+        return self.get(index, n_step=1)  # not every transition has a window
 
     def get(self, index: Any, **how: Any) -> TensorDict:
         """Return transitions by any index of a one-dimensional tensor; 0 is the oldest."""
@@ -202,6 +210,13 @@ class StackStorage(Storage):
 
     def loads(self, path: str | Path) -> None:
         self.load_state_dict(torch.load(Path(path) / "state.pt", weights_only=True))
+
+
+class StackBuffer(ReplayBuffer):
+    """A TorchRL replay buffer over a :class:`StackStorage`."""
+
+    def __getitem__(self, index: Any) -> Any:
+        return super().__getitem__(slice(0, None) if isinstance(index, slice) and index == slice(None) else index)
 
 
 class RingStorage(StackStorage):
@@ -329,10 +344,6 @@ class RingStorage(StackStorage):
             )
         return self._stacks(numbers)
 
-    def __getitem__(self, index: Any) -> TensorDict:
-        # Not every transition has a window: indexing reads single ones.
-        return self.get(index, n_step=1)
-
     def columns_at(self, index: Tensor, *, n_step: int | None = None) -> TensorDict:  # type: ignore[override]
         """See the base class; windows are of :attr:`n_step` transitions, or as many as given."""
         n_step = self.n_step if n_step is None else n_step
@@ -340,7 +351,9 @@ class RingStorage(StackStorage):
         row = number % self.rows
         # The transitions of a window follow one another in rows, and its last one leads to the next observation.
         last = (row + n_step - 1) % self.rows
-        root, following = {"number": number}, {"number": number + n_step}
+        # Equal within an episode, whose first stack took rows without a transition.
+        root = {"number": number, "episode": number - self.oldest - index}
+        following = {"number": number + n_step}
         for name in self.column_names:
             if name in ("reward", "done", "terminated", "truncated"):
                 following[name] = self.content[name][last]

@@ -163,6 +163,8 @@ def describe(root: Path, plan: Plan) -> None:
 
 
 FRAME_BYTES = 3 * 84 * 84
+SPARE_FRAMES = 10_000
+"""Frames of a replay on disk beyond its capacity, for its last two checkpoints."""
 ENCODER_BYTES, CHECKPOINT_BYTES, AGENT_BYTES = 45_000_000, 200_000_000, 12_000_000
 """Sizes of an artifact with its heads, of the two checkpoints of a training, and of an agent."""
 
@@ -176,9 +178,10 @@ def bytes_of(job: Job) -> tuple[int, int]:
         return ENCODER_BYTES, CHECKPOINT_BYTES
     if job.kind == "explored":
         kept = min(facts["decisions"], facts["replay_capacity"] * len(facts["domains"]))
+        kept += SPARE_FRAMES * len(facts["domains"])
         return ENCODER_BYTES + kept * FRAME_BYTES, CHECKPOINT_BYTES * (1 + len(facts["domains"]))
     if job.kind == "run":
-        return AGENT_BYTES, CHECKPOINT_BYTES + facts["replay_capacity"] * FRAME_BYTES
+        return AGENT_BYTES, CHECKPOINT_BYTES + (facts["replay_capacity"] + SPARE_FRAMES) * FRAME_BYTES
     return 1_000_000, 0
 
 

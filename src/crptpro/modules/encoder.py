@@ -140,8 +140,8 @@ class PixelEncoder(nn.Module):
             return
         if not pixels.is_floating_point():
             raise ValueError(f"Pixels must be uint8, or floating in [0, 1], got {pixels.dtype}; use .to(torch.uint8).")
-        if torch.compiler.is_compiling() or not pixels.numel():
-            return
+        if torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active() or not pixels.numel():
+            return  # their values cannot be read
         low, high = (float(bound) for bound in torch.aminmax(pixels.detach()))
         if not (low >= 0 and high <= 1):
             raise ValueError(

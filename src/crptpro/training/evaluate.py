@@ -17,7 +17,7 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import step_mdp
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from torchrl.modules import RandomPolicy
 from tqdm.auto import tqdm
 
@@ -60,8 +60,9 @@ def evaluate(
     """Run a policy for whole episodes and return one result per episode.
 
     Every episode has its own seed, so that neither earlier evaluations nor the number of processes change a result.
-    The environment is unbatched, with ``pixels`` uint8 ``[C, H, W]`` and without an intrinsic reward. ``on_episode`` is
-    called with each episode as it ends.
+    The environment is unbatched, with ``pixels`` uint8 ``[C, H, W]`` and without an intrinsic reward. A TorchRL policy
+    acts with ``ExplorationType.DETERMINISTIC``; put one with dropout in evaluation mode first. ``on_episode`` is called
+    with each episode as it ends.
 
     Raises:
         ValueError: fewer than one episode.
@@ -89,8 +90,12 @@ def run_episode(
     while not done:
         if on_frame is not None:
             on_frame(td["pixels"][-3:].clone())
-        is_torchrls = isinstance(policy, (TensorDictModuleBase, RandomPolicy))
-        action = policy(td.copy()).get("action") if is_torchrls else policy(td["pixels"])
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            if isinstance(policy, (TensorDictModuleBase, RandomPolicy)):
+                td = policy(td.copy())  # its further entries are kept, e.g. a recurrent state
+                action = td.get("action")
+            else:
+                action = policy(td["pixels"])
         if not isinstance(action, Tensor) or action.shape != env.action_spec.shape:
             got = tuple(action.shape) if isinstance(action, Tensor) else type(action).__name__
             raise ValueError(
@@ -98,7 +103,7 @@ def run_episode(
                 f"shape {tuple(env.action_spec.shape)}. A policy maps pixels to one action, or is a TorchRL module "
                 'that writes "action" into a TensorDict.'
             )
-        td["action"] = action.detach()
+        td["action"] = action
         transition = env.step(td)
         episode_return += transition["next", "reward"].item()
         agent_steps += 1

@@ -383,7 +383,9 @@ def _opened(
         name = name or getattr(dataset, "card", {}).get("domain") or f"dataset_{index}"
         if not name.isprintable() or {",", '"'} & set(name):
             raise DatasetError(f"The dataset {name!r} cannot name columns of a record; rename it.")
-        buffers[name if name not in buffers else f"{name}_{index}"] = dataset
+        while name in buffers:
+            name += f"_{index}"
+        buffers[name] = dataset
     # TorchRL draws indices on the storage's device, so its generator must be on it, too.
     devices = {f"sample/{name}": getattr(buffer.storage, "device", None) for name, buffer in buffers.items()}
     generators = Generators(seed, "shift", *devices, devices=devices)
@@ -391,6 +393,8 @@ def _opened(
         for name, buffer in buffers.items():
             if getattr(buffer, "_prefetch", False):
                 raise DatasetError(f"The dataset {name!r} prefetches: its threads would reorder the run's batches.")
+            if any(isinstance(transform, RandomShift) for transform in buffer.transform.transforms):
+                raise DatasetError(f"The dataset {name!r} shifts its images, as pretrain does: remove its RandomShift.")
             stack.callback(buffer.set_rng, buffer._rng)
             buffer.set_rng(generators[f"sample/{name}"])
             buffer.append_transform(_shift_for(loss, name, buffer, generators["shift"], batch_size))
@@ -401,7 +405,10 @@ def _opened(
 def _shift_for(
     loss: LossModule, name: str, buffer: ReplayBuffer, generator: torch.Generator, batch_size: int
 ) -> RandomShift:
-    """Return the shift of every image that a loss reads: each entry, and each second view of one, has its own."""
+    """Return the shift of every image that a loss reads: each entry, and each second view of one, has its own.
+
+    Images have the shape that the encoder declares, or else are uint8 ``[B, C, H, W]``; other entries are not shifted.
+    """
     # Other samplers may not draw single rows.
     sample = buffer.sample(1 if type(buffer.sampler) is RandomSampler else batch_size)
     views: Mapping[NestedKey, NestedKey] = getattr(loss, "views", {})
@@ -415,15 +422,19 @@ def _shift_for(
     images = [key for key in wanted if sample[key].ndim >= 4]
     encoder = getattr(loss, "encoder", None)
     size, channels = getattr(encoder, "image_size", None), getattr(encoder, "in_channels", None)
-    for key in images if size and channels else ():
-        found = tuple(sample[key].shape[-3:])
-        if found != (channels, size, size):
+    if images and size and channels:
+        first, expected = images[0], (channels, size, size)
+        images = [key for key in images if tuple(sample[key].shape[-3:]) == expected]
+        if not images:
+            found = tuple(sample[first].shape[-3:])
             remedy = "Collect with those, or build the encoder for the dataset."
             if found == (3, size, size):
                 remedy = "A FrameReplay that is extended by single frames (replay.extend(buffer[:])) samples stacks."
             raise DatasetError(
-                f"Dataset {name!r} has {key!r} of shape {found}; the encoder takes {(channels, size, size)}. {remedy}"
+                f"Dataset {name!r} has {first!r} of shape {found}; the encoder takes {expected}. {remedy}"
             )
+    else:
+        images = [key for key in images if sample[key].dtype == torch.uint8]
     second_views = [view for view, key in views.items() if key in images]
     read = [*(views[view] for view in second_views), *images]
     return RandomShift(pad=SHIFT_PAD, in_keys=read, out_keys=[*second_views, *images], generator=generator)

@@ -184,11 +184,11 @@ class DenseShiftFeatures(Transform):
         slots = replay.window if observations is None else observations
         self.observations = as_int(slots, "observations", minimum=1)
         self.generator = generator
+        self._own_lock = threading.RLock()
         self.forget()
 
     def forget(self) -> None:
         """Drop all maps, and free their memory."""
-        self._own_lock = threading.RLock()
         self._held = torch.full((self.observations,), -1, dtype=torch.int64, device="cpu")
         self._maps: Tensor | None = None
         self._embeddings: Tensor | None = None
@@ -269,6 +269,7 @@ class DenseShiftFeatures(Transform):
 
     def clone(self) -> Self:
         copy = super().clone()
+        copy._own_lock = threading.RLock()
         copy.forget()
         return copy
 
@@ -278,6 +279,7 @@ class DenseShiftFeatures(Transform):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
+        self._own_lock = threading.RLock()
         self.forget()
 
     def _load_from_state_dict(self, *args: Any) -> None:

@@ -16,8 +16,9 @@ class FrozenEncoder(PixelTransform):
     """Encode images ``[*, C, H, W]`` without gradient, on environments (single and batched) and in replay buffers.
 
     The encoder is any ``nn.Module`` from ``[N, C, H, W]`` to features ``[N, ...]``. It gets the images unscaled and
-    computes in evaluation mode. It is not copied: training it changes the features. Images are moved to its device, and
-    the features, in its output dtype, back to the device of the images.
+    computes in evaluation mode. It is not copied: training it changes the features, and a buffer that prefetches
+    switches its mode from another thread. Images are moved to its device, and the features, in its output dtype, back
+    to the device of the images.
 
     Examples:
         >>> from crptpro.modules import PixelEncoder

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from typing import Any, Self
 
@@ -101,7 +102,8 @@ class PrototypeReward(IntrinsicReward):
 
     As in the released agent (liuxin0824/CRPTpro ``proto.py``), a sample drawn k times or more gets exactly 0, because
     its copies in Q are its neighbours: about 8 % of a batch of 512 with 512 prototypes and k = 3. Empty rows of Q are
-    at distance 1. Rows that are not finite are never drawn.
+    at distance 1. Rows that are not finite are never drawn. Batches must be larger than M / (k - 1/3), 192 for 512
+    prototypes, for most rows to get a bonus; smaller ones cause a warning. A single row gets 0 and leaves Q unchanged.
     Deviation: Eq. 11 prints projections without normalisation; they are normalised here, as in the released agent,
     which also takes Q over from pre-training. Here Q starts from zeros unless ``queue`` is given.
 
@@ -155,7 +157,10 @@ class PrototypeReward(IntrinsicReward):
                 f"projections have length {latents.shape[-1]}, the prototypes {self.queue.shape[-1]}; use the "
                 "projector they were trained with."
             )
+        if len(latents) < 2:
+            return latents.new_zeros(len(latents))
         weight = self.prototypes.get_parameter("weight")
+        warn_if_mostly_zero(len(weight), len(latents), self.knn_k)
         candidates = draw_candidates(F.normalize(weight.float(), dim=-1) @ latents.T, self.generator)
         count = candidates.shape[0]
         rows = (self.queue_pointer + torch.arange(count, device=latents.device)) % self.queue.shape[0]
@@ -164,8 +169,9 @@ class PrototypeReward(IntrinsicReward):
         return knn_distance(latents, self.queue.to(latents.dtype), k=self.knn_k)
 
 
+@functools.cache
 def warn_if_mostly_zero(num_prototypes: int, batch_size: int, knn_k: int) -> None:
-    """Warn if most rows will get 0, for M prototypes and batches of B (the paper has B = M).
+    """Warn, once in a process, if most rows will get 0, for M prototypes and batches of B (the paper has B = M).
 
     A row is drawn about Poisson(M / B) times, with a median of k from M / B = k - 1/3 on.
     """
