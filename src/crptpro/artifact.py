@@ -79,6 +79,27 @@ def require_disk(
         )
 
 
+def require_replaceable(path: str | Path, format_name: str) -> Path:
+    """Raise a CRPTproError if an artifact may not be written to ``path``; see :func:`write_artifact`."""
+    given = as_path(path)
+    path = given.resolve()
+    if path.exists() and path.samefile("."):
+        raise CRPTproError(f"{path} is the working directory, which is not replaced. Write to {path / 'encoder'}.")
+    is_free = not path.exists() or (path.is_dir() and not any(path.iterdir()))
+    if not is_free and (not (path / CARD_FILE).exists() or read_json(path / CARD_FILE).get("format") != format_name):
+        raise CRPTproError(
+            f"{path} exists and is not a {format_name!r}, so it was left unchanged. Choose another directory, such "
+            f"as {path / 'encoder'}."
+        )
+    names = sorted(each.name for each in path.glob("[!.]*")) if not is_free else []
+    if other := [name for name in names if name not in (CARD_FILE, WEIGHTS_FILE)]:
+        raise CRPTproError(
+            f"{path} holds {', '.join(other)} beside the {format_name!r} that would be replaced, so it was left "
+            f"unchanged. Move that, or choose another directory, such as {path / 'encoder'}."
+        )
+    return given
+
+
 def write_artifact(
     path: str | Path,
     modules: Mapping[str, nn.Module | Mapping[str, Tensor]],
@@ -105,22 +126,8 @@ def write_artifact(
     """
     from safetensors.torch import save
 
-    given = as_path(path)
+    given = require_replaceable(path, format_name)
     path = given.resolve()
-    if path.exists() and path.samefile("."):
-        raise CRPTproError(f"{path} is the working directory, which is not replaced. Write to {path / 'encoder'}.")
-    is_free = not path.exists() or (path.is_dir() and not any(path.iterdir()))
-    if not is_free and (not (path / CARD_FILE).exists() or read_json(path / CARD_FILE).get("format") != format_name):
-        raise CRPTproError(
-            f"{path} exists and is not a {format_name!r}, so it was left unchanged. Choose another directory, such "
-            f"as {path / 'encoder'}."
-        )
-    names = sorted(each.name for each in path.glob("[!.]*")) if not is_free else []
-    if other := [name for name in names if name not in (CARD_FILE, WEIGHTS_FILE)]:
-        raise CRPTproError(
-            f"{path} holds {', '.join(other)} beside the {format_name!r} that would be replaced, so it was left "
-            f"unchanged. Move that, or choose another directory, such as {path / 'encoder'}."
-        )
     tensors = {}
     for name, module in modules.items():
         state = module.state_dict() if isinstance(module, nn.Module) else module

@@ -64,9 +64,11 @@ class CompileError(CRPTproError):
 
 def is_disk_full(reason: BaseException) -> bool:
     """Return whether a write failed because the disk, or its quota, is full."""
+    numbers = (errno.ENOSPC, errno.EDQUOT)
     if isinstance(reason, OSError):
-        return reason.errno in (errno.ENOSPC, errno.EDQUOT)
-    return isinstance(reason, DiskSpaceError)
+        return reason.errno in numbers
+    # torch.save raises a RuntimeError with the system's number.
+    return isinstance(reason, DiskSpaceError) or any(f"({number})" in str(reason) for number in numbers)
 
 
 def writing_error(path: Path, reason: OSError | DiskSpaceError) -> OSError | DiskSpaceError:

@@ -26,7 +26,7 @@ from crptpro.modules.encoder import images_of
 from crptpro.modules.registry import describe_network, rebuild_networks
 from crptpro.objectives import get_method, method_names, method_of
 from crptpro.provenance import provenance
-from crptpro.seeding import derive_seed
+from crptpro.seeding import derive_seed, kept_global_rng
 from crptpro.values import as_int, as_path
 
 FORMAT = "crptpro-pretrained"
@@ -147,7 +147,7 @@ def random_pretrained(
     if method not in untrained:
         raise UnknownNameError(f"`method` must be one of {', '.join(untrained)}, got {method!r}.")
     seed = as_int(seed, "seed", minimum=0)
-    with torch.random.fork_rng(devices=[]):
+    with kept_global_rng():
         torch.manual_seed(derive_seed(seed, "random_pretrained"))
         encoder = PixelEncoder(**encoder_config)
     encoder.requires_grad_(False).eval()

@@ -28,11 +28,19 @@ from toy_runs import (
     toy_domain,
 )
 
-from crptpro.errors import CheckpointError, PretrainedError
+from crptpro.errors import CheckpointError, CRPTproError, PretrainedError
 from crptpro.modules import SquashedGaussianActor
 from crptpro.objectives import ProtoLoss
-from crptpro.pretrained import load_pretrained, save_pretrained
-from crptpro.training import DownstreamConfig, DownstreamResult, PixelAgent, load_agent, pretrain, train_downstream
+from crptpro.pretrained import Pretrained, load_pretrained, save_pretrained
+from crptpro.training import (
+    DownstreamConfig,
+    DownstreamResult,
+    PixelAgent,
+    downstream,
+    load_agent,
+    pretrain,
+    train_downstream,
+)
 from crptpro.training.agent import save_agent
 from crptpro.training.downstream import most_observations
 
@@ -120,6 +128,41 @@ def test_a_kill_during_the_last_evaluation_repeats_that_evaluation_alone(tmp_pat
     steps: list[int] = []
     assert train(tmp_path, task=toy_domain("toy", on_step=steps.append)).evaluations[-1]["env_steps"] == 120
     assert len(steps) == 2 * EPISODE
+
+
+@pytest.mark.parametrize("control", ["random-encoder", "drq"])
+def test_a_control_continues_where_its_weights_are_drawn_with_another_rounding(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, control: str
+) -> None:
+    def drawn(seed: int, *, method: str) -> Pretrained:
+        pretrained = make_pretrained(method)
+        with torch.no_grad():
+            pretrained.encoder.convs[0].weight[0, 0, 0, 0] += 1e-7 * len(calls)
+        calls.append(seed)
+        return Pretrained(pretrained.encoder, card=pretrained.card)
+
+    calls: list[int] = []
+    monkeypatch.setattr(downstream, "random_pretrained", drawn)
+    for env_steps in (40, 60):
+        assert train(tmp_path, control, env_steps=env_steps).env_steps == env_steps
+    with pytest.raises(CheckpointError, match="seed was 0, now 1"):
+        train(tmp_path, control, seed=1)
+
+
+def test_what_the_last_line_would_refuse_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    train(tmp_path, env_steps=40)
+    (tmp_path / "agent" / "episode.mp4").touch()
+    with pytest.raises(CRPTproError, match=r"holds episode\.mp4 beside the 'crptpro-agent'"):
+        train(tmp_path)
+    assert {row["env_steps"] for row in record(tmp_path / "eval.csv")} == {"0", "40"}
+    with pytest.raises(ValueError, match="PixelEncoder"):
+        train(tmp_path / "new", Pretrained(OwnEncoder()), features="dense", intrinsic_reward_coef=0.0)
+    assert not (tmp_path / "new").exists()
+
+
+def test_an_episode_that_the_budget_cuts_is_not_recorded_as_one(tmp_path: Path) -> None:
+    train(tmp_path, env_steps=50)
+    assert [row["episode_agent_steps"] for row in record(tmp_path / "episodes.csv")] == [str(EPISODE)] * 2
 
 
 @pytest.mark.parametrize(("task", "most"), [

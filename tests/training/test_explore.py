@@ -67,6 +67,8 @@ def test_every_method_explores_learns_and_resumes_as_if_uninterrupted(tmp_path: 
     rows = record(parts / "episodes.csv")
     assert [row["domain"] for row in rows] == (["left", "right"] * 2 if domains == 2 else ["left"] * 5)
     assert {row["episode_agent_steps"] for row in rows} == {str(EPISODE)}
+    ends = [38, 40, 78, 80] if domains == 2 else [20, 40, 60, 80, 100]  # of all domains
+    assert [int(row["env_steps"]) for row in rows] == ends
     assert f"loss_qvalue/{rows[-1]['domain']}" in record(parts / "explore.csv")[-1]
 
 
@@ -77,6 +79,19 @@ def test_a_killed_run_continues_with_the_same_command(tmp_path: Path) -> None:
     assert 0 < resumed.resumed_from < 112
     assert same_state(resumed.loss, whole.loss)
     assert record(tmp_path / "parts" / "pretrain.csv") == record(tmp_path / "whole" / "pretrain.csv")
+
+
+def test_replays_of_an_attempt_without_a_checkpoint_are_removed(tmp_path: Path) -> None:
+    with pytest.raises(EnvCrashedError):
+        run("apt-s", tmp_path, [toy_domain("left", on_step=lambda _: 1 / 0)])
+    assert (tmp_path / "replay" / "left").exists()
+    run("apt-s", tmp_path, [RIGHT], env_steps=20)
+    assert [path.name for path in (tmp_path / "replay").iterdir()] == ["right"]
+
+
+def test_domains_whose_replays_would_be_one_directory_are_refused() -> None:
+    with pytest.raises(CRPTproError, match="named twice: my env, my-env"):
+        run("apt-c", domains=[toy_domain("my env"), toy_domain("my-env")])
 
 
 def returns(run_dir: Path) -> list[str]:

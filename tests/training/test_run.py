@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -375,7 +376,49 @@ def test_a_full_disk_is_one_clear_error_and_keeps_earlier_checkpoints(
         patch.setattr("torchrl.checkpoint.Checkpoint.save", full)
         with pytest.raises(DiskSpaceError, match=r"No checkpoint .* the disk is full. Earlier ones are kept"):
             walk(tmp_path, 12)
+    for reason, error, message in (  # of torch.save
+        ("failed writing file data/0: unable to write to file (28)", DiskSpaceError, "disk is full"),
+        ("basic_ios::clear: iostream error", CheckpointError, "iostream error .is the disk, or a quota, full"),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr("torch.save", Mock(side_effect=RuntimeError(reason)))
+            with pytest.raises(error, match=f"No checkpoint .*{message}.*Earlier ones"):
+                walk(tmp_path, 12)
     assert first_update(tmp_path) == 5
+
+
+def test_a_signal_that_c_code_handles_is_left_to_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(signal, "getsignal", lambda number: None)
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        walk(tmp_path, 3)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_two_runs_of_one_process_do_not_share_a_directory(tmp_path: Path) -> None:
+    with begin(tmp_path), pytest.raises(CheckpointError, match="Another run of this process is writing to"):
+        begin(tmp_path).__enter__()
+    walk(tmp_path, 3)
+
+
+def test_a_refused_budget_leaves_the_record_as_it_was(tmp_path: Path) -> None:
+    walk(tmp_path, 8)
+    with begin(tmp_path) as run:
+        run.write("train", {"late": 1.0})  # after the last checkpoint
+    before = (tmp_path / "train.csv").read_text()
+    with pytest.raises(CheckpointError, match="more than the 6 requested"):
+        walk(tmp_path, 6)
+    assert (tmp_path / "train.csv").read_text() == before
+
+
+def test_a_run_stays_in_its_directory_if_the_working_directory_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with begin(Path("run")) as run:
+        monkeypatch.chdir("/")
+        assert run.run_dir == tmp_path / "run"
 
 
 def test_means_count_each_name_by_its_own_rate() -> None:

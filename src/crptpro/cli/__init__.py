@@ -24,6 +24,7 @@ import tyro
 from tyro.conf import OmitSubcommandPrefixes, Positional, arg
 
 from crptpro import training
+from crptpro.artifact import require_replaceable
 from crptpro.cli.reproduce import Reproduce
 from crptpro.console import run_main
 from crptpro.data import FrameDataset, collect_group
@@ -36,7 +37,7 @@ from crptpro.modules import usable_device
 from crptpro.modules.encoder import images_of
 from crptpro.objectives import get_method
 from crptpro.plugins import load_plugins
-from crptpro.pretrained import load_pretrained, random_pretrained, require_saveable, save_pretrained
+from crptpro.pretrained import FORMAT, load_pretrained, random_pretrained, require_saveable, save_pretrained
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import seed_everything
 from crptpro.training.evaluate import episode_seed, run_episode
@@ -187,6 +188,7 @@ class Pretraining(EncoderRun):
             untrained = random_pretrained(self.config.seed, method=self.method, datasets=sources, **encoder_options)
             logger.info("untrained encoder: %s", save_pretrained(untrained, self.out / "encoder"))
             return
+        require_replaceable(self.out / "encoder", FORMAT)
         loss_options, encoder_options = named_values("--loss", self.loss), named_values("--encoder", self.encoder)
         seed_everything(self.config.seed)
         loss = method.build(method.build_encoder(**images | encoder_options), **loss_options)
@@ -228,6 +230,7 @@ class Finetune(EncoderRun):
 
     def run(self) -> None:
         pretrained = load_pretrained(self.pretrained)
+        require_replaceable(self.out / "encoder", FORMAT)
         with self.logging.records(self.out) as records:
             result = training.finetune(pretrained, self.dataset, run_dir=self.out, config=self.config, records=records)
             self.keep(result, records)

@@ -7,6 +7,7 @@ import copy
 import dataclasses
 import functools
 import logging
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
+from crptpro.artifact import require_replaceable
 from crptpro.data import FrameReplay
 from crptpro.domains import LONGEST_EPISODE_AGENT_STEPS, Domain, get_domain
 from crptpro.envs import resolve_action_repeat
@@ -32,14 +34,15 @@ from crptpro.objectives.methods import DOWNSTREAM
 from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained, require_saveable
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import derive_seed, seed_everything
-from crptpro.training.agent import PixelAgent, SACLearner, save_agent
+from crptpro.training.agent import AGENT_FORMAT, PixelAgent, SACLearner, save_agent
 from crptpro.training.env_thread import SPARE_FRAMES, EnvThread, make_replay
 from crptpro.training.evaluate import WORKER_BYTES, Episode, Evaluator, summarize
 from crptpro.training.pretrain import SHIFT_PAD
 from crptpro.training.run import Generators, Run
 from crptpro.transforms import DenseShiftFeatures, FrozenEncoder, PrototypeReward, RandomShift, choose_feature_mode
+from crptpro.transforms.dense_shift import dense_shift_geometry
 from crptpro.transforms.rewards import warn_if_mostly_zero
-from crptpro.values import Colors, Quality, check_numbers
+from crptpro.values import Colors, Quality, as_path, check_numbers
 from crptpro.workers import can_be_sent
 
 logger = logging.getLogger(__name__)
@@ -165,12 +168,13 @@ def train_downstream(
     ``overrides`` are single settings of :class:`DownstreamConfig`; the rest as in :func:`~crptpro.training.pretrain`.
 
     Raises:
-        PretrainedError: the artifact cannot be read, its networks do not fit together, or the encoder cannot be saved.
+        PretrainedError: the artifact cannot be read, or the encoder cannot be saved.
         CheckpointError: ``run_dir`` holds a run of other settings (named), or one whose replay is missing.
         NonFiniteError: a loss, a weight, an action or a reward is not finite; the last checkpoint is kept.
         DiskSpaceError: the disk cannot hold the replay.
     """
     settings: Any = dataclasses.replace(config or DownstreamConfig(), **overrides)
+    source, is_control = "", False
     if not isinstance(pretrained, Pretrained):
         if not isinstance(pretrained, (str, Path)):
             kind = type(pretrained).__name__
@@ -182,6 +186,7 @@ def train_downstream(
         pretrained = random_pretrained(settings.seed, method=source) if is_control else load_pretrained(source)
     if run_dir is not None:
         require_saveable(Pretrained(pretrained.encoder))  # the agent will hold it
+        require_replaceable(as_path(run_dir, "run_dir") / "agent", AGENT_FORMAT)
     settings = settings.resolved(task, pretrained)
     if pretrained.method == "drq" and (settings.intrinsic_reward_coef > 0 or settings.features != "auto"):
         raise ValueError("drq trains its encoder: it has no bonus (`intrinsic_reward_coef`) and no kept `features`.")
@@ -190,7 +195,10 @@ def train_downstream(
             None, pretrained.prototypes, knn_k=settings.knn_k, queue_size=settings.queue_size, queue=pretrained.queue
         )
     name = task if isinstance(task, str) else task.task
-    what = {"task": name, "pretrained": pretrained.identity()}
+    if settings.features in ("dense", "dense-bf16"):
+        dense_shift_geometry(pretrained.encoder)
+    # The weights of a control drawn here may differ in the last digit on another machine.
+    what = {"task": name, "pretrained": f"{source}:seed {settings.seed}" if is_control else pretrained.identity()}
     device = usable_device(settings.device)
     repeat = settings.action_repeat
     with contextlib.ExitStack() as stack:
@@ -282,8 +290,9 @@ def train_downstream(
                     row = run.write("train", updates=counters["updates"])
                     run.show(q=row["q_mean"])
             counters["episodes"] += 1
-            ended = {"episode_return": episode_return, "episode_agent_steps": (run.position - first) // repeat}
-            run.write("episodes", ended, episodes=counters["episodes"])
+            if done:  # and not cut by the budget
+                ended = {"episode_return": episode_return, "episode_agent_steps": (run.position - first) // repeat}
+                run.write("episodes", ended, episodes=counters["episodes"])
 
         if run.position != counters["last_evaluation"]:  # unless a finished run is called again
             run.save()  # a kill during the last evaluation costs no env step
@@ -329,7 +338,7 @@ def _make_replay(
 ) -> FrameReplay:
     """Return the replay in the run's directory; a complete run needs none, and gets one of capacity 1."""
     if is_complete:
-        return make_replay(run, None, env, 1, generator=generator)
+        return make_replay(None, env, 1, generator=generator)
     path = None if run.run_dir is None else run.run_dir / "replay"
     if path is not None and run.saved and not path.exists():
         raise CheckpointError(
@@ -338,11 +347,13 @@ def _make_replay(
         )
     # A checkpoint holds counters, not frames: frames of the last two must be kept until the next, at an episode's end.
     longest = episode_length(task, action_repeat=config.action_repeat) or LONGEST_EPISODE_AGENT_STEPS
-    slack = 2 * (config.checkpoint_interval_env_steps // config.action_repeat + longest) + SPARE_FRAMES
+    between = most_observations(task, config.checkpoint_interval_env_steps, config.action_repeat)
+    slack = 2 * (between + longest) + SPARE_FRAMES
     if path is not None and not run.saved:
+        shutil.rmtree(path, ignore_errors=True)  # of an attempt without a checkpoint
         size = (config.replay_capacity + slack) * 3 * env.observation_spec["pixels"].shape[-1] ** 2
         logger.info("replay: %.2f GB in %s; it is kept", size / 1e9, path)
-    return make_replay(run, path, env, config.replay_capacity, slack=slack, generator=generator)
+    return make_replay(path, env, config.replay_capacity, slack=slack, generator=generator)
 
 
 def most_observations(task: str | Domain, env_steps: int, action_repeat: int) -> int:

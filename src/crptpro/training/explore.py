@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import functools
 import logging
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -220,11 +221,10 @@ def pretrain_active(
         capacity = min(settings.replay_capacity, plan.agent_steps)
         slack = 4 * (settings.checkpoint_interval_env_steps // sum(plan.repeats)) + SPARE_FRAMES
         if run.run_dir is not None and not run.saved:
+            shutil.rmtree(run.run_dir / "replay", ignore_errors=True)  # of an attempt without a checkpoint
             needed = len(named) * (capacity + slack) * 3 * images_of(loss.encoder)["image_size"] ** 2
             logger.info("replays: %.2f GB in %s; they are kept", needed / 1e9, run.run_dir / "replay")
-            # Those of an attempt without a checkpoint are replaced.
-            held = sum(file.stat().st_size for file in (run.run_dir / "replay").rglob("*.memmap*"))
-            require_disk(run.run_dir, max(0, needed - held), "The replays of the domains")
+            require_disk(run.run_dir, needed, "The replays of the domains")
         recipe = dataclasses.replace(recipe, learning_rate=settings.learning_rate, updates=plan.encoder_updates)
         optimizer, schedule, targets = make_optimizer(loss, recipe)
         monitor = CollapseMonitor.of(loss)
@@ -245,6 +245,7 @@ def pretrain_active(
             explorer = min(explorers, key=lambda each: each.agent_steps)  # they take turns
             agent_step = explorer.agent_steps
             explorer.begin_step()  # the next observation is rendered while the updates compute
+            run.advance(explorer.action_repeat)
             learns = agent_step >= plan.first_update
             trains_encoder = learns and agent_step % plan.encoder_update_interval == 0
             trains_agent = learns and agent_step % exploration.agent_update_interval == 0
@@ -268,7 +269,6 @@ def pretrain_active(
                 run.log({f"{key}/{explorer.name}": value for key, value in metrics.items()}, "explore")
             if (row := explorer.end_step()) is not None:
                 run.write("episodes", row, updates=done["updates"], episodes=explorer.episodes)
-            run.advance(explorer.action_repeat)
         run.finish()
         if run.means("pretrain"):
             write_row(run, loss, monitor, done["updates"])
@@ -318,7 +318,7 @@ class Explorer:
         path = None if run.run_dir is None else dataset_path(run.run_dir / "replay", name)
         if self._is_finished:
             path, capacity, slack = None, self.exploration.n_step, 0
-        self.replay = self._make_replay(run, path, capacity, slack)
+        self.replay = self._make_replay(path, capacity, slack)
         self._parts = {**self.learner.components(), "reward": self.reward, "generators": self.generators}
         if not self._is_finished:
             self._parts["replay"] = self.replay
@@ -429,10 +429,10 @@ class Explorer:
             reward = ContrastiveReward(loss.projector, temperature=float(loss.temperature))
         return reward.to(self.device)
 
-    def _make_replay(self, run: Run, path: Path | None, capacity: int, slack: int) -> FrameReplay:
+    def _make_replay(self, path: Path | None, capacity: int, slack: int) -> FrameReplay:
         skills = self.exploration.skill_dim
         replay = make_replay(
-            run, path, self.env.env, capacity, slack=slack, n_step=self.exploration.n_step, discount=DISCOUNT,
+            path, self.env.env, capacity, slack=slack, n_step=self.exploration.n_step, discount=DISCOUNT,
             extra_columns=None if skills is None else {"skill": ((skills,), torch.float32)},
             generator=self.generators["replay"],
         )  # fmt: skip
@@ -460,7 +460,7 @@ def _named(domains: str | Domain | Sequence[str | Domain], method: Method) -> di
     for name in named:
         if not name.isprintable() or {",", '"'} & set(name):
             raise CRPTproError(f"The domain {name!r} cannot name columns of a record; rename it.")
-    if len(named) < len(listed):
+    if len({dataset_path("", name) for name in named}) < len(listed):
         raise CRPTproError(f"A domain is named twice: {', '.join(d.name for d in listed)}. Each has one agent.")
     if method.exploration is not None and method.exploration.is_single_domain and len(named) > 1:
         raise CRPTproError(

@@ -26,6 +26,7 @@ from crptpro.objectives import Method, get_method, method_of
 from crptpro.objectives.functional import prototype_metrics
 from crptpro.pretrained import HEADS, Pretrained, class_name, load_pretrained, loss_options
 from crptpro.provenance import provenance
+from crptpro.seeding import seed_everything
 from crptpro.training.collapse import CollapseMonitor
 from crptpro.training.compile import Update, accelerate
 from crptpro.training.run import Generators, Run
@@ -154,7 +155,7 @@ def pretrain(
         buffers, generators = stack.enter_context(
             _opened(datasets, loss, batch_size=settings.batch_size, seed=settings.seed, device=device)
         )
-        torch.manual_seed(settings.seed)
+        seed_everything(settings.seed)
         recipe = dataclasses.replace(recipe, **{name: getattr(settings, name) for name in METHOD_FIELDS})
         optimizer, schedule, targets = make_optimizer(loss, recipe, cuda_graph=settings.cuda_graph)
         monitor = CollapseMonitor.of(loss)

@@ -18,7 +18,8 @@ import psutil
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState, StateDictCheckpointAdapter
+from torchrl.data import ReplayBuffer
 
 from crptpro.artifact import require_disk
 from crptpro.directory_lock import DirectoryLock, refusal_leaves_nothing
@@ -41,6 +42,7 @@ logger = logging.getLogger(__name__)
 CHECKPOINT_SECONDS = 300.0  # between two checkpoints of a run without an interval
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1") if hasattr(signal, name)]
 """Requests to stop: Ctrl-C, and what clusters send before they reclaim a machine."""
+_running: set[Path] = set()  # run directories of this process
 
 
 class Generators(dict[str, torch.Generator]):
@@ -140,7 +142,7 @@ class Run:
         config: Any = None,
         progress: bool = True,
     ) -> None:
-        self.run_dir = None if run_dir is None else as_path(run_dir, "run_dir")
+        self.run_dir = None if run_dir is None else as_path(run_dir, "run_dir").absolute()
         self.unit, self.streams, self.records, self.config = unit, streams, records, config
         self.position = self.resumed_from = 0
         self.counters: dict[str, int] = {}
@@ -163,6 +165,10 @@ class Run:
             if self.run_dir is not None:
                 stack.enter_context(refusal_leaves_nothing(self.run_dir))
                 stack.enter_context(DirectoryLock(self.run_dir, error=CheckpointError, is_reentrant=True))
+                if (directory := self.run_dir.resolve()) in _running:
+                    raise CheckpointError(f"Another run of this process is writing to {self.run_dir}.")
+                _running.add(directory)
+                stack.callback(_running.discard, directory)
                 self._rotation = CheckpointRotation(self.run_dir / "checkpoints", keep_last=2)
                 self._find_checkpoint()
                 if self.records is None:
@@ -208,7 +214,7 @@ class Run:
     def keep(self, **components: Any) -> None:
         """Make objects with ``state_dict`` and ``load_state_dict`` part of every checkpoint, and restore them.
 
-        ``None`` is left out. Without a checkpoint the run begins again; rows of an earlier attempt are set aside.
+        ``None`` is left out.
         """
         # Those whose parameters must be finite: components, and the ``networks`` of other components.
         self._modules = [value for value in components.values() if isinstance(value, nn.Module)]
@@ -216,7 +222,9 @@ class Run:
         means = {f"means_{stream}": value for stream, value in self._means.items()}
         for name, component in {**components, **means, "global_rng": _GlobalRNG()}.items():
             if component is not None:
-                self._checkpoint.register(name, component)
+                # TorchRL's usual payload maps its files: on a disk that fills up, the process would end by a bus error.
+                payload = None if isinstance(component, ReplayBuffer) else StateDictCheckpointAdapter("torch")
+                self._checkpoint.register(name, component, adapter=payload)
         if self.saved:
             try:
                 self._checkpoint.load(self._latest, map_location="cpu")  # its GPU may have another index here
@@ -227,11 +235,7 @@ class Run:
                 raise CheckpointError(f"The checkpoint {self._latest} does not fit this run: {reason}") from reason
             self.position = self.resumed_from = self._row_position = self.saved["position"]
             self.counters.update(self.saved["counters"])
-            if self.records is not None and self.saved["record"] is not None:
-                self.records.load_state_dict(self.saved["record"])
             logger.info("Resuming from %s %s.", f"{self.position:,}", self.unit)
-        elif self.records is not None and self.run_dir is not None and self.records.writes_into(self.run_dir):
-            self.records.begin_again(self.streams)
         self._saved_time = self._row_time = time.monotonic()
         self._started = self._row_time - self.saved.get("seconds", 0.0)
 
@@ -239,17 +243,23 @@ class Run:
         """Yield the position until it has reached ``total``; the body of the loop calls :meth:`advance`.
 
         Between two iterations a checkpoint is written when one is due (every ``checkpoint_interval`` in ``unit``, or
-        every :data:`CHECKPOINT_SECONDS`), or when a signal asks the run to stop.
+        every :data:`CHECKPOINT_SECONDS`), or when a signal asks the run to stop. At first the record is cut to what the
+        checkpoint counted; without a checkpoint, the rows of an earlier attempt are set aside.
         """
         if self.position > total:
             raise CheckpointError(
                 f"{self.run_dir} has done {self.position:,} {self.unit}, more than the {total:,} requested. Request at "
                 "least as many, or choose another run directory."
             )
+        if self.records is not None and self.run_dir is not None:
+            if self.saved.get("record") is not None:
+                self.records.load_state_dict(self.saved["record"])
+            elif not self.saved and self.records.writes_into(self.run_dir):
+                self.records.begin_again(self.streams)
         self._progress = Progress(total, self.position, self.unit, is_shown=self._is_shown)
         if threading.current_thread() is threading.main_thread():  # the only one that receives signals
             for number in SIGNALS:
-                if signal.getsignal(number) == signal.SIG_IGN:  # under nohup, or in the background
+                if signal.getsignal(number) in (signal.SIG_IGN, None):  # under nohup, or handled by C code
                     continue
                 self._stack.callback(signal.signal, number, signal.signal(number, self._receive))
         while self.position < total:
@@ -347,7 +357,7 @@ class Run:
             row[f"{self.unit}_per_s"] = (self.position - self._row_position) / (now - self._row_time)
         row["resident_bytes"] = psutil.Process().memory_info().rss
         if torch.cuda.is_initialized():
-            row["device_peak_bytes"] = torch.cuda.max_memory_allocated()
+            row["device_peak_bytes"] = max(map(torch.cuda.max_memory_allocated, range(torch.cuda.device_count())))
         self._row_time, self._row_position = now, self.position
         return row
 
@@ -366,8 +376,7 @@ class Run:
         self._saved_time = time.monotonic()
         if self.run_dir is None:
             return
-        # Checked before, because TorchRL maps the files that it writes: a disk that fills up would end the process by a
-        # bus error. The new checkpoint is on disk twice for a moment; the first has the parameters and Adam's moments.
+        # The new checkpoint is on disk twice for a moment; the first has the parameters and Adam's moments.
         sizes = [path.stat().st_size for path in self._rotation.directory.glob("checkpoint-*")]
         first = 3 * sum(parameter.nbytes for module in self._modules for parameter in module.parameters())
         remedy = "Earlier ones are kept; free space and run the same command again."
@@ -385,8 +394,11 @@ class Run:
             path = self._rotation.save(self._checkpoint, step=self.position, metadata={"run": self.saved})
             for written in (path, path.parent):
                 _sync(written)
-        except OSError as reason:
-            error, what = (DiskSpaceError, "the disk is full") if is_disk_full(reason) else (CheckpointError, reason)
+        except (OSError, RuntimeError) as reason:
+            is_full = is_disk_full(reason)
+            error, what = (DiskSpaceError, "the disk is full") if is_full else (CheckpointError, str(reason))
+            if not is_full and isinstance(reason, RuntimeError):  # torch.save hides the system's error
+                what += " (is the disk, or a quota, full?)"
             raise error(
                 f"No checkpoint could be written to {self._rotation.directory}: {what}. Earlier ones are kept; fix "
                 "that and run the same command again."
