@@ -84,9 +84,9 @@ def test_a_killed_run_continues_with_the_same_command(tmp_path: Path) -> None:
 def test_replays_of_an_attempt_without_a_checkpoint_are_removed(tmp_path: Path) -> None:
     with pytest.raises(EnvCrashedError):
         run("apt-s", tmp_path, [toy_domain("left", on_step=lambda _: 1 / 0)])
-    assert (tmp_path / "replay" / "left").exists()
+    assert list((tmp_path / "replay" / "left").iterdir())
     run("apt-s", tmp_path, [RIGHT], env_steps=20)
-    assert [path.name for path in (tmp_path / "replay").iterdir()] == ["right"]
+    assert not list((tmp_path / "replay" / "left").iterdir())
 
 
 def test_domains_whose_replays_would_be_one_directory_are_refused() -> None:

@@ -21,6 +21,7 @@ from toy_env import record
 from toy_runs import python
 
 from crptpro.errors import CheckpointError, DiskSpaceError, NonFiniteError
+from crptpro.logging import RunLogger
 from crptpro.training import DownstreamConfig, PretrainConfig, Run
 from crptpro.training.run import SIGNALS, _GlobalRNG
 
@@ -404,8 +405,8 @@ def test_two_runs_of_one_process_do_not_share_a_directory(tmp_path: Path) -> Non
 
 def test_a_refused_budget_leaves_the_record_as_it_was(tmp_path: Path) -> None:
     walk(tmp_path, 8)
-    with begin(tmp_path) as run:
-        run.write("train", {"late": 1.0})  # after the last checkpoint
+    with RunLogger(tmp_path) as records:
+        records.log({"late": 1.0}, stream="train", updates=8)  # after the last checkpoint
     before = (tmp_path / "train.csv").read_text()
     with pytest.raises(CheckpointError, match="more than the 6 requested"):
         walk(tmp_path, 6)

@@ -7,7 +7,6 @@ import copy
 import dataclasses
 import functools
 import logging
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +34,7 @@ from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained, r
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import derive_seed, seed_everything
 from crptpro.training.agent import AGENT_FORMAT, PixelAgent, SACLearner, save_agent
-from crptpro.training.env_thread import SPARE_FRAMES, EnvThread, make_replay
+from crptpro.training.env_thread import SPARE_FRAMES, EnvThread, make_replay, remove_replays
 from crptpro.training.evaluate import WORKER_BYTES, Episode, Evaluator, summarize
 from crptpro.training.pretrain import SHIFT_PAD
 from crptpro.training.run import Generators, Run
@@ -350,7 +349,7 @@ def _make_replay(
     between = most_observations(task, config.checkpoint_interval_env_steps, config.action_repeat)
     slack = 2 * (between + longest) + SPARE_FRAMES
     if path is not None and not run.saved:
-        shutil.rmtree(path, ignore_errors=True)  # of an attempt without a checkpoint
+        remove_replays(path)
         size = (config.replay_capacity + slack) * 3 * env.observation_spec["pixels"].shape[-1] ** 2
         logger.info("replay: %.2f GB in %s; it is kept", size / 1e9, path)
     return make_replay(path, env, config.replay_capacity, slack=slack, generator=generator)

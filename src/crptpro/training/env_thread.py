@@ -67,6 +67,12 @@ class EnvThread:
             self._thread.submit(self.env.close).result()
 
 
+def remove_replays(directory: Path) -> None:
+    """Remove the replays that an attempt without a checkpoint left in or below a directory, and nothing else."""
+    for file in directory.rglob("*.memmap*"):
+        file.unlink()
+
+
 def make_replay(path: Path | None, env: EnvBase, capacity: int, **options: Any) -> FrameReplay:
     """Return the replay of an environment, in ``path`` or in RAM."""
     channels, height, width = env.observation_spec["pixels"].shape

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import functools
 import logging
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,7 +32,7 @@ from crptpro.objectives import AveragedSACLoss, Method, RADSACLoss, SkillDDPGLos
 from crptpro.seeding import derive_seed
 from crptpro.training.agent import PixelAgent, SACLearner
 from crptpro.training.collapse import CollapseMonitor
-from crptpro.training.env_thread import SPARE_FRAMES, EnvThread, make_replay
+from crptpro.training.env_thread import SPARE_FRAMES, EnvThread, make_replay, remove_replays
 from crptpro.training.pretrain import (
     SHIFT_PAD,
     PretrainResult,
@@ -221,7 +220,7 @@ def pretrain_active(
         capacity = min(settings.replay_capacity, plan.agent_steps)
         slack = 4 * (settings.checkpoint_interval_env_steps // sum(plan.repeats)) + SPARE_FRAMES
         if run.run_dir is not None and not run.saved:
-            shutil.rmtree(run.run_dir / "replay", ignore_errors=True)  # of an attempt without a checkpoint
+            remove_replays(run.run_dir / "replay")
             needed = len(named) * (capacity + slack) * 3 * images_of(loss.encoder)["image_size"] ** 2
             logger.info("replays: %.2f GB in %s; they are kept", needed / 1e9, run.run_dir / "replay")
             require_disk(run.run_dir, needed, "The replays of the domains")

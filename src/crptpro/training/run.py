@@ -154,6 +154,7 @@ class Run:
         self._modules: list[nn.Module] = []
         self._stack = contextlib.ExitStack()
         self._signal: int | None = None
+        self._has_record = False  # cut to the checkpoint
         self._last_advance = self._row_position = 0
         self._started = self._saved_time = self._row_time = time.monotonic()
         self._is_shown = progress
@@ -243,19 +244,15 @@ class Run:
         """Yield the position until it has reached ``total``; the body of the loop calls :meth:`advance`.
 
         Between two iterations a checkpoint is written when one is due (every ``checkpoint_interval`` in ``unit``, or
-        every :data:`CHECKPOINT_SECONDS`), or when a signal asks the run to stop. At first the record is cut to what the
-        checkpoint counted; without a checkpoint, the rows of an earlier attempt are set aside.
+        every :data:`CHECKPOINT_SECONDS`), or when a signal asks the run to stop. At first, or before its first row, the
+        record is cut to what the checkpoint counted; without one, the rows of an earlier attempt are set aside.
         """
         if self.position > total:
             raise CheckpointError(
                 f"{self.run_dir} has done {self.position:,} {self.unit}, more than the {total:,} requested. Request at "
                 "least as many, or choose another run directory."
             )
-        if self.records is not None and self.run_dir is not None:
-            if self.saved.get("record") is not None:
-                self.records.load_state_dict(self.saved["record"])
-            elif not self.saved and self.records.writes_into(self.run_dir):
-                self.records.begin_again(self.streams)
+        self._restore_record()
         self._progress = Progress(total, self.position, self.unit, is_shown=self._is_shown)
         if threading.current_thread() is threading.main_thread():  # the only one that receives signals
             for number in SIGNALS:
@@ -277,6 +274,15 @@ class Run:
                 kept = "a checkpoint was written" if self.run_dir else "nothing is kept without run_dir"
                 logger.warning("Stopped at %s of %s %s; %s.", f"{self.position:,}", f"{total:,}", self.unit, kept)
                 raise self._ended()
+
+    def _restore_record(self) -> None:
+        if self._has_record or self.records is None or self.run_dir is None:
+            return
+        self._has_record = True
+        if self.saved.get("record") is not None:
+            self.records.load_state_dict(self.saved["record"])
+        elif not self.saved and self.records.writes_into(self.run_dir):
+            self.records.begin_again(self.streams)
 
     def _ended(self) -> BaseException:
         return KeyboardInterrupt() if self._signal == signal.SIGINT else SystemExit(128 + (self._signal or 0))
@@ -347,6 +353,7 @@ class Run:
         if self.records is None:
             self._rows[stream].append({**counters, **row})
         else:
+            self._restore_record()
             self.records.log(row, stream=stream, **counters)
         return row
 
