@@ -15,7 +15,6 @@ import pytest
 from crptpro import domains, plugins
 from crptpro.modules import precision
 from crptpro.objectives import methods
-from crptpro.transforms import rewards
 
 # Looking for doctests would import this file once more, under a name that another conftest.py has too.
 collect_ignore = ["conftest.py"]
@@ -46,11 +45,6 @@ def _registries_are_as_before(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     monkeypatch.setattr(plugins, "_loaded", [*plugins._loaded])  # processes of later tests would load these
     with patch.dict(methods._METHODS), patch.dict(domains._registered):
         yield
-
-
-@pytest.fixture(autouse=True)
-def _warnings_are_given_again() -> None:
-    rewards.warn_if_mostly_zero.cache_clear()
 
 
 @pytest.fixture

@@ -203,10 +203,8 @@ def test_the_config_is_kept_with_versions_from_the_first_row_that_the_disk_takes
             with pytest.raises(DiskSpaceError, match=r"disk is full: .*/config\.json"):
                 logger.log({"loss": 1.0}, stream="train", updates=1)
         logger.log({"loss": 1.0}, stream="train", updates=1)
-        logger.describe({"seed": 3})  # of another stage with the same record
-        logger.log({"loss": 1.0}, stream="eval", updates=1)
     written = json.loads((tmp_path / "config.json").read_text())
-    assert written["config"] == {"task": "walker_run", "out": "runs", "seed": 3}
+    assert written["config"] == {"task": "walker_run", "out": "runs"}
     assert "torch" in written["versions"]
 
 

@@ -377,18 +377,18 @@ def test_a_users_own_networks_are_saved_and_need_their_class_to_come_back(tmp_pa
 class Margin(LossModule):
     """A loss with options, of which it keeps one under another name."""
 
-    def __init__(self, encoder: nn.Module, scale: float = 2.0, margin: float = 1.0) -> None:
+    def __init__(self, encoder: nn.Module, scale: float = 2.0, margin: float = 1.0, widths: Any = (1, 2)) -> None:
         super().__init__()
         self.convert_to_functional(encoder, "network")
         self.__dict__["encoder"] = encoder
-        self.scale, self._margin = scale, margin
+        self.scale, self._margin, self.widths = scale, margin, widths
 
 
 def test_an_option_of_a_users_loss_that_cannot_be_read_back_is_named(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = save_pretrained(Margin(OwnEncoder(), scale=3.0, margin=0.2), tmp_path / "own")
-    assert "margin of Margin: not recorded, so fine-tuning takes the default" in caplog.text
+    assert "margin, widths of Margin: not recorded, so fine-tuning takes the default" in caplog.text
     assert load_pretrained(path).card["loss"]["config"] == {"scale": 3.0}
     caplog.clear()
     save_pretrained(make_loss(), tmp_path / "ours")
@@ -399,3 +399,6 @@ def test_an_encoder_that_its_loss_did_not_train_is_not_saved(tmp_path: Path) -> 
     with pytest.raises(PretrainedError, match="has none of its parameters, so it was not trained with it"):
         save_pretrained(copy.deepcopy(Margin(OwnEncoder())), tmp_path / "own")
     save_pretrained(copy.deepcopy(make_loss()), tmp_path / "ours")
+    frozen = copy.deepcopy(Margin(OwnEncoder()))
+    frozen.encoder.requires_grad_(False)  # a loss may train heads on it
+    save_pretrained(frozen, tmp_path / "own")

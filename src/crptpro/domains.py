@@ -136,11 +136,11 @@ def register_domain(domain: Domain) -> Domain:
 
     A name that several domains share means the one registered last. A worker process starts without registered
     domains: pass the ``Domain`` itself, or call ``register_domain`` at the top level of the module that defines
-    ``make``. A built-in name, or one with the prefix ``gymnasium:``, raises a ``CRPTproError``.
+    ``make``. A name of the paper's, or with the prefix ``gymnasium:``, raises a ``CRPTproError``.
     """
     for name in (domain.name, domain.task):
-        if name in {*_BUILT_IN, *GROUPS} or name.startswith(GYMNASIUM_PREFIX):
-            raise CRPTproError(f"{name!r} is one of the built-in names; register the domain under another one.")
+        if name in {*PAPER_DOMAINS, *TASKS, *GROUPS} or name.startswith(GYMNASIUM_PREFIX):
+            raise CRPTproError(f"{name!r} is a name of the paper's or of Gymnasium; register the domain under another.")
     for key in (domain.task, domain.name):
         _registered[key] = domain
     return domain

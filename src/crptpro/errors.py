@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 from pathlib import Path
 
 
@@ -67,8 +68,8 @@ def is_disk_full(reason: BaseException) -> bool:
     numbers = (errno.ENOSPC, errno.EDQUOT)
     if isinstance(reason, OSError):
         return reason.errno in numbers
-    # torch.save raises a RuntimeError with the system's number.
-    return isinstance(reason, DiskSpaceError) or any(f"({number})" in str(reason) for number in numbers)
+    # A file that torch cannot write is a RuntimeError with the system's words.
+    return isinstance(reason, DiskSpaceError) or any(f"{os.strerror(n)} ({n})" in str(reason) for n in numbers)
 
 
 def writing_error(path: Path, reason: OSError | DiskSpaceError) -> OSError | DiskSpaceError:

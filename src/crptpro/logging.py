@@ -67,7 +67,7 @@ class RunLogger:
         self._rows, self._columns = self._read(), dict[str, list[str]]()
         for stream in {row["stream"] for row in self._rows}:
             self._write_csv(stream)
-        self._has_described = False
+        self._has_begun = False
         self._mirrors: list[_Wandb | _TensorBoard] = []
         if wandb is not None:
             self._mirrors.append(_Wandb(dict(wandb), self.run_dir, self._config))
@@ -86,7 +86,6 @@ class RunLogger:
         They are kept in ``config.json`` with versions and hardware.
         """
         self._config.update(as_plain(config, "config"))
-        self._has_described = False
 
     def log(self, metrics: Mapping[str, Any], *, stream: str, **counters: int) -> None:
         """Write one row.
@@ -114,9 +113,9 @@ class RunLogger:
                 )
         where = {name: as_int(value, name) for name, value in counters.items()}
         values = {key: _scalar(key, value) for key, value in metrics.items() if value is not None}
-        if not self._has_described and self._config:
+        if not self._has_begun and self._config:
             write_json(self.run_dir / "config.json", {"config": self._config, **provenance()})
-        self._has_described = True
+        self._has_begun = True
         columns, index = self._columns.get(stream, []), len(self._rows)
         row = {"stream": stream, **where, "unix_time_s": round(time.time(), 3)}
         # NaN and infinity as words: they are not JSON, and the CSV shows the same.
@@ -184,7 +183,7 @@ class RunLogger:
         self._mirrors = [mirror for mirror in self._mirrors if "logger" in vars(mirror)]  # that have begun
         self._mirror(lambda mirror: mirror.close())
         self._mirrors = []
-        if self._rows:
+        if self._has_begun:
             self._sync()
         self._lock.release()
 

@@ -285,10 +285,11 @@ def _as_pretrained(trained: Any) -> Pretrained:
             f"{type(loss).__name__} has no `.encoder`, which a pre-training loss exposes. An encoder alone: "
             "Pretrained(encoder)."
         )
-    trained_here, own = [{p.data_ptr() for p in module.parameters()} for module in (loss, encoder)]
+    trained_here = {parameter.data_ptr() for parameter in loss.parameters()}
+    own = {parameter.data_ptr() for parameter in encoder.parameters() if parameter.requires_grad}
     if own and trained_here and trained_here.isdisjoint(own):
         raise PretrainedError(
-            f"The `.encoder` of this {type(loss).__name__} has none of its parameters, so it was not trained with it:  "
+            f"The `.encoder` of this {type(loss).__name__} has none of its parameters, so it was not trained with it: "
             "a deep copy of a LossModule may be so. Save the original."
         )
     heads: dict[str, Any] = {role: _unwrapped(getattr(loss, role, None)) for role in HEADS}
@@ -324,9 +325,9 @@ def loss_options(loss: nn.Module) -> dict[str, Any]:
             value = value.item()
         if isinstance(value, int | float | str) or (value is None and name not in HEADS):
             options[name] = value
-        elif value is parameter.empty and parameter.default is not parameter.empty and name not in HEADS:
+        elif parameter.default is not parameter.empty and name not in HEADS:
             unknown.append(name)
-    if unknown and not type(loss).__module__.startswith("crptpro."):  # ours only build heads from theirs
+    if unknown and not type(loss).__init__.__module__.startswith("crptpro."):  # ours only build heads from theirs
         _LOG.warning(
             "%s of %s: not recorded, so fine-tuning takes the default. Keep each option as an attribute of its name, "
             "or all of them in a dict `config`.", ", ".join(unknown), type(loss).__name__,

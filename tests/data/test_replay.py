@@ -287,7 +287,9 @@ def test_what_a_frame_replay_would_store_wrongly_is_refused() -> None:
         small().share()
 
 
-@pytest.mark.parametrize("key", [{"traj_key": "episode"}, {"end_key": ("next", "done")}])
+@pytest.mark.parametrize("key", [
+    {"traj_key": "episode"}, {"end_key": ("next", "done")}, {"traj_key": "episode", "cache_values": True},
+])  # fmt: skip
 def test_slices_of_torchrls_sampler_are_of_one_episode_in_order_and_read_no_other_stacks(
     monkeypatch: pytest.MonkeyPatch, key: dict[str, Any]
 ) -> None:
@@ -306,6 +308,7 @@ def test_slices_of_torchrls_sampler_are_of_one_episode_in_order_and_read_no_othe
     for _ in range(20):
         numbers = replay.sample()["number"].view(-1, 4)
         assert (numbers.diff(dim=1) == 1).all()
+        driver.write(5)
     assert max(gathered) == 64
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import gc
+import itertools
 import signal
 import threading
 from pathlib import Path
@@ -13,7 +15,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor, nn
-from toy_env import record
+from toy_env import ToyEnv, record
 from toy_runs import (
     EPISODE,
     SIZE,
@@ -28,7 +30,8 @@ from toy_runs import (
     toy_domain,
 )
 
-from crptpro.errors import CheckpointError, CRPTproError, PretrainedError
+from crptpro.domains import Domain
+from crptpro.errors import CheckpointError, CRPTproError, EnvCrashedError, PretrainedError
 from crptpro.modules import SquashedGaussianActor
 from crptpro.objectives import ProtoLoss
 from crptpro.pretrained import Pretrained, load_pretrained, save_pretrained
@@ -143,8 +146,9 @@ def test_a_control_continues_where_its_weights_are_drawn_with_another_rounding(
 
     calls: list[int] = []
     monkeypatch.setattr(downstream, "random_pretrained", drawn)
-    for env_steps in (40, 60):
-        assert train(tmp_path, control, env_steps=env_steps).env_steps == env_steps
+    first, second = (train(tmp_path, control, env_steps=env_steps) for env_steps in (40, 60))
+    assert (first.env_steps, second.env_steps) == (40, 60)
+    assert same_state(first.agent.encoder, second.agent.encoder) == (control == "random-encoder")
     with pytest.raises(CheckpointError, match="seed was 0, now 1"):
         train(tmp_path, control, seed=1)
 
@@ -158,6 +162,28 @@ def test_what_the_last_line_would_refuse_is_refused_before_anything_is_written(t
     with pytest.raises(ValueError, match="PixelEncoder"):
         train(tmp_path / "new", Pretrained(OwnEncoder()), features="dense", intrinsic_reward_coef=0.0)
     assert not (tmp_path / "new").exists()
+
+
+def test_both_checkpoints_can_be_restored_where_every_episode_has_one_transition(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(downstream, "SPARE_FRAMES", 20)
+    monkeypatch.setattr(downstream, "LONGEST_EPISODE_AGENT_STEPS", 10)
+    steps = itertools.count(1)
+    make = functools.partial(make_short, lambda _: next(steps) == 396 and 1 / 0)
+    domain = Domain("short", "short_go", make=make, action_repeat=1)
+    settings = {
+        "env_steps": 500, "checkpoint_interval_env_steps": 100, "eval_interval_env_steps": 1_000, "eval_episodes": 1,
+    }  # fmt: skip
+    with pytest.raises(EnvCrashedError):
+        train(tmp_path, task=domain, **settings)
+    *_, newest = sorted((tmp_path / "checkpoints").iterdir())
+    newest.write_bytes(newest.read_bytes()[:-100])
+    assert train(tmp_path, task=domain, **settings).env_steps == 500
+
+
+def make_short(on_step: Any, *, seed: int, image_size: int) -> ToyEnv:
+    return ToyEnv(lambda seed: 1, seed=seed, image_size=image_size, on_step=on_step)
 
 
 def test_an_episode_that_the_budget_cuts_is_not_recorded_as_one(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 import torch
 from tensordict.nn import InteractionType, TensorDictModule
 from torchrl.data import Unbounded
-from torchrl.envs import TensorDictPrimer, TransformedEnv
+from torchrl.envs import StepCounter, TensorDictPrimer, TransformedEnv
 from torchrl.modules import ProbabilisticActor, RandomPolicy, TanhNormal
 from toy_env import PoisonedEnv, ToyEnv, fixed_length
 from toy_runs import EPISODE, SIZE, make_encoder, toy_domain
@@ -81,6 +81,19 @@ def test_a_policy_of_torchrl_keeps_its_recurrent_state_and_acts_by_its_mode() ->
     returns = [evaluate(policy, env, episodes=1, seed=3, progress=False)[0].episode_return for _ in range(2)]
     assert network.seen == 2 * list(range(EPISODE))
     assert returns[0] == returns[1] == evaluate(lambda _: torch.zeros(2), env, episodes=1, seed=3)[0].episode_return
+
+
+def test_a_policy_may_return_its_action_alone_or_need_gradients() -> None:
+    env = TransformedEnv(make_toy_env(), StepCounter())
+    expected = evaluate(lambda _: torch.zeros(2), env, episodes=1, progress=False)
+    alone = TensorDictModule(lambda pixels: torch.zeros(2), ["pixels"], ["action"], inplace=False)
+
+    def planned(_: torch.Tensor) -> torch.Tensor:
+        action = torch.ones(2, requires_grad=True)
+        return action - torch.autograd.grad(action.square().sum() / 2, action)[0]
+
+    for policy in (alone, planned):
+        assert evaluate(policy, env, episodes=1, progress=False) == expected
 
 
 @pytest.mark.parametrize(("policy", "got"), [

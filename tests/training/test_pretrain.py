@@ -14,6 +14,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs import Compose
 from torchrl.objectives import LossModule
 from toy_env import random_episode, record, write_dataset
 from toy_runs import SIZE, make_dataset, make_datasets, make_encoder, make_loss, pretend_cpu, same_state
@@ -300,7 +301,9 @@ def test_only_images_are_shifted() -> None:
 
 def test_a_dataset_that_shifts_its_images_itself_is_refused() -> None:
     buffer = make_dataset(0)
-    buffer.append_transform(RandomShift(in_keys=["pixels"]))
+    buffer.append_transform(RandomShift(in_keys=["pixels"], out_keys=["view"]))
+    run(Brightness(), 1, datasets={"dark": buffer})
+    buffer.append_transform(Compose(RandomShift(in_keys=["pixels"])))
     with pytest.raises(DatasetError, match="'dark' shifts its images, as pretrain does: remove its RandomShift"):
         run(Brightness(), 1, datasets={"dark": buffer})
 

@@ -322,6 +322,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
 
     def note_rendering(self, gl: Mapping[str, Any]) -> None:
         """Record in the card what renders the frames; a ``backend`` or ``gl_renderer`` other than before is refused."""
+        self._require_open()
         before = self.state["render"]
         for name in ("backend", "gl_renderer"):
             if name in before and gl.get(name, before[name]) != before[name]:

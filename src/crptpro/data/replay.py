@@ -94,7 +94,7 @@ class FrameReplay(StackBuffer):
             **dict.fromkeys(("done", "terminated", "truncated"), ((1,), torch.bool)),
         }
         extra = dict(extra_columns or {})
-        own = {"branch", "index", "next", "number", "row_of", "step", "steps_to_next_obs"}
+        own = {"branch", "episode", "index", "next", "number", "row_of", "step", "steps_to_next_obs"}
         if taken := sorted({*columns, *own} & extra.keys()):
             raise ValueError(f"extra_columns may not be named {taken}: a sample has those; choose other names.")
         if "sampler" in options and n_step > 1:

@@ -163,7 +163,10 @@ def read_rows(
 
 
 class StackStorage(Storage):
-    """A TorchRL storage of transitions; the ``number`` of an observation counts the frames stored before its newest."""
+    """A TorchRL storage of transitions; the ``number`` of an observation counts the frames stored before its newest.
+
+    ``storage[:]`` has no pixels; ``buffer[:]`` of this library's buffers has.
+    """
 
     pixels: Tensor  # uint8 [rows, C, H, W]; frame n is row n % rows
     step: Tensor  # [rows], frames of the same episode before each
@@ -291,6 +294,7 @@ class RingStorage(StackStorage):
             frames, lead = torch.cat([first, frames]), len(first)
             self.episode_step = -1
         count, length = len(frames), len(rows.following)
+        self._bump_mutation_revision()  # samplers of slices may have kept where episodes end
         if not self._is_continued:
             self.branch, self._is_continued = int(self.content["branch"].max()) + 1, True
             self.number[self.number > self.frames] = 0
@@ -408,6 +412,7 @@ class RingStorage(StackStorage):
         for name, value in counters.items():
             setattr(self, name, value)
         self._is_continued = False
+        self._bump_mutation_revision()
 
     def _require_rows(self, frames: int, branch: int) -> None:
         """Refuse a state if a row of its window was overwritten since."""
@@ -425,6 +430,7 @@ class RingStorage(StackStorage):
             raise CheckpointError(f"{lost} rows that the checkpoint of {self.path} needs are gone: {why}")
 
     def _empty(self) -> None:
+        self._bump_mutation_revision()
         self.oldest = self.transitions  # numbers continue: none is used twice
         self.is_open = False
 

@@ -140,7 +140,8 @@ def passed_on(name: str, call: str) -> Iterator[None]:
         while origin.__cause__ is not None:  # Gymnasium re-raises exceptions of a constructor
             origin = origin.__cause__
         where = traceback.extract_tb(origin.__traceback__)[-1]
-        remedy = " Call crptpro.envs.select_backend() before it is built." if "OpenGL" in str(reason) else ""
+        has_no_gl = "OpenGL platform library has not been loaded" in str(reason)
+        remedy = " Call crptpro.envs.select_backend() before it is built." if has_no_gl else ""
         raise EnvCrashedError(
             f"{reason} ({type(reason).__name__} in {call}() of the environment {name!r}, {where.filename}, line "
             f"{where.lineno}){remedy}"

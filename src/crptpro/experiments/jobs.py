@@ -163,8 +163,7 @@ def describe(root: Path, plan: Plan) -> None:
 
 
 FRAME_BYTES = 3 * 84 * 84
-SPARE_FRAMES = 10_000
-"""Frames of a replay on disk beyond its capacity, for its last two checkpoints."""
+INTERVAL = "checkpoint_interval_env_steps"  # replays on disk keep further frames, for the last two checkpoints
 ENCODER_BYTES, CHECKPOINT_BYTES, AGENT_BYTES = 45_000_000, 200_000_000, 12_000_000
 """Sizes of an artifact with its heads, of the two checkpoints of a training, and of an agent."""
 
@@ -177,11 +176,12 @@ def bytes_of(job: Job) -> tuple[int, int]:
     if job.kind in ("encoder", "finetuned"):
         return ENCODER_BYTES, CHECKPOINT_BYTES
     if job.kind == "explored":
-        kept = min(facts["decisions"], facts["replay_capacity"] * len(facts["domains"]))
-        kept += SPARE_FRAMES * len(facts["domains"])
+        domains, interval = len(facts["domains"]), facts["explore"].get(INTERVAL, 5_000)
+        kept = min(facts["decisions"], facts["replay_capacity"] * domains) * 51 // 50 + 2 * interval + 2_500 * domains
         return ENCODER_BYTES + kept * FRAME_BYTES, CHECKPOINT_BYTES * (1 + len(facts["domains"]))
     if job.kind == "run":
-        return AGENT_BYTES, CHECKPOINT_BYTES + (facts["replay_capacity"] + SPARE_FRAMES) * FRAME_BYTES
+        frames = facts["replay_capacity"] * 51 // 50 + facts.get(INTERVAL, 5_000) + 3_500
+        return AGENT_BYTES, CHECKPOINT_BYTES + frames * FRAME_BYTES
     return 1_000_000, 0
 
 

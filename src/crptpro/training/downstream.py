@@ -34,13 +34,12 @@ from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained, r
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import derive_seed, seed_everything
 from crptpro.training.agent import AGENT_FORMAT, PixelAgent, SACLearner, save_agent
-from crptpro.training.env_thread import SPARE_FRAMES, EnvThread, make_replay, remove_replays
+from crptpro.training.env_thread import SPARE_FRAMES, EnvThread, make_replay
 from crptpro.training.evaluate import WORKER_BYTES, Episode, Evaluator, summarize
 from crptpro.training.pretrain import SHIFT_PAD
 from crptpro.training.run import Generators, Run
 from crptpro.transforms import DenseShiftFeatures, FrozenEncoder, PrototypeReward, RandomShift, choose_feature_mode
 from crptpro.transforms.dense_shift import dense_shift_geometry
-from crptpro.transforms.rewards import warn_if_mostly_zero
 from crptpro.values import Colors, Quality, as_path, check_numbers
 from crptpro.workers import can_be_sent
 
@@ -169,6 +168,7 @@ def train_downstream(
     Raises:
         PretrainedError: the artifact cannot be read, or the encoder cannot be saved.
         CheckpointError: ``run_dir`` holds a run of other settings (named), or one whose replay is missing.
+        CRPTproError: ``run_dir`` holds other files where the agent will be.
         NonFiniteError: a loss, a weight, an action or a reward is not finite; the last checkpoint is kept.
         DiskSpaceError: the disk cannot hold the replay.
     """
@@ -196,7 +196,7 @@ def train_downstream(
     name = task if isinstance(task, str) else task.task
     if settings.features in ("dense", "dense-bf16"):
         dense_shift_geometry(pretrained.encoder)
-    # The weights of a control drawn here may differ in the last digit on another machine.
+    # A control's weights may differ in the last digit on another machine; a resumed run has those of its checkpoint.
     what = {"task": name, "pretrained": f"{source}:seed {settings.seed}" if is_control else pretrained.identity()}
     device = usable_device(settings.device)
     repeat = settings.action_repeat
@@ -238,6 +238,7 @@ def train_downstream(
         counters = run.counters
         counters.update(updates=0, episodes=0, last_evaluation=-1)
         run.keep(**learner.components(), generators=generators, evaluator=evaluator,
+                 control=encoder if source == "random-encoder" else None,
                  replay=None if is_complete else replay)  # fmt: skip
 
         if run.position < settings.env_steps <= repeat * settings.random_agent_steps:
@@ -337,7 +338,7 @@ def _make_replay(
 ) -> FrameReplay:
     """Return the replay in the run's directory; a complete run needs none, and gets one of capacity 1."""
     if is_complete:
-        return make_replay(None, env, 1, generator=generator)
+        return make_replay(run, None, env, 1, generator=generator)
     path = None if run.run_dir is None else run.run_dir / "replay"
     if path is not None and run.saved and not path.exists():
         raise CheckpointError(
@@ -349,10 +350,9 @@ def _make_replay(
     between = most_observations(task, config.checkpoint_interval_env_steps, config.action_repeat)
     slack = 2 * (between + longest) + SPARE_FRAMES
     if path is not None and not run.saved:
-        remove_replays(path)
         size = (config.replay_capacity + slack) * 3 * env.observation_spec["pixels"].shape[-1] ** 2
         logger.info("replay: %.2f GB in %s; it is kept", size / 1e9, path)
-    return make_replay(path, env, config.replay_capacity, slack=slack, generator=generator)
+    return make_replay(run, path, env, config.replay_capacity, slack=slack, generator=generator)
 
 
 def most_observations(task: str | Domain, env_steps: int, action_repeat: int) -> int:
@@ -425,7 +425,6 @@ def attach_transforms(
         )
     if not has_bonus:
         return
-    warn_if_mostly_zero(len(prototypes.weight), config.batch_size, config.knn_k)
     bonus = PrototypeReward(
         None if keeps_projections else projector,
         prototypes,
@@ -436,6 +435,7 @@ def attach_transforms(
         queue=pretrained.queue,
         generator=generators["bonus"],
     )
+    bonus.warn_if_mostly_zero(config.batch_size)
     replay.append_transform(bonus)
 
 

@@ -19,6 +19,7 @@ from crptpro.envs import make_env, needs_gl
 from crptpro.envs.rendering import select_backend
 from crptpro.modules.encoder import images_of
 from crptpro.provenance import cpu_cores
+from crptpro.training.run import Run
 from crptpro.workers import Inline, single_core_threads
 
 SPARE_FRAMES = 2_000
@@ -67,15 +68,12 @@ class EnvThread:
             self._thread.submit(self.env.close).result()
 
 
-def remove_replays(directory: Path) -> None:
-    """Remove the replays that an attempt without a checkpoint left in or below a directory, and nothing else."""
-    for file in directory.rglob("*.memmap*"):
-        file.unlink()
-
-
-def make_replay(path: Path | None, env: EnvBase, capacity: int, **options: Any) -> FrameReplay:
+def make_replay(run: Run, path: Path | None, env: EnvBase, capacity: int, **options: Any) -> FrameReplay:
     """Return the replay of an environment, in ``path`` or in RAM."""
     channels, height, width = env.observation_spec["pixels"].shape
+    if path is not None and not run.saved:
+        for file in path.glob("*.memmap*"):  # of an attempt without a checkpoint
+            file.unlink()
     return FrameReplay(
         capacity,
         frame_shape=(3, height, width),

@@ -90,12 +90,12 @@ def run_episode(
     while not done:
         if on_frame is not None:
             on_frame(td["pixels"][-3:].clone())
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            if isinstance(policy, (TensorDictModuleBase, RandomPolicy)):
-                td = policy(td.copy())  # its further entries are kept, e.g. a recurrent state
-                action = td.get("action")
-            else:
-                action = policy(td["pixels"])
+        if isinstance(policy, (TensorDictModuleBase, RandomPolicy)):
+            with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+                td = td.update(policy(td.copy()))  # further entries are kept, e.g. a recurrent state
+            action = td.get("action", None)
+        else:
+            action = policy(td["pixels"])
         if not isinstance(action, Tensor) or action.shape != env.action_spec.shape:
             got = tuple(action.shape) if isinstance(action, Tensor) else type(action).__name__
             raise ValueError(
@@ -103,7 +103,7 @@ def run_episode(
                 f"shape {tuple(env.action_spec.shape)}. A policy maps pixels to one action, or is a TorchRL module "
                 'that writes "action" into a TensorDict.'
             )
-        td["action"] = action
+        td["action"] = action.detach()
         transition = env.step(td)
         episode_return += transition["next", "reward"].item()
         agent_steps += 1

@@ -32,7 +32,7 @@ from crptpro.objectives import AveragedSACLoss, Method, RADSACLoss, SkillDDPGLos
 from crptpro.seeding import derive_seed
 from crptpro.training.agent import PixelAgent, SACLearner
 from crptpro.training.collapse import CollapseMonitor
-from crptpro.training.env_thread import SPARE_FRAMES, EnvThread, make_replay, remove_replays
+from crptpro.training.env_thread import SPARE_FRAMES, EnvThread, make_replay
 from crptpro.training.pretrain import (
     SHIFT_PAD,
     PretrainResult,
@@ -46,7 +46,6 @@ from crptpro.training.pretrain import (
 )
 from crptpro.training.run import Generators, Run
 from crptpro.transforms import ContrastiveReward, FrozenEncoder, ParticleReward, PrototypeReward, RandomShift
-from crptpro.transforms.rewards import warn_if_mostly_zero
 from crptpro.values import Quality, check_numbers
 
 logger = logging.getLogger(__name__)
@@ -220,10 +219,12 @@ def pretrain_active(
         capacity = min(settings.replay_capacity, plan.agent_steps)
         slack = 4 * (settings.checkpoint_interval_env_steps // sum(plan.repeats)) + SPARE_FRAMES
         if run.run_dir is not None and not run.saved:
-            remove_replays(run.run_dir / "replay")
             needed = len(named) * (capacity + slack) * 3 * images_of(loss.encoder)["image_size"] ** 2
             logger.info("replays: %.2f GB in %s; they are kept", needed / 1e9, run.run_dir / "replay")
-            require_disk(run.run_dir, needed, "The replays of the domains")
+            replays = [dataset_path(run.run_dir / "replay", name) for name in named]
+            # Those of an attempt without a checkpoint are replaced.
+            held = sum(file.stat().st_size for replay in replays for file in replay.glob("*.memmap*"))
+            require_disk(run.run_dir, max(0, needed - held), "The replays of the domains")
         recipe = dataclasses.replace(recipe, learning_rate=settings.learning_rate, updates=plan.encoder_updates)
         optimizer, schedule, targets = make_optimizer(loss, recipe)
         monitor = CollapseMonitor.of(loss)
@@ -317,7 +318,7 @@ class Explorer:
         path = None if run.run_dir is None else dataset_path(run.run_dir / "replay", name)
         if self._is_finished:
             path, capacity, slack = None, self.exploration.n_step, 0
-        self.replay = self._make_replay(path, capacity, slack)
+        self.replay = self._make_replay(run, path, capacity, slack)
         self._parts = {**self.learner.components(), "reward": self.reward, "generators": self.generators}
         if not self._is_finished:
             self._parts["replay"] = self.replay
@@ -418,20 +419,20 @@ class Explorer:
             return kind(loss, generator).to(self.device)
         reward: Transform
         if kind == "prototype":
-            warn_if_mostly_zero(len(loss.prototypes.weight), self.config.batch_size, 3)
             reward = PrototypeReward(
                 loss.projector, loss.prototypes, coef=None, generator=generator, queue_size=self.config.queue_size
             )
+            reward.warn_if_mostly_zero(self.config.batch_size)
         elif kind == "particle":
             reward = ParticleReward(loss.projector)
         else:
             reward = ContrastiveReward(loss.projector, temperature=float(loss.temperature))
         return reward.to(self.device)
 
-    def _make_replay(self, path: Path | None, capacity: int, slack: int) -> FrameReplay:
+    def _make_replay(self, run: Run, path: Path | None, capacity: int, slack: int) -> FrameReplay:
         skills = self.exploration.skill_dim
         replay = make_replay(
-            path, self.env.env, capacity, slack=slack, n_step=self.exploration.n_step, discount=DISCOUNT,
+            run, path, self.env.env, capacity, slack=slack, n_step=self.exploration.n_step, discount=DISCOUNT,
             extra_columns=None if skills is None else {"skill": ((skills,), torch.float32)},
             generator=self.generators["replay"],
         )  # fmt: skip
@@ -460,7 +461,8 @@ def _named(domains: str | Domain | Sequence[str | Domain], method: Method) -> di
         if not name.isprintable() or {",", '"'} & set(name):
             raise CRPTproError(f"The domain {name!r} cannot name columns of a record; rename it.")
     if len({dataset_path("", name) for name in named}) < len(listed):
-        raise CRPTproError(f"A domain is named twice: {', '.join(d.name for d in listed)}. Each has one agent.")
+        names = ", ".join(d.name for d in listed)
+        raise CRPTproError(f"A domain is named twice, or two share a directory: {names}. Each has one agent.")
     if method.exploration is not None and method.exploration.is_single_domain and len(named) > 1:
         raise CRPTproError(
             f"{method.name} pre-trains on one domain, got {len(named)} ({', '.join(named)}). Run it once per domain, "

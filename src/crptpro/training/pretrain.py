@@ -394,11 +394,13 @@ def _opened(
         for name, buffer in buffers.items():
             if getattr(buffer, "_prefetch", False):
                 raise DatasetError(f"The dataset {name!r} prefetches: its threads would reorder the run's batches.")
-            if any(isinstance(transform, RandomShift) for transform in buffer.transform.transforms):
-                raise DatasetError(f"The dataset {name!r} shifts its images, as pretrain does: remove its RandomShift.")
             stack.callback(buffer.set_rng, buffer._rng)
             buffer.set_rng(generators[f"sample/{name}"])
-            buffer.append_transform(_shift_for(loss, name, buffer, generators["shift"], batch_size))
+            shift = _shift_for(loss, name, buffer, generators["shift"], batch_size)
+            own = [each for each in buffer.transform.modules() if isinstance(each, RandomShift)]
+            if any(key in shift.out_keys for each in own for key in each.out_keys):
+                raise DatasetError(f"The dataset {name!r} shifts its images, as pretrain does: remove its RandomShift.")
+            buffer.append_transform(shift)
             stack.callback(buffer.transform.pop, -1)
         yield buffers, generators
 
@@ -408,7 +410,7 @@ def _shift_for(
 ) -> RandomShift:
     """Return the shift of every image that a loss reads: each entry, and each second view of one, has its own.
 
-    Images have the shape that the encoder declares, or else are uint8 ``[B, C, H, W]``; other entries are not shifted.
+    Images have the shape that the encoder declares, or else four or more dimensions; other entries are not shifted.
     """
     # Other samplers may not draw single rows.
     sample = buffer.sample(1 if type(buffer.sampler) is RandomSampler else batch_size)
@@ -422,7 +424,8 @@ def _shift_for(
             )
     images = [key for key in wanted if sample[key].ndim >= 4]
     encoder = getattr(loss, "encoder", None)
-    size, channels = getattr(encoder, "image_size", None), getattr(encoder, "in_channels", None)
+    declared = getattr(encoder, "config", None) or {}
+    size, channels = (getattr(encoder, fact, declared.get(fact)) for fact in ("image_size", "in_channels"))
     if images and size and channels:
         first, expected = images[0], (channels, size, size)
         images = [key for key in images if tuple(sample[key].shape[-3:]) == expected]
@@ -434,8 +437,6 @@ def _shift_for(
             raise DatasetError(
                 f"Dataset {name!r} has {first!r} of shape {found}; the encoder takes {expected}. {remedy}"
             )
-    else:
-        images = [key for key in images if sample[key].dtype == torch.uint8]
     second_views = [view for view, key in views.items() if key in images]
     read = [*(views[view] for view in second_views), *images]
     return RandomShift(pad=SHIFT_PAD, in_keys=read, out_keys=[*second_views, *images], generator=generator)

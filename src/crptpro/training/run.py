@@ -180,8 +180,10 @@ class Run:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        self._progress.close()
-        self._stack.__exit__(*exception)  # type: ignore[arg-type]
+        try:
+            self._progress.close()
+        finally:
+            self._stack.__exit__(*exception)  # type: ignore[arg-type]
         if self._signal is not None and exception[0] is None:  # it came after the last checkpoint that was due
             raise self._ended()
 
@@ -224,7 +226,7 @@ class Run:
         for name, component in {**components, **means, "global_rng": _GlobalRNG()}.items():
             if component is not None:
                 # TorchRL's usual payload maps its files: on a disk that fills up, the process would end by a bus error.
-                payload = None if isinstance(component, ReplayBuffer) else StateDictCheckpointAdapter("torch")
+                payload = None if isinstance(component, ReplayBuffer) else StateDictCheckpointAdapter("archive")
                 self._checkpoint.register(name, component, adapter=payload)
         if self.saved:
             try:
@@ -383,6 +385,7 @@ class Run:
         self._saved_time = time.monotonic()
         if self.run_dir is None:
             return
+        self._restore_record()
         # The new checkpoint is on disk twice for a moment; the first has the parameters and Adam's moments.
         sizes = [path.stat().st_size for path in self._rotation.directory.glob("checkpoint-*")]
         first = 3 * sum(parameter.nbytes for module in self._modules for parameter in module.parameters())
@@ -402,10 +405,9 @@ class Run:
             for written in (path, path.parent):
                 _sync(written)
         except (OSError, RuntimeError) as reason:
-            is_full = is_disk_full(reason)
-            error, what = (DiskSpaceError, "the disk is full") if is_full else (CheckpointError, str(reason))
-            if not is_full and isinstance(reason, RuntimeError):  # torch.save hides the system's error
-                what += " (is the disk, or a quota, full?)"
+            if isinstance(reason, RuntimeError) and not is_disk_full(reason):
+                raise
+            error, what = (DiskSpaceError, "the disk is full") if is_disk_full(reason) else (CheckpointError, reason)
             raise error(
                 f"No checkpoint could be written to {self._rotation.directory}: {what}. Earlier ones are kept; fix "
                 "that and run the same command again."

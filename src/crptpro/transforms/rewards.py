@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 from typing import Any, Self
 
@@ -121,6 +120,7 @@ class PrototypeReward(IntrinsicReward):
     prototypes: nn.Module
     queue: Tensor
     queue_pointer: Tensor
+    _has_warned = False
 
     def __init__(
         self,
@@ -160,7 +160,7 @@ class PrototypeReward(IntrinsicReward):
         if len(latents) < 2:
             return latents.new_zeros(len(latents))
         weight = self.prototypes.get_parameter("weight")
-        warn_if_mostly_zero(len(weight), len(latents), self.knn_k)
+        self.warn_if_mostly_zero(len(latents))
         candidates = draw_candidates(F.normalize(weight.float(), dim=-1) @ latents.T, self.generator)
         count = candidates.shape[0]
         rows = (self.queue_pointer + torch.arange(count, device=latents.device)) % self.queue.shape[0]
@@ -168,20 +168,17 @@ class PrototypeReward(IntrinsicReward):
         self.queue_pointer.add_(count).remainder_(self.queue.shape[0])
         return knn_distance(latents, self.queue.to(latents.dtype), k=self.knn_k)
 
-
-@functools.cache
-def warn_if_mostly_zero(num_prototypes: int, batch_size: int, knn_k: int) -> None:
-    """Warn, once in a process, if most rows will get 0, for M prototypes and batches of B (the paper has B = M).
-
-    A row is drawn about Poisson(M / B) times, with a median of k from M / B = k - 1/3 on.
-    """
-    too_few = int(num_prototypes / (knn_k - 1 / 3))
-    if batch_size <= too_few:
-        logger.warning(
-            "The prototype reward will mostly be 0: %d prototypes draw their candidates from batches of %d, so that "
-            "the %d nearest candidates of a row are the row itself. Take batches of more than %d, or fewer prototypes.",
-            num_prototypes, batch_size, knn_k, too_few,
-        )  # fmt: skip
+    def warn_if_mostly_zero(self, batch_size: int) -> None:
+        """Warn at the first call if most rows of such batches will get 0; a row is drawn about Poisson(M / B) times."""
+        num_prototypes = len(self.prototypes.get_parameter("weight"))
+        too_few = int(num_prototypes / (self.knn_k - 1 / 3))  # the median of the draws is k from M / B = k - 1/3 on
+        if batch_size <= too_few and not self._has_warned:
+            logger.warning(
+                "The prototype reward will mostly be 0: %d prototypes draw their candidates from batches of %d, so "
+                "that the %d nearest candidates of a row are the row itself. Take batches of more than %d, or fewer "
+                "prototypes.", num_prototypes, batch_size, self.knn_k, too_few,
+            )  # fmt: skip
+        self._has_warned = True
 
 
 def draw_candidates(logits: Tensor, generator: torch.Generator | None = None) -> Tensor:
