@@ -387,7 +387,7 @@ class Margin(LossModule):
 def test_an_option_of_a_users_loss_that_cannot_be_read_back_is_named(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    path = save_pretrained(Margin(OwnEncoder(), scale=3.0, margin=0.2), tmp_path / "own")
+    path = save_pretrained(Margin(OwnEncoder(), scale=3.0, margin=0.2, widths=(3,)), tmp_path / "own")
     assert "margin, widths of Margin: not recorded, so fine-tuning takes the default" in caplog.text
     assert load_pretrained(path).card["loss"]["config"] == {"scale": 3.0}
     caplog.clear()

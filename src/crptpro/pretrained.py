@@ -325,12 +325,12 @@ def loss_options(loss: nn.Module) -> dict[str, Any]:
             value = value.item()
         if isinstance(value, int | float | str) or (value is None and name not in HEADS):
             options[name] = value
-        elif parameter.default is not parameter.empty and name not in HEADS:
+        elif parameter.default is not parameter.empty and name not in HEADS and value is not parameter.default:
             unknown.append(name)
     if unknown and not type(loss).__init__.__module__.startswith("crptpro."):  # ours only build heads from theirs
         _LOG.warning(
-            "%s of %s: not recorded, so fine-tuning takes the default. Keep each option as an attribute of its name, "
-            "or all of them in a dict `config`.", ", ".join(unknown), type(loss).__name__,
+            "%s of %s: not recorded, so fine-tuning takes the default. Keep each option as an attribute of its name, a "
+            "number or text, or all of them in a dict `config`.", ", ".join(unknown), type(loss).__name__,
         )  # fmt: skip
     return options
 

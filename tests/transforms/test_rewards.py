@@ -49,7 +49,7 @@ def kth_distance(z, queue, k):
 
 def test_batches_too_small_for_the_prototypes_are_announced_once_and_a_single_row_is_no_candidate(caplog):
     transform = on_latents()
-    for rows in (3, 2, 3, 1):
+    for rows in (B, 3, 2, 1):
         found = transform(batch(rows))["next", "intrinsic_reward"]
     assert found.tolist() == [[0.0]]
     assert transform.queue_pointer == 3 * M

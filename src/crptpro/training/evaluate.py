@@ -60,9 +60,9 @@ def evaluate(
     """Run a policy for whole episodes and return one result per episode.
 
     Every episode has its own seed, so that neither earlier evaluations nor the number of processes change a result.
-    The environment is unbatched, with ``pixels`` uint8 ``[C, H, W]`` and without an intrinsic reward. A TorchRL policy
-    acts with ``ExplorationType.DETERMINISTIC``; put one with dropout in evaluation mode first. ``on_episode`` is called
-    with each episode as it ends.
+    The environment is unbatched, with ``pixels`` uint8 ``[C, H, W]`` and without an intrinsic reward. TorchRL
+    distributions act with ``ExplorationType.DETERMINISTIC``; put a policy with dropout in evaluation mode first.
+    ``on_episode`` is called with each episode as it ends.
 
     Raises:
         ValueError: fewer than one episode.
@@ -90,12 +90,13 @@ def run_episode(
     while not done:
         if on_frame is not None:
             on_frame(td["pixels"][-3:].clone())
-        if isinstance(policy, (TensorDictModuleBase, RandomPolicy)):
-            with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-                td = td.update(policy(td.copy()))  # further entries are kept, e.g. a recurrent state
-            action = td.get("action", None)
-        else:
-            action = policy(td["pixels"])
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            if isinstance(policy, (TensorDictModuleBase, RandomPolicy)):
+                with torch.no_grad():
+                    td = td.update(policy(td.copy()))  # further entries are kept, e.g. a recurrent state
+                action = td.get("action", None)
+            else:
+                action = policy(td["pixels"])
         if not isinstance(action, Tensor) or action.shape != env.action_spec.shape:
             got = tuple(action.shape) if isinstance(action, Tensor) else type(action).__name__
             raise ValueError(

@@ -424,7 +424,8 @@ def _shift_for(
             )
     images = [key for key in wanted if sample[key].ndim >= 4]
     encoder = getattr(loss, "encoder", None)
-    declared = getattr(encoder, "config", None) or {}
+    config = getattr(encoder, "config", None)
+    declared = config if isinstance(config, Mapping) else {}
     size, channels = (getattr(encoder, fact, declared.get(fact)) for fact in ("image_size", "in_channels"))
     if images and size and channels:
         first, expected = images[0], (channels, size, size)

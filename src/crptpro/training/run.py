@@ -217,6 +217,7 @@ class Run:
     def keep(self, **components: Any) -> None:
         """Make objects with ``state_dict`` and ``load_state_dict`` part of every checkpoint, and restore them.
 
+        A state may hold tensors, numbers, strings, NumPy arrays of numbers, and lists, tuples and dictionaries of them.
         ``None`` is left out.
         """
         # Those whose parameters must be finite: components, and the ``networks`` of other components.
@@ -405,9 +406,10 @@ class Run:
             for written in (path, path.parent):
                 _sync(written)
         except (OSError, RuntimeError) as reason:
-            if isinstance(reason, RuntimeError) and not is_disk_full(reason):
+            is_full = is_disk_full(reason) or "inline_container" in str(reason)  # a write of torch.save was cut short
+            if isinstance(reason, RuntimeError) and not is_full:
                 raise
-            error, what = (DiskSpaceError, "the disk is full") if is_disk_full(reason) else (CheckpointError, reason)
+            error, what = (DiskSpaceError, "the disk is full") if is_full else (CheckpointError, reason)
             raise error(
                 f"No checkpoint could be written to {self._rotation.directory}: {what}. Earlier ones are kept; fix "
                 "that and run the same command again."

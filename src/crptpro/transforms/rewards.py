@@ -169,16 +169,16 @@ class PrototypeReward(IntrinsicReward):
         return knn_distance(latents, self.queue.to(latents.dtype), k=self.knn_k)
 
     def warn_if_mostly_zero(self, batch_size: int) -> None:
-        """Warn at the first call if most rows of such batches will get 0; a row is drawn about Poisson(M / B) times."""
+        """Warn once if most rows of such batches will get 0; a row is drawn about Poisson(M / B) times."""
         num_prototypes = len(self.prototypes.get_parameter("weight"))
         too_few = int(num_prototypes / (self.knn_k - 1 / 3))  # the median of the draws is k from M / B = k - 1/3 on
         if batch_size <= too_few and not self._has_warned:
+            self._has_warned = True
             logger.warning(
                 "The prototype reward will mostly be 0: %d prototypes draw their candidates from batches of %d, so "
                 "that the %d nearest candidates of a row are the row itself. Take batches of more than %d, or fewer "
                 "prototypes.", num_prototypes, batch_size, self.knn_k, too_few,
             )  # fmt: skip
-        self._has_warned = True
 
 
 def draw_candidates(logits: Tensor, generator: torch.Generator | None = None) -> Tensor:
