@@ -110,6 +110,29 @@ def test_each_observation_is_encoded_once_until_its_place_is_needed():
     assert set(replay.asked[12:]) <= set(range(12, 19))
 
 
+@pytest.mark.parametrize("way", ["in place", "load_state_dict", "another tensor", "projector"])
+def test_a_change_of_weights_encodes_again(way):
+    encoder = small_encoder()
+    projector, _ = small_heads(encoder)
+    dense = dense_of(encoder, projector=projector)
+    td = dense.replay.batch(4)
+    dense(td.clone())
+    changed = projector if way == "projector" else encoder
+    with torch.no_grad():
+        if way == "load_state_dict":
+            changed.load_state_dict({name: 2 * value for name, value in changed.state_dict().items()})
+        for weight in changed.parameters() if way != "load_state_dict" else ():
+            if way == "another tensor":
+                weight.data = 2 * weight
+            else:
+                weight.mul_(2)
+    dense.generator.manual_seed(3)
+    ours = dense(td.clone())
+    theirs = dense_of(encoder, dense.replay, projector=projector)(td.clone())
+    for key in ("features", ("next", "features"), ("next", "embedding")):
+        assert torch.equal(ours[key], theirs[key])
+
+
 def test_a_policy_reads_the_features_of_an_unshifted_observation_that_batches_use_again():
     dense = dense_of()
     found = dense.unshifted(5)

@@ -122,13 +122,13 @@ class DenseShiftFeatures(Transform):
 
     Attached to a :class:`~crptpro.data.FrameReplay` it does what ``RandomShift`` and ``FrozenEncoder`` would, with the
     same shifts from the same generator and the same bits. It encodes each observation only once, when first sampled.
-    Its dense maps are kept until the replay has overwritten it; no state dictionary, copy or pickle holds them. If the
-    transform is not attached, call :meth:`forget` after loading a state of the replay.
+    Its dense maps are kept until the replay has overwritten it, or a weight changes; no state dictionary, copy or pickle
+    holds them. If the transform is not attached, call :meth:`forget` after loading a state of the replay.
 
     Threads may share it. On an environment use :class:`~crptpro.transforms.FrozenEncoder`.
 
     Args:
-        encoder: frozen, see :func:`dense_shift_geometry`; its weights must not change from now on.
+        encoder: frozen, see :func:`dense_shift_geometry`; a change of its weights drops all maps.
         replay: a :class:`~crptpro.data.FrameReplay`, or any object with ``observations(numbers)``, uint8
             ``[B, C, H, W]``, and a ``window``: the observations held at once have numbers that differ modulo this.
         pad: largest shift in pixels.
@@ -192,6 +192,7 @@ class DenseShiftFeatures(Transform):
         self._held = torch.full((self.observations,), -1, dtype=torch.int64, device="cpu")
         self._maps: Tensor | None = None
         self._embeddings: Tensor | None = None
+        self._encoded_with: list[tuple[int, int]] = []  # identifies the weights that the maps come from
 
     @property
     def _lock(self) -> Any:
@@ -232,6 +233,12 @@ class DenseShiftFeatures(Transform):
 
     def _encode_missing(self, numbers: Tensor) -> tuple[Tensor, Tensor | None]:
         """Return all maps and projections, after encoding those of these observations that are missing."""
+        networks = [network for network in (self.encoder, self.projector) if network is not None]
+        weights = [value for network in networks for value in (*network.parameters(), *network.buffers())]
+        now = [(value.data_ptr(), 0 if value.is_inference() else value._version) for value in weights]
+        if now != self._encoded_with:
+            self.forget()
+            self._encoded_with = now
         if self._maps is None:
             shape = (self.observations, *self.maps_shape)
             self._maps = torch.empty(shape, dtype=self.dtype, device=device_of(self.encoder))
@@ -274,7 +281,7 @@ class DenseShiftFeatures(Transform):
         return copy
 
     def __getstate__(self) -> dict[str, Any]:
-        derived = ("_own_lock", "_held", "_maps", "_embeddings")
+        derived = ("_own_lock", "_held", "_maps", "_embeddings", "_encoded_with")
         return {key: value for key, value in super().__getstate__().items() if key not in derived}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
