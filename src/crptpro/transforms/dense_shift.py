@@ -122,8 +122,8 @@ class DenseShiftFeatures(Transform):
 
     Attached to a :class:`~crptpro.data.FrameReplay` it does what ``RandomShift`` and ``FrozenEncoder`` would, with the
     same shifts from the same generator and the same bits. It encodes each observation only once, when first sampled.
-    Its dense maps are kept until the replay has overwritten it, or a weight changes; no state dictionary, copy or pickle
-    holds them. If the transform is not attached, call :meth:`forget` after loading a state of the replay.
+    Its dense maps are kept until the replay has overwritten it, or a weight changes. No state dictionary, copy or
+    pickle holds them. If the transform is not attached, call :meth:`forget` after loading a state of the replay.
 
     Threads may share it. On an environment use :class:`~crptpro.transforms.FrozenEncoder`.
 
