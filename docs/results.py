@@ -12,6 +12,7 @@ import re
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import pandas as pd
@@ -38,6 +39,9 @@ PROBES = {
     50_000: ROOT / "src" / "crptpro" / "encoders" / "group-a" / "probe.csv",
 }
 """Updates of the probed encoders to their records."""
+ALL_DOMAINS = RECORDS / "all_domains"
+EIGHT_DOMAINS = {name: ALL_DOMAINS / f"probe_{name}.csv" for name in ("random-encoder", "group-a")}
+"""Encoders probed on all eight domains to their records."""
 
 
 def downstream_runs(record: str, file: str = "eval") -> pd.DataFrame:
@@ -241,18 +245,33 @@ def probes() -> pd.DataFrame:
     """R² of positions and velocities along pre-training; a negative one counts as 0."""
     rows = []
     for updates, scores in probe_scores(PROBES).items():
-        cells = {name: f"{scores[name, 'r2_position']:.3f} / {scores[name, 'r2_velocity']:.3f}" for name in DOMAINS}
+        cells = {name: _positions_velocities(scores[name]) for name in DOMAINS}
         rows.append({"updates": f"{updates:,}" if updates else "0 (`random-encoder`)", **cells})
     return pd.DataFrame(rows)
 
 
-def probe_scores(paths: Mapping[int, Path]) -> dict[int, pd.Series]:
-    """Mean R² of each domain's coordinates by updates; a negative one counts as 0."""
+def probes_of_eight_domains() -> pd.DataFrame:
+    """R² of positions and velocities of every domain of the paper; a negative one counts as 0."""
+    scores = probe_scores(EIGHT_DOMAINS)
+    rows = []
+    for name in pd.read_csv(EIGHT_DOMAINS["group-a"])["domain"].unique():
+        row = {"domain": name, "in the training data of `group-a`": "yes" if name in DOMAINS[:3] else "no"}
+        row |= {f"`{encoder}`": _positions_velocities(own[name]) for encoder, own in scores.items()}
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _positions_velocities(scores: pd.Series) -> str:
+    return f"{scores['r2_position']:.3f} / {scores['r2_velocity']:.3f}"
+
+
+def probe_scores(paths: Mapping[Any, Path]) -> dict[Any, pd.Series]:
+    """Mean R² of each domain's coordinates by encoder; a negative one counts as 0."""
     found = {}
-    for updates, path in paths.items():
+    for key, path in paths.items():
         table = pd.read_csv(path)
         table = table[table["embedding"] == "features"].assign(value=table["value"].clip(lower=0))
-        found[updates] = table.groupby(["domain", "measure"])["value"].mean()
+        found[key] = table.groupby(["domain", "measure"])["value"].mean()
     return found
 
 
@@ -260,7 +279,7 @@ TABLES = {"quickstart": quickstart, "small scale": small_scale, "controls": cont
           "control differences": control_differences, "cheetah_run": partial(paper_scale, "cheetah_run"),
           "cheetah_run means": cheetah_run_means, "cheetah_run long": cheetah_run_long,
           "finger_spin": partial(paper_scale, "finger_spin"), "finger_spin means": finger_spin_means,
-          "pre-training": pretraining, "probes": probes}  # fmt: skip
+          "pre-training": pretraining, "probes": probes, "eight domains": probes_of_eight_domains}  # fmt: skip
 
 
 def draw_pretraining() -> None:

@@ -66,6 +66,18 @@ def sentences() -> Iterator[str]:
     apart = max((probes[n] - probes[-n]).abs().max().max() for n in (1_000, 3_000, 10_000))
     yield f"a first attempt's after 1,000, 3,000 and 10,000 updates differ by {apart:.3f} at most"
 
+    scores = pd.DataFrame(RESULTS["probe_scores"](RESULTS["EIGHT_DOMAINS"])).unstack("measure")
+    untrained, trained = (scores[name] for name in ("random-encoder", "group-a"))
+    gains = trained - untrained
+    count = "all eight" if (gains["r2_velocity"] > 0).all() else "some"
+    yield f"are more predictable from `group-a` than from the untrained encoder in {count} domains"
+    most = gains["r2_velocity"].idxmax()
+    velocities = [own.at[most, "r2_velocity"] for own in (untrained, trained)]
+    yield "The gain is largest in {}, from {:.3f} to {:.3f}".format(most, *velocities)
+    low = sorted(trained.index[trained["r2_velocity"] < 0.07])
+    yield f"Velocities of {' and '.join(low)} stay below 0.07"
+    yield f"quadruped's positions fall by {-gains.at['quadruped', 'r2_position']:.3f}"
+
     means = RESULTS["cheetah_run_means"]().set_index("cheetah_run")["at 60,000, 80,000 and 100,000"]
     each = means.str.findall(r"[(, ](\d+)").map(lambda runs: " and ".join(", ".join(runs).rsplit(", ", 1)))
     yield f"{each['`crptpro-no-bonus`']} on the pre-trained encoder, {each['`random-encoder`']} on untrained ones"
