@@ -39,7 +39,8 @@ class Progress:
             return
         self._last_line = line
         rate = (self.done - self._first) / max(time.monotonic() - self._began, 1e-9)
-        texts += [f"{rate:.4g} {self.unit}/s", f"{(self.total - self.done) / max(rate, 1e-9):.0f} s left"]
+        left = tqdm.format_interval((self.total - self.done) / max(rate, 1e-9))
+        texts += [f"{rate:.4g} {self.unit}/s", f"{left} left"]
         logger.info(
             "%s%s of %s %s (%d %%), %s",
             f"{self.label}: " if self.label else "", f"{self.done:,}", f"{self.total:,}", self.unit,

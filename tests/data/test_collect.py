@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -159,6 +160,7 @@ def test_progress_is_logged_where_the_output_is_no_terminal(tmp_path: Path, capl
     lines = [record.message for record in caplog.records if "transitions/s" in record.message]
     assert len(lines) == 10
     assert lines[-1].startswith("toy-fixed: 100 of 100 transitions (100 %), ")
+    assert all(re.search(r", \d\d:\d\d left$", line) for line in lines)
 
 
 def test_an_environment_that_fails_is_named_with_its_cause_and_does_not_block_the_repaired_one(tmp_path: Path) -> None:
