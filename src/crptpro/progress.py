@@ -40,7 +40,7 @@ class Progress:
         self._last_line = line
         rate = (self.done - self._first) / max(time.monotonic() - self._began, 1e-9)
         left = tqdm.format_interval((self.total - self.done) / max(rate, 1e-9))
-        texts += [f"{rate:.4g} {self.unit}/s", f"{left} left"]
+        texts += [f"{rate:{',.0f' if rate >= 100 else '.3g'}} {self.unit}/s", f"{left} left"]
         logger.info(
             "%s%s of %s %s (%d %%), %s",
             f"{self.label}: " if self.label else "", f"{self.done:,}", f"{self.total:,}", self.unit,
