@@ -40,7 +40,10 @@ PROBES = {
 }
 """Updates of the probed encoders to their records."""
 ALL_DOMAINS = RECORDS / "all_domains"
-EIGHT_DOMAINS = {name: ALL_DOMAINS / f"probe_{name}.csv" for name in ("random-encoder", "group-a")}
+EIGHT_DOMAINS = {
+    **{name: ALL_DOMAINS / f"probe_{name}.csv" for name in ("random-encoder", "group-a")},
+    "all-domains": ROOT / "src" / "crptpro" / "encoders" / "all-domains" / "probe.csv",
+}
 """Encoders probed on all eight domains to their records."""
 
 
@@ -230,12 +233,15 @@ def evaluations(task: str) -> list[tuple[str, pd.DataFrame]]:
     return [*rows, ("DrQ, its authors' log", _published(task))]
 
 
-def pretraining() -> pd.DataFrame:
-    """The record of pre-training with the paper's settings."""
-    record = pd.read_csv(PAPER_SCALE / "pretrain.csv").set_index("updates")
-    rows = record.loc[[500, 1_000, 3_000, 5_000, 10_000, 20_000, 30_000, 40_000, 50_000]]
+def pretraining(record: Path, shown: tuple[str, ...] = ()) -> pd.DataFrame:
+    """One pre-training with the paper's settings; the cosine of these domains, or the range over all of them."""
+    table = pd.read_csv(record / "pretrain.csv").set_index("updates")
+    rows = table.loc[[500, 1_000, 3_000, 5_000, 10_000, 20_000, 30_000, 40_000, 50_000]]
     columns = {"updates": rows.index.map("{:,}".format), "loss": rows["loss_comp"].map("{:.3f}".format)}
-    columns |= {f"cosine: {name}": rows[f"cosine/{name}"].map("{:.3f}".format) for name in DOMAINS[:3]}
+    columns |= {f"cosine: {name}": rows[f"cosine/{name}"].map("{:.3f}".format) for name in shown}
+    if not shown:
+        cosines = rows.filter(like="cosine/")
+        columns["cosine, over domains"] = cosines.apply(lambda row: f"{row.min():.3f} to {row.max():.3f}", axis=1)
     columns["prototypes in use"] = rows["prototypes_in_use"].map("{:.0f}".format)
     columns["prototypes: cosine to the third nearest"] = rows["prototype_kne_3"].map("{:.3f}".format)
     return pd.DataFrame(columns)
@@ -279,14 +285,17 @@ TABLES = {"quickstart": quickstart, "small scale": small_scale, "controls": cont
           "control differences": control_differences, "cheetah_run": partial(paper_scale, "cheetah_run"),
           "cheetah_run means": cheetah_run_means, "cheetah_run long": cheetah_run_long,
           "finger_spin": partial(paper_scale, "finger_spin"), "finger_spin means": finger_spin_means,
-          "pre-training": pretraining, "probes": probes, "eight domains": probes_of_eight_domains}  # fmt: skip
+          "pre-training": partial(pretraining, PAPER_SCALE, DOMAINS[:3]), "probes": probes,
+          "pre-training on eight domains": partial(pretraining, ALL_DOMAINS),
+          "eight domains": probes_of_eight_domains}  # fmt: skip
 
 
 def draw_pretraining() -> None:
     """Draw the loss and the probes along pre-training with the paper's settings."""
     figure, (loss, gain) = plt.subplots(1, 2, figsize=(10, 3.4), layout="constrained")
-    record = pd.read_csv(PAPER_SCALE / "pretrain.csv")
-    loss.plot(record["updates"], record["loss_comp"], label="group A")
+    for name, record in {"group A": PAPER_SCALE, "all eight domains": ALL_DOMAINS}.items():
+        table = pd.read_csv(record / "pretrain.csv")
+        loss.plot(table["updates"], table["loss_comp"], label=name)
     loss.axhline(math.log(512), color="grey", linestyle=":", label="ln 512: uniform predictions")
     loss.set(title="Pre-training", xlabel="updates", ylabel="comparative loss")
     scores = probe_scores(PROBES)
@@ -294,7 +303,7 @@ def draw_pretraining() -> None:
         gains = [scores[n][name, "r2_velocity"] - scores[0][name, "r2_velocity"] for n in PROBES]
         unseen = name not in DOMAINS[:3]
         gain.plot(list(PROBES), gains, "o--" if unseen else "o-", label=name + " (unseen)" * unseen)
-    gain.set(title="State probe of its encoders", xlabel="updates", ylabel="R² of velocities, beyond untrained")
+    gain.set(title="State probe, encoders of group A", xlabel="updates", ylabel="R² of velocities, beyond untrained")
     gain.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
     _save(figure, "pretraining")
 

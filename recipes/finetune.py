@@ -27,7 +27,7 @@ class Config:
     """Encoder, domain and task; the numbers of a stage are below --pretrain.* and --downstream.*."""
 
     pretrained: tyro.conf.Positional[str]
-    """directory of the pretrained encoder; the one that ships is slim, and cannot be trained further"""
+    """directory of the pretrained encoder; those that ship are slim, and cannot be trained further"""
     domain: str = "pendulum"
     """domain to fine-tune on"""
     task: str | None = None

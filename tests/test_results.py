@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import runpy
 from collections.abc import Iterator
@@ -46,7 +47,7 @@ def verdict(task: str, method: str, at: list[int]) -> Iterator[str]:
     if method == "`crptpro`":
         yield f"is {trained.mean():.0f} with encoder and bonus, {untrained.mean():.0f} with neither (three"
     else:
-        yield f"is {trained.mean():.0f} on the encoder that ships, {untrained.mean():.0f} on untrained ones (three"
+        yield f"is {trained.mean():.0f} on `group-a`, {untrained.mean():.0f} on untrained ones (three"
 
 
 def sentences() -> Iterator[str]:
@@ -54,6 +55,12 @@ def sentences() -> Iterator[str]:
     record, first = (pd.read_csv(RECORDS / name / "pretrain.csv", index_col="updates")["loss_comp"] for name in RUNS)
     yield f"The loss is lowest at {record.idxmin():,} updates"
     yield f"a first attempt had a loss lower by {record[24_000] - first[24_000]:.3f} at 24,000 updates"
+    wide = pd.read_csv(RESULTS["ALL_DOMAINS"] / "pretrain.csv", index_col="updates")
+    loss, end = wide["loss_comp"], wide.filter(like="cosine/").iloc[-1].max()
+    near = loss.index[(loss / math.log(512) - 1).abs() < 0.005].max()
+    yield f"stays near ln 512 for {near:,} updates, is lowest at {loss.idxmin():,}"
+    yield f"ends {loss.iloc[-1] - loss.min():.3f} above that"
+    yield f"no domain's cosine exceeds {end:.3f}"
 
     paths = RESULTS["PROBES"] | {-n: RECORDS / RUNS[1] / f"probe_{n}_updates.csv" for n in (1_000, 3_000, 10_000)}
     probes = pd.DataFrame(RESULTS["probe_scores"](paths)).unstack("domain").loc[["r2_position", "r2_velocity"]]
@@ -77,6 +84,15 @@ def sentences() -> Iterator[str]:
     low = sorted(trained.index[trained["r2_velocity"] < 0.07])
     yield f"Velocities of {' and '.join(low)} stay below 0.07"
     yield f"quadruped's positions fall by {-gains.at['quadruped', 'r2_position']:.3f}"
+    wide = scores["all-domains"]
+    count = "all eight" if (wide > untrained)["r2_velocity"].all() else "some"
+    yield f"From `all-domains`, too, velocities are more predictable than from the untrained encoder in {count}"
+    gains = (wide - trained)["r2_velocity"]
+    yield f"Velocities gain {gains['cartpole']:.3f} in cartpole and {gains['cheetah']:.3f} in cheetah"
+    yield f"and lose {-gains['walker']:.3f} in walker"
+    yield f"the other five differ by {gains.drop(['cartpole', 'cheetah', 'walker']).abs().max():.3f} at most"
+    yield f"the other six differ by {gains.drop(['cartpole', 'walker']).abs().max():.3f} at most"
+    yield f"Positions differ by {(wide - trained)['r2_position'].abs().max():.3f} at most"
 
     means = RESULTS["cheetah_run_means"]().set_index("cheetah_run")["at 60,000, 80,000 and 100,000"]
     each = means.str.findall(r"[(, ](\d+)").map(lambda runs: " and ".join(", ".join(runs).rsplit(", ", 1)))

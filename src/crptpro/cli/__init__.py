@@ -222,7 +222,7 @@ class Finetune(EncoderRun):
     """
 
     pretrained: Annotated[Positional[str], arg(metavar="ENCODER")]
-    """directory of the pretrained encoder; the one that ships is slim, and cannot be trained further"""
+    """directory of the pretrained encoder; those that ship are slim, and cannot be trained further"""
     dataset: Annotated[Positional[Path], arg(metavar="DATASET")]
     """dataset directory of the one domain"""
     config: Annotated[training.PretrainConfig, arg(name="")] = field(default_factory=training.PretrainConfig)
@@ -243,8 +243,8 @@ class Downstream:
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """task to learn, e.g. walker_run, reach_duplo, gymnasium:HalfCheetah-v5"""
     pretrained: Annotated[str, arg(metavar="ENCODER")]
-    """directory of the pretrained encoder, the name of one that ships (group-a), `random-encoder` for the untrained
-    control, or `drq` to learn the encoder with the task"""
+    """directory of the pretrained encoder, the name of one that ships (group-a, all-domains),
+    `random-encoder` for the untrained control, or `drq` to learn the encoder with the task"""
     out: Path
     """run directory: eval.csv, train.csv, checkpoints, and the agent in OUT/agent"""
     config: Annotated[training.DownstreamConfig, arg(name="")] = field(default_factory=training.DownstreamConfig)
