@@ -98,8 +98,7 @@ def sentences() -> Iterator[str]:
     each = means.str.findall(r"[(, ](\d+)").map(lambda runs: " and ".join(", ".join(runs).rsplit(", ", 1)))
     yield f"{each['`crptpro-no-bonus`']} on the pre-trained encoder, {each['`random-encoder`']} on untrained ones"
     yield from verdict("cheetah_run", "`crptpro-no-bonus`", [60_000, 80_000, 100_000])
-    alone = means["`random-encoder-standardised`"]
-    yield f"with standardised features, one run averaged {alone} over these evaluations"
+    yield f"features, two runs averaged {each['`random-encoder-standardised`']} over these evaluations"
     both = RESULTS["cheetah_run_means"]().set_index("cheetah_run")["evaluations at 60,000 and 80,000 env steps"]
     bonus, none = (both[name].split()[0] for name in ("`crptpro`", "`crptpro-no-bonus`"))
     yield f"the runs with the bonus average {bonus}, those without it {none}"
@@ -109,6 +108,7 @@ def sentences() -> Iterator[str]:
     is_trained, is_plain = (near.index.str.startswith(name) for name in ("crptpro", "random-encoder_seed"))
     yield "falls below 3 nats (uniform: 4.16) after {:,}, {:,} and {:,} env steps".format(*near[is_plain])
     yield f"it does so after {near[is_trained].min():,} to {near[is_trained].max():,}"
+    yield "in those with standardised features after {:,} and {:,}".format(*near[~is_trained & ~is_plain])
     runs = RESULTS["PAPER_SCALE"].glob("cheetah_run/crptpro_seed_*/episodes.csv")
     ends = [end for path in runs if (end := pd.read_csv(path)["env_steps"].max()) < 100_000]
     runs = dict(RESULTS["evaluations"]("cheetah_run"))
