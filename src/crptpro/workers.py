@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import pickle
@@ -102,6 +103,8 @@ def _begin(plugins: tuple[str, ...], prepare: Callable[..., None], arguments: tu
     # One software-rendering thread per process is faster than several; it must be set before GL loads.
     os.environ.setdefault("LP_NUM_THREADS", "1")
     torch.set_num_threads(1)
+    # dm_control warns of every pose of an arm that it rejects, in the middle of the progress bar.
+    logging.getLogger("absl").setLevel(logging.ERROR)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     for name in plugins:
         load_plugin(name)

@@ -90,6 +90,13 @@ def test_an_endless_episode_is_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not dataset.transitions["next", "terminated"].any()
 
 
+def test_warnings_of_the_simulator_do_not_cross_the_progress_bar(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    collect_random(toy_env.WARNING, tmp_path, transitions=20, workers=2, **SMALL)
+    assert "Failed to converge" not in capfd.readouterr().err
+
+
 def test_processes_that_hang_are_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(collect.WorkerPool, "submit", lambda *_: Future())
     monkeypatch.setattr(collect, "STALL_S", 0.1)

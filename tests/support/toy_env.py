@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import absl.logging
 import numpy as np
 import pandas as pd
 import torch
@@ -119,6 +120,10 @@ def _die(count: int) -> None:
         os._exit(7)
 
 
+def _warn_like_dm_control(count: int) -> None:
+    absl.logging.warning("Failed to converge after 99 steps")
+
+
 def _fail(count: int) -> None:
     if count == 5:
         raise ValueError("the simulator exploded")
@@ -133,6 +138,7 @@ def make_toy(
 FIXED = Domain("toy-fixed", "toy-fixed_go", make=partial(make_toy, fixed_length), episode_env_steps=10)
 VARIABLE = Domain("toy-variable", "toy-variable_go", make=partial(make_toy, variable_length))
 SLOW = Domain("toy-slow", "toy-slow_go", make=partial(make_toy, variable_length, _pause_like_a_renderer))
+WARNING = Domain("toy-warning", "toy-warning_go", make=partial(make_toy, fixed_length, _warn_like_dm_control))
 DYING = Domain("toy-dying", "toy-dying_go", make=partial(make_toy, fixed_length, _die))
 FAILING = Domain("toy-failing", "toy-failing_go", make=partial(make_toy, fixed_length, _fail))
 SEEDLESS = Domain("toy-seedless", "toy-seedless_go", make=partial(make_toy, fixed_length, None, SeedlessEnv))
