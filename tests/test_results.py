@@ -47,7 +47,23 @@ def verdict(task: str, method: str, at: list[int]) -> Iterator[str]:
     if method == "`crptpro`":
         yield f"is {trained.mean():.0f} with encoder and bonus, {untrained.mean():.0f} with neither (three"
     else:
-        yield f"is {trained.mean():.0f} on `group-a`, {untrained.mean():.0f} on untrained ones (three"
+        yield f"is {trained.mean():.0f} on `group-a`, {untrained.mean():.0f} on untrained ones"
+
+
+def conditioning() -> Iterator[str]:
+    """What standardised features of untrained encoders reach, beside the pre-trained and the plain untrained ones."""
+    runs = dict(RESULTS["evaluations"]("cheetah_run"))
+    names = ("crptpro-no-bonus", "random-encoder-standardised", "random-encoder")
+    trained, standardised, plain = (runs[f"`{name}`"][[60_000, 80_000, 100_000]].mean(axis=1) for name in names)
+    each = "{:.0f}, {:.0f} and {:.0f}".format
+    yield f"is {standardised.mean():.0f} ({each(*standardised)})"
+    count = "All three" if standardised.max() < trained.min() else "Some"
+    yield f"{count} runs lie below those on the pre-trained encoder"
+    how = "overlaps with" if standardised.min() < plain.max() else "lies above"
+    yield f"Their range {how} that of plain untrained ones ({each(*plain)})"
+    others = f"{each(*standardised)} on untrained ones with standardised features"
+    yield f"{each(*trained)} on the pre-trained encoder, {others}"
+    yield f"{plain.mean():.0f} on untrained ones, {standardised.mean():.0f} with standardised features (three each)"
 
 
 def sentences() -> Iterator[str]:
@@ -98,7 +114,7 @@ def sentences() -> Iterator[str]:
     each = means.str.findall(r"[(, ](\d+)").map(lambda runs: " and ".join(", ".join(runs).rsplit(", ", 1)))
     yield f"{each['`crptpro-no-bonus`']} on the pre-trained encoder, {each['`random-encoder`']} on untrained ones"
     yield from verdict("cheetah_run", "`crptpro-no-bonus`", [60_000, 80_000, 100_000])
-    yield f"features, two runs averaged {each['`random-encoder-standardised`']} over these evaluations"
+    yield from conditioning()
     both = RESULTS["cheetah_run_means"]().set_index("cheetah_run")["evaluations at 60,000 and 80,000 env steps"]
     bonus, none = (both[name].split()[0] for name in ("`crptpro`", "`crptpro-no-bonus`"))
     yield f"the runs with the bonus average {bonus}, those without it {none}"
@@ -108,7 +124,7 @@ def sentences() -> Iterator[str]:
     is_trained, is_plain = (near.index.str.startswith(name) for name in ("crptpro", "random-encoder_seed"))
     yield "falls below 3 nats (uniform: 4.16) after {:,}, {:,} and {:,} env steps".format(*near[is_plain])
     yield f"it does so after {near[is_trained].min():,} to {near[is_trained].max():,}"
-    yield "in those with standardised features after {:,} and {:,}".format(*near[~is_trained & ~is_plain])
+    yield "in those with standardised features after {:,}, {:,} and {:,}".format(*near[~is_trained & ~is_plain])
     runs = RESULTS["PAPER_SCALE"].glob("cheetah_run/crptpro_seed_*/episodes.csv")
     ends = [end for path in runs if (end := pd.read_csv(path)["env_steps"].max()) < 100_000]
     runs = dict(RESULTS["evaluations"]("cheetah_run"))
