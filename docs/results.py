@@ -32,8 +32,8 @@ ENV_STEPS = {"cheetah_run": 100_000, "finger_spin": 60_000}
 FIGURES = {task: (task, end) for task, end in ENV_STEPS.items()} | {"cheetah_run_long": ("cheetah_run", 500_000)}
 """Names of figures to the task and the env steps that are drawn."""
 COLORS = {"`crptpro`": "#0b80c3", "`crptpro-no-bonus`": "#109e77", "`random-encoder`": "#d9640a",
-          "`random-encoder-standardised`": "#b03a78", "CRPTpro, its authors' log": "#5d6672",
-          "DrQ, its authors' log": "#8a7bd8"}  # fmt: skip
+          "`random-encoder-standardised`": "#b03a78", "`all-domains`": "#b8901b",
+          "CRPTpro, its authors' log": "#5d6672", "DrQ, its authors' log": "#8a7bd8"}  # fmt: skip
 PROBES = {
     **{n: PAPER_SCALE / f"probe_{n}_updates.csv" for n in (0, 1_000, 3_000, 10_000, 30_000)},
     50_000: ROOT / "src" / "crptpro" / "encoders" / "group-a" / "probe.csv",

@@ -188,6 +188,12 @@ def sentences() -> Iterator[str]:
     yield f"DrQ's runs have {RESULTS['_spread'](drq[60_000])}"
     yield f"{RESULTS['_spread'](drq[[40_000, 60_000]].mean(axis=1))} in DrQ's log (ten)"
     yield from verdict("finger_spin", "`crptpro`", [40_000, 60_000])
+    wide, narrow = (finger[name].mean() for name in ("`all-domains`", "`crptpro`"))
+    means = [own[[40_000, 60_000]].mean() for own in (wide, narrow)]
+    yield "the one run so far has a mean of {:.0f} at 40,000 and 60,000 env steps, beside {:.0f} on `group-a`".format(
+        *means
+    )
+    yield f"At 20,000 it returned {wide[20_000]:.0f}, where the runs on `group-a` have {narrow[20_000]:.0f} on average"
     more = [("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "all ten")[count]
             for count in (drq[[20_000, 60_000]] > ours[[20_000, 60_000]]).sum()]  # fmt: skip
     yield f"at 40,000 env steps they average {ours[40_000]:.0f}, the others {untrained[40_000]:.0f}"
