@@ -6,7 +6,7 @@ import difflib
 import functools
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from crptpro.errors import CRPTproError, UnknownNameError
 from crptpro.values import as_int
@@ -49,6 +49,12 @@ class Domain:
         for name in ("action_repeat", "episode_env_steps"):
             if (value := getattr(self, name)) is not None:
                 object.__setattr__(self, name, as_int(value, name, minimum=1))
+
+
+def describe_domain(task: str | Domain) -> dict[str, Any]:
+    """Return what identifies an environment in the settings of a run: its task, its domain and the camera."""
+    domain = get_domain(task)
+    return {"task": domain.task, "domain": domain.name, "camera": domain.camera}
 
 
 _suite = functools.partial(Domain, action_repeat=2, episode_env_steps=1000, source="suite")

@@ -174,10 +174,6 @@ class RunLogger:
             _LOG.warning("%s has no checkpoint: it begins again; its earlier rows are in %s.", self.run_dir, kept)
         self.load_state_dict(dict.fromkeys(streams, 0))
 
-    def writes_into(self, directory: str | Path) -> bool:
-        """Whether the record is inside ``directory``: only then does all of it belong to that directory's run."""
-        return self.run_dir.resolve().is_relative_to(Path(directory).resolve())
-
     def close(self) -> None:
         """Finish the mirrors and unlock the directory; every row is on disk already."""
         self._mirrors = [mirror for mirror in self._mirrors if "logger" in vars(mirror)]  # that have begun

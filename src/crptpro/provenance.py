@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import importlib.metadata
+import logging
 import os
 import platform
 import re
 import subprocess
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import psutil
 import torch
+
+logger = logging.getLogger(__name__)
 
 UNUSABLE = "unusable"
 """Prefix of the name of a GPU that torch sees and cannot use."""
@@ -82,3 +86,13 @@ def git_revision() -> str:
 def provenance() -> dict[str, Any]:
     """Return the part of a card that every artifact shares: versions, hardware, git revision."""
     return {"versions": versions(), "hardware": hardware(), "git_revision": git_revision()}
+
+
+def warn_of_other_versions(made_with: Mapping[str, Any], what: str) -> None:
+    """Log a warning if a run or dataset is continued with other versions than those it was begun or continued with."""
+    before = made_with["versions"]
+    changed = [f"{name} {old} is now {now}" for name, now in versions().items() if (old := before.get(name)) != now]
+    if changed:
+        logger.warning(
+            "%s is continued with other versions, which may change its numbers: %s.", what, ", ".join(changed)
+        )

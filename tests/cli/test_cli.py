@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import imageio.v2 as imageio
 import pandas as pd
@@ -120,6 +121,14 @@ def test_every_command_works_without_a_simulator(call: Call, dataset: Path, monk
     assert out.startswith(f"{TASK}: ")
     assert "over 2 episodes" in out
     assert [(row["task"], row["agent_steps"]) for row in rows(file)] == [(TASK, "10")] * 2
+    with monkeypatch.context() as inside:
+        cameras: list[Any] = []
+        inside.setattr("crptpro.cli.make_env", lambda task, **own: cameras.append(task.camera) or make_env(task, **own))
+        card = (agent / "card.json").read_text()
+        (agent / "card.json").write_text(json.dumps({**json.loads(card), "camera": 5}))
+        assert call("evaluate", agent, "--episodes", 2)[:2] == (0, out)
+        (agent / "card.json").write_text(card)
+        assert cameras == [5]
     assert "is a 'crptpro-agent'" in refused(call("downstream", TASK, "--pretrained", agent, "--out", "other"))
     assert not Path("other").exists()
     with monkeypatch.context() as inside:

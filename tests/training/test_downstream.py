@@ -340,6 +340,8 @@ def test_what_does_not_fit_a_run_is_refused_by_name(tmp_path: Path) -> None:
         train(tmp_path, cuda_graph=True)
     with pytest.raises(ValueError, match="`cuda_graph` needs a GPU, but `device` is 'cpu'"):
         train(tmp_path / "new", cuda_graph=True)
+    with pytest.raises(CheckpointError, match="camera was 0, now 1; domain was 'toy', now 'toy_back'"):
+        train(tmp_path, task=dataclasses.replace(TOY, name="toy_back", camera=1))
     assert not (tmp_path / "new" / "episodes.csv").exists()
     with pytest.raises(CheckpointError, match="pretrained was"):
         train(tmp_path, make_pretrained("proto-rl-c"))
@@ -385,16 +387,23 @@ def test_candidates_that_the_artifact_brings_set_the_length_of_the_queue() -> No
     train(None, pretrained, env_steps=40)
 
 
-def test_a_run_keeps_its_precision_and_features_on_another_machine(
+def test_a_run_keeps_its_precision_and_features_on_another_machine_unless_its_maps_no_longer_fit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def continued(env_steps: int, **options: Any) -> tuple[str, str]:
+        result = train(tmp_path / "run", env_steps=env_steps, **{"precision": "auto", "features": "auto"} | options)
+        _, card = load_agent(result.agent_path)
+        return card["precision"], card["features"]
+
     pretend_cpu("amx_bf16", monkeypatch, tmp_path)
-    train(tmp_path / "run", env_steps=40, precision="auto", features="auto")
+    continued(40)
     pretend_cpu("", monkeypatch, tmp_path)
+    assert continued(60) == ("bf16", "dense")
     monkeypatch.setattr("crptpro.training.downstream.free_bytes", lambda device: 0)
-    result = train(tmp_path / "run", env_steps=60, precision="auto", features="auto")
-    _, card = load_agent(result.agent_path)
-    assert (card["precision"], card["features"]) == ("bf16", "dense")
+    with pytest.raises(CRPTproError, match=r"dense maps do not fit in memory: .*can be continued"):
+        continued(80)
+    assert continued(80, features="reencode") == ("bf16", "reencode")
+    assert continued(100) == ("bf16", "reencode")
 
 
 def test_batches_too_small_for_the_prototypes_are_announced(caplog: pytest.LogCaptureFixture) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -116,7 +117,9 @@ def test_a_domains_agent_does_not_depend_on_its_company(tmp_path: Path) -> None:
     # Up to the first update on another domain's batch.
     alone = run("apt-c", tmp_path / "alone", [LEFT], env_steps=40, learning_rate=0.0)
     run("apt-c", tmp_path / "both", env_steps=80, learning_rate=0.0)
-    assert alone.training["datasets"][0] == {"domain": "left", "agent_steps": 20, "episodes": 2}
+    assert alone.training["datasets"][0] == {
+        "task": "left_go", "domain": "left", "camera": 0, "agent_steps": 20, "episodes": 2,
+    }  # fmt: skip
     together = [row for row in record(tmp_path / "both" / "episodes.csv") if row["domain"] == "left"]
     apart = record(tmp_path / "alone" / "episodes.csv")
     assert [row["episode_return"] for row in apart] == [row["episode_return"] for row in together]
@@ -180,7 +183,11 @@ def test_a_run_of_other_settings_is_refused_by_name(tmp_path: Path) -> None:
     run("apt-s", tmp_path, env_steps=20)
     with pytest.raises(CheckpointError, match="batch_size was 4, now 8"):
         run("apt-s", tmp_path, env_steps=20, batch_size=8)
-    assert run("apt-s", tmp_path, env_steps=20, log_interval=3).env_steps == 20  # it decides no number
+    with pytest.raises(CheckpointError, match=r"domains\[0\]\.task was 'left_go', now 'left_run'"):
+        run("apt-s", tmp_path, [replace(LEFT, task="left_run")], env_steps=20)
+    again = run("apt-s", tmp_path, env_steps=20, log_interval=3)  # it decides no number
+    assert again.env_steps == 20
+    assert again.training["datasets"][0]["task"] == "left_go"
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from torchrl.checkpoint import GlobalRNGState
 from toy_env import record
 from toy_runs import python
 
+from crptpro import provenance
 from crptpro.errors import CheckpointError, DiskSpaceError, NonFiniteError
 from crptpro.logging import RunLogger
 from crptpro.training import DownstreamConfig, PretrainConfig, Run
@@ -279,6 +280,48 @@ def test_a_setting_left_open_keeps_what_it_meant_when_the_run_began(tmp_path: Pa
     with begin(tmp_path) as run:
         assert run.saved_setting("precision", "auto") == "bf16"
         assert run.saved_setting("precision", "fp32") == "fp32"
+
+
+def test_a_record_outside_the_run_directory_is_refused(tmp_path: Path) -> None:
+    with (
+        RunLogger(tmp_path / "shared") as records,
+        pytest.raises(CheckpointError, match=r"not in the run directory .*mine: .* Use RunLogger\('.*mine'\)"),
+        Run(tmp_path / "mine", unit="updates", streams=("train",), records=records),
+    ):
+        pass
+    assert not (tmp_path / "mine").exists()
+
+
+def test_runs_without_a_directory_share_a_record_and_each_returns_its_own_rows(tmp_path: Path) -> None:
+    with RunLogger(tmp_path) as records:
+        for loss in (1.0, 2.0):
+            with Run(None, unit="updates", streams=("train",), records=records, progress=False) as run:
+                run.keep()
+                run.advance(1)
+                run.write("train", {"loss": loss})
+                assert [row["loss"] for row in run.rows("train")] == [loss]
+        assert [row["loss"] for row in records.rows("train")] == [1.0, 2.0]
+
+
+def test_a_finished_run_that_is_called_again_keeps_the_rate_of_its_last_row(tmp_path: Path) -> None:
+    for _ in range(2):
+        walk(tmp_path, 5)
+        with RunLogger(tmp_path) as records:
+            rows = records.rows("train")
+        assert [(row["updates"], row["updates_per_s"] > 0) for row in rows] == [(4, True), (5, True)]
+
+
+def test_other_versions_are_announced_where_a_run_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    walk(tmp_path, 5)
+    now = {**provenance.versions(), "mujoco": "9.9"}
+    monkeypatch.setattr(provenance, "versions", lambda: now)
+    walk(tmp_path, 5)
+    assert "9.9" not in caplog.text
+    walk(tmp_path, 6)
+    assert f"{tmp_path} is continued with other versions" in caplog.text
+    assert "is now 9.9." in caplog.text
 
 
 def test_two_processes_in_one_directory_are_refused(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from torchrl.envs import Compose, TransformedEnv
 from toy_env import rollout_of
 
 from crptpro.data import FrameReplay
+from crptpro.errors import CRPTproError
 from crptpro.modules import PixelEncoder
 from crptpro.transforms import DenseShiftFeatures, FrozenEncoder, RandomShift, choose_feature_mode, random_shift
 from crptpro.transforms.dense_shift import _crop_by_index, crop_features, dense_maps_bytes, dense_shift_maps
@@ -328,11 +329,10 @@ def test_auto_takes_dense_maps_where_they_fit_and_says_why(encoder, dtype, avail
     assert "\n" not in reason
 
 
-def test_explicit_modes_are_obeyed_or_refused(caplog):
+def test_explicit_modes_are_obeyed_or_refused():
     assert choose_feature_mode("reencode", PixelEncoder(), 1, torch.float32, 2**40)[0] == "reencode"
     assert choose_feature_mode("dense", PixelEncoder(), 1000, torch.bfloat16, 2**40)[0] == "dense"
-    assert not caplog.records
-    assert choose_feature_mode("dense", PixelEncoder(), 1000, torch.bfloat16, 2**20)[0] == "dense"
-    assert "may not fit: 0.4 GiB for 1000 observations, 0.0 GiB free" in caplog.text
+    with pytest.raises(CRPTproError, match=r"do not fit in memory: 0\.4 GiB for 1000 observations, 0\.0 GiB free"):
+        choose_feature_mode("dense", PixelEncoder(), 1000, torch.bfloat16, 2**20)
     with pytest.raises(ValueError, match="Flatten"):
         choose_feature_mode("dense", nn.Flatten(), 1, torch.float32, 2**40)

@@ -13,7 +13,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -291,6 +291,7 @@ class Evaluate:
         csv, video = require_writable(self.csv, "--csv"), require_video(self.video)  # before an hour of episodes
         agent, card = (None, {}) if is_random else training.load_agent(self.agent)
         task = self.task or card["task"]
+        domain = get_domain(task) if agent is None else replace(get_domain(task), camera=card["camera"])
         usual = {"quality": "exact", "colors": "normal", "action_repeat": None} | card
         names = ("quality", "colors", "action_repeat")
         given = {name: getattr(self, name) for name in names}
@@ -298,7 +299,7 @@ class Evaluate:
         settings["render"] = not is_random or video is not None  # the random policy needs no pixels
         if agent is not None:
             settings |= images_of(agent.encoder)
-        with contextlib.closing(make_env(task, seed=self.seed, **settings)) as env:
+        with contextlib.closing(make_env(domain, seed=self.seed, **settings)) as env:
             action_dim = env.action_spec.shape[-1]
             if agent is not None and agent.actor.config["action_dim"] != action_dim:
                 raise CRPTproError(

@@ -20,7 +20,7 @@ from crptpro.data.replay import as_it_is
 from crptpro.data.storage import Rows, StackBuffer, StackStorage, map_rows, read_rows, require_size
 from crptpro.directory_lock import DirectoryLock
 from crptpro.errors import DatasetError, DiskSpaceError, is_disk_full
-from crptpro.provenance import provenance
+from crptpro.provenance import provenance, warn_of_other_versions
 from crptpro.values import as_int, as_path, as_plain
 
 logger = logging.getLogger(__name__)
@@ -374,6 +374,7 @@ class EpisodeWriter(ImmutableDatasetWriter):
         for path, expected in _sizes(self.path, state).items():
             require_size(path, min(expected, path.stat().st_size if path.exists() else 0), expected)
         self.state = state
+        warn_of_other_versions(state, str(self.path))
         logger.info("%s: continuing after %d of %d transitions", self.path.name, self.transitions, self.target)
 
     def _save(self, **changes: Any) -> None:

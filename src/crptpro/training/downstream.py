@@ -14,12 +14,12 @@ from typing import Any, Literal
 
 import torch
 from torch import nn
-from torchrl.envs import EnvBase
+from torchrl.envs import Compose, EnvBase
 from torchrl.envs.utils import step_mdp
 
 from crptpro.artifact import require_replaceable
 from crptpro.data import FrameReplay
-from crptpro.domains import LONGEST_EPISODE_AGENT_STEPS, Domain, get_domain
+from crptpro.domains import LONGEST_EPISODE_AGENT_STEPS, Domain, describe_domain, get_domain
 from crptpro.envs import resolve_action_repeat
 from crptpro.envs.factory import episode_length
 from crptpro.errors import CheckpointError, PretrainedError
@@ -193,11 +193,12 @@ def train_downstream(
         PrototypeReward(
             None, pretrained.prototypes, knn_k=settings.knn_k, queue_size=settings.queue_size, queue=pretrained.queue
         )
-    name = task if isinstance(task, str) else task.task
+    where = describe_domain(task)
+    name = where["task"]
     if settings.features in ("dense", "dense-bf16"):
         dense_shift_geometry(pretrained.encoder)
     # A control's weights may differ in the last digit on another machine; a resumed run has those of its checkpoint.
-    what = {"task": name, "pretrained": f"{source}:seed {settings.seed}" if is_control else pretrained.identity()}
+    what = {**where, "pretrained": f"{source}:seed {settings.seed}" if is_control else pretrained.identity()}
     device = usable_device(settings.device)
     repeat = settings.action_repeat
     with contextlib.ExitStack() as stack:
@@ -206,11 +207,12 @@ def train_downstream(
         networks = (pretrained.encoder, pretrained.projector, pretrained.prototypes)
         dtype = resolve_precision(run.saved_setting("precision", settings.precision), device, *networks)
         # The budget may grow, and machines differ; everything else decides the numbers of the run.
-        free = ("env_steps", "eval_workers", "compile", "device")
+        free = ("env_steps", "eval_workers", "compile", "device", "features")
         run.require_same({
             **what, **{key: value for key, value in dataclasses.asdict(settings).items() if key not in free},
-            "precision": PRECISION_NAMES[dtype], "features": run.saved_setting("features", settings.features),
+            "precision": PRECISION_NAMES[dtype], "features": run.saved_setting("features", "auto"),
         })  # fmt: skip
+        run.settings["features"] = run.saved_setting("features", settings.features)
         seed_everything(derive_seed(settings.seed, "downstream"))
         generators = Generators(settings.seed, "replay", "shift", "bonus", "policy", "random_actions")
         env = EnvThread(task, pretrained.encoder, settings, seed=settings.seed, action_repeat=repeat)
@@ -220,7 +222,7 @@ def train_downstream(
         # Proto-RL(S): it starts as the actor that explored the task's own domain.
         domains = [each["domain"] for each in (pretrained.card.get("training") or {}).get("datasets", ())]
         has_explored = isinstance(actor, SquashedGaussianActor) and actor.config["action_dim"] == action_dim
-        has_explored = has_explored and (not domains or get_domain(task).name in domains)
+        has_explored = has_explored and (not domains or where["domain"] in domains)
         learner, agent = _make_agent(pretrained, encoder, action_dim, settings, generators["policy"], has_explored)
         set_compute_dtype(learner.loss, dtype)
         evaluator = Evaluator(env.make_env, agent, episodes=settings.eval_episodes, seed=settings.seed,
@@ -364,6 +366,10 @@ def most_observations(task: str | Domain, env_steps: int, action_repeat: int) ->
     return agent_steps + -(-agent_steps // length) + max(16, agent_steps // 50)
 
 
+class _Chain(Compose):
+    """Stays one transform of a replay, whose checkpoint names transforms by their index."""
+
+
 def attach_transforms(
     replay: FrameReplay,
     pretrained: Pretrained,
@@ -408,15 +414,14 @@ def attach_transforms(
         latent_dim=prototypes.weight.shape[1] if keeps_projections else None,
     )  # fmt: skip
     logger.info("features: %s", reason)
-    # The two modes round differently in bfloat16: a resumed run keeps its mode.
+    # The two modes round differently in bfloat16: a resumed run keeps its mode unless another is requested.
     run.settings["features"] = setting if is_rounded else mode
     if mode == "reencode":
         keeps_projections = False
         # Features, 40 times as large as a frame, need not move. TorchRL's DeviceCastTransform synchronises with the GPU
         # at every sample if the machine has one and `device` is the CPU.
-        replay.append_transform(lambda sample: sample.to(device))
-        replay.append_transform(RandomShift(in_keys=pixels, **shift))
-        replay.append_transform(FrozenEncoder(encoder, in_keys=pixels, out_keys=features))
+        encode = FrozenEncoder(encoder, in_keys=pixels, out_keys=features)
+        replay.append_transform(_Chain(lambda sample: sample.to(device), RandomShift(in_keys=pixels, **shift), encode))
     else:
         replay.storage.returns_pixels = False
         kept = projector if keeps_projections else None

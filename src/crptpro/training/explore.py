@@ -21,7 +21,7 @@ from torchrl.objectives import LossModule
 from crptpro.artifact import require_disk
 from crptpro.data import FrameReplay
 from crptpro.data.collect import dataset_path
-from crptpro.domains import Domain, get_domain
+from crptpro.domains import Domain, describe_domain, get_domain
 from crptpro.envs import resolve_action_repeat
 from crptpro.errors import CRPTproError
 from crptpro.logging import RunLogger
@@ -195,6 +195,7 @@ def pretrain_active(
     given = dataclasses.replace(config or ExploreConfig(), **overrides)
     named = _named(domains, recipe)
     plan = plan_exploration(recipe, list(named.values()), given)
+    places = [describe_domain(domain) for domain in named.values()]
     exploration: Any = recipe.exploration
     settings = given.resolved(recipe)
     if isinstance(kind := exploration.reward, str):
@@ -212,7 +213,8 @@ def pretrain_active(
         stack.enter_context(computing(loss, dtype))
         run.require_same({
             **{k: v for k, v in dataclasses.asdict(settings).items() if k not in ("device", "log_interval")},
-            "domains": list(named), "precision": PRECISION_NAMES[dtype], "loss": describe_loss(loss),
+            "domains": [{**where, "action_repeat": repeat} for where, repeat in zip(places, plan.repeats)],
+            "precision": PRECISION_NAMES[dtype], "loss": describe_loss(loss),
             "exploration": {**dataclasses.asdict(exploration), "reward": _described(exploration.reward)},
         })  # fmt: skip
         torch.manual_seed(derive_seed(settings.seed, "active", "loss"))
@@ -273,7 +275,9 @@ def pretrain_active(
         if run.means("pretrain"):
             write_row(run, loss, monitor, done["updates"])
             run.write("explore", updates=done["updates"])
-        explored = [{"domain": e.name, "agent_steps": e.agent_steps, "episodes": e.episodes} for e in explorers]
+        explored = [
+            {**where, "agent_steps": e.agent_steps, "episodes": e.episodes} for where, e in zip(places, explorers)
+        ]
         facts = {"device": str(device), "datasets": explored, "env_steps": run.position}
         first = explorers[0]
         return ExploreResult(

@@ -33,7 +33,7 @@ from crptpro.errors import (
 )
 from crptpro.logging import RunLogger
 from crptpro.progress import Progress
-from crptpro.provenance import provenance
+from crptpro.provenance import provenance, warn_of_other_versions
 from crptpro.seeding import derive_seed, kept_global_rng
 from crptpro.values import as_path, as_plain
 
@@ -119,7 +119,7 @@ class Run:
         run_dir: record and checkpoints; ``None`` keeps nothing.
         unit: what the position counts, ``"updates"`` or ``"env_steps"``; the first counter of every row.
         streams: those of the record that this run writes; :meth:`log` takes the first by default.
-        records: used instead of a record in ``run_dir``.
+        records: a record in ``run_dir``, such as one that Weights & Biases mirrors; by default a plain one.
         config: settings, for the record.
         progress: show a bar, or lines in a log file.
 
@@ -149,14 +149,16 @@ class Run:
         self.settings: dict[str, Any] = {}
         self.saved: dict[str, Any] = {}
         self._rows: dict[str, list[dict[str, Any]]] = {stream: [] for stream in streams}  # without a record
+        self._first_rows = dict.fromkeys(streams, 0)  # of the record
         self._means = {stream: _Means() for stream in streams}
         self._checkpoint = Checkpoint(format="archive")
         self._modules: list[nn.Module] = []
         self._stack = contextlib.ExitStack()
         self._signal: int | None = None
         self._has_record = False  # cut to the checkpoint
-        self._last_advance = self._row_position = 0
-        self._started = self._saved_time = self._row_time = time.monotonic()
+        self._last_advance = 0
+        self._last_row = 0, 0.0  # position and training time
+        self._started = self._saved_time = time.monotonic()
         self._is_shown = progress
         self._progress = Progress(0, 0, unit, is_shown=False)
 
@@ -174,8 +176,15 @@ class Run:
                 self._find_checkpoint()
                 if self.records is None:
                     self.records = stack.enter_context(RunLogger(self.run_dir))
+                elif not self.records.run_dir.resolve().is_relative_to(directory):
+                    raise CheckpointError(
+                        f"The record in {self.records.run_dir} is not in the run directory {self.run_dir}: a resumed "
+                        f"run could not tell its rows from those of another. Use RunLogger({str(self.run_dir)!r})."
+                    )
             if self.records is not None and self.config is not None:
                 self.records.describe(self.config)
+            if self.records is not None and self.run_dir is None:  # it may hold rows of other runs
+                self._first_rows = self.records.state_dict(self.streams)
             self._stack = stack.pop_all()
         return self
 
@@ -237,11 +246,12 @@ class Run:
                 if isinstance(cause, (EnvCrashedError, RenderingError, OSError)):  # not the checkpoint's fault
                     raise cause from None
                 raise CheckpointError(f"The checkpoint {self._latest} does not fit this run: {reason}") from reason
-            self.position = self.resumed_from = self._row_position = self.saved["position"]
+            self.position = self.resumed_from = self.saved["position"]
+            self._last_row = self.saved["last_row"]
             self.counters.update(self.saved["counters"])
             logger.info("Resuming from %s %s.", f"{self.position:,}", self.unit)
-        self._saved_time = self._row_time = time.monotonic()
-        self._started = self._row_time - self.saved.get("seconds", 0.0)
+        self._saved_time = time.monotonic()
+        self._started = self._saved_time - self.saved.get("seconds", 0.0)
 
     def until(self, total: int, *, checkpoint_interval: int | None = None) -> Iterator[int]:
         """Yield the position until it has reached ``total``; the body of the loop calls :meth:`advance`.
@@ -256,6 +266,8 @@ class Run:
                 "least as many, or choose another run directory."
             )
         self._restore_record()
+        if self.resumed_from and self.position < total:
+            warn_of_other_versions(self.saved["made_with"], str(self.run_dir))
         self._progress = Progress(total, self.position, self.unit, is_shown=self._is_shown)
         if threading.current_thread() is threading.main_thread():  # the only one that receives signals
             for number in SIGNALS:
@@ -284,7 +296,7 @@ class Run:
         self._has_record = True
         if self.saved.get("record") is not None:
             self.records.load_state_dict(self.saved["record"])
-        elif not self.saved and self.records.writes_into(self.run_dir):
+        elif not self.saved:
             self.records.begin_again(self.streams)
 
     def _ended(self) -> BaseException:
@@ -361,19 +373,20 @@ class Run:
         return row
 
     def _rate_and_memory(self) -> dict[str, float]:
-        now = time.monotonic()
+        (position, seconds), self._last_row = self._last_row, (self.position, self.seconds)
         row = {}
-        if self.position > self._row_position and now > self._row_time:
-            row[f"{self.unit}_per_s"] = (self.position - self._row_position) / (now - self._row_time)
+        if self.position > position and self.seconds > seconds:
+            row[f"{self.unit}_per_s"] = (self.position - position) / (self.seconds - seconds)
         row["resident_bytes"] = psutil.Process().memory_info().rss
         if torch.cuda.is_initialized():
             row["device_peak_bytes"] = max(map(torch.cuda.max_memory_allocated, range(torch.cuda.device_count())))
-        self._row_time, self._row_position = now, self.position
         return row
 
     def rows(self, stream: str) -> list[dict[str, Any]]:
         """Return every row of a stream; with a record, those of all resumptions."""
-        return self._rows[stream] if self.records is None else self.records.rows(stream)
+        if self.records is None:
+            return self._rows[stream]
+        return self.records.rows(stream)[self._first_rows[stream] :]
 
     def save(self, *, is_finished: bool = False) -> None:
         """Write a checkpoint of the components of :meth:`keep`, whose parameters must be finite; two are kept."""
@@ -397,6 +410,7 @@ class Run:
             "position": self.position,
             "counters": dict(self.counters),
             "seconds": self.seconds,
+            "last_row": self._last_row,
             "is_finished": is_finished,
             "record": None if self.records is None else self.records.state_dict(self.streams),
             "made_with": provenance(),

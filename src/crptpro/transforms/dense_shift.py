@@ -8,7 +8,6 @@ at (dy // S, dx // S) of the map of phase (dy % S, dx % S), as in the shift-and-
 
 from __future__ import annotations
 
-import logging
 import math
 import threading
 from typing import Any, Literal, Self
@@ -21,13 +20,12 @@ from torch import Tensor, nn
 from torchrl.data.tensor_specs import TensorSpec
 from torchrl.envs.transforms import Transform
 
+from crptpro.errors import CRPTproError
 from crptpro.modules import PixelEncoder
 from crptpro.modules.precision import device_of, evaluating
 from crptpro.transforms.base import Keys, require_pairs
 from crptpro.transforms.random_shift import as_numpy_bits, draw_offsets
 from crptpro.values import as_int, read_entry
-
-logger = logging.getLogger(__name__)
 
 
 def dense_shift_geometry(encoder: nn.Module, pad: int = 4) -> tuple[int, int, tuple[int, int, int, int]]:
@@ -309,8 +307,8 @@ def choose_feature_mode(
 
     ``"auto"`` chooses dense maps for a suitable encoder if they fit in four fifths of the free memory,
     ``available_bytes``: the maps of ``observations`` in ``dtype`` and, with ``latent_dim``, their projections. The rest
-    is for networks, batches and the page cache. Shifts are of up to 4 pixels. ``"dense"`` for an unsuitable encoder
-    raises a ``ValueError``.
+    is for networks, batches and the page cache. Shifts are of up to 4 pixels. ``"dense"`` raises a ``ValueError`` for
+    an unsuitable encoder, and a ``CRPTproError`` if the maps do not fit.
     """
     if mode == "reencode":
         return "reencode", "re-encoding at every update, as requested"
@@ -323,15 +321,18 @@ def choose_feature_mode(
     size = f"{needed / 2**30:.1f} GiB for {observations} observations, {available_bytes / 2**30:.1f} GiB free"
     if mode == "dense":
         if needed > available_bytes:
-            logger.warning("The dense-shift cache was requested and may not fit: %s.", size)
-        return "dense", f"dense-shift cache, as requested ({size})"
+            raise CRPTproError(
+                f"The dense maps do not fit in memory: {size}. features='reencode' needs none; a run that began with "
+                "dense maps can be continued with it."
+            )
+        return "dense", f"dense maps, as requested ({size})"
     budget = 0.8 * available_bytes
     if needed <= budget:
-        return "dense", f"dense-shift cache ({size})"
+        return "dense", f"dense maps ({size})"
     in_bf16 = dense_maps_bytes(encoder, observations, torch.bfloat16, latent_dim=latent_dim)
     if in_bf16 <= budget:
         size += f"; with features=dense-bf16 it would fit in {in_bf16 / 2**30:.1f} GiB"
-    return "reencode", f"re-encoding at every update: too little memory for the dense-shift cache ({size})"
+    return "reencode", f"re-encoding at every update: too little memory for dense maps ({size})"
 
 
 def dense_maps_bytes(
