@@ -8,7 +8,7 @@ import json
 import os
 import shutil
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,8 +48,10 @@ def write_json(path: str | Path, content: Mapping[str, Any]) -> None:
     write_whole(path, json.dumps(plain, indent=2, sort_keys=True) + "\n")
 
 
-def read_json(path: str | Path, *, error: type[CRPTproError] = CRPTproError) -> dict[str, Any]:
-    """Read a JSON object; raises ``error`` if the file is missing, not JSON, or not an object."""
+def read_json(
+    path: str | Path, *, keys: Iterable[str] = (), error: type[CRPTproError] = CRPTproError
+) -> dict[str, Any]:
+    """Read a JSON object with these keys; raises ``error`` if the file is missing, not JSON, or not such an object."""
     path = as_path(path)
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -59,6 +61,8 @@ def read_json(path: str | Path, *, error: type[CRPTproError] = CRPTproError) -> 
         raise error(f"{path} cannot be read as JSON ({reason}); it is damaged or not written by crptpro.") from None
     if not isinstance(content, dict):
         raise error(f"{path} holds a {type(content).__name__}, expected a JSON object.")
+    if missing := [key for key in keys if key not in content]:
+        raise error(f"{path} has no {', '.join(missing)}; it is damaged or not written by crptpro.")
     return content
 
 

@@ -243,6 +243,16 @@ def load_pretrained(path: str | Path) -> Pretrained:
     return _rebuilt(path, card, tensors)
 
 
+def domains_seen(card: Mapping[str, Any]) -> set[str]:
+    """Return the domains that an encoder, and the encoder it started from, were trained or standardised on."""
+    training: Any = card.get("training")
+    seen = {str(dataset.get("domain")) for dataset in card.get("standardised_on") or ()}
+    while isinstance(training, Mapping):
+        seen |= {str(dataset.get("domain")) for dataset in training.get("datasets") or ()}
+        training = training.get("previous_training")
+    return seen
+
+
 def shipped_encoders() -> list[str]:
     """Return the names of the encoders that ship with the package, in alphabetical order."""
     return sorted(card.parent.name for card in SHIPPED.glob(f"*/{CARD_FILE}"))

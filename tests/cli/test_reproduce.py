@@ -13,6 +13,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
+import torch
 from command import Call, refused
 from toy_env import FIXED
 
@@ -68,15 +69,21 @@ def test_a_plan_names_what_was_requested_and_is_no_part_of_an_experiment(
     assert ("left out" in out) == bool(named)
 
 
-def test_a_plan_says_when_fewer_jobs_would_leave_room_for_dense_maps(
-    call: Call, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("free_gb", "jobs", "hint"), [
+    (96, 1, r""),
+    (96, 16, r"Each job can use 4\.8 GB of memory for dense maps\. .* The maps take [\d.]+ GB for crptpro \(they fit "
+             r"with --jobs 4\); [\d.]+ GB for proto-rl-c \(they fit with --jobs 1\)\."),
+    (48, 1, r"The maps take [\d.]+ GB for proto-rl-c \(more than this machine has free\)\."),
+])  # fmt: skip
+def test_a_plan_says_which_dense_maps_do_not_fit(
+    call: Call, monkeypatch: pytest.MonkeyPatch, free_gb: int, jobs: int, hint: str
 ) -> None:
-    monkeypatch.setattr("crptpro.cli.reproduce.free_bytes", lambda _: 96e9)
-    for jobs, has_hint in ((16, True), (1, False)):
-        plan = ("--methods", "crptpro", "--jobs", jobs, "--scale", "paper", "--dry-run")
-        _, out, _ = call("reproduce", "seen", *plan)
-        assert ("Each job may take 6.0 GB of memory" in out) == has_hint
-        assert bool(re.search("several times slower; they fit with --jobs [1-9]", out)) == has_hint
+    monkeypatch.setattr("crptpro.cli.reproduce.free_bytes", lambda _: free_gb * 1e9)
+    monkeypatch.setattr("crptpro.cli.reproduce.resolve_precision", lambda *_: torch.bfloat16)
+    plan = ("--methods", "crptpro", "proto-rl-c", "--jobs", jobs, "--scale", "paper", "--dry-run")
+    _, out, _ = call("reproduce", "seen", *plan)
+    assert ("for dense maps" in out) == bool(hint)
+    assert re.search(hint, out)
 
 
 def test_all_means_the_experiments_with_requested_cells(call: Call) -> None:

@@ -129,3 +129,11 @@ def test_a_damaged_record_is_named(tmp_path: Path) -> None:
     path.write_text(path.read_text()[:-9])
     with pytest.raises(RecordError, match=r"seen-tiny\.json"):
         load_results(tmp_path)
+    path.write_text('{"experiment": "seen"}')
+    with pytest.raises(RecordError, match=r"seen-tiny\.json has no scale, cells; it is damaged"):
+        load_results(tmp_path)
+    path.unlink()
+    describe(tmp_path, make_plan([trained()], tmp_path))
+    (tmp_path / "jobs" / trained().key / "job.json").write_text('{"kind": "encoder"}')
+    with pytest.raises(RecordError, match=r"job\.json has no command, facts, needs"):
+        load_results(tmp_path)

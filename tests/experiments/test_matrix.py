@@ -177,10 +177,11 @@ def test_a_users_method_takes_the_scale_of_its_kind(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(plugins, "_loaded", [str(plugin)])
     monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
     usual = of(cells("seen", TINY, methods=("crptpro",), **PART), "crptpro")[0].needs[0]
-    register_method("mine", ProtoLoss, loss_options={"tau": 0.2}, is_preset=True)
+    register_method("mine", ProtoLoss, loss_options={"tau": 0.2}, updates=300, is_preset=True)
     [mine] = [c.job.needs[0] for c in cells("seen", TINY, methods=("mine",), **PART)]
     assert mine.facts["loss"] == usual.facts["loss"]
     assert (mine.facts["updates"], mine.facts["batch_size"]) == (6, 4)
+    assert cells("seen", PAPER, methods=("mine",), **PART)[0].job.needs[0].facts["updates"] == 300
     # An edited plugin makes another encoder, and leaves those of the library alone.
     plugin.write_text("# second")
     assert cells("seen", TINY, methods=("mine",), **PART)[0].job.needs[0].key != mine.key

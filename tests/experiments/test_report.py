@@ -20,6 +20,8 @@ from matplotlib.image import imread
 
 from crptpro.artifact import write_json
 from crptpro.errors import RecordError
+from crptpro.experiments import figures
+from crptpro.experiments.matrix import METHODS
 from crptpro.experiments.measure import write_rows
 from crptpro.experiments.report import build_report, left_plateau
 
@@ -162,7 +164,7 @@ def test_a_partial_reproduction_says_what_is_missing(made: Reproduction) -> None
     made.ask("unseen", [("atc", "run-other", {"group": "A", "task": "finger_spin", "encoder_seed": 0})])
     report = made.report()
     assert "Finished: 1 of 3 results." in report.text
-    assert "Missing: crptpro 1, atc 1. Missing results are left out, not replaced." in report.text
+    assert "Missing: crptpro: 1; atc: 1. Missing results are left out, not replaced." in report.text
     assert report.table("2 missing results")["job"].tolist() == ["run-begun", "run-none"]
     states = report.table("run: 2 jobs").set_index("job")["state"]
     assert states.tolist() == ["begun", "finished"]
@@ -283,15 +285,47 @@ def test_unplanned_runs_are_labelled_by_the_settings_that_differ(tmp_path: Path)
     report = Report(build_report(tmp_path, out=tmp_path / "page"))
     row = report.table("Episode return at the final").iloc[0]
     assert row["task"] == "walker_run"
-    assert row["crptpro, learning_rate 0.001"] == "100 ± 1 (n = 2)"
-    assert row["crptpro, learning_rate 0.0001"] == "102 (n = 1)"
+    assert row["crptpro (learning_rate 0.001)"] == "100 ± 1 (n = 2)"
+    assert row["crptpro (learning_rate 0.0001)"] == "102 (n = 1)"
     assert report.cell("Budgets beside", "here", "downstream runs per encoder") == "1"
-    assert "Runs on several encoders count as one method: crptpro, learning_rate 0.001 (2)." in report.text
+    assert "Runs on several encoders count as one method (crptpro (learning_rate 0.001): 2)." in report.text
     assert "This scale does not show" in report.text  # a learning rate is not the paper's
     # What is not known is not there.
     assert list(report.table("run: 3 jobs")) == ["job", "state"]
     assert "h of work" not in report.text
     assert "Machines, as tables" not in report.text
+
+
+def test_unplanned_runs_on_encoders_of_other_domains_and_without_bonus_are_other_methods(tmp_path: Path) -> None:
+    own = {"walker": "crptpro:1", "cheetah, walker": "crptpro:2"}
+    for number, (domains, encoder) in enumerate([*own.items(), *own.items()]):
+        settings = {"task": "walker_run", "env_steps": 500_000, "pretrained": encoder, "pretrained_on": domains}
+        settings |= {"intrinsic_reward_coef": 0.2 if number < 3 else 0}
+        write_json(tmp_path / str(number) / "config.json", {"config": settings, "versions": {}})
+        write_rows(tmp_path / str(number) / "eval.csv", evaluations(100.0 + number))
+    settings |= {"task": "walker_walk", "intrinsic_reward_coef": 0.2}  # alone on its task: nothing differs
+    write_json(tmp_path / "walk" / "config.json", {"config": settings, "versions": {}})
+    write_rows(tmp_path / "walk" / "eval.csv", evaluations(7.0))
+    table = (
+        Report(build_report(tmp_path, out=tmp_path / "page")).table("Episode return at the final").set_index("method")
+    )
+    walker = "crptpro (encoder walker)", "crptpro (encoder cheetah+walker)", "crptpro-no-bonus"
+    assert [table.loc[method, "walker_run"] for method in walker] == ["101 ± 1 (n = 2)", "101 (n = 1)", "103 (n = 1)"]
+    assert table.loc["crptpro", "walker_walk"] == "7.0 (n = 1)"
+
+
+def test_a_report_tells_the_encoders_apart_that_ship(tmp_path: Path) -> None:
+    table = Report(build_report(RESULTS / "paper_scale" / "finger_spin", out=tmp_path)).table(
+        "Episode return at the final"
+    )
+    names = " ".join(table.astype(str).to_numpy().ravel()) + " ".join(table)
+    assert "crptpro (encoder group-a)" in names
+    assert "crptpro (encoder all-domains)" in names
+
+
+def test_every_method_has_a_colour_of_its_own() -> None:
+    colors = [style["color"] for style in figures.styles(METHODS).values()]
+    assert len(set(colors)) == len(METHODS)
 
 
 def test_runs_with_the_papers_budgets_are_not_said_to_have_less_and_runs_on_one_encoder_are_not_warned_of(

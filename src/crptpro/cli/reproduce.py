@@ -156,7 +156,9 @@ class Reproduce:
 
     def _wanted(self, request: Request) -> dict[str, list[Cell]]:
         """Return cells by experiment. A named experiment must have cells; ``all`` means those that have any."""
-        for name in self.experiments or ("",):
+        if not self.experiments:
+            raise CRPTproError(f"Name at least one experiment: {', '.join(EXPERIMENTS)}, or {ALL}.")
+        for name in self.experiments:
             if name not in (*EXPERIMENTS, ALL):
                 raise UnknownNameError(
                     f"There is no experiment {name!r}; choose from {', '.join(EXPERIMENTS)}, or {ALL}."
@@ -195,7 +197,11 @@ def plan_text(plan: Plan, root: Path, disk: int, jobs: int) -> str:
 
     done = list(root.glob(f"{JOBS}/*/{DONE}"))
     kinds = [path.parent.name.split("-")[0] for path in done]
-    spent = pd.Series([read_json(path)["seconds"] for path in done], kinds, float).groupby(level=0).median()
+    spent = (
+        pd.Series([read_json(path, keys=("seconds",))["seconds"] for path in done], kinds, float)
+        .groupby(level=0)
+        .median()
+    )
     rows = []
     for kind, name in KINDS.items():
         needed = sum(job.kind == kind for job in plan.jobs)
@@ -218,19 +224,28 @@ def memory_text(plan: Plan, jobs: int) -> str:
     from crptpro.training.downstream import most_observations  # late, as they import TorchRL
     from crptpro.transforms.dense_shift import dense_maps_bytes
 
-    slots = 0
+    methods: dict[int, list[str]] = {}  # by the size of their dense maps
     for facts in (job.facts for job in plan.missing if job.kind == "run" and job.needs):  # without DrQ's
         stored = most_observations(facts["task"], facts["env_steps"], resolve_action_repeat(facts["task"]))
-        slots = max(slots, min(facts["replay_capacity"] * 51 // 50, stored))
-    needed = dense_maps_bytes(PixelEncoder(), slots, resolve_precision("auto", "cpu"), latent_dim=128)
-    free = free_bytes(torch.device("cpu"))
-    if needed <= 0.8 * free / jobs:
+        slots = min(facts["replay_capacity"] * 51 // 50, stored)
+        needed = dense_maps_bytes(PixelEncoder(), slots, resolve_precision("auto", "cpu"), latent_dim=128)
+        methods.setdefault(needed, []).append(facts["method"])
+    usable = 0.8 * free_bytes(torch.device("cpu"))  # by dense maps
+    too_large = [
+        f"{needed / 1e9:.1f} GB for {', '.join(dict.fromkeys(names))} "
+        + (
+            f"(they fit with --jobs {int(usable / needed)})"
+            if usable >= needed
+            else "(more than this machine has free)"
+        )
+        for needed, names in sorted(methods.items())
+        if needed > usable / jobs
+    ]
+    if not too_large:
         return ""
-    fitting = int(0.8 * free / needed)
-    advice = f"they fit with --jobs {fitting}" if fitting else "this machine has too little memory for one"
     return (
-        f"Each job may take {free / jobs / 1e9:.1f} GB of memory. A run whose dense maps ({needed / 1e9:.1f} GB) do "
-        f"not fit encodes again at every update, which is several times slower; {advice}."
+        f"Each job can use {usable / jobs / 1e9:.1f} GB of memory for dense maps. Runs whose maps do not fit encode "
+        f"again at every update, which is several times slower. The maps take {'; '.join(too_large)}."
     )
 
 

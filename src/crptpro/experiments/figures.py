@@ -11,9 +11,9 @@ import pandas as pd
 from crptpro.experiments.matrix import METHODS
 
 COLORS = {
-    "crptpro": "#0b80c3", "crptpro-fast": "#3d44d8", "crptpro-no-bonus": "#0b80c3", "crptpro-finetune": "#5fc0f0",
+    "crptpro": "#0b80c3", "crptpro-fast": "#3d44d8", "crptpro-no-bonus": "#1d2733", "crptpro-finetune": "#5fc0f0",
     "proto-rl-c": "#d9640a", "proto-rl-s": "#e6a800", "atc": "#109e77", "apt-c": "#c76aa2", "apt-s": "#8a3f70",
-    "becl": "#8f8a2a", "drq": "#8a7bd8", "random-encoder": "#858a91", "random-encoder-standardised": "#858a91",
+    "becl": "#8f8a2a", "drq": "#8a7bd8", "random-encoder": "#858a91", "random-encoder-standardised": "#7a4a1e",
     "random policy": "#858a91",
 }  # fmt: skip
 """From Okabe and Ito's and from Tol's colour-blind-safe sets; methods that are not listed take matplotlib's."""

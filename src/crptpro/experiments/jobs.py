@@ -185,6 +185,9 @@ def bytes_of(job: Job) -> tuple[int, int]:
     return 1_000_000, 0
 
 
+CELLS = ("experiment", "scale", "cells")  # keys of a file of cells
+
+
 def write_cells(root: Path, experiment: str, scale: str, cells: Iterable[tuple[str, str, Mapping[str, Any]]]) -> None:
     """Record the cells of an experiment: label, key of the job and place of each number.
 
@@ -195,7 +198,7 @@ def write_cells(root: Path, experiment: str, scale: str, cells: Iterable[tuple[s
     path.parent.mkdir(parents=True, exist_ok=True)
     new = [{"label": label, "job": key, "place": place} for label, key, place in cells]
     with locked(path.parent / ".lock"):
-        before = read_json(path, error=RecordError)["cells"] if path.exists() else []
+        before = read_json(path, keys=CELLS, error=RecordError)["cells"] if path.exists() else []
         taken = [(cell["label"], cell["place"]) for cell in new]
         kept = [cell for cell in before if (cell["label"], cell["place"]) not in taken]
         write_json(path, {"experiment": experiment, "scale": scale, "cells": [*new, *kept]})
@@ -230,7 +233,7 @@ def load_results(root: str | Path) -> Results:
     rows = {path.parent.name: _job_row(path) for path in sorted((root / JOBS).glob(f"*/{DESCRIPTION}"))}
     cells = []
     for path in sorted((root / EXPERIMENTS).glob("*.json")):
-        content = read_json(path, error=RecordError)
+        content = read_json(path, keys=CELLS, error=RecordError)
         for cell in content["cells"]:
             row = {"experiment": content["experiment"], "scale": content["scale"]}
             row |= {"label": cell["label"], "job": cell["job"]}
@@ -242,7 +245,7 @@ def load_results(root: str | Path) -> Results:
 
 
 def _job_row(path: Path) -> dict[str, Any]:
-    content, done_path = read_json(path, error=RecordError), path.with_name(DONE)
+    content, done_path = read_json(path, keys=DESCRIBED, error=RecordError), path.with_name(DONE)
     done = read_json(done_path, error=RecordError) if done_path.exists() else {}
     made = {name: done.get(name) for name in MADE} | {"machine": machine(done.get("hardware"))}
     return {name: content[name] for name in DESCRIBED} | made | {"path": path.parent, "done": done_path.exists()}

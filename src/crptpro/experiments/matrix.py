@@ -108,7 +108,7 @@ SMALL = Scale(
     paper_timing_updates=7,  # about as many transitions
     coverage_samples=512,
 )  # fmt: skip
-"""A fifth of the data, 6 % of the updates, 4 % of the env steps, a quarter of the batch: a day on two CPU cores."""
+"""A fifth of the data, 6 % of the updates, 4 % of the env steps, a quarter of the batch."""
 TINY = Scale(
     "tiny",
     transitions=130,  # an episode of manipulation has 125
@@ -270,9 +270,11 @@ def encoder(scale: Scale, system: str, domains: Iterable[str], seed: int, *, los
     settings = {"loss": {k: v for k, v in chosen.items() if k not in defaults or defaults[k] != v}, **scale.training}
     facts |= {"domains": names, **settings}
     if method.exploration is None:
-        facts |= {"updates": scale.updates, "transitions": scale.transitions}
+        # At the paper's scale a method has its own budget.
+        updates = method.updates if scale.updates == PAPER.updates else scale.updates
+        facts |= {"updates": updates, "transitions": scale.transitions}
         command = ["pretrain", *map(_dataset_of, data), *where]
-        command += options(seed=seed, updates=scale.updates, **settings)
+        command += options(seed=seed, updates=updates, **settings)
         return Job("encoder", title, tuple(command), facts, data, _definition(method=method))
     exploring = {**scale.explore, **(scale.explore_single if method.exploration.is_single_domain else {})}
     if "encoder_update_interval" in exploring:

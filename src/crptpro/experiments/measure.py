@@ -29,7 +29,7 @@ from crptpro.modules import Projector
 from crptpro.modules.encoder import images_of
 from crptpro.modules.precision import device_of
 from crptpro.objectives import get_method
-from crptpro.pretrained import Pretrained, load_pretrained
+from crptpro.pretrained import Pretrained, domains_seen, load_pretrained
 from crptpro.seeding import derive_seed
 from crptpro.training.explore import plan_exploration
 
@@ -86,16 +86,6 @@ def _untrained_projector(pretrained: Pretrained) -> Projector:
         torch.manual_seed(derive_seed(int(pretrained.card.get("seed", 0)), "untrained_projector"))
         projector = Projector(pretrained.encoder.feature_dim)
     return projector.requires_grad_(False).eval().to(device_of(pretrained.encoder) or "cpu")
-
-
-def domains_seen(card: Mapping[str, Any]) -> set[str]:
-    """Return the domains that an encoder, and the encoder it started from, were trained or standardised on."""
-    training: Any = card.get("training")
-    seen = {str(dataset.get("domain")) for dataset in card.get("standardised_on") or ()}
-    while isinstance(training, Mapping):
-        seen |= {str(dataset.get("domain")) for dataset in training.get("datasets") or ()}
-        training = training.get("previous_training")
-    return seen
 
 
 @dataclass(frozen=True, kw_only=True)

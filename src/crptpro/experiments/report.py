@@ -21,14 +21,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from crptpro.artifact import read_json, write_whole
+from crptpro.artifact import CARD_FILE, identity_of, read_json, write_whole
 from crptpro.errors import RecordError
 from crptpro.experiments import jobs as records
 from crptpro.experiments import published
 from crptpro.experiments import statistics as stats
 from crptpro.experiments.figures import draw, in_order
 from crptpro.experiments.launch import duration
-from crptpro.experiments.matrix import EXPERIMENTS, PAPER
+from crptpro.experiments.matrix import EXPERIMENTS, NO_BONUS, PAPER
+from crptpro.pretrained import SHIPPED, shipped_encoders
 from crptpro.values import as_path
 
 logger = logging.getLogger(__name__)
@@ -184,9 +185,10 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Find downstream runs that no experiment planned, and describe them as cells and jobs.
 
     Runs of one method on one task are seeds of each other only if all other settings agree. Otherwise the label names
-    the settings that differ, as in ``"crptpro, env_steps 20000"``.
+    the settings that differ, as in ``"crptpro (env_steps 20000)"``.
     """
     cells = []
+    shipped = {identity_of(read_json(SHIPPED / name / CARD_FILE)): name for name in shipped_encoders()}
     jobs: dict[str, dict[str, Any]] = {}
     for path in sorted(path.parent for path in root.rglob("eval.csv")):
         try:
@@ -194,6 +196,10 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
             episodes = _read(path / "eval.csv", *EPISODES)
             label = episodes["method"].iloc[0]
             facts = content["config"] | {"method": label}
+            domains = facts.pop("pretrained_on", "").replace(", ", "+")  # encoders of the same ones count as one method
+            facts["encoder"] = shipped.get(facts.get("pretrained"), domains)
+            if label == "crptpro" and facts.get("intrinsic_reward_coef") == 0:
+                label = NO_BONUS
             is_done = bool(episodes["env_steps"].max() >= facts["env_steps"])
         except (RecordError, KeyError, TypeError, AttributeError) as reason:
             logger.warning("Left out: %s is not a readable downstream run (%s).", path, reason)
@@ -211,10 +217,11 @@ def _unplanned_runs(root: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
             "finished downstream run."
         )
     settings = pd.DataFrame([job["facts"] for job in jobs.values()]).astype(str)
-    for _, own in table.groupby("label"):
-        counts = settings.loc[own.index].groupby([own["task"], own["colors"]]).nunique().max()
-        for name in counts.index[counts > 1].difference(NOT_IN_LABELS):
-            table.loc[own.index, "label"] += f", {name} " + settings[name]
+    for _, own in table.groupby(["label", "task", "colors"]):
+        here = settings.loc[own.index]
+        if names := [name for name in sorted(here) if name not in NOT_IN_LABELS and here[name].nunique() > 1]:
+            differing = [", ".join(f"{name} {row[name]}" for name in names) for row in here.to_dict("records")]
+            table.loc[own.index, "label"] += [f" ({each})" for each in differing]
     return table, pd.DataFrame.from_dict(jobs, orient="index")
 
 
@@ -377,7 +384,7 @@ def _experiment(page: Page, experiment: str, scale: str, cells: pd.DataFrame, jo
     page.text(f"Finished: {len(cells) - len(missing)} of {_count(len(cells), 'result')}.")
     if len(missing):
         counts = missing["label"].value_counts(sort=False)
-        names = ", ".join(f"{label} {count}" for label, count in counts.items())
+        names = "; ".join(f"{label}: {count}" for label, count in counts.items())
         page.text(f"Missing: {names}. Missing results are left out, not replaced.", "warning")
         places = missing.drop(columns=["experiment", "scale", "done"])
         page.table(_count(len(missing), "missing result"), places, fold=True)
@@ -404,10 +411,10 @@ def _scores(page: Page, name: str, cells: pd.DataFrame, jobs: pd.DataFrame) -> N
     if jobs["command"].isna().all():  # no experiment says how its encoders were trained
         trained = runs[~runs["label"].str.startswith(("random-encoder", "drq"))]
         encoders = trained.groupby("label", sort=False)["encoder"].nunique()
-        if several := [f"{label} ({count})" for label, count in encoders.items() if count > 1]:
+        if several := [f"{label}: {count}" for label, count in encoders.items() if count > 1]:
             page.text(
-                f"Runs on several encoders count as one method: {', '.join(several)}. Whether these encoders were "
-                "trained alike is not recorded here.",
+                f"Runs on several encoders count as one method ({'; '.join(several)}). Beyond the domains of their "
+                "training, whether these encoders were trained alike is not recorded here.",
                 "warning",
             )
     late = _late(evaluations)
@@ -488,7 +495,7 @@ def _aggregates(page: Page, runs: pd.DataFrame) -> None:
     labels = in_order(runs["label"])
     has_run = runs.groupby(["task", "label"], sort=False).size().unstack().notna()[labels]
     for task, row in has_run[~has_run.all(axis=1)].iterrows():
-        page.text(f"Left out of the comparison of methods: {task} (no run of {', '.join(row.index[~row])}).", "note")
+        page.text(f"Left out of the comparison of methods: {task} (no run of {'; '.join(row.index[~row])}).", "note")
     shared = has_run.index[has_run.all(axis=1)]
     if shared.empty:
         page.text("There is no task on which every method has a run: nothing to aggregate.", "note")

@@ -30,7 +30,7 @@ from crptpro.modules.precision import PRECISION_NAMES, Precision
 from crptpro.objectives import DrQLoss, RADSACLoss, get_method, method_names
 from crptpro.objectives.base import require_positive
 from crptpro.objectives.methods import DOWNSTREAM
-from crptpro.pretrained import Pretrained, load_pretrained, random_pretrained, require_saveable
+from crptpro.pretrained import Pretrained, domains_seen, load_pretrained, random_pretrained, require_saveable
 from crptpro.provenance import cpu_cores
 from crptpro.seeding import derive_seed, seed_everything
 from crptpro.training.agent import AGENT_FORMAT, PixelAgent, SACLearner, save_agent
@@ -198,7 +198,9 @@ def train_downstream(
     if settings.features in ("dense", "dense-bf16"):
         dense_shift_geometry(pretrained.encoder)
     # A control's weights may differ in the last digit on another machine; a resumed run has those of its checkpoint.
-    what = {**where, "pretrained": f"{source}:seed {settings.seed}" if is_control else pretrained.identity()}
+    identity = f"{source}:seed {settings.seed}" if is_control else pretrained.identity()
+    seen = domains_seen(pretrained.card)
+    what = {**where, "pretrained": identity, "pretrained_on": ", ".join(sorted(seen))}
     device = usable_device(settings.device)
     repeat = settings.action_repeat
     with contextlib.ExitStack() as stack:
@@ -220,9 +222,8 @@ def train_downstream(
         encoder = _frozen_copy(pretrained.encoder, device, dtype)
         actor, action_dim = pretrained.actor, env.env.action_spec.shape[-1]
         # Proto-RL(S): it starts as the actor that explored the task's own domain.
-        domains = [each["domain"] for each in (pretrained.card.get("training") or {}).get("datasets", ())]
         has_explored = isinstance(actor, SquashedGaussianActor) and actor.config["action_dim"] == action_dim
-        has_explored = has_explored and (not domains or where["domain"] in domains)
+        has_explored = has_explored and (not seen or where["domain"] in seen)
         learner, agent = _make_agent(pretrained, encoder, action_dim, settings, generators["policy"], has_explored)
         set_compute_dtype(learner.loss, dtype)
         evaluator = Evaluator(env.make_env, agent, episodes=settings.eval_episodes, seed=settings.seed,
