@@ -1,4 +1,4 @@
-"""CRPTpro in TorchRL's idioms (--task walker_walk). Deviation: every decision updates actor, critic and temperature."""
+"""CRPTpro in TorchRL's idioms (--task walker_walk). Deviation: every agent step updates actor and temperature, too."""
 
 import torch
 import tyro

@@ -61,7 +61,7 @@ class Config:
     quality: Literal["exact", "fast"] = "fast"
     """render quality; fast uses smaller shadow maps, less than 1 % of the pixels differ [exact]"""
     action_repeat: int = 4
-    """env steps per decision; fewer renderings per episode than with the paper's [2]"""
+    """env steps per agent step; fewer renderings per episode than with the paper's [2]"""
     prototypes: int = 256
     """with more, batches of 128 would leave the exploration bonus mostly 0 [512]"""
     assignment_temperature: float = 0.05

@@ -29,10 +29,7 @@ def _empty_registry(monkeypatch: pytest.MonkeyPatch) -> None:
     ("hopper", "hopper", "hopper_hop"),
     ("finger", "finger", "finger_spin"),
     ("walker_stand", "walker", "walker_stand"),
-    ("manip_reach_duplo", "manipulation", "reach_duplo"),
-    ("manipulation_reach_duplo", "manipulation", "reach_duplo"),
-    ("reach_duplo_vision", "manipulation", "reach_duplo"),
-    ("manip_lift_brick", "manipulation", "lift_brick"),
+    ("lift_brick", "manipulation", "lift_brick"),
     ("ball_in_cup_catch", "ball_in_cup", "ball_in_cup_catch"),
     ("acrobot", "acrobot", "acrobot_swingup"),
     ("lqr_2_1", "lqr", "lqr_2_1"),
@@ -108,7 +105,7 @@ def test_looking_up_names_does_not_import_dm_control(monkeypatch: pytest.MonkeyP
     # The import would fix the render backend before it can be chosen.
     monkeypatch.setitem(sys.modules, "dm_control", None)  # makes "import dm_control" raise
     get_domain("dog_run")
-    get_domain("manip_place_cradle")
+    get_domain("place_cradle")
     with pytest.raises(UnknownNameError):
         get_domain("nothing_like_it")
 

@@ -45,9 +45,9 @@ def verdict(task: str, method: str, at: list[int]) -> Iterator[str]:
     else:
         yield f"{means}. By the rule pre-training {'helps' if met else 'does not help'}: the difference is at least 100"
     if method == "`crptpro`":
-        yield f"is {trained.mean():.0f} with encoder and bonus, {untrained.mean():.0f} with neither (three"
+        yield f"is {trained.mean():.0f} with encoder and bonus, {untrained.mean():.0f} with neither,"
     else:
-        yield f"is {trained.mean():.0f} on `group-a`, {untrained.mean():.0f} on untrained ones"
+        yield f"runs on `group-a` average {trained.mean():.0f}, on untrained encoders {untrained.mean():.0f},"
 
 
 def conditioning() -> Iterator[str]:
@@ -63,7 +63,8 @@ def conditioning() -> Iterator[str]:
     yield f"Their range {how} that of plain untrained ones ({each(*plain)})"
     others = f"{each(*standardised)} on untrained ones with standardised features"
     yield f"{each(*trained)} on the pre-trained encoder, {others}"
-    yield f"{plain.mean():.0f} on untrained ones, {standardised.mean():.0f} with standardised features (three each)"
+    ours = f"on those with standardised features {standardised.mean():.0f} (three each)"
+    yield f"on untrained encoders {plain.mean():.0f}, {ours}"
 
 
 def sentences() -> Iterator[str]:
@@ -147,7 +148,8 @@ def sentences() -> Iterator[str]:
     theirs = authors[[60_000, 80_000, 100_000]].mean(axis=1).iloc[0]
     all_of_theirs = runs[AUTHORS].loc[:, 60_000:100_000].mean(axis=1).iloc[0]
     yield f"The authors' run has {theirs:.0f} ({all_of_theirs:.0f} over all its evaluations there"
-    yield f"three new ones average {means.mean():.0f}, the authors' run {theirs:.0f}"
+    yield f"parity with the authors' run ({theirs:.0f})"
+    yield f"three new ones average {means.mean():.0f}"
     log = "[the authors' log](#a-task-with-the-settings-of-the-paper)"
     yield f"env steps is {means.mean():.0f}, that of {log} {theirs:.0f}"
     without = runs["`crptpro-no-bonus`"][[60_000, 80_000, 100_000]].mean(axis=1).mean()
@@ -186,7 +188,7 @@ def sentences() -> Iterator[str]:
     drq = finger["DrQ, its authors' log"]
     yield f"is: {ours[60_000]:.0f} after 60,000 env steps, {untrained[60_000]:.0f} on untrained encoders"
     yield f"DrQ's runs have {RESULTS['_spread'](drq[60_000])}"
-    yield f"{RESULTS['_spread'](drq[[40_000, 60_000]].mean(axis=1))} in DrQ's log (ten)"
+    yield f"{RESULTS['_spread'](drq[[40_000, 60_000]].mean(axis=1))} for DrQ."
     yield from verdict("finger_spin", "`crptpro`", [40_000, 60_000])
     wide, narrow = (finger[name].mean() for name in ("`all-domains`", "`crptpro`"))
     means = [own[[40_000, 60_000]].mean() for own in (wide, narrow)]

@@ -161,7 +161,7 @@ def get_domain(name: str | Domain) -> Domain:
     Examples:
         >>> get_domain("cheetah").task
         'cheetah_run'
-        >>> get_domain("manip_reach_duplo").name
+        >>> get_domain("reach_duplo").name
         'manipulation'
     """
     if isinstance(name, Domain):
@@ -170,9 +170,6 @@ def get_domain(name: str | Domain) -> Domain:
         return found
     if name.startswith(GYMNASIUM_PREFIX):
         return _gymnasium_domain(name)
-    bare = name.removeprefix("manipulation_").removeprefix("manip_").removesuffix("_vision")
-    if bare in MANIPULATION_TASKS:
-        return _BUILT_IN[bare]
     known = sorted({*_BUILT_IN, *_registered})
     near = difflib.get_close_matches(name.lower().replace("-", "_"), known, n=5, cutoff=0.5)
     hint = f"Nearest: {', '.join(near)}." if near else f"Domains: {', '.join(PAPER_DOMAINS)}."

@@ -52,7 +52,7 @@ class RecordError(CRPTproError):
 
 
 class NonFiniteError(CRPTproError):
-    """A loss, a gradient, a weight, or a value from an environment became NaN or infinite."""
+    """A loss, a weight, or a value from an environment became NaN or infinite."""
 
 
 class SubmissionError(CRPTproError):

@@ -236,7 +236,7 @@ def load_pretrained(path: str | Path) -> Pretrained:
         if not (SHIPPED / path / CARD_FILE).exists():
             raise PretrainedError(
                 f"{path} does not exist, and no encoder of this name ships with crptpro; those that do: "
-                f"{', '.join(shipped_encoders()) or 'none'}. Without pre-training: random-encoder or drq."
+                f"{', '.join(shipped_encoders()) or 'none'}."
             )
         path = SHIPPED / path
     card, tensors = read_artifact(path, format_name=FORMAT, version=VERSION, error=PretrainedError)

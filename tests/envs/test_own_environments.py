@@ -151,7 +151,7 @@ def test_agent_steps_are_counted_by_what_a_domain_repeats() -> None:
         assert resolve_action_repeat(name) == 2
     assert repr(episode_length(repeating)) == "5"
     assert episode_length("cheetah") == episode_length("dog_run") == 500
-    assert episode_length("reach_duplo") == episode_length("manip_lift_brick") == 125
+    assert episode_length("reach_duplo") == episode_length("lift_brick") == 125
     assert episode_length("walker_walk", action_repeat=3) == 334
     assert episode_length("lqr_2_1") is episode_length(endless) is None
     assert episode_length("gymnasium:HalfCheetah-v5") == 500

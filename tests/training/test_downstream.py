@@ -201,7 +201,7 @@ def test_dense_maps_are_for_as_many_observations_as_a_budget_can_store(task: Any
 def test_a_run_that_ends_before_its_first_update_is_announced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("INFO", logger="crptpro"):
         assert train(tmp_path, env_steps=20).evaluations[-1]["updates"] == 0
-    assert "20 env steps end before the first update, which comes after 12 decisions of 2 env" in caplog.text
+    assert "20 env steps end before the first update, which comes after 12 agent steps of 2 env" in caplog.text
     assert f"GB in {tmp_path / 'replay'}; it is kept" in caplog.text
 
 

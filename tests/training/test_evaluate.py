@@ -101,7 +101,7 @@ def test_a_policy_may_return_its_action_alone_or_need_gradients() -> None:
     (lambda pixels: [0.0, 0.0], "list"), (TensorDictModule(torch.nn.Identity(), ["pixels"], ["features"]), "NoneType"),
 ])  # fmt: skip
 def test_a_policy_that_returns_no_action_of_the_environment_is_refused(policy: Any, got: str) -> None:
-    with pytest.raises(ValueError, match=rf"decision 0: the policy returned {got} for an action of shape \(2,\)"):
+    with pytest.raises(ValueError, match=rf"agent step 0: the policy returned {got} for an action of shape \(2,\)"):
         evaluate(policy, make_toy_env(), episodes=1, progress=False)
 
 

@@ -59,27 +59,22 @@ class Logging:
     """Where metrics go besides the local CSV and JSONL records, which are always written."""
 
     wandb: Literal["off", "auto", "offline", "online"] = "off"
-    """mirror to Weights & Biases; auto is online when logged in, else offline"""
+    """mirror to Weights & Biases (its variables apply, e.g. WANDB_TAGS); auto is online when logged in, else offline"""
     wandb_project: str | None = None
     """W&B project (None: $WANDB_PROJECT, or crptpro)"""
-    wandb_group: str | None = None
-    """W&B group (None: $WANDB_RUN_GROUP, or none)"""
-    wandb_tags: Annotated[tuple[str, ...], arg(help_behavior_hint="(default: none)")] = ()
-    """W&B tags"""
     tensorboard: bool = False
     """also write TensorBoard event files"""
 
     @contextlib.contextmanager
     def records(self, run_dir: Path) -> Iterator[RunLogger | None]:
         """Open the record of a run with its mirrors; without mirrors yields ``None``: the run then opens its own."""
-        if self.wandb == "off" and (self.wandb_project or self.wandb_group or self.wandb_tags):
-            raise CRPTproError("A W&B project, group or tag needs --logging.wandb: auto, offline or online.")
+        if self.wandb == "off" and self.wandb_project:
+            raise CRPTproError("--logging.wandb-project needs --logging.wandb: auto, offline or online.")
         if self.wandb == "off" and not self.tensorboard:
             yield None
             return
         run_dir = as_path(run_dir, "out")
-        mode = None if self.wandb == "auto" else self.wandb
-        asked = {"project": self.wandb_project, "group": self.wandb_group, "tags": self.wandb_tags, "mode": mode}
+        asked = {"project": self.wandb_project, "mode": None if self.wandb == "auto" else self.wandb}
         wandb = None if self.wandb == "off" else {name: value for name, value in asked.items() if value}
         with refusal_leaves_nothing(run_dir), RunLogger(run_dir, wandb=wandb, tensorboard=self.tensorboard) as logger:
             yield logger
@@ -122,7 +117,7 @@ class Collect:
     colors: Colors = "normal"
     """colours of the environments; reversed_background are the unseen ones of the paper"""
     action_repeat: int | None = None
-    """simulator steps per decision (None: the domain's, 2)"""
+    """simulator steps per agent step (None: the domain's, 2)"""
 
     def run(self) -> None:
         settings = {k: v for k, v in vars(self).items() if k not in ("domains", "out")}
@@ -208,7 +203,7 @@ class Pretrain(Pretraining):
 
 @dataclass(frozen=True, kw_only=True)
 class Explore(Pretraining):
-    """Pre-train one encoder on what exploring agents see: one decision per domain in turn."""
+    """Pre-train one encoder on what exploring agents see: one agent step per domain in turn."""
 
     config: Annotated[training.ExploreConfig, arg(name="")] = field(default_factory=training.ExploreConfig)
     """all settings of the stage"""
@@ -243,8 +238,8 @@ class Downstream:
     task: Annotated[Positional[str], arg(metavar="TASK")]
     """task to learn, e.g. walker_run, reach_duplo, gymnasium:HalfCheetah-v5"""
     pretrained: Annotated[str, arg(metavar="ENCODER")]
-    """directory of the pretrained encoder, the name of one that ships (group-a, all-domains),
-    `random-encoder` for the untrained control, or `drq` to learn the encoder with the task"""
+    """directory of the pretrained encoder, the name of one that ships (group-a, all-domains), `random-encoder` for the
+    untrained control, or `drq` to learn the encoder with the task"""
     out: Path
     """run directory: eval.csv, train.csv, checkpoints, and the agent in OUT/agent"""
     config: Annotated[training.DownstreamConfig, arg(name="")] = field(default_factory=training.DownstreamConfig)
@@ -278,7 +273,7 @@ class Evaluate:
     colors: Colors | None = None
     """colours of the environment (None: those of the agent's training; normal for the random policy)"""
     action_repeat: int | None = None
-    """simulator steps per decision (None: what the agent was trained with; the domain's for the random policy)"""
+    """simulator steps per agent step (None: what the agent was trained with; the domain's for the random policy)"""
     csv: Path | None = None
     """write one row per episode here"""
     video: Path | None = None
@@ -334,7 +329,7 @@ class Probe:
     """Predict positions and velocities from frozen features by ridge regression, on held-out episodes."""
 
     encoder: Annotated[Positional[str], arg(metavar="ENCODER")]
-    """directory of a pretrained encoder, or `random-encoder` for the untrained control"""
+    """directory of a pretrained encoder, the name of one that ships (group-a, all-domains), or `random-encoder`"""
     datasets: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="DATASET [DATASET ...]", help_behavior_hint="(required)")
     ]

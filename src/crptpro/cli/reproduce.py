@@ -61,8 +61,6 @@ class Reproduce:
     """seeds of the downstream runs on each encoder"""
     encoder_seeds: tuple[int, ...] = (0,)
     """seeds of data and pre-training"""
-    colors_by: Literal["background", "image"] = "background"
-    """what the experiment `colors` reverses: the background or the whole image"""
     out: Annotated[str, arg(metavar="PATH")] = "runs/reproduce"
     """ROOT, the directory of all jobs and results; finished jobs in it are reused"""
     dry_run: bool = False
@@ -72,8 +70,7 @@ class Reproduce:
     launcher: Literal["local", "slurm", "ray"] = "local"
     """local: processes here; slurm, ray: a cluster whose nodes share ROOT"""
     jobs: int | None = None
-    """most jobs at a time, each with its own memory (None: one per core, or --jobs-per-gpu for each GPU,
-    which is also the most here; on a cluster 16)"""
+    """most jobs at a time, each with its own memory (None: one per core; with GPUs --jobs-per-gpu each; cluster 16)"""
     cores_per_job: int | None = None
     """cores of each job (None: this machine's divided by jobs; on a cluster 1, or 4 with a GPU)"""
     jobs_per_gpu: int = 1
@@ -97,7 +94,7 @@ class Reproduce:
         )
         request = Request(
             SCALES[self.scale], methods=self.methods, groups=self.groups, tasks=self.tasks, seeds=self.seeds,
-            encoder_seeds=self.encoder_seeds, colors=f"reversed_{self.colors_by}", device=self.device,
+            encoder_seeds=self.encoder_seeds, device=self.device,
             threads=min(cores * jobs, cpu_cores()) if self.launcher == "local" else cores,
         )  # fmt: skip
         wanted = self._wanted(request)

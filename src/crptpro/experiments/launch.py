@@ -206,7 +206,7 @@ class SlurmLauncher:
 
     def __init__(self, parameters: Mapping[str, Any], cluster: str = "slurm") -> None:
         if find_spec("submitit") is None:
-            raise CRPTproError("--launcher slurm needs submitit: pip install 'crptpro[launch]'.")
+            raise CRPTproError("--launcher slurm needs submitit: pip install 'crptpro[slurm]'.")
         if cluster == "slurm" and (shutil.which("srun") is None or shutil.which("sbatch") is None):
             raise CRPTproError(
                 "--launcher slurm needs sbatch and srun, which are not here: call it on a login node of the cluster, "

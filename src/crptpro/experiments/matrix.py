@@ -91,7 +91,7 @@ SMALL = Scale(
     # As many prototypes as rows, as in the paper (512 of both): with more, most rows are their own nearest candidates
     # and the prototype reward is 0.
     loss={"ProtoLoss": {"num_prototypes": 128}},
-    # 20,000 decisions and, after the random ones, as many encoder updates as the methods on random data have.
+    # 20,000 agent steps and, after the random ones, as many encoder updates as the methods on random data have.
     explore={
         "env_steps": 40_000, "checkpoint_interval_env_steps": 2_000, "encoder_update_interval": 6,
         "random_agent_steps": 667,
@@ -132,7 +132,7 @@ TINY = Scale(
     alphas=(5e-2,),
     capacities=(130,),  # equal to ``transitions``: no further data
     probe_samples=60,
-    probe_transitions=1_100,  # three episodes; one has 500 decisions
+    probe_transitions=1_100,  # three episodes; one has 500 agent steps
     timing_updates=2,
     coverage_samples=32,
     embedded_samples=8,
@@ -164,7 +164,6 @@ class Request:
     tasks: tuple[str, ...] = ()
     encoder_seeds: tuple[int, ...] = (0,)
     seeds: tuple[int, ...] = ()
-    colors: str = "reversed_background"
     device: str = "cpu"
     threads: int = 1
 
@@ -446,9 +445,9 @@ def _unseen(request: Request) -> Iterator[Cell]:
 def _colors(request: Request) -> Iterator[Cell]:
     """Tasks with the colours of the background reversed, without fine-tuning (section IV.C).
 
-    The paper exchanges their RGB values and does not say what the background is; whole images are the option.
+    The paper exchanges their RGB values and does not say what the background is.
     """
-    return _paper_rows(request, COLORS, request.methods or CROSS_DOMAIN, place={"colors": request.colors})
+    return _paper_rows(request, COLORS, request.methods or CROSS_DOMAIN, place={"colors": "reversed_background"})
 
 
 @_experiment("Fine-tuning on one domain")

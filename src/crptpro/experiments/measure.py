@@ -35,8 +35,8 @@ from crptpro.training.explore import plan_exploration
 
 StageOf = Callable[[Sequence[str]], type]  # returns the dataclass of the stage that a command line names
 WINDOWS = 5  # parts of a timing; their median is robust against one slow part
-RANDOM_AGENT_STEPS = 24  # random decisions per domain before a timed exploration, instead of the method's own
-COVERAGE_WINDOWS = 10  # of the training; fewer if a window would have fewer decisions of a domain than samples
+RANDOM_AGENT_STEPS = 24  # random ones per domain before a timed exploration, instead of the method's own
+COVERAGE_WINDOWS = 10  # of the training; fewer if a window would have fewer agent steps of a domain than samples
 
 
 def write_rows(path: Path, rows: pd.DataFrame | Sequence[Mapping[str, Any]]) -> None:
@@ -117,7 +117,7 @@ class Comparison:
 def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
     """Write how widely an explorer's observations are spread along its training, beside random data: OUT/coverage.csv.
 
-    A window has the same decisions of both sources; a source with too few of them has no row.
+    A window has the same agent steps of both sources; a source with too few of them has no row.
     """
     pretrained, explored = of.load(), load_pretrained(of.explorer)
     frame_stack = images_of(pretrained.encoder)["frame_stack"]
@@ -132,7 +132,7 @@ def coverage(of: Annotated[Comparison, tyro.conf.arg(name="")]) -> None:
         replay = StoredReplay(replay_path, frame_stack=frame_stack)
         domain = random.domain
         total = decisions[domain]
-        lost = total - len(replay)  # the oldest decisions, which the ring has overwritten
+        lost = total - len(replay)  # the oldest agent steps, which the ring has overwritten
         for window, source in product(range(windows), ("random", "explorer")):
             start, end = window * total // windows, (window + 1) * total // windows
             is_random = source == "random"

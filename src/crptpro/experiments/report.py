@@ -277,7 +277,7 @@ BUDGETS = (
     ("pre-training batch", "512, or the method's own", "batch_size", "encoder|explored", ""),
     ("prototypes", "512", "loss.num_prototypes", "encoder|explored", "crptpro|proto-rl"),
     ("env steps of exploration (C)", "200,000", "explore.env_steps", "explored", "proto-rl-c"),
-    ("decisions per encoder update (C)", "2", "explore.encoder_update_interval", "explored", "proto-rl-c"),
+    ("agent steps per encoder update (C)", "2", "explore.encoder_update_interval", "explored", "proto-rl-c"),
     ("downstream env steps", "500,000", "env_steps", "run", "(?!drq)"),
     ("DrQ's env steps", "1,000,000", "env_steps", "run", "drq"),
     ("downstream batch", "512", "batch_size", "run", ""),
@@ -623,7 +623,7 @@ def _sensitivity(page: Page, name: str, runs: pd.DataFrame, varied: str) -> None
 
 COSTS = {
     "s per encoder update": ("seconds_per_update", ".3g"),
-    "s per decision": ("seconds_per_decision", ".3g"),
+    "s per agent step": ("seconds_per_decision", ".3g"),
     "encoder updates at this scale": ("budget_updates", ",.0f"),
     "hours at this scale": ("projected_hours", ".3g"),
     "hours of collecting": ("collecting", ".3g"),
@@ -735,7 +735,7 @@ def _coverage(page: Page, name: str, rows: pd.DataFrame, jobs: pd.DataFrame) -> 
         ends[column] = ends[column].map(f"{{:{form}}}".format)
     page.table(
         "Coverage at the end: particle estimate over observations from the last of up to ten equal windows of the "
-        "training, and from as many decisions of the random policy; mean over n runs; higher is wider. Env steps are "
+        "training, and from as many agent steps of the random policy; mean over n runs; higher is wider. Env steps are "
         "the explorer's in all domains.",
         ends.rename(columns={"label": "data"}),
     )

@@ -51,8 +51,8 @@ def accelerate(
         except RuntimeError as reason:  # the compiler's own errors are RuntimeErrors
             what = (str(reason).strip().splitlines() or [type(reason).__name__])[0]
             raise CompileError(
-                f"The update cannot be compiled or recorded: {what} `compile` needs a C++ compiler (CXX=...), on a GPU "
-                "Triton too. Try it without `compile` and `cuda_graph`."
+                f"The update cannot be compiled or recorded: {what.rstrip('.')}. `compile` needs a C++ compiler "
+                "(CXX=...), on a GPU Triton too. Try it without `compile` and `cuda_graph`."
             ) from reason
 
     return call

@@ -60,7 +60,7 @@ class DownstreamConfig:
     replay_capacity: int | None = None
     """transitions kept (None: the method's; 40,000, proto-rl and drq 100,000); the oldest go first"""
     random_agent_steps: int = 1_000
-    """decisions before the first update, uniformly at random unless the actor has explored the domain (proto-rl-s)"""
+    """agent steps before the first update, uniformly at random unless the actor has explored the domain (proto-rl-s)"""
     intrinsic_reward_coef: float | None = None
     """weight of the prototype-kNN bonus (None: the method's; 0.2 for those with prototypes); 0 switches it off"""
     knn_k: int = 3
@@ -78,10 +78,9 @@ class DownstreamConfig:
     critic_tau: float = 0.01
     """EMA rate of the target critic, at every second update"""
     action_repeat: int | None = None
-    """simulator steps per decision (None: the domain's, 2)"""
+    """simulator steps per agent step (None: the domain's, 2)"""
     features: Literal["auto", "dense", "dense-bf16", "reencode"] = "auto"
-    """features of shifted observations: crops of dense maps, stored once per observation (exact; in bfloat16 rounded
-    once, with half the memory), or the encoder at every update; auto takes dense maps where the memory suffices"""
+    """crops of dense maps (exact; dense-bf16: rounded, half the memory) or re-encoding; auto is dense where it fits"""
     eval_interval_env_steps: int = 10_000
     """simulator steps between two evaluations; the first is at 0, the last at the end"""
     eval_episodes: int = 10
@@ -99,8 +98,7 @@ class DownstreamConfig:
     colors: Colors = "normal"
     """colours of the task: reversed_background are the paper's unseen ones, reversed_image works everywhere"""
     precision: Precision = "auto"
-    """of convolutions and matrix products; auto is bf16 where faster, fp32 for your own networks. Deviation: the
-    released code uses fp32"""
+    """auto is bf16 where faster, fp32 for your own networks. Deviation: the released code uses fp32"""
     compile: bool = False
     """compile the losses with torch.compile; changes rounding only"""
     cuda_graph: bool = False
@@ -246,7 +244,7 @@ def train_downstream(
 
         if run.position < settings.env_steps <= repeat * settings.random_agent_steps:
             logger.warning(
-                "%s env steps end before the first update, which comes after %s decisions of %d env steps each.",
+                "%s env steps end before the first update, which comes after %s agent steps of %d env steps each.",
                 f"{settings.env_steps:,}", f"{settings.random_agent_steps:,}", repeat,
             )  # fmt: skip
 
@@ -402,7 +400,7 @@ def attach_transforms(
     if has_bonus:
         projector, prototypes = [_frozen_copy(n, device, dtype) for n in (projector, prototypes)]
     elif config.intrinsic_reward_coef > 0:
-        logger.info("no exploration bonus: the encoder of %s has no prototypes", pretrained.label)
+        logger.info("no exploration bonus: the encoder of %s has no prototypes, or no projector", pretrained.label)
     # An update projects its whole batch, an agent step every shift of one observation.
     keeps_projections = has_bonus and config.batch_size >= 2 * (2 * SHIFT_PAD + 1) ** 2
     setting = run.settings["features"]

@@ -43,7 +43,7 @@ class Episode:
     episode_return: float
     """sum of the environment's own rewards, without any bonus"""
     agent_steps: int
-    """decisions, ``env_steps / action_repeat``"""
+    """``env_steps / action_repeat``"""
     seed: int
     """of the environment, set before its reset"""
 
@@ -100,7 +100,7 @@ def run_episode(
         if not isinstance(action, Tensor) or action.shape != env.action_spec.shape:
             got = tuple(action.shape) if isinstance(action, Tensor) else type(action).__name__
             raise ValueError(
-                f"Evaluation episode {episode}, decision {agent_steps}: the policy returned {got} for an action of "
+                f"Evaluation episode {episode}, agent step {agent_steps}: the policy returned {got} for an action of "
                 f"shape {tuple(env.action_spec.shape)}. A policy maps pixels to one action, or is a TorchRL module "
                 'that writes "action" into a TensorDict.'
             )
@@ -139,7 +139,7 @@ class Evaluator:
 
     ``on_result`` gets the episodes and the counters of an evaluation, called by :meth:`poll` once it has ended, or by
     :meth:`finish`. Without ``workers``, or where none can import ``make_env`` or the encoder's class, this process
-    evaluates. One CPU thread computes every decision either way.
+    evaluates. One CPU thread computes every action either way.
     """
 
     def __init__(

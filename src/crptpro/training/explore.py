@@ -58,7 +58,7 @@ class ExploreConfig:
     """How agents explore while an encoder is pre-trained. ``None`` means the method's own value.
 
     Source: Proto-RL's released agent (denisyarats/proto) and CRPTpro's comparison of it across domains. Every interval
-    counts a domain's own decisions.
+    counts a domain's own agent steps.
     """
 
     env_steps: int | None = None
@@ -68,9 +68,9 @@ class ExploreConfig:
     learning_rate: float | None = None
     """of the encoder's Adam (None: the method's)"""
     encoder_update_interval: int | None = None
-    """decisions in a domain between two encoder updates on it (None: the method's, 2)"""
+    """agent steps in a domain between two encoder updates on it (None: the method's, 2)"""
     random_agent_steps: int | None = None
-    """decisions per domain taken uniformly at random before its first update (None: the method's)"""
+    """agent steps per domain taken uniformly at random before its first update (None: the method's)"""
     replay_capacity: int | None = None
     """transitions kept per domain (None: the method's, 100,000)"""
     hidden_dim: int = 1_024
@@ -82,8 +82,7 @@ class ExploreConfig:
     quality: Quality = "exact"
     """render quality"""
     precision: Precision = "auto"
-    """of convolutions and matrix products; auto is bf16 where faster, fp32 for your own loss or network. Deviation: the
-    released code uses fp32"""
+    """auto is bf16 where faster, fp32 for your own loss or network. Deviation: the released code uses fp32"""
     device: str = "cpu"
     """device of all networks"""
     log_interval: int = 50
@@ -102,12 +101,12 @@ class ExploreConfig:
 
 @dataclass(frozen=True)
 class ExplorationPlan:
-    """How many decisions and updates an active pre-training makes; domains take turns, one decision each."""
+    """How many agent steps and updates an active pre-training makes; domains take turns, one agent step each."""
 
-    repeats: tuple[int, ...]  # simulator steps per decision, of each domain; ``env_steps`` are over all
-    agent_steps: int  # decisions of each domain
-    first_update: int  # decision of a domain from which on updates follow
-    encoder_update_interval: int  # in a domain's own decisions
+    repeats: tuple[int, ...]  # simulator steps per agent step, of each domain; ``env_steps`` are over all
+    agent_steps: int  # of each domain
+    first_update: int  # agent step of a domain from which on updates follow
+    encoder_update_interval: int  # in a domain's own agent steps
     encoder_updates_each: int  # encoder updates after each interval
 
     @property
@@ -144,7 +143,7 @@ def plan_exploration(
     )
     if not plan.encoder_updates:
         raise CRPTproError(
-            f"{settings.env_steps:,} env steps are {plan.agent_steps:,} decisions per domain, of which the first "
+            f"{settings.env_steps:,} env steps are {plan.agent_steps:,} agent steps per domain, of which the first "
             f"{plan.first_update:,} come without updates: nothing would be learned. Use more env_steps or fewer "
             "random_agent_steps."
         )
@@ -176,12 +175,12 @@ def pretrain_active(
 ) -> ExploreResult:
     """Train a self-supervised loss on what exploring agents see (Proto-RL, APT, BeCL; here also across domains).
 
-    The domains take turns, one decision each. A domain has its own environment, replay, actor, critic and temperature;
+    The domains take turns, one agent step each. Each has its own environment, replay, actor, critic and temperature;
     encoder, heads, prototypes and their optimiser are shared. Its agent learns from the intrinsic reward alone, the
     encoder from the self-supervised loss alone, on batches of one domain at a time.
 
     Deviation: neither the paper nor the released code says how its cross-domain active baselines are built. Turns,
-    shared candidates and schedules in a domain's own decisions are this project's choice.
+    shared candidates and schedules in a domain's own agent steps are this project's choice.
 
     ``domains`` are one or several, by domain or task name. ``run_dir`` gets records (``pretrain.csv``, ``explore.csv``,
     ``episodes.csv``), replays and checkpoints; the same call with a new loss resumes. ``overrides`` are single settings

@@ -54,8 +54,7 @@ class PretrainConfig:
     seed: int = 0
     """seeds sampling, shifts, and what the loss draws"""
     precision: Precision = "auto"
-    """of convolutions and matrix products; auto is bf16 where faster, fp32 for your own loss or network. Deviation: the
-    released code uses fp32"""
+    """auto is bf16 where faster, fp32 for your own loss or network. Deviation: the released code uses fp32"""
     compile: bool = False
     """compile the loss with torch.compile; changes rounding only"""
     cuda_graph: bool = False
