@@ -5,8 +5,8 @@
     python recipes/explore.py --method becl --domains A
 
 One agent per domain explores for the intrinsic reward alone, and the encoder learns from its observations. Every
-default is the method's number. Disk: a replay per domain (0.8 GB with -c on group A, 2.4 GB with -s) and 1.3 GB per task
-(Proto-RL 2.6). If killed, the same command resumes. Writes one eval.csv per task below OUT, a row per episode.
+default is the method's number. Disk: a replay per domain (-c on group A 0.8 GB, -s 2.4 GB) and 1.3 GB per task (Proto-RL
+2.6). If killed, the same command resumes. Writes one eval.csv per task below OUT, a row per episode.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@
     python recipes/paper.py --group A --method random-encoder     # the control: the same without pre-training
 
 Every default is the paper's number, or the sources' where the paper is silent. Disk: 2.1 GB per domain and 1.3 GB per
-task. Memory: 4 GB; with dense maps 20 GB in bfloat16, 36 GB in float32. If killed, the same command resumes; another seed
-needs another --out, because its random data differ. Writes one eval.csv per task below OUT, a row per episode.
+task. Memory: 4 GB; with dense maps 20 GB (bfloat16) or 36 GB (float32). If killed, the same command resumes; another
+seed needs another --out, because its random data differ. Writes one eval.csv per task below OUT, a row per episode.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def verdict(task: str, method: str, at: list[int]) -> Iterator[str]:
     else:
         yield f"{means}. By the rule pre-training {'helps' if met else 'does not help'}: the difference is at least 100"
     if method == "`crptpro`":
-        yield f"is {trained.mean():.0f} with encoder and bonus, {untrained.mean():.0f} with neither,"
+        yield f"is {trained.mean():.0f} with encoder and bonus, {untrained.mean():.0f} with neither (three each)"
     else:
         yield f"runs on `group-a` average {trained.mean():.0f}, on untrained encoders {untrained.mean():.0f},"
 
@@ -188,7 +188,7 @@ def sentences() -> Iterator[str]:
     drq = finger["DrQ, its authors' log"]
     yield f"is: {ours[60_000]:.0f} after 60,000 env steps, {untrained[60_000]:.0f} on untrained encoders"
     yield f"DrQ's runs have {RESULTS['_spread'](drq[60_000])}"
-    yield f"{RESULTS['_spread'](drq[[40_000, 60_000]].mean(axis=1))} for DrQ."
+    yield f"{RESULTS['_spread'](drq[[40_000, 60_000]].mean(axis=1))} for DrQ (ten)"
     yield from verdict("finger_spin", "`crptpro`", [40_000, 60_000])
     wide, narrow = (finger[name].mean() for name in ("`all-domains`", "`crptpro`"))
     means = [own[[40_000, 60_000]].mean() for own in (wide, narrow)]
