@@ -5,7 +5,7 @@
     python recipes/explore.py --method becl --domains A
 
 One agent per domain explores for the intrinsic reward alone, and the encoder learns from its observations. Every
-default is the method's number. Disk: a replay per domain (-c on group A 0.8 GB, -s 2.4 GB) and 1.3 GB per task (Proto-RL
+default is the method's number. Disk: a replay per domain (-c on group A 0.8 GB, -s 2.4 GB), 1.3 GB per task (Proto-RL
 2.6). If killed, the same command resumes. Writes one eval.csv per task below OUT, a row per episode.
 """
 
