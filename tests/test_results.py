@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import runpy
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pandas as pd
@@ -32,6 +32,10 @@ def test_the_readme_quotes_the_returns_of_the_quickstart() -> None:
     quoted = re.search(ours, readme)
     assert quoted is not None
     assert list(quoted.groups()) == [cell.split()[0] for cell in RESULTS["quickstart"]().iloc[-1, -3:]]
+
+
+def listed(values: Iterable[float]) -> str:
+    return " and ".join(", ".join(f"{value:.0f}" for value in values).rsplit(", ", 1))
 
 
 def verdict(task: str, method: str, at: list[int]) -> Iterator[str]:
@@ -142,9 +146,8 @@ def sentences() -> Iterator[str]:
     yield f"From 60,000 to 100,000 env steps its runs average {RESULTS['_spread'](drq)}"
     complete = runs["`crptpro`"].loc[:, :100_000].dropna()
     means = complete[[60_000, 80_000, 100_000]].mean(axis=1)
-    listed = " and ".join(", ".join(f"{mean:.0f}" for mean in means).rsplit(", ", 1))
     within = "within" if 200 <= means.mean() <= 340 else "outside"
-    yield f"from 60,000 to 100,000 env steps is {means.mean():.0f} ({listed}), {within} the 200 to 340"
+    yield f"from 60,000 to 100,000 env steps is {means.mean():.0f} ({listed(means)}), {within} the 200 to 340"
     theirs = authors[[60_000, 80_000, 100_000]].mean(axis=1).iloc[0]
     all_of_theirs = runs[AUTHORS].loc[:, 60_000:100_000].mean(axis=1).iloc[0]
     yield f"The authors' run has {theirs:.0f} ({all_of_theirs:.0f} over all its evaluations there"
@@ -190,12 +193,12 @@ def sentences() -> Iterator[str]:
     yield f"DrQ's runs have {RESULTS['_spread'](drq[60_000])}"
     yield f"{RESULTS['_spread'](drq[[40_000, 60_000]].mean(axis=1))} for DrQ (ten)"
     yield from verdict("finger_spin", "`crptpro`", [40_000, 60_000])
-    wide, narrow = (finger[name].mean() for name in ("`all-domains`", "`crptpro`"))
-    means = [own[[40_000, 60_000]].mean() for own in (wide, narrow)]
-    yield "the one run so far has a mean of {:.0f} at 40,000 and 60,000 env steps, beside {:.0f} on `group-a`".format(
-        *means
-    )
-    yield f"At 20,000 it returned {wide[20_000]:.0f}, where the runs on `group-a` have {narrow[20_000]:.0f} on average"
+    wide, narrow = (finger[name] for name in ("`all-domains`", "`crptpro`"))
+    means = wide[[40_000, 60_000]].mean(axis=1)
+    stated = f"have a mean of {means.mean():.0f} at 40,000 and 60,000 env steps ({listed(means)})"
+    yield f"{stated}, beside {narrow[[40_000, 60_000]].mean(axis=1).mean():.0f} on `group-a`"
+    theirs = f"where the runs on `group-a` have {narrow[20_000].mean():.0f} on average"
+    yield f"At 20,000 they returned {listed(wide[20_000])}, {theirs}"
     more = [("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "all ten")[count]
             for count in (drq[[20_000, 60_000]] > ours[[20_000, 60_000]]).sum()]  # fmt: skip
     yield f"at 40,000 env steps they average {ours[40_000]:.0f}, the others {untrained[40_000]:.0f}"
