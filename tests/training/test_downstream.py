@@ -388,7 +388,7 @@ def test_candidates_that_the_artifact_brings_set_the_length_of_the_queue() -> No
 
 
 def test_a_run_keeps_its_precision_and_features_on_another_machine_unless_its_maps_no_longer_fit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def continued(env_steps: int, **options: Any) -> tuple[str, str]:
         result = train(tmp_path / "run", env_steps=env_steps, **{"precision": "auto", "features": "auto"} | options)
@@ -401,9 +401,12 @@ def test_a_run_keeps_its_precision_and_features_on_another_machine_unless_its_ma
     assert continued(60) == ("bf16", "dense")
     monkeypatch.setattr("crptpro.training.downstream.free_bytes", lambda device: 0)
     with pytest.raises(CRPTproError, match=r"dense maps do not fit in memory: .*can be continued"):
-        continued(80)
-    assert continued(80, features="reencode") == ("bf16", "reencode")
+        continued(80, features="dense")
+    assert continued(80) == ("bf16", "reencode")
+    assert "re-encoding at every update: too little memory for dense maps" in caplog.text
+    monkeypatch.undo()
     assert continued(100) == ("bf16", "reencode")
+    assert continued(120, features="dense") == ("bf16", "dense")
 
 
 def test_batches_too_small_for_the_prototypes_are_announced(caplog: pytest.LogCaptureFixture) -> None:

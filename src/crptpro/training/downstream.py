@@ -407,13 +407,15 @@ def attach_transforms(
     is_rounded = setting == "dense-bf16"
     map_dtype = torch.bfloat16 if is_rounded else dtype
     slots = min(replay.window, observations)
+    # The two modes round differently in bfloat16: a resumed run keeps its mode while that is possible.
+    is_resumed = setting == "dense" and config.features == "auto"
     mode, reason = choose_feature_mode(
-        "dense" if is_rounded else setting, encoder, slots, map_dtype,
+        "auto" if is_resumed else "dense" if is_rounded else setting, encoder, slots, map_dtype,
         available_bytes=max(0, free_bytes(device) - reserved_bytes),
-        latent_dim=prototypes.weight.shape[1] if keeps_projections else None,
+        latent_dim=prototypes.weight.shape[1] if keeps_projections else None, share=1.0 if is_resumed else 0.8,
     )  # fmt: skip
-    logger.info("features: %s", reason)
-    # The two modes round differently in bfloat16: a resumed run keeps its mode unless another is requested.
+    level = logging.WARNING if is_resumed and mode == "reencode" else logging.INFO
+    logger.log(level, "features: %s", reason)
     run.settings["features"] = setting if is_rounded else mode
     if mode == "reencode":
         keeps_projections = False

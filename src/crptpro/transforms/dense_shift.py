@@ -302,10 +302,11 @@ def choose_feature_mode(
     available_bytes: int,
     *,
     latent_dim: int | None = None,
+    share: float = 0.8,
 ) -> tuple[Literal["dense", "reencode"], str]:
     """Choose dense maps or re-encoding of shifted images, which give the same features; returns mode and reason.
 
-    ``"auto"`` chooses dense maps for a suitable encoder if they fit in four fifths of the free memory,
+    ``"auto"`` chooses dense maps for a suitable encoder if they fit in a ``share`` of the free memory,
     ``available_bytes``: the maps of ``observations`` in ``dtype`` and, with ``latent_dim``, their projections. The rest
     is for networks, batches and the page cache. Shifts are of up to 4 pixels. ``"dense"`` raises a ``ValueError`` for
     an unsuitable encoder, and a ``CRPTproError`` if the maps do not fit.
@@ -326,7 +327,7 @@ def choose_feature_mode(
                 "dense maps can be continued with it."
             )
         return "dense", f"dense maps, as requested ({size})"
-    budget = 0.8 * available_bytes
+    budget = share * available_bytes
     if needed <= budget:
         return "dense", f"dense maps ({size})"
     in_bf16 = dense_maps_bytes(encoder, observations, torch.bfloat16, latent_dim=latent_dim)
