@@ -286,7 +286,8 @@ class Evaluate:
         csv, video = require_writable(self.csv, "--csv"), require_video(self.video)  # before an hour of episodes
         agent, card = (None, {}) if is_random else training.load_agent(self.agent)
         task = self.task or card["task"]
-        domain = get_domain(task) if agent is None else replace(get_domain(task), camera=card["camera"])
+        domain = get_domain(task)
+        domain = replace(domain, camera=card.get("camera", domain.camera))
         usual = {"quality": "exact", "colors": "normal", "action_repeat": None} | card
         names = ("quality", "colors", "action_repeat")
         given = {name: getattr(self, name) for name in names}
