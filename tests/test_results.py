@@ -195,10 +195,19 @@ def sentences() -> Iterator[str]:
     yield from verdict("finger_spin", "`crptpro`", [40_000, 60_000])
     wide, narrow = (finger[name] for name in ("`all-domains`", "`crptpro`"))
     means = wide[[40_000, 60_000]].mean(axis=1)
-    stated = f"have a mean of {means.mean():.0f} at 40,000 and 60,000 env steps ({listed(means)})"
+    stated = f"the three runs have a mean of {means.mean():.0f} at 40,000 and 60,000 env steps ({listed(means)})"
     yield f"{stated}, beside {narrow[[40_000, 60_000]].mean(axis=1).mean():.0f} on `group-a`"
     theirs = f"where the runs on `group-a` have {narrow[20_000].mean():.0f} on average"
     yield f"At 20,000 they returned {listed(wide[20_000])}, {theirs}"
+    theirs = listed(narrow[[40_000, 60_000]].mean(axis=1))
+    yield f"are {listed(means)} on `all-domains`, {theirs} on `group-a`"
+    folders = [RESULTS["PAPER_SCALE"] / f"finger_spin/all-domains_seed_{seed}" for seed in range(3)]
+    early = pd.read_csv(folders[2] / "episodes.csv").query("env_steps <= 40_000")["episode_return"]
+    yield f"training episodes returned {early.mean():.0f} on average, {early.max():.0f} at most"
+    trained = [pd.read_csv(folder / "train.csv", index_col="env_steps") for folder in folders]
+    sure = [run.index[run["entropy"] < 1].min() for run in trained]
+    yield "below 1 nat after {2:,} env steps, as in the other two ({0:,} and {1:,})".format(*sure)
+    yield f"The critic's mean value at 40,000 was {trained[2]['q_mean'][40_000]:.0f}, nearly all"
     more = [("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "all ten")[count]
             for count in (drq[[20_000, 60_000]] > ours[[20_000, 60_000]]).sum()]  # fmt: skip
     yield f"at 40,000 env steps they average {ours[40_000]:.0f}, the others {untrained[40_000]:.0f}"
