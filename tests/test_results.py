@@ -194,6 +194,15 @@ def sentences() -> Iterator[str]:
     yield f"{RESULTS['_spread'](drq[[40_000, 60_000]].mean(axis=1))} for DrQ (ten)"
     yield from verdict("finger_spin", "`crptpro`", [40_000, 60_000])
     wide, narrow = (finger[name] for name in ("`all-domains`", "`crptpro`"))
+    (alone,) = finger["`crptpro-no-bonus`"].to_dict("records")
+    highest = pd.concat([wide, narrow]).max()
+    how = "more" if all(alone[at] > highest[at] for at in (20_000, 40_000, 60_000)) else "not always more"
+    beside = f"beside {narrow[[40_000, 60_000]].mean(axis=1).mean():.0f} with it"
+    yield f"so far has a mean of {(alone[40_000] + alone[60_000]) / 2:.0f} at 40,000 and 60,000 env steps, {beside}"
+    yield "It returned {:.0f} at 20,000, {:.0f} at 40,000 and {:.0f} at 60,000, each".format(
+        *(alone[at] for at in (20_000, 40_000, 60_000))
+    )
+    yield f"each {how} than any run with the bonus at that point"
     means = wide[[40_000, 60_000]].mean(axis=1)
     stated = f"the three runs have a mean of {means.mean():.0f} at 40,000 and 60,000 env steps ({listed(means)})"
     yield f"{stated}, beside {narrow[[40_000, 60_000]].mean(axis=1).mean():.0f} on `group-a`"
