@@ -17,6 +17,7 @@ from torchrl.data import RandomSampler, ReplayBuffer, SliceSampler
 from torchrl.envs import CatFrames, TransformedEnv
 from toy_env import ToyEnv, collect_toy, collection_request, data_bytes, random_episode, variable_length, write_dataset
 
+from crptpro import provenance
 from crptpro.artifact import CARD_FILE
 from crptpro.data import FrameDataset, FrameReplay
 from crptpro.errors import DatasetError, DiskSpaceError
@@ -343,6 +344,19 @@ def test_another_backend_or_renderer_may_not_continue(tmp_path: Path, now: dict[
     with pytest.raises(DatasetError, match=message):
         resumed.writer.note_rendering(now)
     resumed.writer.close()
+
+
+def test_a_collection_that_is_continued_with_other_versions_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    dataset = FrameDataset.create(tmp_path, **collection_request())
+    dataset.extend(random_episode(10, size=8))
+    dataset.writer.close()
+    now = {**provenance.versions(), "mujoco": "9.9"}
+    monkeypatch.setattr(provenance, "versions", lambda: now)
+    FrameDataset.create(tmp_path, **collection_request()).writer.close()
+    assert f"{tmp_path} is continued with other versions" in caplog.text
+    assert "is now 9.9." in caplog.text
 
 
 def test_a_dataset_takes_21_kb_per_transition(tmp_path: Path) -> None:
